@@ -1,0 +1,1 @@
+"""One file per heavy library: arrays in, arrays out, foreign exceptions turned into ours."""

@@ -1,0 +1,1 @@
+"""From a disparity to a clean cloud of points with their errors."""

@@ -1,0 +1,112 @@
+"""The errors of the project: one tree, one clear line each.
+
+::
+
+    ReconError
+    ├── SettingsError            a setting is unknown or out of its range
+    ├── ShapeError               an array has the wrong dtype, shape or values
+    ├── CalibrationError         cameras that cannot give metric depth
+    ├── FormatError              a file is missing, truncated or not what it claims to be
+    ├── SourceError              a folder or device cannot give stereo pairs
+    ├── MatchingError            a pair cannot be matched
+    ├── RegistrationError        frames cannot be registered
+    ├── MappingError             a map cannot be built
+    ├── MeshingError             a surface cannot be reconstructed
+    ├── EvaluationError          an estimate cannot be compared with its truth
+    ├── OutputError              a result cannot be written
+    └── MissingDependencyError   an optional package is not installed
+
+The command line prints ``str(error)`` and exits with 1; the library only raises.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import Any
+
+
+class ReconError(Exception):
+    """An error that a user can act on, told in one line.
+
+    Args:
+        what: What is wrong, in a few words.
+        where: File, frame or setting concerned.
+        got: What was found.
+        expected: What would have been right.
+        hint: What to do about it.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str | PathLike[str] | None = None,
+        got: Any = None,
+        expected: Any = None,
+        hint: str | None = None,
+    ) -> None:
+        self.what = what
+        self.where = where
+        self.got = got
+        self.expected = expected
+        self.hint = hint
+        super().__init__(self._line())
+
+    def _line(self) -> str:
+        found = [
+            f"{label} {value}"
+            for label, value in (("got", self.got), ("expected", self.expected))
+            if value is not None
+        ]
+        line = f"{self.where}: {self.what}" if self.where is not None else self.what
+        line += f" ({', '.join(found)})" if found else ""
+        line += f"; {self.hint}" if self.hint else ""
+        return " ".join(line.split())
+
+
+class SettingsError(ReconError):
+    """A setting is unknown or out of its range."""
+
+
+class ShapeError(ReconError):
+    """An array has the wrong dtype, shape or values."""
+
+
+class CalibrationError(ReconError):
+    """Cameras that cannot give metric depth."""
+
+
+class FormatError(ReconError):
+    """A file is missing, truncated or not what it claims to be."""
+
+
+class SourceError(ReconError):
+    """A folder or device cannot give stereo pairs."""
+
+
+class MatchingError(ReconError):
+    """A pair cannot be matched."""
+
+
+class RegistrationError(ReconError):
+    """Frames cannot be registered."""
+
+
+class MappingError(ReconError):
+    """A map cannot be built."""
+
+
+class MeshingError(ReconError):
+    """A surface cannot be reconstructed."""
+
+
+class EvaluationError(ReconError):
+    """An estimate cannot be compared with its truth."""
+
+
+class OutputError(ReconError):
+    """A result cannot be written."""
+
+
+class MissingDependencyError(ReconError):
+    """An optional package is not installed."""

@@ -1,0 +1,1 @@
+"""Pure functions of space: rigid motions, projection, triangulation and its error."""

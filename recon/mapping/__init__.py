@@ -1,0 +1,1 @@
+"""From posed clouds to a fused cloud, 3-D occupancy and a flat grid."""

@@ -1,0 +1,1 @@
+"""From a rectified pair to a disparity with confidence and reasons."""

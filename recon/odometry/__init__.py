@@ -1,0 +1,1 @@
+"""From frames to poses: a visual prior and a kiss-icp correction that must earn its place."""

@@ -1,0 +1,80 @@
+"""What every odometry takes, gives and promises."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from recon.structures import Disparity, RectifiedPair
+from recon.structures.arrays import Float64, freeze
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryFrame:
+    """All that an odometry may use of one frame.
+
+    Attributes:
+        pair: The rectified pictures, for tracking.
+        disparity: What the matcher found in them.
+    """
+
+    pair: RectifiedPair
+    disparity: Disparity
+
+
+@dataclass(frozen=True)
+class OdometryHealth:
+    """How far the pose of one frame can be trusted. NaN = does not apply or not measured.
+
+    Attributes:
+        ok: False where the pose rests on no measurement (it is then extrapolated).
+        tracks: Features followed from the last frame.
+        inliers: Features that agree with the visual motion.
+        reprojection_px: Their median reprojection error.
+        icp_points: Points given to ICP.
+        overlap: Share of ICP source points with a neighbour in the map.
+        residual_m: Median distance of those to the map.
+        correction_m: Translation by which ICP would move the prior.
+        correction_deg: Rotation by which ICP would move the prior.
+        accepted: True where (a part of) the ICP correction was taken.
+        notes: Why something was refused or went wrong, for the log.
+    """
+
+    ok: bool = True
+    tracks: int = 0
+    inliers: int = 0
+    reprojection_px: float = float("nan")
+    icp_points: int = 0
+    overlap: float = float("nan")
+    residual_m: float = float("nan")
+    correction_m: float = float("nan")
+    correction_deg: float = float("nan")
+    accepted: bool = False
+    notes: tuple[str, ...] = field(default=())
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryResult:
+    """Where the left camera was when the frame was taken.
+
+    Attributes:
+        T_world_camera: float64 (4, 4); the first frame is the identity.
+        health: How far it can be trusted.
+    """
+
+    T_world_camera: Float64
+    health: OdometryHealth
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_world_camera", np.float64, (4, 4))
+
+
+@runtime_checkable
+class Odometry(Protocol):
+    """Follows the camera from frame to frame; holds state, so frames come in order."""
+
+    def register(self, frame: OdometryFrame) -> OdometryResult:
+        """Register the next frame. A poor or empty frame gives a health record, not a jump."""
+        ...

@@ -1,0 +1,1 @@
+"""The stages in order: configuration, frames, sequences, products, run directory."""

@@ -1,0 +1,1 @@
+"""From recorded pictures to rows that correspond, and from colour to grey."""

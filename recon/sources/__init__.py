@@ -1,0 +1,1 @@
+"""Where stereo pairs come from: one class per kind of input."""

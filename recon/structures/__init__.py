@@ -1,0 +1,35 @@
+"""Values: frozen, checked when they are made, numpy only; they neither read files nor draw."""
+
+from recon.structures.camera import CameraIntrinsics, RectifiedCamera, StereoCalibration
+from recon.structures.cloud import Frame, PointCloud
+from recon.structures.disparity import Disparity, Reason
+from recon.structures.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
+from recon.structures.image import RectifiedPair, StereoPair
+from recon.structures.mesh import TriangleMesh
+from recon.structures.metrics import DisparityMetrics, MapMetrics, TrajectoryMetrics
+from recon.structures.trajectory import Trajectory
+from recon.structures.truth import DisparityTruth, SequenceTruth
+
+__all__ = [
+    "FREE",
+    "OCCUPIED",
+    "UNKNOWN",
+    "CameraIntrinsics",
+    "Disparity",
+    "DisparityMetrics",
+    "DisparityTruth",
+    "Frame",
+    "MapMetrics",
+    "OccupancyGrid",
+    "OccupancyVoxels",
+    "PointCloud",
+    "Reason",
+    "RectifiedCamera",
+    "RectifiedPair",
+    "SequenceTruth",
+    "StereoCalibration",
+    "StereoPair",
+    "Trajectory",
+    "TrajectoryMetrics",
+    "TriangleMesh",
+]

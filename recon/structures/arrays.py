@@ -1,0 +1,60 @@
+"""The check that every value passes: dtype, shape, and a view that cannot be written to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from recon.errors import ShapeError
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+Int32 = NDArray[np.int32]
+Bool = NDArray[np.bool_]
+
+
+def frozen_array(
+    name: str, value: Any, dtype: DTypeLike, shape: tuple[int | None, ...]
+) -> NDArray[Any]:
+    """Return a read-only view of ``value`` after checking it.
+
+    Args:
+        name: Named in the error.
+        value: An array; it is never converted silently, so a float64 passed for a float32 fails.
+        dtype: The dtype that it must have.
+        shape: The shape that it must have; ``None`` is any length.
+
+    Raises:
+        ShapeError: It is no array, or has another dtype or shape.
+    """
+    expected = f"{np.dtype(dtype).name} {_shape_text(shape)}"
+    if not isinstance(value, np.ndarray):
+        raise ShapeError(f"{name} is not an array", got=type(value).__name__, expected=expected)
+    fits = len(value.shape) == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, value.shape, strict=True)
+    )
+    if value.dtype != np.dtype(dtype) or not fits:
+        raise ShapeError(
+            f"{name} has the wrong dtype or shape",
+            got=f"{value.dtype.name} {value.shape}",
+            expected=expected,
+        )
+    view: NDArray[Any] = value.view()
+    view.flags.writeable = False
+    return view
+
+
+def freeze(instance: object, name: str, dtype: DTypeLike, shape: tuple[int | None, ...]) -> None:
+    """Check the field ``name`` of a frozen dataclass and keep its read-only view; None passes."""
+    value = getattr(instance, name)
+    if value is not None:
+        label = f"{type(instance).__name__}.{name}"
+        object.__setattr__(instance, name, frozen_array(label, value, dtype, shape))
+
+
+def _shape_text(shape: tuple[int | None, ...]) -> str:
+    names = iter("NMKL")
+    return "(" + ", ".join(next(names) if n is None else str(n) for n in shape) + ")"

@@ -1,0 +1,139 @@
+"""Cameras: what a lens does (raw), and what is left of it after rectification."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from recon.errors import CalibrationError
+from recon.structures.arrays import Float64, freeze
+
+
+@dataclass(frozen=True, eq=False)
+class CameraIntrinsics:
+    """One raw camera.
+
+    Attributes:
+        matrix: float64 (3, 3), the pinhole matrix in pixels; pixel centres are at integers.
+        distortion: float64 (N,), OpenCV's order (k1 k2 p1 p2 k3 …); empty = none.
+        width_px: Image width.
+        height_px: Image height.
+    """
+
+    matrix: Float64
+    distortion: Float64
+    width_px: int
+    height_px: int
+
+    def __post_init__(self) -> None:
+        freeze(self, "matrix", np.float64, (3, 3))
+        freeze(self, "distortion", np.float64, (None,))
+        if not (np.isfinite(self.matrix).all() and np.isfinite(self.distortion).all()):
+            raise CalibrationError("camera matrix or distortion is not finite")
+        if min(self.matrix[0, 0], self.matrix[1, 1]) <= 0:
+            raise CalibrationError("focal length is not positive", got=f"{self.matrix[0, 0]:g} px")
+
+
+@dataclass(frozen=True, eq=False)
+class StereoCalibration:
+    """Two raw cameras and how the right one stands to the left one.
+
+    Attributes:
+        left: The left camera.
+        right: The right camera.
+        T_right_left: float64 (4, 4); ``xyz_right = apply(T_right_left, xyz_left)``, metres
+            (OpenCV's ``R`` and ``T``).
+    """
+
+    left: CameraIntrinsics
+    right: CameraIntrinsics
+    T_right_left: Float64
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_right_left", np.float64, (4, 4))
+        rotation = self.T_right_left[:3, :3]
+        if not np.isfinite(self.T_right_left).all():
+            raise CalibrationError("pose of the right camera is not finite")
+        # 1e-3: calibration files print six digits or fewer.
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+            raise CalibrationError("rotation of the right camera is not orthonormal")
+        if self.baseline_m <= 0:
+            raise CalibrationError("baseline is zero", got="0 m", expected="> 0 m")
+
+    @property
+    def baseline_m(self) -> float:
+        """Distance between the two camera centres."""
+        return float(np.linalg.norm(self.T_right_left[:3, 3]))
+
+
+@dataclass(frozen=True)
+class RectifiedCamera:
+    """A rectified stereo camera: rows aligned, one focal length, x axes along the baseline.
+
+    Attributes:
+        focal_px: Focal length of both views.
+        cx_px: Principal point of the left view, column.
+        cy_px: Principal point of both views, row.
+        cx_right_px: Principal point of the right view, column.
+        baseline_m: Distance between the camera centres.
+        width_px: Image width.
+        height_px: Image height.
+        ndisp: Number of disparities that the calibration file promises to suffice, or None.
+    """
+
+    focal_px: float
+    cx_px: float
+    cy_px: float
+    cx_right_px: float
+    baseline_m: float
+    width_px: int
+    height_px: int
+    ndisp: int | None = None
+
+    def __post_init__(self) -> None:
+        numbers = (self.focal_px, self.cx_px, self.cy_px, self.cx_right_px, self.baseline_m)
+        if not all(math.isfinite(number) for number in numbers):
+            raise CalibrationError("calibration holds a number that is not finite", got=numbers)
+        if self.focal_px <= 0:
+            raise CalibrationError("focal length is not positive", got=f"{self.focal_px:g} px")
+        if self.baseline_m <= 0:
+            raise CalibrationError(
+                "baseline is not positive",
+                got=f"{self.baseline_m:g} m",
+                expected="> 0 m",
+                hint="check that left and right are not swapped",
+            )
+        if min(self.width_px, self.height_px) < 1:
+            raise CalibrationError("image size is empty", got=f"{self.width_px}x{self.height_px}")
+
+    @property
+    def doffs_px(self) -> float:
+        """``cx_right - cx_left``: the disparity of a point at infinity, negated."""
+        return self.cx_right_px - self.cx_px
+
+    @property
+    def matrix(self) -> Float64:
+        """float64 (3, 3) pinhole matrix of the left view."""
+        f, cx, cy = self.focal_px, self.cx_px, self.cy_px
+        return np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+
+    def resized(self, width_px: int, height_px: int) -> RectifiedCamera:
+        """The camera of the same view at another size; the baseline stays.
+
+        Pixel centres are at integers, so a principal point moves as
+        ``(c + 0.5)·s - 0.5``; Middlebury scales ``c`` and ``doffs`` plainly, which is the
+        same for ``doffs`` and half a pixel off for ``c``.
+        """
+        s = width_px / self.width_px
+        return replace(
+            self,
+            focal_px=self.focal_px * s,
+            cx_px=(self.cx_px + 0.5) * s - 0.5,
+            cy_px=(self.cy_px + 0.5) * height_px / self.height_px - 0.5,
+            cx_right_px=(self.cx_right_px + 0.5) * s - 0.5,
+            width_px=width_px,
+            height_px=height_px,
+            ndisp=None if self.ndisp is None else math.ceil(self.ndisp * s),
+        )

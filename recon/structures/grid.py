@@ -1,0 +1,61 @@
+"""Occupancy: sparse voxels in 3-D, and the flat grid that robots plan on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.structures.arrays import Float32, Float64, Int32, freeze
+
+FREE: Final = 0
+OCCUPIED: Final = 100
+UNKNOWN: Final = -1
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyVoxels:
+    """The observed cells of a 3-D map; cells that are not listed are unknown.
+
+    Attributes:
+        keys: int32 (N, 3); cell ``k`` spans ``[k, k + 1) · resolution_m`` on each axis of the map.
+        log_odds: float32 (N,), natural logarithm; above 0 = occupied.
+        resolution_m: Edge of a cell.
+    """
+
+    keys: Int32
+    log_odds: Float32
+    resolution_m: float
+
+    def __post_init__(self) -> None:
+        freeze(self, "keys", np.int32, (None, 3))
+        freeze(self, "log_odds", np.float32, (len(self.keys),))
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    @property
+    def centres_m(self) -> Float64:
+        """float64 (N, 3), centres of the cells, map axes."""
+        return (self.keys.astype(np.float64) + 0.5) * self.resolution_m
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyGrid:
+    """A flat grid in map axes, ROS conventions.
+
+    Attributes:
+        cells: int8 (rows, columns): FREE, OCCUPIED or UNKNOWN; row 0 has the smallest y,
+            column 0 the smallest x.
+        resolution_m: Edge of a cell.
+        origin_m: (x, y) of the outer corner of cell (0, 0).
+    """
+
+    cells: NDArray[np.int8]
+    resolution_m: float
+    origin_m: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        freeze(self, "cells", np.int8, (None, None))

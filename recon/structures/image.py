@@ -1,0 +1,85 @@
+"""Pairs of images: as recorded, and rectified."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import ShapeError
+from recon.structures.arrays import UInt8, freeze
+from recon.structures.camera import RectifiedCamera
+
+
+@dataclass(frozen=True, eq=False)
+class StereoPair:
+    """Two pictures taken at one moment, as a source gives them.
+
+    Attributes:
+        left: uint8 (H, W) grey or (H, W, 3) RGB.
+        right: The same shape as ``left``.
+        timestamp_s: Time of exposure.
+        index: Number of the frame in its source.
+        name: What a user would call it: the file name of the left image.
+    """
+
+    left: UInt8
+    right: UInt8
+    timestamp_s: float = 0.0
+    index: int = 0
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        for side in ("left", "right"):
+            image = getattr(self, side)
+            colour = isinstance(image, np.ndarray) and image.ndim == 3
+            freeze(self, side, np.uint8, (None, None, 3) if colour else (None, None))
+        if self.left.shape[:2] != self.right.shape[:2]:
+            raise ShapeError(
+                "left and right image differ in size",
+                where=self.name or None,
+                got=f"left {_size(self.left)}, right {_size(self.right)}",
+                hint="both cameras must record the same size",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedPair:
+    """Two grey pictures whose rows correspond.
+
+    Attributes:
+        left: uint8 (H, W), grey.
+        right: uint8 (H, W), grey.
+        camera: Geometry of both views.
+        left_rgb: uint8 (H, W, 3) colour of the left view, or None where the source is grey.
+        valid: bool (H, W), False where rectification had no source pixel; None = all valid.
+        timestamp_s: Time of exposure.
+        index: Number of the frame in its source.
+    """
+
+    left: UInt8
+    right: UInt8
+    camera: RectifiedCamera
+    left_rgb: UInt8 | None = None
+    valid: NDArray[np.bool_] | None = None
+    timestamp_s: float = 0.0
+    index: int = 0
+
+    def __post_init__(self) -> None:
+        size = (self.camera.height_px, self.camera.width_px)
+        freeze(self, "left", np.uint8, size)
+        freeze(self, "right", np.uint8, size)
+        freeze(self, "left_rgb", np.uint8, (*size, 3))
+        freeze(self, "valid", np.bool_, size)
+
+    @property
+    def colours(self) -> UInt8:
+        """uint8 (H, W, 3): the left view's colours, or its grey thrice."""
+        if self.left_rgb is not None:
+            return self.left_rgb
+        return np.repeat(self.left[:, :, None], 3, axis=2)
+
+
+def _size(image: UInt8) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
