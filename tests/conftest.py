@@ -1,0 +1,20 @@
+"""What all tests share: the real data, where there is any."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def recon_data() -> Path:
+    """Folder of real data; the test is skipped where ``RECON_DATA`` does not name one."""
+    folder = os.environ.get("RECON_DATA")
+    if not folder:
+        pytest.skip("real data: the environment variable RECON_DATA is not set")
+    path = Path(folder)
+    if not path.is_dir():
+        pytest.skip(f"real data: RECON_DATA={folder} is no folder")
+    return path
