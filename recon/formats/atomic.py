@@ -1,0 +1,90 @@
+"""Files that appear whole or not at all: temporary file, fsync, rename."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+
+from recon.errors import OutputError
+
+
+@contextmanager
+def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path to write to, which becomes ``path`` when the block ends well.
+
+    The temporary lies in the same folder and ends in the same name, so a library that chooses
+    its format by the suffix chooses the same. Missing folders are made. When the block raises,
+    the temporary is removed and a file that stood at ``path`` before is untouched.
+
+    Args:
+        path: The file to write or to replace.
+
+    Yields:
+        The temporary path; nothing exists there yet.
+
+    Raises:
+        OutputError: The folder or file cannot be written, or the block wrote nothing.
+    """
+    target = Path(path)
+    temporary = target.with_name(f".{secrets.token_hex(6)}-{target.name}")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        _sync(temporary)
+        temporary.replace(target)
+        _sync(target.parent)
+    except OSError as error:
+        raise _output_error(target, error) from error
+    finally:
+        _remove(temporary)
+
+
+def write_text(path: str | PathLike[str], text: str) -> None:
+    """Write UTF-8 text, line ends as they are, atomically.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: str | PathLike[str], content: bytes) -> None:
+    """Write bytes atomically.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file, or a folder's list of names, is on the disk."""
+    if os.name == "nt" and path.is_dir():  # Windows cannot open a folder, and needs no sync of it
+        return
+    handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _remove(temporary: Path) -> None:
+    """Remove what a failed block left; where even that fails, the first error counts."""
+    try:
+        temporary.unlink(missing_ok=True)
+    except OSError:
+        return
+
+
+def _output_error(target: Path, error: OSError) -> OutputError:
+    return OutputError(
+        "cannot write the file",
+        where=target,
+        got=error.strerror or type(error).__name__,
+        hint="check that the folder is writable and the disk not full",
+    )
