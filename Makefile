@@ -1,0 +1,47 @@
+# On a fresh Debian or Ubuntu, `make demo` and `make test` do everything by themselves.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+
+BIN := .venv/bin
+READY := .venv/.ready
+WORKERS ?= 2
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
+
+.PHONY: help setup demo test test-all check lint format bench clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+setup: $(READY) ## system libraries, .venv and the package with its tested versions
+
+$(READY): pyproject.toml constraints.txt scripts/setup.sh
+	@scripts/setup.sh
+	@touch $@
+
+demo: $(READY) ## map a synthetic street drive into outputs/demo/
+	$(BIN)/recon demo
+
+test: $(READY) ## fast tests, with style, types and import contracts; real data where RECON_DATA is set
+	$(PYTEST) -m "not slow"
+
+test-all: $(READY) ## every test
+	$(PYTEST)
+
+check: lint test ## what CI runs, with the quick answers first
+
+lint: $(READY) ## style, formatting, types and import contracts
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(READY) ## put the code into the project's style
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+bench: $(READY) ## measure speed and accuracy side by side with other tools
+	$(BIN)/python -m benchmarks
+
+clean: ## remove .venv, caches and builds; outputs/ stays
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
