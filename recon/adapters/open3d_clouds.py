@@ -1,0 +1,193 @@
+"""Open3D's point cloud filters: arrays in, arrays out, its complaints turned into ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from recon.errors import SettingsError, ShapeError
+from recon.structures.arrays import Bool, Float32, Int32
+
+
+def voxel_downsample(
+    xyz: NDArray[Any], attributes: NDArray[Any], voxel_m: float
+) -> tuple[Float32, Float32]:
+    """One point per occupied voxel: the mean of its points and of their attributes.
+
+    Args:
+        xyz: (N, 3), metres, finite.
+        attributes: (N, K) numbers that travel with the points; K may be 0.
+        voxel_m: Edge of a voxel.
+
+    Returns:
+        float32 (M, 3) and float32 (M, K).
+
+    Raises:
+        SettingsError: The voxel is so small that Open3D cannot number it.
+        ShapeError: A point is not finite.
+    """
+    # Open3D averages three more numbers per point ("colours"), so attributes go by threes; the
+    # order of its voxels depends on the positions alone, so it is the same each time.
+    groups = [attributes[:, k : k + 3] for k in range(0, attributes.shape[1], 3)]
+    cloud = _legacy(xyz)
+    if not groups:
+        return _array(_voxelised(cloud, voxel_m).points), np.zeros((0, 0), dtype=np.float32)
+    means = []
+    for group in groups:
+        padded = np.zeros((len(xyz), 3))
+        padded[:, : group.shape[1]] = group
+        cloud.colors = o3d.utility.Vector3dVector(padded)
+        reduced = _voxelised(cloud, voxel_m)
+        means.append(_array(reduced.colors)[:, : group.shape[1]])
+    return _array(reduced.points), np.concatenate(means, axis=1)
+
+
+def statistical_inliers(xyz: NDArray[Any], neighbours: int, sigmas: float) -> Bool:
+    """Points whose mean distance to their neighbours is not unusually large.
+
+    Args:
+        xyz: (N, 3), metres, finite.
+        neighbours: Number of nearest neighbours looked at.
+        sigmas: Standard deviations above the cloud's mean that are still usual.
+
+    Returns:
+        bool (N,), True = keep.
+    """
+    if len(xyz) <= neighbours:
+        return np.ones(len(xyz), dtype=bool)
+    with _quiet():
+        _, index = _legacy(xyz).remove_statistical_outlier(neighbours, sigmas)
+    return _mask(index, len(xyz))
+
+
+def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float) -> Bool:
+    """Points that have at least ``neighbours`` others within ``radius_m``.
+
+    Args:
+        xyz: (N, 3), metres, finite.
+        neighbours: Number of other points that must be near.
+        radius_m: How near.
+
+    Returns:
+        bool (N,), True = keep.
+    """
+    if len(xyz) == 0:
+        return np.ones(0, dtype=bool)
+    with _quiet():
+        # Open3D counts the point itself as a neighbour and asks for more than its number.
+        _, index = _legacy(xyz).remove_radius_outlier(neighbours, radius_m)
+    return _mask(index, len(xyz))
+
+
+def estimate_normals(xyz: NDArray[Any], neighbours: int) -> Float32:
+    """Unit normals of the planes through each point's nearest neighbours; the sign is free.
+
+    Args:
+        xyz: (N, 3), metres, finite.
+        neighbours: Number of nearest neighbours, the point included.
+
+    Returns:
+        float32 (N, 3).
+    """
+    cloud = _legacy(xyz)
+    with _quiet():
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(neighbours))
+    return _array(cloud.normals)
+
+
+def agree_normals(xyz: NDArray[Any], normals: NDArray[Any], neighbours: int) -> Float32:
+    """Normals flipped so that neighbours agree, along a minimum spanning tree.
+
+    Args:
+        xyz: (N, 3), metres, finite.
+        normals: (N, 3), unit.
+        neighbours: Number of nearest neighbours that the tree may use.
+
+    Returns:
+        float32 (N, 3).
+
+    Ref: Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992.
+    """
+    cloud = _legacy(xyz)
+    cloud.normals = o3d.utility.Vector3dVector(np.array(normals, dtype=np.float64))
+    with _quiet():
+        cloud.orient_normals_consistent_tangent_plane(min(neighbours, len(xyz) - 1))
+    return _array(cloud.normals)
+
+
+def nearest(
+    query: NDArray[Any], reference: NDArray[Any], neighbours: int = 1
+) -> tuple[Int32, Float32]:
+    """The nearest reference points of each query point.
+
+    Args:
+        query: (N, 3), metres, finite.
+        reference: (M, 3), metres, finite, ``M >= neighbours``.
+        neighbours: How many.
+
+    Returns:
+        int32 (N, neighbours), rows of ``reference``, and float32 (N, neighbours), distances in
+        metres, nearest first.
+
+    Raises:
+        ShapeError: There are fewer reference points than neighbours asked for.
+    """
+    if len(reference) < neighbours:
+        raise ShapeError(
+            "too few points to search", got=len(reference), expected=f"at least {neighbours}"
+        )
+    if len(query) == 0:
+        empty = np.zeros((0, neighbours))
+        return empty.astype(np.int32), empty.astype(np.float32)
+    # Far from the origin float32 squares lose centimetres: both clouds move to the reference.
+    centre = np.mean(reference, axis=0, dtype=np.float64)
+    with _quiet():
+        search = o3d.core.nns.NearestNeighborSearch(_tensor(reference - centre))
+        search.knn_index()
+        index, squared = search.knn_search(_tensor(query - centre), neighbours)
+    return index.numpy().astype(np.int32), np.sqrt(squared.numpy()).astype(np.float32)
+
+
+def _voxelised(cloud: Any, voxel_m: float) -> Any:
+    """Open3D's own reduction."""
+    try:
+        with _quiet():
+            return cloud.voxel_down_sample(voxel_m)
+    except RuntimeError as error:
+        raise SettingsError(
+            "the voxel is too small for the extent of the cloud", got=f"{voxel_m:g} m"
+        ) from error
+
+
+def _legacy(xyz: NDArray[Any]) -> Any:
+    """Open3D's cloud of a copy of the points; it takes neither read-only nor float32 arrays."""
+    copied = np.array(xyz, dtype=np.float64)
+    if not np.isfinite(copied).all():
+        raise ShapeError("a point of the cloud is not finite")
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(copied))
+
+
+def _tensor(xyz: NDArray[Any]) -> Any:
+    return o3d.core.Tensor.from_numpy(np.array(xyz, dtype=np.float32))
+
+
+def _array(vectors: Any) -> Float32:
+    return np.asarray(vectors).astype(np.float32)
+
+
+def _mask(index: Any, length: int) -> Bool:
+    mask = np.zeros(length, dtype=bool)
+    mask[np.asarray(index, dtype=np.intp)] = True
+    return mask
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Open3D's warnings off standard output; what matters is checked and raised."""
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        yield

@@ -1,0 +1,137 @@
+"""Thinning and cleaning of clouds: voxels, outliers, normals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recon.adapters import open3d_clouds
+from recon.settings import Settings
+from recon.structures import PointCloud
+from recon.structures.arrays import Float32
+
+_MIN_POINTS_OF_A_PLANE = 3
+
+
+class FilterSettings(Settings):
+    """Which filters a cloud passes, in this order; null turns one off."""
+
+    voxel_m: float | None = Field(
+        default=0.1, gt=0, description="edge of the voxels that points are averaged in"
+    )
+    statistical_neighbours: int | None = Field(
+        default=None, ge=1, le=1000, description="neighbours of the statistical outlier filter"
+    )
+    statistical_sigmas: float = Field(
+        default=2.0, gt=0, description="its limit, in standard deviations of the mean distance"
+    )
+    radius_m: float | None = Field(
+        default=0.3, gt=0, description="radius in which a point needs neighbours"
+    )
+    radius_neighbours: int = Field(default=4, ge=1, description="how many it needs")
+    normals_neighbours: int | None = Field(
+        default=None, ge=3, le=1000, description="estimate normals anew from that many points"
+    )
+
+
+#: For the cloud of one pair, whose scale is not known beforehand: no filter that counts metres.
+ANY_SCALE = FilterSettings(voxel_m=None, radius_m=None, statistical_neighbours=20)
+
+
+def filter_cloud(
+    cloud: PointCloud,
+    settings: FilterSettings,
+    viewpoint_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> PointCloud:
+    """Thin a cloud, drop its outliers, and estimate its normals.
+
+    The voxels come first, because what is left makes the searches of the others cheap and even.
+
+    Args:
+        cloud: Any cloud.
+        settings: Which filters, and how.
+        viewpoint_m: Where new normals turn to where the cloud had none to agree with: the
+            camera, in the frame of the cloud.
+
+    Returns:
+        A cloud in the same frame. In a voxel every attribute is averaged (``sigma_m`` too: the
+        errors of neighbouring pixels are not independent), normals are unit again.
+
+    Raises:
+        SettingsError: The voxel is too small for the extent of the cloud.
+    """
+    if settings.voxel_m is not None and len(cloud):
+        cloud = voxel_downsample(cloud, settings.voxel_m)
+    if settings.statistical_neighbours is not None:
+        keep = open3d_clouds.statistical_inliers(
+            cloud.xyz, settings.statistical_neighbours, settings.statistical_sigmas
+        )
+        cloud = cloud.select(keep)
+    if settings.radius_m is not None:
+        cloud = cloud.select(
+            open3d_clouds.radius_inliers(cloud.xyz, settings.radius_neighbours, settings.radius_m)
+        )
+    if settings.normals_neighbours is not None:
+        cloud = with_normals(cloud, settings.normals_neighbours, viewpoint_m)
+    return cloud
+
+
+def voxel_downsample(cloud: PointCloud, voxel_m: float) -> PointCloud:
+    """One point per voxel, the mean of its points in every attribute.
+
+    Raises:
+        SettingsError: The voxel is too small for the extent of the cloud.
+    """
+    names = [name for name in _ATTRIBUTES if getattr(cloud, name) is not None]
+    columns = [np.reshape(getattr(cloud, name), (len(cloud), -1)) for name in names]
+    packed = np.concatenate(columns, axis=1) if columns else np.zeros((len(cloud), 0))
+    xyz, means = open3d_clouds.voxel_downsample(cloud.xyz, packed, voxel_m)
+    widths = np.cumsum([column.shape[1] for column in columns])[:-1]
+    parts = dict(zip(names, np.split(means, widths, axis=1), strict=True)) if names else {}
+    fields: dict[str, Any] = {name: _restored(name, parts[name]) for name in names}
+    return replace(cloud, xyz=xyz, **fields)
+
+
+def with_normals(
+    cloud: PointCloud, neighbours: int, viewpoint_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> PointCloud:
+    """The cloud with normals estimated from nearest neighbours.
+
+    Args:
+        cloud: Any cloud; under three points no plane exists, and it comes back as it is.
+        neighbours: Number of neighbours, the point included.
+        viewpoint_m: See `filter_cloud`.
+    """
+    if len(cloud) < _MIN_POINTS_OF_A_PLANE:
+        return cloud
+    normals = open3d_clouds.estimate_normals(cloud.xyz, neighbours)
+    towards = np.asarray(viewpoint_m, dtype=np.float32) - cloud.xyz
+    if cloud.normals is not None:
+        towards = cloud.normals
+    away = np.einsum("ij,ij->i", normals, towards) < 0
+    return replace(cloud, normals=np.where(away[:, None], -normals, normals))
+
+
+#: Every attribute of a point but its place, and the dtype that a mean goes back to.
+_ATTRIBUTES = {
+    "rgb": np.uint8,
+    "normals": np.float32,
+    "sigma_m": np.float32,
+    "confidence": np.float32,
+    "weight": np.float32,
+    "count": np.int32,
+}
+
+
+def _restored(name: str, mean: Float32) -> NDArray[Any]:
+    """The mean of an attribute in the dtype and shape that a cloud keeps it in."""
+    if name == "normals":
+        length = np.linalg.norm(mean, axis=1, keepdims=True)
+        return np.asarray(mean / np.maximum(length, np.float32(1e-12)), dtype=np.float32)
+    dtype = np.dtype(_ATTRIBUTES[name])
+    rounded = np.rint(mean) if dtype.kind in "iu" else mean
+    return rounded.astype(dtype) if name == "rgb" else rounded[:, 0].astype(dtype)

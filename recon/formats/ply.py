@@ -1,0 +1,155 @@
+"""Point clouds as PLY files that MeshLab, CloudCompare and Open3D read."""
+
+from __future__ import annotations
+
+from os import PathLike
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import FormatError
+from recon.formats.ply_tables import PlyHeader, Table, read_tables, write_tables
+from recon.structures import Frame, PointCloud
+from recon.structures.arrays import UInt8
+
+_XYZ: Final = ("x", "y", "z")
+_NORMAL: Final = ("nx", "ny", "nz")
+_COLOUR: Final = ("red", "green", "blue")
+#: Scalars of a point: field of `PointCloud`, property of the file, type. MeshLab shows `quality`.
+_SCALARS: Final = (
+    ("confidence", "quality", "<f4"),
+    ("sigma_m", "sigma", "<f4"),
+    ("weight", "weight", "<f4"),
+    ("count", "count", "<i4"),
+)
+_FRAME: Final = "frame "
+_FRAMES: Final[tuple[Frame, ...]] = ("camera", "world", "map")
+
+
+def write_ply(
+    path: str | PathLike[str],
+    cloud: PointCloud,
+    *,
+    ascii: bool = False,  # noqa: A002 - what the format calls it
+) -> None:
+    """Write a cloud, binary little endian unless ``ascii``.
+
+    Positions and normals are float, colours uchar; ``quality`` is the confidence, and sigma,
+    weight and count follow under their names where the cloud has them. The frame is a comment.
+
+    Args:
+        path: The file to write; it appears whole or not at all.
+        cloud: The cloud.
+        ascii: Write text (larger, slower, the same numbers).
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    write_tables(path, {"vertex": _table(cloud)}, [_FRAME + cloud.frame], ascii=ascii)
+
+
+def read_ply(path: str | PathLike[str]) -> PointCloud:
+    """Read the vertices of a cloud or mesh, in ascii or binary, float or double.
+
+    Points with a coordinate that is not finite are dropped: organised clouds hold their gaps so.
+    ``quality`` (or ``confidence``) becomes the confidence if all of it lies in [0, 1].
+
+    Args:
+        path: The file.
+
+    Returns:
+        The cloud, in the frame that the file names, else ``camera``. It may be empty.
+
+    Raises:
+        FormatError: The file is missing, no PLY, truncated, without x, y, z, or holds no finite
+            point though it holds points.
+    """
+    header, tables = read_tables(path, ["vertex"])
+    vertex = tables.get("vertex")
+    if vertex is None or not _has(vertex, _XYZ):
+        raise FormatError("the PLY file has no vertices with x, y and z", where=path)
+    xyz = _stacked(vertex, _XYZ, np.float32)
+    finite = np.isfinite(xyz).all(axis=1)
+    if len(xyz) and not finite.any():
+        raise FormatError("no point of the PLY file is finite", where=path)
+    cloud = PointCloud(
+        xyz=xyz,
+        rgb=colours_of(vertex),
+        normals=normals_of(vertex),
+        confidence=_confidence(vertex),
+        sigma_m=_scalar(vertex, "sigma", np.float32),
+        weight=_scalar(vertex, "weight", np.float32),
+        count=_scalar(vertex, "count", np.int32),
+        frame=_frame(header),
+    )
+    return cloud if finite.all() else cloud.select(finite)
+
+
+def vertex_dtype(*, normals: bool, colours: bool) -> list[tuple[str, str]]:
+    """Fields of a vertex table: place, and normal and colour if there are any."""
+    fields = [(name, "<f4") for name in _XYZ + (_NORMAL if normals else ())]
+    return fields + [(name, "u1") for name in (_COLOUR if colours else ())]
+
+
+def fill_vertices(
+    table: Table, xyz: NDArray[Any], normals: NDArray[Any] | None, rgb: UInt8 | None
+) -> None:
+    """Copy places, normals and colours into the fields that `vertex_dtype` gave the table."""
+    for names, values in ((_XYZ, xyz), (_NORMAL, normals), (_COLOUR, rgb)):
+        if values is not None:
+            for column, name in enumerate(names):
+                table[name] = values[:, column]
+
+
+def normals_of(vertex: Table) -> NDArray[np.float32] | None:
+    """float32 (N, 3), the normals of a vertex table, or None."""
+    return _stacked(vertex, _NORMAL, np.float32) if _has(vertex, _NORMAL) else None
+
+
+def colours_of(vertex: Table) -> UInt8 | None:
+    """uint8 (N, 3), the colours of a vertex table, or None; floats mean [0, 1]."""
+    if not _has(vertex, _COLOUR):
+        return None
+    if vertex.dtype["red"].kind == "f":
+        share = np.nan_to_num(_stacked(vertex, _COLOUR, np.float32))
+        return np.asarray(np.rint(np.clip(share, 0, 1) * 255), dtype=np.uint8)
+    return np.asarray(_stacked(vertex, _COLOUR, np.uint8))
+
+
+def _table(cloud: PointCloud) -> Table:
+    scalars = [row for row in _SCALARS if getattr(cloud, row[0]) is not None]
+    fields = vertex_dtype(normals=cloud.normals is not None, colours=cloud.rgb is not None)
+    table = np.zeros(len(cloud), fields + [(name, code) for _, name, code in scalars])
+    fill_vertices(table, cloud.xyz, cloud.normals, cloud.rgb)
+    for attribute, name, _ in scalars:
+        table[name] = getattr(cloud, attribute)
+    return table
+
+
+def _has(table: Table, names: tuple[str, ...]) -> bool:
+    return set(names) <= set(table.dtype.names or ())
+
+
+def _stacked(table: Table, names: tuple[str, ...], dtype: type[Any]) -> NDArray[Any]:
+    return np.stack([table[name] for name in names], axis=1).astype(dtype)
+
+
+def _scalar(table: Table, name: str, dtype: type[Any]) -> NDArray[Any] | None:
+    return table[name].astype(dtype) if _has(table, (name,)) else None
+
+
+def _confidence(vertex: Table) -> NDArray[np.float32] | None:
+    for name in ("quality", "confidence"):
+        values = _scalar(vertex, name, np.float32)
+        if values is not None and ((values >= 0) & (values <= 1)).all():
+            return values
+    return None
+
+
+def _frame(header: PlyHeader) -> Frame:
+    for comment in header.comments:
+        for frame in _FRAMES:
+            if comment == _FRAME + frame:
+                return frame
+    return "camera"

@@ -1,0 +1,236 @@
+"""The PLY container: a header, and a table for each of its elements.
+
+Ref: G. Turk, "The PLY polygon file format", 1994.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from os import SEEK_END, PathLike
+from pathlib import Path
+from typing import IO, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import FormatError
+from recon.formats.atomic import atomic_path
+
+#: A table: a structured array with one field per property. A list of three indices, the only kind
+#: of list that is known, is a field of shape (3,) after a field of its length (`list_length`).
+Table = NDArray[Any]
+
+_TYPES: Final[dict[str, str]] = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
+    "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_NAMES: Final = {code: name for name, code in list(_TYPES.items())[:8]}
+_ORDERS: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
+_LONGEST_HEADER_LINES: Final = 1000
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """What a PLY file says of itself.
+
+    Attributes:
+        encoding: ``ascii``, ``binary_little_endian`` or ``binary_big_endian``.
+        elements: Name, number of rows and dtype of each element, in the order of the file.
+        comments: The comment lines, without the word.
+    """
+
+    encoding: str
+    elements: tuple[tuple[str, int, np.dtype[Any]], ...]
+    comments: tuple[str, ...]
+
+
+def list_length(name: str) -> str:
+    """Name of the field that holds the length of the list property ``name``."""
+    return f"{name} length"
+
+
+def read_tables(
+    path: str | PathLike[str], wanted: Sequence[str]
+) -> tuple[PlyHeader, dict[str, Table]]:
+    """Read some elements of a PLY file.
+
+    Args:
+        path: The file.
+        wanted: Names of the elements; what follows the last of them is not looked at.
+
+    Returns:
+        The header, and a table for each wanted element that the file has.
+
+    Raises:
+        FormatError: The file is missing, no PLY, truncated, or has lists that are not of three.
+    """
+    try:
+        with Path(path).open("rb") as stream:
+            header = _read_header(stream, path)
+            return header, _read_body(stream, header, wanted, path)
+    except OSError as error:
+        raise FormatError("cannot read the file", where=path, got=error.strerror) from error
+
+
+def write_tables(
+    path: str | PathLike[str],
+    tables: Mapping[str, Table],
+    comments: Sequence[str] = (),
+    *,
+    ascii: bool = False,  # noqa: A002 - what the format calls it
+) -> None:
+    """Write tables as a PLY file, binary little endian unless ``ascii``, atomically.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    encoding = "ascii" if ascii else "binary_little_endian"
+    lines = ["ply", f"format {encoding} 1.0", *(f"comment {comment}" for comment in comments)]
+    for name, table in tables.items():
+        lines += [f"element {name} {len(table)}", *_property_lines(table.dtype)]
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        stream.write("\n".join([*lines, "end_header", ""]).encode())
+        for table in tables.values():
+            if ascii:
+                _write_rows(stream, table)
+            else:
+                stream.write(table.tobytes())
+
+
+def _property_lines(dtype: np.dtype[Any]) -> list[str]:
+    lines = []
+    for name, field in _fields(dtype):
+        code = _NAMES[field.base.str[1:]]
+        if field.shape:
+            lines.append(f"property list uchar {code} {name}")
+        elif list_length(name.removesuffix(" length")) != name:
+            lines.append(f"property {code} {name}")
+    return lines
+
+
+def _fields(dtype: np.dtype[Any]) -> list[tuple[str, np.dtype[Any]]]:
+    """Names and dtypes of the fields of a table."""
+    return [(name, dtype[name]) for name in dtype.names or ()]
+
+
+def _write_rows(stream: IO[bytes], table: Table) -> None:
+    """Rows of text; nine digits give a float32 back bit by bit."""
+    columns, formats = [], []
+    for name, field in _fields(table.dtype):
+        column = table[name].reshape(len(table), -1)
+        columns.append(column.astype(np.float64))
+        formats += ["%.9g" if field.base.kind == "f" else "%d"] * column.shape[1]
+    np.savetxt(stream, np.concatenate(columns, axis=1), fmt=formats)
+
+
+def _read_header(stream: IO[bytes], path: str | PathLike[str]) -> PlyHeader:
+    """Parse the header and leave the stream behind it."""
+    if stream.readline(8).strip() != b"ply":
+        raise FormatError("not a PLY file: it does not start with 'ply'", where=path)
+    encoding, comments = "", []
+    elements: list[tuple[str, int, list[tuple[Any, ...]]]] = []
+    for _ in range(_LONGEST_HEADER_LINES):
+        line = stream.readline(4096).decode("ascii", errors="replace").strip()
+        match line.split():
+            case ["end_header"]:
+                break
+            case ["format", encoding, *_] if encoding in _ORDERS:
+                pass
+            case ["comment" | "obj_info", *_]:
+                comments.append(line.partition(" ")[2])
+            case ["element", name, count] if count.isdigit():
+                elements.append((name, int(count), []))
+            case ["property", *words] if elements and _is_property(words):
+                elements[-1][2].extend(_property_fields(words, _ORDERS.get(encoding, "<")))
+            case _:
+                raise FormatError("cannot read the PLY header", where=path, got=repr(line[:60]))
+    else:
+        raise FormatError("the PLY header does not end", where=path)
+    if not encoding:
+        raise FormatError("the PLY header names no format", where=path)
+    try:
+        typed = tuple((name, count, np.dtype(fields)) for name, count, fields in elements)
+    except ValueError as error:
+        raise FormatError("the PLY header names a property twice", where=path) from error
+    return PlyHeader(encoding, typed, tuple(comments))
+
+
+def _is_property(words: list[str]) -> bool:
+    is_list = words[:1] == ["list"]
+    types = words[is_list:-1]
+    return len(types) == 1 + is_list and set(types) <= _TYPES.keys()
+
+
+def _property_fields(words: list[str], order: str) -> list[tuple[Any, ...]]:
+    """Fields of one property line."""
+    name = words[-1]
+    if words[0] == "list":
+        length, entry = (order + _TYPES[word] for word in words[1:-1])
+        return [(list_length(name), length), (name, entry, (3,))]
+    return [(name, order + _TYPES[words[0]])]
+
+
+def _read_body(
+    stream: IO[bytes], header: PlyHeader, wanted: Sequence[str], path: str | PathLike[str]
+) -> dict[str, Table]:
+    """Read element by element until all that is wanted has been seen."""
+    tables: dict[str, Table] = {}
+    missing = {name for name, _, _ in header.elements} & set(wanted)
+    for name, count, dtype in header.elements:
+        if not missing:
+            break
+        read = _read_text if header.encoding == "ascii" else _read_binary
+        tables[name] = _checked_lists(read(stream, count, dtype), path)
+        if len(tables[name]) < count:
+            raise FormatError(
+                f"the file is truncated in its element {name!r}",
+                where=path,
+                got=f"{len(tables[name])} rows",
+                expected=f"{count}",
+            )
+        missing.discard(name)
+    return {name: table for name, table in tables.items() if name in wanted}
+
+
+def _read_binary(stream: IO[bytes], count: int, dtype: np.dtype[Any]) -> Table:
+    """As many whole rows as there are, at most ``count``."""
+    here = stream.tell()
+    left = stream.seek(0, SEEK_END) - here
+    stream.seek(here)
+    # A damaged header may promise more than memory holds.
+    content = stream.read(min(count * dtype.itemsize, left))
+    return np.frombuffer(content, dtype, len(content) // max(dtype.itemsize, 1))
+
+
+def _read_text(stream: IO[bytes], count: int, dtype: np.dtype[Any]) -> Table:
+    """Rows of text up to the first that is missing or does not hold numbers of that many."""
+    width = sum(int(np.prod(field.shape)) for _, field in _fields(dtype))
+    rows = []
+    for _ in range(count):
+        words = stream.readline().split()
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            break
+        if len(numbers) != width:
+            break
+        rows.append(numbers)
+    values = np.array(rows, dtype=np.float64).reshape(len(rows), width)
+    table = np.zeros(len(rows), dtype)
+    start = 0
+    for name, field in _fields(dtype):
+        stop = start + int(np.prod(field.shape))
+        table[name] = values[:, start:stop].reshape(len(rows), *field.shape)
+        start = stop
+    return table
+
+
+def _checked_lists(table: Table, path: str | PathLike[str]) -> Table:
+    for name, field in _fields(table.dtype):
+        if field.shape and (table[list_length(name)] != 3).any():
+            raise FormatError(
+                "a face is not a triangle", where=path, hint="triangulate the mesh first"
+            )
+    return table
