@@ -1,0 +1,118 @@
+"""Parts that the reports of several commands share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
+
+from recon.geometry.triangulation import depth_from_disparity
+from recon.reports.figures import (
+    confidence_figure,
+    depth_figure,
+    disparity_figure,
+    is_wide,
+    pair_figure,
+    reasons_figure,
+)
+from recon.reports.html import Block, FigureBlock, SceneBlock, TableBlock
+from recon.reports.plots import timing_figure
+from recon.reports.scene3d import Scene, plot_scene
+from recon.structures import Disparity, RectifiedPair
+
+# Key of the summary -> label and format of its figure.
+FigureFormats = Mapping[str, tuple[str, str]]
+_NOT_TABULATED: Final = frozenset({"stages", "warnings"})
+_HOW_TO_TURN: Final = (
+    "Drag to turn, scroll to come closer, right button to move; a click in the legend shows or "
+    "hides a part."
+)
+
+
+def known_figures(summary: Mapping[str, Any], formats: FigureFormats) -> list[tuple[str, str]]:
+    """Label and text of each figure of ``formats`` that the summary has as a finite number."""
+    return [
+        (label, template.format(summary[key]))
+        for key, (label, template) in formats.items()
+        if is_number(summary.get(key))
+    ]
+
+
+def stereo_blocks(pair: RectifiedPair, disparity: Disparity) -> list[Block]:
+    """A pair and all that was found for its pixels."""
+    wide = is_wide(disparity.values.shape)
+    share = f"{float(disparity.valid.mean()):.1%}"
+    depth_m = depth_from_disparity(disparity.values, pair.camera)
+    return [
+        FigureBlock(
+            "Input pair", pair_figure(pair), "Rectified: a point lies on the same row of both."
+        ),
+        FigureBlock(
+            "Disparity",
+            disparity_figure(disparity, pair.camera),
+            f"Red is near, blue is far, dark is not known; {share} of the pixels have a value.",
+            wide,
+        ),
+        FigureBlock(
+            "Depth", depth_figure(depth_m), "The same in metres along the optical axis.", wide
+        ),
+        FigureBlock(
+            "Why pixels have no disparity",
+            reasons_figure(disparity),
+            "The first check that a pixel failed, and the share of all pixels.",
+            wide,
+        ),
+        FigureBlock(
+            "Confidence", confidence_figure(disparity), "How far each match can be trusted.", wide
+        ),
+    ]
+
+
+def scene_blocks(scene: Scene, caption: str) -> list[Block]:
+    """The view in 3-D, or nothing where there is nothing to see."""
+    empty_cloud = scene.cloud is None or not len(scene.cloud)
+    empty_mesh = scene.mesh is None or not len(scene.mesh.faces)
+    if empty_cloud and empty_mesh:
+        return []
+    return [SceneBlock("In 3-D", plot_scene(scene), f"{caption} {_HOW_TO_TURN}")]
+
+
+def run_blocks(summary: Mapping[str, Any]) -> list[Block]:
+    """Where the time went, and every figure of the summary."""
+    blocks: list[Block] = []
+    stages = {
+        name: float(s) for name, s in dict(summary.get("stages") or {}).items() if is_number(s)
+    }
+    if stages:
+        caption = "Wall-clock seconds of each stage; stages that run side by side count each."
+        blocks.append(FigureBlock("Time by stage", timing_figure(stages), caption, wide=False))
+    rows = list(_rows(summary))
+    if rows:
+        blocks.append(TableBlock("All figures", ("figure", "value"), rows))
+    return blocks
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of a summary is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _rows(summary: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
+    """Names and texts of a nested mapping, one row for each leaf."""
+    for key, value in summary.items():
+        if not prefix and key in _NOT_TABULATED:
+            continue
+        if isinstance(value, Mapping):
+            yield from _rows(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", _text(value)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return ", ".join(_text(item) for item in value)
+    return str(value)

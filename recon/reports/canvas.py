@@ -1,0 +1,67 @@
+"""The look that all figures share, drawn without pyplot: no display and no global state."""
+
+from __future__ import annotations
+
+import io
+import math
+from typing import Final
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+WIDE_IN: Final = 11.0
+HALF_IN: Final = 7.2
+DPI: Final = 120
+
+ESTIMATE: Final = "#0b6bcb"
+TRUTH: Final = "#e07a1f"
+BAD: Final = "#cf222e"
+INK: Final = "#24292f"
+FAINT: Final = "#6e7781"
+_LINES: Final = "#d8dee4"
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure of the shared look."""
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+    figure.set_facecolor("white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def to_png(figure: Figure) -> bytes:
+    """Draw a figure to the bytes of a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return buffer.getvalue()
+
+
+def style_plot(axes: Axes, x_label: str, y_label: str) -> None:
+    """Give axes of numbers their labels, a faint mesh and no box."""
+    axes.set_xlabel(x_label, color=INK)
+    axes.set_ylabel(y_label, color=INK)
+    axes.grid(visible=True, color=_LINES, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=INK, length=0)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color(_LINES)
+
+
+def style_picture(axes: Axes, title: str) -> None:
+    """Give axes that hold a picture their title and take the pixel numbers away."""
+    axes.set_title(title, loc="left", fontsize=11, color=INK)
+    axes.set_axis_off()
+
+
+def write_note(axes: Axes, text: str) -> None:
+    """Say in the middle of empty axes why they are empty."""
+    axes.text(0.5, 0.5, text, ha="center", va="center", color=FAINT, transform=axes.transAxes)
+
+
+def nice_length(target: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is at most ``target`` (> 0)."""
+    power = 10.0 ** math.floor(math.log10(target))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= target * (1 + 1e-9))

@@ -1,0 +1,185 @@
+"""Figures of pictures: the pair, and what was found for its pixels. All return PNG bytes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colorbar import Colorbar
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from recon.geometry.triangulation import depth_from_disparity, disparity_from_depth
+from recon.reports.canvas import FAINT, HALF_IN, INK, WIDE_IN, new_figure, style_picture, to_png
+from recon.reports.colour import (
+    CONFIDENCE_SCALE,
+    DISPARITY_SCALE,
+    ERROR_SCALE,
+    REASON_COLOURS,
+    REASON_LABELS,
+    colour_confidence,
+    colour_disparity,
+    colour_error,
+    colour_reasons,
+    colour_values,
+    unit_colour,
+    value_range,
+)
+from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
+from recon.structures.arrays import UInt8
+
+_BAR_IN = 0.85
+_WIDE_ASPECT = 2.0
+_DEPTH_STEPS = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
+
+
+def is_wide(shape: tuple[int, ...]) -> bool:
+    """Whether pictures of this shape (H, W, …) need the whole width of a page."""
+    return shape[1] >= _WIDE_ASPECT * shape[0]
+
+
+def pair_figure(pair: RectifiedPair) -> bytes:
+    """Both rectified pictures: stacked where they are wide, else side by side."""
+    height, width = pair.left.shape
+    stacked = is_wide(pair.left.shape)
+    columns = 1 if stacked else 2
+    picture_in = WIDE_IN / columns * height / width
+    figure = new_figure(WIDE_IN, (picture_in + 0.3) * (2 if stacked else 1))
+    titles = ("Left, rectified", "Right, rectified")
+    all_axes = figure.subplots(2 if stacked else 1, columns)
+    for axes, picture, title in zip(all_axes.flat, (pair.colours, pair.right), titles, strict=True):
+        axes.imshow(picture, cmap="gray", vmin=0, vmax=255)
+        style_picture(axes, title)
+    return to_png(figure)
+
+
+def disparity_figure(disparity: Disparity, camera: RectifiedCamera) -> bytes:
+    """The disparity map, with a scale in pixels below it and in metres of depth above that."""
+    limits = value_range(disparity.values)
+    figure, axes = _picture(colour_disparity(disparity.values, *limits))
+    bar = _colour_bar(figure, axes, DISPARITY_SCALE, limits)
+    bar.set_label("disparity in pixels", color=INK)
+    _depth_ticks(bar, limits, camera)
+    return to_png(figure)
+
+
+def depth_figure(depth_m: NDArray[Any]) -> bytes:
+    """A depth map (H, W) in metres, NaN = unknown; the scale is logarithmic, near is red."""
+    low, high = value_range(np.where(depth_m > 0, depth_m, np.nan))
+    low = max(low, 1e-3)
+    limits = (float(np.log(low)), float(np.log(max(high, low * 1.01))))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        logarithm = np.log(np.where(depth_m > 0, depth_m, np.nan))
+    # Reversed, so that near has the same colour here and in the disparity map.
+    scale = f"{DISPARITY_SCALE}_r"
+    figure, axes = _picture(colour_values(logarithm, scale, limits))
+    bar = _colour_bar(figure, axes, scale, limits)
+    depths = _spaced(_nice_depths(low, high), np.log, limits)
+    bar.set_ticks(list(np.log(depths)), labels=[f"{depth:g}" for depth in depths])
+    bar.set_label("depth in metres (logarithmic)", color=INK)
+    return to_png(figure)
+
+
+def confidence_figure(disparity: Disparity) -> bytes:
+    """The confidence of each match, from 0 to 1."""
+    figure, axes = _picture(colour_confidence(disparity.confidence))
+    bar = _colour_bar(figure, axes, CONFIDENCE_SCALE, (0.0, 1.0))
+    bar.set_label("confidence (dark: no match)", color=INK)
+    return to_png(figure)
+
+
+def error_figure(error_px: NDArray[Any], limit_px: float) -> bytes:
+    """The size of the disparity error of each pixel, up to ``limit_px``; NaN = not compared."""
+    figure, axes = _picture(colour_error(error_px, limit_px))
+    bar = _colour_bar(figure, axes, ERROR_SCALE, (0.0, limit_px), extend="max")
+    bar.set_label("absolute disparity error in pixels (dark: not compared)", color=INK)
+    return to_png(figure)
+
+
+def reasons_figure(disparity: Disparity) -> bytes:
+    """Why each pixel has, or has not, a disparity, and the share of each reason."""
+    figure, _ = _picture(colour_reasons(disparity.reason))
+    handles = [
+        Patch(
+            facecolor=unit_colour(REASON_COLOURS[reason]),
+            edgecolor=FAINT,
+            linewidth=0.5,
+            label=label,
+        )
+        for reason, label in _reason_shares(disparity.reason)
+    ]
+    columns = 4 if is_wide(disparity.reason.shape) else 3
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
+    return to_png(figure)
+
+
+def reason_shares(reason: UInt8) -> dict[Reason, float]:
+    """Share of the pixels, in [0, 1], for each reason that occurs; the largest first."""
+    counts = np.bincount(reason.ravel(), minlength=len(Reason))
+    total = max(int(counts.sum()), 1)
+    order = sorted(Reason, key=lambda code: -int(counts[code]))
+    return {code: float(counts[code]) / total for code in order if counts[code]}
+
+
+def _reason_shares(reason: UInt8) -> list[tuple[Reason, str]]:
+    shares = reason_shares(reason)
+    return [(code, f"{REASON_LABELS[code]} {share:.1%}") for code, share in shares.items()]
+
+
+def _picture(picture: UInt8) -> tuple[Figure, Axes]:
+    """A figure as wide as the picture needs, with room for a scale below."""
+    height, width = picture.shape[:2]
+    width_in = WIDE_IN if is_wide(picture.shape) else HALF_IN
+    figure = new_figure(width_in, width_in * height / width + _BAR_IN)
+    axes = figure.subplots()
+    axes.imshow(picture)
+    axes.set_axis_off()
+    return figure, axes
+
+
+def _colour_bar(
+    figure: Figure, axes: Axes, scale: str, limits: tuple[float, float], extend: str = "neither"
+) -> Colorbar:
+    colours = ScalarMappable(Normalize(*limits), cmap=scale)
+    return figure.colorbar(
+        colours, ax=axes, orientation="horizontal", aspect=50, pad=0.02, extend=extend
+    )
+
+
+def _depth_ticks(bar: Colorbar, limits: tuple[float, float], camera: RectifiedCamera) -> None:
+    """Mark round depths on the upper side of a horizontal disparity bar."""
+    near_far = depth_from_disparity(np.asarray([limits[1], limits[0]]), camera)
+    near = float(near_far[0])
+    if not np.isfinite(near):
+        return
+    # A disparity of about 0 is a depth without end; 1 km is far enough for marks.
+    far = min(float(near_far[1]), 1000.0) if np.isfinite(near_far[1]) else 1000.0
+    depths = _spaced(
+        _nice_depths(near, far), lambda z: disparity_from_depth(np.asarray(z), camera), limits
+    )
+    upper = bar.ax.twiny()
+    upper.set_xlim(*limits)
+    places = disparity_from_depth(np.asarray(depths), camera)
+    upper.set_xticks(list(places), labels=[f"{depth:g} m" for depth in depths])
+    upper.tick_params(length=2, pad=1)
+
+
+def _nice_depths(low: float, high: float) -> list[float]:
+    """Round numbers between two depths, in rising order."""
+    powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    steps = [step * 10.0**power for power in powers for step in _DEPTH_STEPS]
+    return [depth for depth in steps if low <= depth <= high]
+
+
+def _spaced(depths: list[float], place: Any, limits: tuple[float, float]) -> list[float]:
+    """The depths whose places on a scale leave room for their labels."""
+    room = 0.055 * (limits[1] - limits[0])
+    kept: list[float] = []
+    for depth in depths:
+        if not kept or abs(float(place(depth)) - float(place(kept[-1]))) >= room:
+            kept.append(depth)
+    return kept

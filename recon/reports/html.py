@@ -1,0 +1,251 @@
+"""A report as one HTML file that loads nothing: pictures, 3-D and style are inside it."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from importlib.resources import files
+from itertools import count
+from typing import Any, Final
+
+from plotly.offline import get_plotlyjs
+
+# The browser itself refuses whatever is not inside the file. plotly.js compiles its shaders'
+# helpers at run time, hence 'unsafe-eval'; there is no foreign text that could become code.
+_POLICY: Final = (
+    "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline' 'unsafe-eval'"
+)
+_DRAW_SCENES: Final = """
+for (const element of document.querySelectorAll(".scene")) {
+  const scene = JSON.parse(document.getElementById(element.dataset.source).textContent);
+  Plotly.newPlot(element, scene.data, scene.layout, scene.config);
+}
+"""
+
+
+@dataclass(frozen=True)
+class FigureBlock:
+    """A picture.
+
+    Attributes:
+        title: What one sees.
+        png: Bytes of a PNG file.
+        caption: How to read it.
+        wide: Whether it needs the whole width of the page.
+    """
+
+    title: str
+    png: bytes
+    caption: str = ""
+    wide: bool = True
+
+
+@dataclass(frozen=True)
+class TableBlock:
+    """A table; ``header`` may be empty."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+    wide: bool = False
+
+
+@dataclass(frozen=True)
+class TextBlock:
+    """A paragraph."""
+
+    title: str
+    text: str
+    wide: bool = True
+
+
+@dataclass(frozen=True)
+class SceneBlock:
+    """A view in 3-D.
+
+    Attributes:
+        title: What one sees.
+        scene: ``data``, ``layout`` and ``config`` for plotly.js, see `plot_scene`.
+        caption: How to read it.
+    """
+
+    title: str
+    scene: Mapping[str, Any]
+    caption: str = ""
+
+
+Block = FigureBlock | TableBlock | TextBlock | SceneBlock
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading with what belongs below it."""
+
+    title: str
+    blocks: Sequence[Block]
+    intro: str = ""
+
+
+@dataclass(frozen=True)
+class ReportContent:
+    """All that a report tells.
+
+    Attributes:
+        title: Heading and window title.
+        subtitle: One line below it: source, size, time.
+        command: The command that made the run, or "".
+        warnings: What a reader must know before the figures; shown first.
+        figures: The few numbers that matter most, as (label, value).
+        sections: The body.
+        config: The effective configuration, shown folded.
+        versions: Versions of what made the run, shown folded.
+    """
+
+    title: str
+    subtitle: str = ""
+    command: str = ""
+    warnings: Sequence[str] = ()
+    figures: Sequence[tuple[str, str]] = ()
+    sections: Sequence[Section] = ()
+    config: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+def render_html(content: ReportContent) -> str:
+    """Write a report as one HTML document without any external resource.
+
+    All text is escaped. plotly.js is put in once, and only where there is a scene.
+    """
+    sections = [section for section in content.sections if section.blocks]
+    scene_numbers = count()
+    body = [
+        _header(content, sections),
+        "<main>",
+        _warnings(content.warnings),
+        _figures(content.figures),
+        *(_section(number, section, scene_numbers) for number, section in enumerate(sections)),
+        _details(content),
+        "</main><footer></footer>",
+    ]
+    has_scene = any(
+        isinstance(block, SceneBlock) for section in sections for block in section.blocks
+    )
+    if has_scene:
+        body += [f"<script>{get_plotlyjs()}</script>", f"<script>{_DRAW_SCENES}</script>"]
+    return _document(content.title, "\n".join(part for part in body if part))
+
+
+def _document(title: str, body: str) -> str:
+    style = files("recon.reports").joinpath("report.css").read_text(encoding="utf-8")
+    return (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title>\n<style>\n{style}</style>\n</head>\n"
+        f"<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _header(content: ReportContent, sections: Sequence[Section]) -> str:
+    links = "".join(
+        f'<a href="#section-{number}">{escape(section.title)}</a>'
+        for number, section in enumerate(sections)
+    )
+    subtitle = f'<p class="subtitle">{escape(content.subtitle)}</p>' if content.subtitle else ""
+    command = f'<code class="command">{escape(content.command)}</code>' if content.command else ""
+    return (
+        f'<header><div class="inner"><h1>{escape(content.title)}</h1>{subtitle}{command}'
+        f"<nav>{links}</nav></div></header>"
+    )
+
+
+def _warnings(warnings: Sequence[str]) -> str:
+    if not warnings:
+        return '<div class="notice good"><h2>No warnings</h2></div>'
+    items = "".join(f"<li>{escape(text)}</li>" for text in warnings)
+    plural = "s" if len(warnings) > 1 else ""
+    return (
+        f'<div class="notice warn" role="alert"><h2>{len(warnings)} warning{plural}</h2>'
+        f"<ul>{items}</ul></div>"
+    )
+
+
+def _figures(figures: Sequence[tuple[str, str]]) -> str:
+    cards = "".join(
+        f"<div><dt>{escape(label)}</dt><dd>{escape(value)}</dd></div>" for label, value in figures
+    )
+    return f'<dl class="figures">{cards}</dl>' if cards else ""
+
+
+def _section(number: int, section: Section, scene_numbers: count[int]) -> str:
+    intro = f'<p class="intro">{escape(section.intro)}</p>' if section.intro else ""
+    blocks = "\n".join(_block(block, scene_numbers) for block in section.blocks)
+    return (
+        f'<section id="section-{number}"><h2>{escape(section.title)}</h2>{intro}'
+        f'<div class="blocks">{blocks}</div></section>'
+    )
+
+
+def _block(block: Block, scene_numbers: count[int]) -> str:
+    if isinstance(block, FigureBlock):
+        return _framed(block.title, block.caption, _picture(block), wide=block.wide)
+    if isinstance(block, TableBlock):
+        return _framed(block.title, block.caption, _table(block), wide=block.wide)
+    if isinstance(block, SceneBlock):
+        inside = _scene(block, f"scene-{next(scene_numbers)}")
+        return _framed(block.title, block.caption, inside, wide=True)
+    return _framed(block.title, "", f"<p>{escape(block.text)}</p>", wide=block.wide)
+
+
+def _framed(title: str, caption: str, inside: str, *, wide: bool) -> str:
+    note = f'<p class="caption">{escape(caption)}</p>' if caption else ""
+    kind = "block wide" if wide else "block"
+    return f'<figure class="{kind}"><h3>{escape(title)}</h3>{note}{inside}</figure>'
+
+
+def _picture(block: FigureBlock) -> str:
+    data = base64.b64encode(block.png).decode("ascii")
+    return f'<img alt="{escape(block.title)}" src="data:image/png;base64,{data}">'
+
+
+def _table(block: TableBlock) -> str:
+    titles = "".join(f'<th scope="col">{escape(title)}</th>' for title in block.header)
+    head = f"<thead><tr>{titles}</tr></thead>" if titles else ""
+    rows = "".join(f"<tr>{_row(row)}</tr>" for row in block.rows)
+    return f'<div class="scroll"><table>{head}<tbody>{rows}</tbody></table></div>'
+
+
+def _row(cells: Sequence[str]) -> str:
+    first = "".join(f'<th scope="row">{escape(cell)}</th>' for cell in cells[:1])
+    return first + "".join(f"<td>{escape(cell)}</td>" for cell in cells[1:])
+
+
+def _scene(block: SceneBlock, name: str) -> str:
+    # "<" is written as an escape, so that no text in it can end the script element.
+    data = json.dumps(block.scene, separators=(",", ":")).replace("<", "\\u003c")
+    return (
+        f'<div class="scene" data-source="{name}">'
+        "<noscript>The view in 3-D needs JavaScript.</noscript></div>"
+        f'<script type="application/json" id="{name}">{data}</script>'
+    )
+
+
+def _details(content: ReportContent) -> str:
+    versions = [(name, version) for name, version in content.versions.items()]
+    parts = []
+    if content.config:
+        parts.append(_folded("Configuration", f"<pre>{escape(content.config)}</pre>"))
+    if versions:
+        parts.append(_folded("Versions", _table(TableBlock("", (), versions))))
+    if not parts:
+        return ""
+    return "<section><h2>How it was made</h2>" + "".join(parts) + "</section>"
+
+
+def _folded(title: str, inside: str) -> str:
+    return f"<details><summary>{escape(title)}</summary>{inside}</details>"

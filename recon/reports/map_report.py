@@ -1,0 +1,179 @@
+"""The report of a drive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, Final
+
+from recon.odometry.protocol import OdometryHealth
+from recon.reports.blocks import (
+    FigureFormats,
+    known_figures,
+    run_blocks,
+    scene_blocks,
+    stereo_blocks,
+)
+from recon.reports.html import Block, FigureBlock, ReportContent, Section, TableBlock
+from recon.reports.plots import grid_figure, health_figure, path_error_figure, trajectory_figure
+from recon.reports.scene3d import Scene
+from recon.structures import (
+    Disparity,
+    OccupancyGrid,
+    PointCloud,
+    RectifiedPair,
+    Trajectory,
+    TrajectoryMetrics,
+    TriangleMesh,
+)
+from recon.structures.arrays import Float64
+
+_MAX_NOTES: Final = 20
+_FIGURES: Final[FigureFormats] = MappingProxyType(
+    {
+        "fps": ("Mapping rate", "{:.1f} fps"),
+        "seconds": ("Run time", "{:.1f} s"),
+        "peak_memory_mb": ("Peak memory", "{:,.0f} MB"),
+        "points": ("Points in the map", "{:,}"),
+        "faces": ("Triangles", "{:,}"),
+    }
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MapReportInputs:
+    """All that the report of a drive is made from; None = the run does not have it.
+
+    Attributes:
+        source: What a user calls the source.
+        trajectory: The path that was found.
+        T_map_world: float64 (4, 4), turns world to map axes (x forward, z up).
+        samples: One or a few pairs with their disparities.
+        health: One record per frame.
+        truth: True path in the same world.
+        metrics: How far the two paths are apart.
+        grid: The flat map.
+        cloud: The fused cloud, frame ``world``.
+        mesh: The surface, frame ``world``.
+        summary: The figures of ``summary.json``.
+        command: The command line, or "".
+        config: The effective configuration as text.
+        warnings: What went less than well.
+        versions: Versions of the packages that took part.
+    """
+
+    source: str
+    trajectory: Trajectory
+    T_map_world: Float64
+    samples: Sequence[tuple[RectifiedPair, Disparity]] = ()
+    health: Sequence[OdometryHealth] = ()
+    truth: Trajectory | None = None
+    metrics: TrajectoryMetrics | None = None
+    grid: OccupancyGrid | None = None
+    cloud: PointCloud | None = None
+    mesh: TriangleMesh | None = None
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    command: str = ""
+    config: str = ""
+    warnings: Sequence[str] = ()
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+def map_report(inputs: MapReportInputs) -> ReportContent:
+    """Compose the report of a drive: the map and the path first, then what they rest on."""
+    sections = [
+        Section("Map", _map_blocks(inputs)),
+        Section("Path", _path_blocks(inputs)),
+        *(
+            Section(f"Stereo, frame {pair.index}", stereo_blocks(pair, disparity))
+            for pair, disparity in inputs.samples
+        ),
+        Section("Run", run_blocks(inputs.summary)),
+    ]
+    length = f"{inputs.trajectory.path_length_m:.1f} m"
+    return ReportContent(
+        title=f"Map of {inputs.source}",
+        subtitle=f"{len(inputs.trajectory)} frames, {length} of path",
+        command=inputs.command,
+        warnings=inputs.warnings,
+        figures=_figures(inputs),
+        sections=sections,
+        config=inputs.config,
+        versions=inputs.versions,
+    )
+
+
+def _figures(inputs: MapReportInputs) -> list[tuple[str, str]]:
+    figures: list[tuple[str, str]] = [("Path", f"{inputs.trajectory.path_length_m:.1f} m")]
+    if inputs.metrics is not None:
+        figures.append(("Drift (t_rel)", f"{inputs.metrics.t_rel_percent:.2f} %"))
+        figures.append(("Position error (ATE)", f"{inputs.metrics.ate_m:.2f} m"))
+    if inputs.health:
+        lost = sum(not record.ok for record in inputs.health)
+        figures.append(("Frames not measured", f"{lost} of {len(inputs.health)}"))
+    return figures + known_figures(inputs.summary, _FIGURES)
+
+
+def _map_blocks(inputs: MapReportInputs) -> list[Block]:
+    paths = [("path", inputs.trajectory)]
+    if inputs.truth is not None:
+        paths.append(("true path", inputs.truth))
+    scene = Scene(inputs.T_map_world, inputs.cloud, inputs.mesh, paths)
+    blocks = scene_blocks(scene, "The fused cloud in map axes, with the path of the camera.")
+    if inputs.grid is not None:
+        caption = (
+            f"Seen from above, cells of {inputs.grid.resolution_m:g} m; "
+            "the line is the path of the camera."
+        )
+        figure = grid_figure(inputs.grid, inputs.trajectory, inputs.T_map_world)
+        blocks.append(FigureBlock("Occupancy grid", figure, caption))
+    return blocks
+
+
+def _path_blocks(inputs: MapReportInputs) -> list[Block]:
+    drawn = trajectory_figure(inputs.trajectory, inputs.truth, inputs.T_map_world, inputs.health)
+    blocks: list[Block] = [
+        FigureBlock("Path from above", drawn, "Map axes; both axes have the same scale.")
+    ]
+    if inputs.truth is not None:
+        error = path_error_figure(inputs.trajectory, inputs.truth, inputs.health)
+        caption = "Both paths start at the same pose, so all drift shows."
+        blocks.append(FigureBlock("Error along the path", error, caption))
+    if inputs.health:
+        caption = "What each pose rests on; frames that rest on no measurement are shaded red."
+        blocks.append(FigureBlock("Health of the odometry", health_figure(inputs.health), caption))
+    return blocks + _tables(inputs)
+
+
+def _tables(inputs: MapReportInputs) -> list[Block]:
+    tables: list[Block] = []
+    if inputs.metrics is not None:
+        tables.append(_metrics_table(inputs.metrics))
+    notes = [
+        (str(frame), "; ".join(record.notes) or "no measurement")
+        for frame, record in enumerate(inputs.health)
+        if record.notes or not record.ok
+    ]
+    if notes:
+        shown = notes[:_MAX_NOTES]
+        caption = f"The first {len(shown)} of {len(notes)}." if len(notes) > len(shown) else ""
+        tables.append(TableBlock("Notes of the odometry", ("frame", "note"), shown, caption))
+    return tables
+
+
+def _metrics_table(metrics: TrajectoryMetrics) -> TableBlock:
+    lengths = ", ".join(f"{length:g}" for length in metrics.segment_lengths_m)
+    return TableBlock(
+        "Path against truth",
+        ("figure", "value"),
+        (
+            ("relative translation error (t_rel)", f"{metrics.t_rel_percent:.3f} %"),
+            ("relative rotation error (r_rel)", f"{metrics.r_rel_deg_per_100m:.3f} °/100 m"),
+            ("absolute trajectory error, aligned (ATE)", f"{metrics.ate_m:.3f} m"),
+            ("frame to frame, translation (RPE)", f"{metrics.rpe_m:.4f} m"),
+            ("frame to frame, rotation (RPE)", f"{metrics.rpe_deg:.4f} °"),
+            ("length of the true path", f"{metrics.path_length_m:.1f} m"),
+            ("segments", f"{metrics.segments} of {lengths} m"),
+        ),
+    )

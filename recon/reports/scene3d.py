@@ -1,0 +1,198 @@
+"""A cloud, a mesh and paths in 3-D, as plain data for plotly.js.
+
+Numbers travel as base64 of their bytes, and a point's colour as one byte: its place in a scale
+of at most 256 colours. A list of ``rgb()`` texts would be ten times the size.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.geometry.se3 import apply
+from recon.reports.colour import scale_colours, value_range
+from recon.reports.decimate import quantise_colours, thin_cloud, thin_mesh
+from recon.structures import PointCloud, Trajectory, TriangleMesh
+from recon.structures.arrays import Float32, Float64, UInt8
+
+MAX_POINTS: Final = 120_000
+MAX_FACES: Final = 80_000
+HEIGHT_SCALE: Final = "turbo"
+# Camera axes (x right, y down, z forward) turned so that forward is x and up is z.
+T_UPRIGHT_CAMERA: Final[Float64] = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+_BACKGROUND = "#14181d"
+_PATH_COLOURS = ("#ff5252", "#ffb74d", "#81c784")
+_OUTLIER_SHARE = 0.002
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What is to be seen in 3-D, all in one frame.
+
+    Attributes:
+        T_view_frame: float64 (4, 4), turns that frame so that x is forward and z is up.
+        cloud: Points, or None.
+        mesh: A surface, or None.
+        paths: Named paths of the camera.
+    """
+
+    T_view_frame: Float64
+    cloud: PointCloud | None = None
+    mesh: TriangleMesh | None = None
+    paths: Sequence[tuple[str, Trajectory]] = ()
+
+
+def plot_scene(scene: Scene, max_points: int = MAX_POINTS, max_faces: int = MAX_FACES) -> Json:
+    """The ``data``, ``layout`` and ``config`` that plotly.js draws; plain JSON values.
+
+    Args:
+        scene: What to draw. The mesh is hidden at first where there is a cloud as well.
+        max_points: The cloud is thinned evenly to at most this number.
+        max_faces: The mesh is simplified to about this number of triangles.
+    """
+    T = scene.T_view_frame
+    traces: list[Json] = []
+    buttons: list[Json] = []
+    if scene.cloud is not None and len(scene.cloud):
+        traces.append(_cloud_trace(_without_outliers(scene.cloud), T, max_points))
+        buttons = traces[0].pop("_buttons")
+    if scene.mesh is not None and len(scene.mesh.faces):
+        traces.append(_mesh_trace(thin_mesh(scene.mesh, max_faces), T, hidden=bool(traces)))
+    for number, (name, path) in enumerate(scene.paths):
+        traces.append(_path_trace(name, path, T, _PATH_COLOURS[number % len(_PATH_COLOURS)]))
+    config = {"displaylogo": False, "responsive": True, "scrollZoom": True}
+    return {"data": traces, "layout": _layout(buttons), "config": config}
+
+
+def pack(array: NDArray[Any]) -> Json:
+    """An array (N,) as plotly.js reads it: the name of its type, and base64 of its bytes."""
+    little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+    return {
+        "dtype": array.dtype.str[1:],
+        "bdata": base64.b64encode(little.tobytes()).decode("ascii"),
+    }
+
+
+def _cloud_trace(cloud: PointCloud, T: Float64, max_points: int) -> Json:
+    thinned = thin_cloud(cloud, max_points)
+    xyz = apply(T, thinned.xyz)
+    by_height = _height_colouring(xyz)
+    colourings = [("height", by_height)]
+    if thinned.rgb is not None:
+        colourings.insert(0, ("picture", _colouring(*quantise_colours(thinned.rgb))))
+    first = colourings[0][1]
+    return {
+        "type": "scatter3d",
+        "mode": "markers",
+        "name": f"cloud ({len(thinned):,} of {len(cloud):,} points)",
+        "hoverinfo": "skip",
+        **_xyz(xyz),
+        "marker": {"size": 1.6, "showscale": False, **first},
+        "_buttons": [_button(name, colouring) for name, colouring in colourings],
+    }
+
+
+def _mesh_trace(mesh: TriangleMesh, T: Float64, *, hidden: bool) -> Json:
+    vertices = apply(T, mesh.vertices)
+    if mesh.rgb is None:
+        colouring: Json = {"color": "#b8c4ce"}
+    else:
+        # One colour per face: between two places of a palette there is no colour to blend.
+        of_faces = mesh.rgb[mesh.faces].mean(axis=1)
+        palette, index = quantise_colours(np.rint(of_faces).astype(np.uint8))
+        scale = _colouring(palette, index)
+        scale["intensity"] = scale.pop("color")
+        colouring = {**scale, "intensitymode": "cell", "showscale": False}
+    corners = {axis: pack(mesh.faces[:, n]) for n, axis in enumerate("ijk")}
+    return {
+        "type": "mesh3d",
+        "name": f"mesh ({len(mesh.faces):,} triangles)",
+        "hoverinfo": "skip",
+        "showlegend": True,
+        "visible": "legendonly" if hidden else True,
+        "lighting": {"ambient": 0.65, "diffuse": 0.5, "specular": 0.05},
+        **_xyz(vertices),
+        **corners,
+        **colouring,
+    }
+
+
+def _path_trace(name: str, path: Trajectory, T: Float64, colour: str) -> Json:
+    xyz = apply(T, path.positions_m).astype(np.float32)
+    return {
+        "type": "scatter3d",
+        "mode": "lines",
+        "name": name,
+        "line": {"color": colour, "width": 6},
+        "hovertemplate": "frame %{pointNumber}<br>x %{x:.2f} y %{y:.2f} z %{z:.2f} m",
+        **_xyz(xyz),
+    }
+
+
+def _xyz(points: NDArray[Any]) -> Json:
+    return {axis: pack(points[:, n].astype(np.float32)) for n, axis in enumerate("xyz")}
+
+
+def _colouring(palette: UInt8, index: UInt8) -> Json:
+    """A scale of one colour per palette entry, and each point's place in it."""
+    colours = palette if len(palette) > 1 else np.repeat(palette, 2, axis=0)
+    last = len(colours) - 1
+    scale = [[n / last, f"rgb({r},{g},{b})"] for n, (r, g, b) in enumerate(colours.tolist())]
+    return {"color": pack(index), "colorscale": scale, "cmin": 0, "cmax": last}
+
+
+def _height_colouring(xyz: Float32) -> Json:
+    low, high = value_range(xyz[:, 2])
+    index = np.clip((xyz[:, 2] - low) / (high - low) * 255.0, 0, 255).astype(np.uint8)
+    return _colouring(scale_colours(HEIGHT_SCALE), index)
+
+
+def _button(name: str, colouring: Json) -> Json:
+    changes = {f"marker.{key}": [value] for key, value in colouring.items()}
+    return {"method": "restyle", "label": f"colour: {name}", "args": [changes, [0]]}
+
+
+def _without_outliers(cloud: PointCloud) -> PointCloud:
+    """Drop the few points far from all others, which would make the rest small."""
+    low, high = np.quantile(cloud.xyz, (_OUTLIER_SHARE, 1.0 - _OUTLIER_SHARE), axis=0)
+    room = 0.1 * (high - low)
+    inside = ((cloud.xyz >= low - room) & (cloud.xyz <= high + room)).all(axis=1)
+    return cloud.select(inside)
+
+
+def _layout(buttons: list[Json]) -> Json:
+    axis = {"color": "#aab4be", "gridcolor": "#2c343c", "zeroline": False, "showbackground": False}
+    menu = {
+        "type": "buttons",
+        "direction": "right",
+        "x": 0.0,
+        "xanchor": "left",
+        "y": 1.0,
+        "yanchor": "top",
+        "buttons": buttons,
+        "bgcolor": "#e6ebf0",
+        "font": {"size": 12, "color": "#14181d"},
+        "pad": {"l": 8, "t": 8},
+    }
+    return {
+        "paper_bgcolor": _BACKGROUND,
+        "font": {"color": "#dfe5ea"},
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "legend": {"x": 0.0, "y": 0.0, "yanchor": "bottom", "itemsizing": "constant"},
+        "updatemenus": [menu] if len(buttons) > 1 else [],
+        "scene": {
+            "aspectmode": "data",
+            "camera": {"eye": {"x": -1.1, "y": -0.75, "z": 0.9}},
+            "xaxis": {"title": {"text": "x forward (m)"}, **axis},
+            "yaxis": {"title": {"text": "y left (m)"}, **axis},
+            "zaxis": {"title": {"text": "z up (m)"}, **axis},
+        },
+    }
