@@ -1,0 +1,57 @@
+"""Any calibration file, recognised by its content."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from recon.errors import FormatError
+from recon.formats.files import StrPath, read_text
+from recon.formats.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_calib
+from recon.formats.middlebury_calib import read_middlebury_calib
+from recon.formats.opencv_yaml import read_opencv_calibration
+from recon.structures import RectifiedCamera, StereoCalibration
+
+_KITTI: Final = re.compile(r"^P(?:_rect_0)?\d:", re.MULTILINE)
+_MIDDLEBURY: Final = re.compile(r"^\s*cam[01]\s*=", re.MULTILINE)
+_OPENCV: Final = re.compile(r"^%YAML|<opencv_storage>|opencv-matrix")
+
+
+def read_calibration(
+    path: StrPath, width_px: int, height_px: int, *, metres_per_unit: float = 1.0
+) -> RectifiedCamera | StereoCalibration:
+    """Read a calibration file of a kind that need not be named.
+
+    Understood are KITTI's ``calib.txt`` (the grey pair where it has one, else the colour pair),
+    Middlebury's ``calib.txt``, and what OpenCV's ``FileStorage`` writes.
+
+    Args:
+        path: The file.
+        width_px: Width of the pictures, for files that do not tell.
+        height_px: Height of the pictures.
+        metres_per_unit: Unit of the translation in an OpenCV file; the others define theirs.
+
+    Returns:
+        A `RectifiedCamera` where the pictures are rectified already.
+
+    Raises:
+        FormatError: The file is missing, damaged or of no kind that is understood.
+        CalibrationError: The numbers cannot give depth.
+    """
+    text = read_text(path)
+    # OpenCV first: its extrinsics hold a ``P1:`` as well.
+    if _OPENCV.search(text):
+        return read_opencv_calibration(
+            path, size_px=(width_px, height_px), metres_per_unit=metres_per_unit
+        )
+    if _MIDDLEBURY.search(text):
+        return read_middlebury_calib(path).camera
+    if _KITTI.search(text):
+        known = list_kitti_cameras(path)
+        grey = known.issuperset(GREY_CAMERAS) or not known.issuperset(COLOUR_CAMERAS)
+        return read_kitti_calib(path, width_px, height_px, GREY_CAMERAS if grey else COLOUR_CAMERAS)
+    raise FormatError(
+        "not a calibration file",
+        where=path,
+        expected="KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…) or OpenCV YAML/XML (M1 …)",
+    )

@@ -1,0 +1,89 @@
+"""Disparity as a PNG: 16 bits, ``256·d``, 0 = unknown (KITTI), or in colours to look at."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from recon.errors import FormatError, OutputError
+from recon.formats.files import StrPath
+from recon.formats.image import read_grey_levels, write_image
+from recon.structures.arrays import Float32, UInt8, frozen_array
+
+
+def read_disparity_png(path: StrPath, *, scale: float = 256.0) -> Float32:
+    """Read a disparity stored as grey levels.
+
+    Args:
+        path: PNG or PGM of 8 or 16 bits.
+        scale: Grey levels per pixel of disparity: 256 in KITTI, 4 or 8 or 16 in Middlebury.
+
+    Returns:
+        float32 (H, W), pixels; NaN where the level is 0.
+
+    Raises:
+        FormatError: The file is missing, no grey image, truncated, or of 8 bits where the scale
+            needs 16.
+    """
+    levels = read_grey_levels(path)
+    if levels.dtype == np.uint8 and scale > 255:
+        raise FormatError("disparity image has 8 bits", where=path, expected="16 bits")
+    values: Float32 = levels.astype(np.float32) / np.float32(scale)
+    values[levels == 0] = np.nan
+    return values
+
+
+def write_disparity_png(path: StrPath, values: Float32, *, scale: float = 256.0) -> None:
+    """Write a disparity as a 16-bit PNG atomically.
+
+    A disparity of (nearly) 0 becomes level 1, as in KITTI's own writer: level 0 is unknown.
+
+    Args:
+        path: Ends in .png.
+        values: float32 (H, W), pixels; NaN = unknown.
+        scale: Grey levels per pixel; see `fitting_scale`.
+
+    Raises:
+        ShapeError: The array has another dtype or shape.
+        OutputError: A disparity is negative or too large for 16 bits, or the file cannot be
+            written.
+    """
+    frozen_array("values", values, np.float32, (None, None))
+    known = np.isfinite(values)
+    levels = np.rint(np.where(known, values, 0).astype(np.float64) * scale)
+    if (levels < 0).any() or (levels > 65535).any():
+        raise OutputError(
+            "disparity does not fit a 16-bit image",
+            where=path,
+            got=f"{values[known].min():g} to {values[known].max():g} px",
+            expected=f"0 to {65535 / scale:g} px",
+            hint="write PFM instead, or take a smaller scale",
+        )
+    write_image(path, np.where(known, np.maximum(levels, 1), 0).astype(np.uint16))
+
+
+def fitting_scale(values: Float32) -> float:
+    """The largest power of two, at most KITTI's 256, with which ``values`` fit 16 bits."""
+    highest = max(1.0, float(np.nanmax(values, initial=1.0)))
+    return min(256.0, 2.0 ** math.floor(math.log2(65535 / highest)))
+
+
+def colour_disparity(values: Float32, low_px: float, high_px: float) -> UInt8:
+    """Paint a disparity: blue is far, red is near, black is unknown.
+
+    Args:
+        values: float32 (H, W), pixels; NaN = unknown.
+        low_px: Painted blue, as all below it.
+        high_px: Painted red, as all above it.
+
+    Returns:
+        uint8 (H, W, 3) RGB.
+    """
+    frozen_array("values", values, np.float32, (None, None))
+    span = max(high_px - low_px, 1e-6)
+    share = np.clip((np.where(np.isfinite(values), values, low_px) - low_px) / span, 0, 1)
+    painted = cv2.applyColorMap(np.rint(share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
+    painted[~np.isfinite(values)] = 0
+    return np.ascontiguousarray(painted[:, :, ::-1])

@@ -1,0 +1,142 @@
+"""Pictures: PNG, JPEG, PGM, PPM and TIFF, whole or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import FormatError, OutputError, ShapeError
+from recon.formats.atomic import write_bytes
+from recon.formats.files import StrPath, read_bytes
+from recon.formats.image_integrity import check_image_bytes
+from recon.structures.arrays import UInt8
+
+_GREY_ONLY: Final = frozenset({".pgm"})
+_COLOUR_ONLY: Final = frozenset({".ppm"})
+_EIGHT_BIT_ONLY: Final = frozenset({".jpg", ".jpeg"})
+_WRITABLE: Final = _GREY_ONLY | _COLOUR_ONLY | _EIGHT_BIT_ONLY | {".png", ".tif", ".tiff"}
+
+
+def read_image(path: StrPath) -> UInt8:
+    """Read a picture to look at or to match.
+
+    16-bit pictures are scaled from their whole range to 8 bits (``value / 257``, rounded). An
+    alpha channel is dropped. The orientation tag of a camera is ignored: a calibration belongs to
+    the pixels as the sensor recorded them.
+
+    Args:
+        path: PNG, JPEG, PGM, PPM or TIFF, recognised by content.
+
+    Returns:
+        uint8 (H, W) where the file is grey, else (H, W, 3) RGB.
+
+    Raises:
+        FormatError: The file is missing, empty, truncated, no image, or of floating-point pixels.
+    """
+    levels = read_levels(path)
+    if levels.dtype == np.uint8:
+        return levels
+    return ((levels.astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def read_levels(path: StrPath) -> NDArray[Any]:
+    """Read a picture whose numbers mean something: a mask, or a scaled disparity.
+
+    Returns:
+        uint8 or uint16, as stored, (H, W) or (H, W, 3) RGB.
+
+    Raises:
+        FormatError: As in `read_image`.
+    """
+    content = read_bytes(path)
+    check_image_bytes(content, path)
+    try:
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise FormatError("image cannot be decoded", where=path, got=error.err) from error
+    if image is None:
+        raise FormatError("image cannot be decoded", where=path, hint="copy the file again")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise FormatError(
+            "image has a pixel type that is not understood",
+            where=path,
+            got=image.dtype.name,
+            expected="8 or 16 bits",
+        )
+    return image if image.ndim == 2 else _swap_red_and_blue(image[:, :, :3])
+
+
+def read_grey_levels(path: StrPath) -> NDArray[Any]:
+    """Like `read_levels`, but (H, W): a grey picture stored as three equal channels is taken.
+
+    Raises:
+        FormatError: As in `read_image`, or the picture has colours.
+    """
+    levels = read_levels(path)
+    if levels.ndim == 2:
+        return levels
+    if (levels != levels[:, :, :1]).any():
+        raise FormatError("image has colours", where=path, expected="grey")
+    return np.ascontiguousarray(levels[:, :, 0])
+
+
+def write_image(path: StrPath, image: NDArray[Any]) -> None:
+    """Write a picture atomically; the suffix chooses the format.
+
+    Args:
+        path: Ends in .png, .tif, .tiff, .jpg, .jpeg, .pgm (grey) or .ppm (colour).
+        image: uint8 or uint16 (not JPEG), (H, W) grey or (H, W, 3) RGB.
+
+    Raises:
+        ShapeError: The array is no picture.
+        OutputError: The suffix cannot hold this picture, or the file cannot be written.
+    """
+    _check_pixels(image)
+    suffix = Path(path).suffix.lower()
+    _check_suffix(path, suffix, image)
+    pixels = image if image.ndim == 2 else _swap_red_and_blue(image)
+    try:
+        done, content = cv2.imencode(suffix, pixels)
+    except cv2.error as error:
+        raise OutputError("image cannot be encoded", where=path, got=error.err) from error
+    if not done:
+        raise OutputError("image cannot be encoded", where=path)
+    write_bytes(path, content.tobytes())
+
+
+def _swap_red_and_blue(image: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(image[:, :, ::-1])
+
+
+def _check_pixels(image: NDArray[Any]) -> None:
+    shaped = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
+    if image.dtype not in (np.uint8, np.uint16) or not shaped or image.size == 0:
+        raise ShapeError(
+            "array is no picture",
+            got=f"{image.dtype.name} {image.shape}",
+            expected="uint8 or uint16 (H, W) or (H, W, 3)",
+        )
+
+
+def _check_suffix(path: StrPath, suffix: str, image: NDArray[Any]) -> None:
+    if suffix not in _WRITABLE:
+        expected = ", ".join(sorted(_WRITABLE))
+        raise OutputError(
+            "unknown image format", where=path, got=suffix or "no suffix", expected=expected
+        )
+    fits = (
+        not (suffix in _GREY_ONLY and image.ndim == 3)
+        and not (suffix in _COLOUR_ONLY and image.ndim == 2)
+        and not (suffix in _EIGHT_BIT_ONLY and image.dtype != np.uint8)
+    )
+    if not fits:
+        raise OutputError(
+            f"a {suffix} file cannot hold this picture",
+            where=path,
+            got=f"{image.dtype.name} {image.shape}",
+            hint="write .png",
+        )

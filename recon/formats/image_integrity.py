@@ -1,0 +1,95 @@
+"""Is an image file whole? Decoders fill what is missing and say nothing, so ask before decoding.
+
+Ref:
+    PNG: ISO/IEC 15948, section 5 (chunks). JPEG: ITU-T T.81, annex B (markers).
+    PGM and PPM: the netpbm manual.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from typing import Final
+
+from recon.errors import FormatError
+from recon.formats.files import StrPath
+
+_PNG_START: Final = b"\x89PNG\r\n\x1a\n"
+_JPEG_START: Final = b"\xff\xd8\xff"
+_TIFF_STARTS: Final = (b"II*\x00", b"MM\x00*")
+_PNM_HEADER: Final = re.compile(
+    rb"P([2356])(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)\s"
+)
+UNDERSTOOD: Final = "PNG, JPEG, PGM, PPM or TIFF"
+
+
+def check_image_bytes(content: bytes, path: StrPath) -> None:
+    """Check by its content that an image file is of a kind that is understood, and whole.
+
+    A TIFF is only recognised: its decoder does refuse a truncated file.
+
+    Args:
+        content: The whole file.
+        path: Named in the error.
+
+    Raises:
+        FormatError: It is no image, or truncated or damaged.
+    """
+    if content.startswith(_PNG_START):
+        _check_png(content, path)
+    elif content.startswith(_JPEG_START):
+        _check_jpeg(content, path)
+    elif content[:1] == b"P" and content[1:2] in b"2356":
+        _check_pnm(content, path)
+    elif not content.startswith(_TIFF_STARTS):
+        raise FormatError("not an image", where=path, expected=UNDERSTOOD)
+
+
+def _truncated(kind: str, path: StrPath, got: str) -> FormatError:
+    return FormatError(
+        f"{kind} image is truncated or damaged", where=path, got=got, hint="copy the file again"
+    )
+
+
+def _check_png(content: bytes, path: StrPath) -> None:
+    """Walk the chunks up to IEND; each must lie inside the file and match its checksum."""
+    at = len(_PNG_START)
+    name = b""
+    while name != b"IEND":
+        if at + 12 > len(content):
+            raise _truncated("PNG", path, f"the file ends after {len(content)} bytes, before IEND")
+        length = int.from_bytes(content[at : at + 4], "big")
+        name = content[at + 4 : at + 8]
+        end = at + 8 + length
+        if end + 4 > len(content):
+            raise _truncated("PNG", path, f"the file ends inside a chunk of {length} bytes")
+        if zlib.crc32(content[at + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
+            raise _truncated("PNG", path, f"checksum of chunk {name!r} differs")
+        at = end + 4
+
+
+def _check_jpeg(content: bytes, path: StrPath) -> None:
+    """Look for the end marker behind the start of the scan; an embedded preview has its own."""
+    at = 2
+    while content[at : at + 2] != b"\xff\xda":
+        if at + 4 > len(content) or content[at] != 0xFF:
+            raise _truncated("JPEG", path, "no start of scan")
+        # A marker may be preceded by any number of fill bytes 0xFF.
+        at += 1 if content[at + 1] == 0xFF else 2 + struct.unpack_from(">H", content, at + 2)[0]
+    if content.rfind(b"\xff\xd9") < at:
+        raise _truncated("JPEG", path, "no end-of-image marker")
+
+
+def _check_pnm(content: bytes, path: StrPath) -> None:
+    header = _PNM_HEADER.match(content)
+    if header is None:
+        raise _truncated("PGM/PPM", path, "no readable header")
+    kind, width, height, top = (int(group) for group in header.groups())
+    samples = width * height * (3 if kind in {3, 6} else 1)
+    if kind in {2, 3}:
+        found = len(content[header.end() :].split())
+    else:
+        found = (len(content) - header.end()) // (2 if top > 255 else 1)
+    if found < samples:
+        raise _truncated("PGM/PPM", path, f"{found} of {samples} samples")

@@ -1,0 +1,117 @@
+"""KITTI calibration: projection matrices ``P0`` … ``P3`` of the rectified cameras."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+import numpy as np
+
+from recon.errors import CalibrationError, FormatError
+from recon.formats.files import StrPath, read_text
+from recon.structures import RectifiedCamera
+from recon.structures.arrays import Float64
+
+GREY_CAMERAS: Final = (0, 1)
+COLOUR_CAMERAS: Final = (2, 3)
+_LINE: Final = re.compile(r"^P(?:_rect_0)?(\d):(.*)$", re.MULTILINE)
+
+
+def read_kitti_calib(
+    path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int] = GREY_CAMERAS
+) -> RectifiedCamera:
+    """Read the rectified camera of one stereo pair.
+
+    ``P = K·[I | t]`` with ``t`` from camera 0; the baseline is how far the two cameras of the
+    pair lie apart along x, so it is right for the colour pair too.
+
+    Args:
+        path: ``calib.txt`` of a KITTI odometry sequence (``P0:`` …), or ``calib_cam_to_cam.txt``
+            of a raw drive (``P_rect_00:`` …).
+        width_px: Image width; the file does not know it.
+        height_px: Image height.
+        cameras: Left and right camera: (0, 1) grey, (2, 3) colour.
+
+    Raises:
+        FormatError: The file is missing, has no such cameras, or a matrix is not 12 numbers.
+        CalibrationError: The two have different focal lengths or rows, or no positive baseline.
+    """
+    left, right = (_projection(path, camera) for camera in cameras)
+    if not np.allclose(left[:, :3][[0, 1, 1], [0, 1, 2]], right[:, :3][[0, 1, 1], [0, 1, 2]]):
+        raise CalibrationError(
+            f"P{cameras[0]} and P{cameras[1]} have different focal lengths or rows",
+            where=path,
+            hint="a rectified pair shares them; rectify the pictures first",
+        )
+    baseline_m = float(_centre_m(left)[0] - _centre_m(right)[0])
+    if baseline_m <= 0:
+        raise CalibrationError(
+            "baseline is zero" if baseline_m == 0 else "baseline is negative",
+            where=path,
+            got=f"{baseline_m:g} m",
+            expected="> 0 m",
+            hint="check that left and right are not swapped",
+        )
+    return RectifiedCamera(
+        focal_px=float(left[0, 0]),
+        cx_px=float(left[0, 2]),
+        cy_px=float(left[1, 2]),
+        cx_right_px=float(right[0, 2]),
+        baseline_m=baseline_m,
+        width_px=width_px,
+        height_px=height_px,
+    )
+
+
+def read_kitti_offset(path: StrPath, camera: int) -> Float64:
+    """Where a camera stands: float64 (4, 4), ``T_camera_camera0``, a translation in metres.
+
+    KITTI's poses are those of camera 0.
+
+    Raises:
+        FormatError: As in `read_kitti_calib`.
+    """
+    T = np.eye(4)
+    T[:3, 3] = _centre_m(_projection(path, camera))
+    return T
+
+
+def list_kitti_cameras(path: StrPath) -> frozenset[int]:
+    """The numbers of the cameras that a calibration file has a matrix for.
+
+    Raises:
+        FormatError: The file is missing or no text.
+    """
+    return frozenset(int(number) for number, _ in _LINE.findall(read_text(path)))
+
+
+def _projection(path: StrPath, camera: int) -> Float64:
+    """Read float64 (3, 4), the projection matrix of one camera."""
+    rows = {int(number): row for number, row in _LINE.findall(read_text(path))}
+    if camera not in rows:
+        raise FormatError(
+            f"calibration has no P{camera}",
+            where=path,
+            got=", ".join(f"P{number}" for number in sorted(rows)) or "no projection matrix",
+            hint="a stereo pair needs P0 and P1, or P2 and P3",
+        )
+    try:
+        matrix = np.array([float(word) for word in rows[camera].split()]).reshape(3, 4)
+    except ValueError as error:
+        raise FormatError(
+            f"P{camera} is not a 3x4 matrix", where=path, expected="12 numbers"
+        ) from error
+    if not np.isfinite(matrix).all():
+        raise FormatError(f"P{camera} holds a number that is not finite", where=path)
+    if not np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
+        raise FormatError(f"P{camera} is no projection of a rectified camera", where=path)
+    if min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise CalibrationError(
+            f"focal length of P{camera} is not positive", where=path, got=f"{matrix[0, 0]:g} px"
+        )
+    return matrix
+
+
+def _centre_m(projection: Float64) -> Float64:
+    """``t`` of ``P = K·[I | t]``, float64 (3,)."""
+    return np.asarray(np.linalg.solve(projection[:, :3], projection[:, 3]), dtype=np.float64)

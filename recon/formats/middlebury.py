@@ -1,0 +1,158 @@
+"""Middlebury stereo scenes of 2001, 2003, 2005, 2006, 2014 and MiddEval3."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from recon.errors import FormatError
+from recon.formats.files import StrPath, read_table
+from recon.formats.image import read_image
+from recon.formats.middlebury_calib import (
+    MiddleburyCalib,
+    nominal_camera_2005,
+    read_middlebury_calib,
+)
+from recon.formats.middlebury_layout import (
+    Generation,
+    Layout,
+    find_layout,
+    find_picture,
+    full_size_factor,
+    generation_of,
+    levels_per_pixel,
+)
+from recon.formats.middlebury_truth import read_middlebury_truth
+from recon.structures import DisparityTruth, RectifiedCamera, StereoPair
+from recon.structures.arrays import UInt8
+
+
+@dataclass(frozen=True, eq=False)
+class MiddleburyScene:
+    """One scene with all that its folder says about it.
+
+    Attributes:
+        name: Name of the folder.
+        generation: Whose layout the folder has: "2005" is that of 2006 too, "2014" that of
+            MiddEval3 too.
+        pair: The pictures; they are rectified.
+        camera: Geometry, or None where none is published: 2001, 2003, and 2005 or 2006 without
+            ``dmin.txt``. Matching can then use a `stand_in_camera`.
+        truth: True disparity of the left picture, or None where the folder has none.
+        ndisp: Number of disparities that suffice, or None where it is not published.
+        isint: True where results are rounded to whole pixels before they are compared.
+        full_size_factor: Full-size pixels per pixel here: the benchmark's error limits are in
+            full-size pixels.
+    """
+
+    name: str
+    generation: Generation
+    pair: StereoPair
+    camera: RectifiedCamera | None
+    truth: DisparityTruth | None
+    ndisp: int | None
+    isint: bool
+    full_size_factor: float
+
+
+def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
+    """Read one scene; `middlebury_layout` lists what is understood.
+
+    Raises:
+        FormatError: The folder is no Middlebury scene, or a file in it is missing, damaged or of
+            another size than the left picture.
+        CalibrationError: The calibration file cannot give depth.
+    """
+    path = Path(folder).resolve()
+    layout = find_layout(path)
+    if layout is None:
+        raise FormatError(
+            "folder is no Middlebury scene",
+            where=folder,
+            expected="im0 and im1 with calib.txt, view1 and view5, im2 and im6, or im3 and im4",
+        )
+    pair = _read_pair(path, layout)
+    height_px, width_px = pair.left.shape[:2]
+    factor = full_size_factor(layout, width_px, height_px, path.parent.name)
+    calib = _read_calib(path, generation_of(layout, width_px), pair.left, factor)
+    scale = levels_per_pixel(layout, width_px, height_px)
+    return MiddleburyScene(
+        name=path.name,
+        generation=generation_of(layout, width_px),
+        pair=pair,
+        camera=calib.camera if calib else None,
+        truth=read_middlebury_truth(path, layout, scale, (height_px, width_px)),
+        ndisp=calib.camera.ndisp if calib else _read_ndisp(path),
+        isint=calib.isint if calib else False,
+        full_size_factor=factor,
+    )
+
+
+def stand_in_camera(width_px: int, height_px: int, ndisp: int | None = None) -> RectifiedCamera:
+    """A camera for pictures whose calibration is unknown: fit for matching, not for depth.
+
+    The focal length is taken as the image width and the baseline as 1, so depth is in units of
+    an unknown length.
+    """
+    cx_px = (width_px - 1) / 2
+    return RectifiedCamera(
+        focal_px=float(width_px),
+        cx_px=cx_px,
+        cy_px=(height_px - 1) / 2,
+        cx_right_px=cx_px,
+        baseline_m=1.0,
+        width_px=width_px,
+        height_px=height_px,
+        ndisp=ndisp,
+    )
+
+
+def _read_pair(path: Path, layout: Layout) -> StereoPair:
+    left, right = (_read_picture(path, stem) for stem in (layout.left, layout.right))
+    if left.shape != right.shape:
+        raise FormatError(
+            "left and right picture differ in size",
+            where=path,
+            got=f"{layout.left} {_size(left)}, {layout.right} {_size(right)}",
+        )
+    return StereoPair(left, right, name=path.name)
+
+
+def _read_picture(path: Path, stem: str) -> UInt8:
+    file = find_picture(path, stem)
+    if file is None:
+        raise FormatError("picture is missing", where=path, expected=f"{stem}.png")
+    return read_image(file)
+
+
+def _read_calib(
+    path: Path, generation: Generation, left: UInt8, factor: float
+) -> MiddleburyCalib | None:
+    height_px, width_px = left.shape[:2]
+    if generation == "2005" and (path / "dmin.txt").is_file():
+        table, _ = read_table(path / "dmin.txt", (1,))
+        return MiddleburyCalib(nominal_camera_2005(width_px, height_px, float(table[0, 0]), factor))
+    if generation != "2014":
+        return None
+    calib = read_middlebury_calib(path / "calib.txt")
+    if (calib.camera.width_px, calib.camera.height_px) != (width_px, height_px):
+        raise FormatError(
+            "size in the calibration is not that of the pictures",
+            where=path / "calib.txt",
+            got=f"{calib.camera.width_px}x{calib.camera.height_px}",
+            expected=_size(left),
+        )
+    return calib
+
+
+def _read_ndisp(path: Path) -> int | None:
+    """``info.txt`` of the version 2 benchmark: grey levels per pixel, largest disparity."""
+    info = path / "v2eval" / "info.txt"
+    if not info.is_file():
+        return None
+    table, _ = read_table(info, (1, 2))
+    return int(table.ravel()[-1]) + 1
+
+
+def _size(image: UInt8) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"

@@ -1,0 +1,135 @@
+"""Calibration of Middlebury scenes: ``calib.txt`` of 2014, nominal numbers of 2005 and 2006."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from recon.errors import CalibrationError, FormatError
+from recon.formats.files import StrPath, naming, read_text
+from recon.structures import RectifiedCamera
+from recon.structures.arrays import Float64
+
+_LINE: Final = re.compile(r"^\s*(\w+)\s*=\s*(.*?)\s*$", re.MULTILINE)
+
+# Ref: https://vision.middlebury.edu/stereo/data/scenes2005/ and scenes2006/, at full size.
+_2005_FOCAL_PX: Final = 3740.0
+_2005_BASELINE_M: Final = 0.160
+
+
+@dataclass(frozen=True)
+class MiddleburyCalib:
+    """All that a ``calib.txt`` says.
+
+    Attributes:
+        camera: The rectified camera, in metres.
+        isint: True where the truth is in whole pixels, so that results are rounded before they
+            are compared.
+        vmin_px: Smallest true disparity, or None.
+        vmax_px: Largest true disparity, or None.
+    """
+
+    camera: RectifiedCamera
+    isint: bool = False
+    vmin_px: float | None = None
+    vmax_px: float | None = None
+
+
+def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
+    """Read a ``calib.txt`` of the 2014 data or of MiddEval3.
+
+    Raises:
+        FormatError: The file is missing, lacks a key, or a value is no number.
+        CalibrationError: The two cameras differ in focal length or rows, the baseline is not
+            positive, or ``doffs`` is not ``cx1 - cx0``.
+    """
+    entries = dict(_LINE.findall(read_text(path)))
+    cam0, cam1 = (_matrix(entries, key, path) for key in ("cam0", "cam1"))
+    _check_views(cam0, cam1, _number(entries, "doffs", path), path)
+    with naming(path):
+        camera = RectifiedCamera(
+            focal_px=float(cam0[0, 0]),
+            cx_px=float(cam0[0, 2]),
+            cy_px=float(cam0[1, 2]),
+            cx_right_px=float(cam1[0, 2]),
+            baseline_m=_number(entries, "baseline", path) / 1000,
+            width_px=int(_number(entries, "width", path)),
+            height_px=int(_number(entries, "height", path)),
+            ndisp=int(_number(entries, "ndisp", path)) if "ndisp" in entries else None,
+        )
+    bounds = [_number(entries, key, path) if key in entries else None for key in ("vmin", "vmax")]
+    isint = "isint" in entries and _number(entries, "isint", path) != 0
+    return MiddleburyCalib(camera, isint, *bounds)
+
+
+def nominal_camera_2005(
+    width_px: int, height_px: int, dmin_px: float, factor: float
+) -> RectifiedCamera:
+    """The camera of a 2005 or 2006 scene, for which the publishers give round numbers.
+
+    The pictures are cropped so that a disparity is too small by ``dmin``. The principal point is
+    unknown and taken as the middle of the picture.
+
+    Args:
+        width_px: Image width at the size at hand.
+        height_px: Image height.
+        dmin_px: Content of ``dmin.txt``, full-size pixels.
+        factor: Full-size pixels per pixel: 1, 2 or 3.
+    """
+    cx_px = (width_px - 1) / 2
+    return RectifiedCamera(
+        focal_px=_2005_FOCAL_PX / factor,
+        cx_px=cx_px,
+        cy_px=(height_px - 1) / 2,
+        cx_right_px=cx_px + dmin_px / factor,
+        baseline_m=_2005_BASELINE_M,
+        width_px=width_px,
+        height_px=height_px,
+    )
+
+
+def _check_views(cam0: Float64, cam1: Float64, doffs_px: float, path: StrPath) -> None:
+    if not np.allclose(cam0[[0, 1, 1], [0, 1, 2]], cam1[[0, 1, 1], [0, 1, 2]], rtol=1e-4):
+        raise CalibrationError("cam0 and cam1 have different focal lengths or rows", where=path)
+    # Three decimals are printed of each number.
+    if abs(cam1[0, 2] - cam0[0, 2] - doffs_px) > 0.01:
+        raise CalibrationError(
+            "doffs is not the difference of the principal points",
+            where=path,
+            got=f"{doffs_px:g}",
+            expected=f"{cam1[0, 2] - cam0[0, 2]:g}",
+        )
+
+
+def _entry(entries: dict[str, str], key: str, path: StrPath) -> str:
+    if key not in entries:
+        raise FormatError(f"calibration has no {key!r}", where=path, expected=f"a line {key}=…")
+    return entries[key]
+
+
+def _number(entries: dict[str, str], key: str, path: StrPath) -> float:
+    text = _entry(entries, key, path)
+    try:
+        number = float(text)
+    except ValueError:
+        number = float("nan")
+    if not np.isfinite(number):
+        raise FormatError(f"{key!r} is no finite number", where=path, got=text)
+    return number
+
+
+def _matrix(entries: dict[str, str], key: str, path: StrPath) -> Float64:
+    text = _entry(entries, key, path)
+    try:
+        numbers = [float(word) for word in text.strip("[]").replace(";", " ").split()]
+        matrix = np.array(numbers).reshape(3, 3)
+    except ValueError as error:
+        raise FormatError(
+            f"{key!r} is not a 3x3 matrix", where=path, got=text, expected="[f 0 cx; 0 f cy; 0 0 1]"
+        ) from error
+    if not np.isfinite(matrix).all():
+        raise FormatError(f"{key!r} holds a number that is not finite", where=path, got=text)
+    return matrix

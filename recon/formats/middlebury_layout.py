@@ -1,0 +1,115 @@
+"""Which files a Middlebury scene of each year consists of, and in what units its truth is.
+
+=========  ==================  ======================  =========================================
+year       pictures            truth                   grey levels per pixel of disparity
+=========  ==================  ======================  =========================================
+2001       im3, im4 (Tsukuba)  disp3                   16
+2001       im2, im6            disp2, disp6            8
+2001       im0, im1 (Map)      disp0, disp1            8
+2003       im2, im6            disp2, disp6            4, 2, 1 at quarter, half, full size
+2005/2006  view1, view5        disp1, disp5            3, 2, 1 at third, half, full size
+2014       im0, im1, calib     disp0, disp1 (PFM)      floats, inf = unknown
+MiddEval3  im0, im1, calib     disp0GT, disp1GT (PFM)  floats, inf = unknown
+=========  ==================  ======================  =========================================
+
+Ref: https://vision.middlebury.edu/stereo/data/
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+Generation = Literal["2001", "2003", "2005", "2014"]
+
+_PICTURES: Final = (".png", ".ppm", ".pgm", ".jpg")
+_2003_FACTORS: Final = {1800: 1, 900: 2, 450: 4}
+_2005_FULL_HEIGHT_PX: Final = 1110
+_EVAL3_FACTORS: Final = {"F": 1, "H": 2, "Q": 4}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """File stems of a scene.
+
+    Attributes:
+        left: Left picture.
+        right: Right picture.
+        truth_left: True disparity of the left view.
+        truth_right: True disparity of the right view.
+    """
+
+    left: str
+    right: str
+    truth_left: str
+    truth_right: str
+
+
+_TSUKUBA: Final = Layout("im3", "im4", "disp3", "disp4")
+_MAP: Final = Layout("im0", "im1", "disp0", "disp1")
+_2001_2003: Final = Layout("im2", "im6", "disp2", "disp6")
+_2005: Final = Layout("view1", "view5", "disp1", "disp5")
+_2014: Final = Layout("im0", "im1", "disp0", "disp1")
+_EVAL3: Final = Layout("im0", "im1", "disp0GT", "disp1GT")
+
+
+def find_layout(folder: Path) -> Layout | None:
+    """The layout that a folder's files fit, or None; one picture of the two is enough."""
+    if (folder / "calib.txt").is_file():
+        eval3 = (folder / "disp0GT.pfm").is_file()
+        return (_EVAL3 if eval3 else _2014) if _has_picture(folder, _2014) else None
+    known = (_2005, _2001_2003, _TSUKUBA)
+    layout = next((one for one in known if _has_picture(folder, one)), None)
+    if layout is None and _has_picture(folder, _MAP) and find_picture(folder, "disp0"):
+        return _MAP
+    return layout
+
+
+def find_picture(folder: Path, stem: str) -> Path | None:
+    """The picture of that stem, whatever its suffix, or None."""
+    paths = (folder / f"{stem}{suffix}" for suffix in _PICTURES)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def generation_of(layout: Layout, width_px: int) -> Generation:
+    """The year; scenes of 2001 and 2003 share their names and differ in width."""
+    if layout in {_2014, _EVAL3}:
+        return "2014"
+    if layout == _2005:
+        return "2005"
+    return "2003" if layout == _2001_2003 and width_px in _2003_FACTORS else "2001"
+
+
+def levels_per_pixel(layout: Layout, width_px: int, height_px: int) -> float | None:
+    """Grey levels per pixel of disparity in the truth's files; None = they are PFM."""
+    generation = generation_of(layout, width_px)
+    if generation == "2014":
+        return None
+    if generation == "2001":
+        return 16.0 if layout == _TSUKUBA else 8.0
+    return full_size_factor(layout, width_px, height_px, "")
+
+
+def full_size_factor(layout: Layout, width_px: int, height_px: int, collection: str) -> float:
+    """Full-size pixels per pixel of the scene at hand.
+
+    Args:
+        layout: The layout.
+        width_px: Width of the pictures.
+        height_px: Height of the pictures.
+        collection: Name of the folder that the scene lies in; MiddEval3 tells the size by its
+            last letter (``trainingQ``).
+    """
+    generation = generation_of(layout, width_px)
+    if generation == "2003":
+        return float(_2003_FACTORS[width_px])
+    if generation == "2005":
+        return float(max(1, round(_2005_FULL_HEIGHT_PX / height_px)))
+    if generation == "2014" and collection.startswith(("training", "test")):
+        return float(_EVAL3_FACTORS.get(collection[-1], 1))
+    return 1.0
+
+
+def _has_picture(folder: Path, layout: Layout) -> bool:
+    return any(find_picture(folder, stem) for stem in (layout.left, layout.right))

@@ -1,0 +1,193 @@
+"""OpenCV's stereo calibration: YAML, XML or JSON as ``cv2.FileStorage`` writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+
+from recon.errors import CalibrationError, FormatError
+from recon.formats.atomic import write_text
+from recon.formats.files import StrPath, naming, read_text
+from recon.geometry.se3 import make_transform
+from recon.structures import CameraIntrinsics, StereoCalibration
+from recon.structures.arrays import Float64
+
+# One spelling per line: OpenCV's samples, then what calibration tools and tutorials use.
+_LEFT_MATRIX: Final = ("M1", "K1", "cameraMatrix1", "camera_matrix_left", "cameraMatrixL")
+_RIGHT_MATRIX: Final = ("M2", "K2", "cameraMatrix2", "camera_matrix_right", "cameraMatrixR")
+_LEFT_DISTORTION: Final = ("D1", "distCoeffs1", "dist_coeffs_left", "distCoeffsL")
+_RIGHT_DISTORTION: Final = ("D2", "distCoeffs2", "dist_coeffs_right", "distCoeffsR")
+_ROTATION: Final = ("R", "rotation_matrix")
+_TRANSLATION: Final = ("T", "translation_vector")
+_SIZE: Final = ("image_size", "imageSize", "img_size")
+_WIDTH: Final = ("image_width", "imageWidth", "width")
+_HEIGHT: Final = ("image_height", "imageHeight", "height")
+
+# The numbers of coefficients that OpenCV's lens model knows.
+_DISTORTION_COUNTS: Final = frozenset({0, 4, 5, 8, 12, 14})
+
+# Longer than any rig: a file in millimetres that was read as metres.
+_LONGEST_BASELINE_M: Final = 20.0
+
+Nodes = dict[str, Float64]
+
+
+def read_opencv_calibration(
+    intrinsics: StrPath,
+    extrinsics: StrPath | None = None,
+    *,
+    size_px: tuple[int, int] | None = None,
+    metres_per_unit: float = 1.0,
+) -> StereoCalibration:
+    """Read two raw cameras from one file, or from OpenCV's pair of files.
+
+    Args:
+        intrinsics: Holds ``M1 D1 M2 D2`` (or ``cameraMatrix1`` …), perhaps also ``R T``.
+        extrinsics: Holds ``R T``. None = the same file, else a file beside it whose name has
+            ``extrinsics`` in the place of ``intrinsics``.
+        size_px: (width, height) of the pictures, for files that do not hold
+            ``image_width`` and ``image_height``.
+        metres_per_unit: Length of the unit of ``T``: 0.001 where it is in millimetres, the edge
+            of a square where the board was taken as 1.
+
+    Raises:
+        FormatError: A file is missing, or lacks a matrix, or the size is nowhere.
+        CalibrationError: The numbers cannot give depth.
+    """
+    nodes = _read_nodes(intrinsics)
+    outer = _find_extrinsics(intrinsics, extrinsics, nodes)
+    size = _size(nodes, size_px, intrinsics)
+    left = _camera(nodes, _LEFT_MATRIX, _LEFT_DISTORTION, size, intrinsics)
+    right = _camera(nodes, _RIGHT_MATRIX, _RIGHT_DISTORTION, size, intrinsics)
+    outer_nodes = _read_nodes(outer)
+    rotation = _matrix(outer_nodes, _ROTATION, (3, 3), outer)
+    translation = _matrix(outer_nodes, _TRANSLATION, (3,), outer)
+    with naming(outer):
+        calibration = StereoCalibration(
+            left, right, make_transform(rotation, translation * metres_per_unit)
+        )
+    _check_baseline(calibration.baseline_m, outer)
+    return calibration
+
+
+def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> None:
+    """Write one YAML file that OpenCV's ``FileStorage`` reads, ``T`` in metres, atomically.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("image_width", calibration.left.width_px)
+    storage.write("image_height", calibration.left.height_px)
+    for number, camera in enumerate((calibration.left, calibration.right), start=1):
+        storage.write(f"M{number}", np.array(camera.matrix))
+        storage.write(f"D{number}", np.array(camera.distortion).reshape(1, -1))
+    storage.write("R", np.array(calibration.T_right_left[:3, :3]))
+    storage.write("T", np.array(calibration.T_right_left[:3, 3]).reshape(3, 1))
+    write_text(path, storage.releaseAndGetString())
+
+
+def _read_nodes(path: StrPath) -> Nodes:
+    """Read every top-level number, list of numbers and matrix of a file, as float64 arrays."""
+    text = read_text(path)
+    flags = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
+    try:
+        # Nodes point into the storage: it stays alive until all are copied.
+        storage = cv2.FileStorage(text, flags)
+        root = storage.root()
+        nodes = {name: _numbers(root.getNode(name)) for name in root.keys()}  # noqa: SIM118
+    except (cv2.error, SystemError) as error:  # the bindings raise both for one syntax error
+        raise FormatError("not a file of OpenCV's FileStorage", where=path) from error
+    return {name: numbers for name, numbers in nodes.items() if numbers is not None}
+
+
+def _numbers(node: cv2.FileNode) -> Float64 | None:
+    if node.isInt() or node.isReal():
+        return np.array(node.real())
+    if node.isSeq():
+        parts = [node.at(i) for i in range(node.size())]
+        numeric = all(part.isInt() or part.isReal() for part in parts)
+        return np.array([part.real() for part in parts]) if numeric else None
+    if node.isMap() and not node.getNode("data").isNone():
+        return np.asarray(node.mat(), dtype=np.float64)
+    return None
+
+
+def _find(nodes: Nodes, names: Sequence[str]) -> Float64 | None:
+    return next((nodes[name] for name in names if name in nodes), None)
+
+
+def _matrix(nodes: Nodes, names: Sequence[str], shape: tuple[int, ...], path: StrPath) -> Float64:
+    value = _find(nodes, names)
+    if value is None:
+        raise FormatError(
+            f"calibration has no {names[0]!r}",
+            where=path,
+            got=", ".join(nodes) or "nothing",
+            expected=" or ".join(names),
+        )
+    if value.size != np.prod(shape):
+        raise FormatError(
+            f"{names[0]!r} has the wrong size", where=path, got=value.shape, expected=shape
+        )
+    return value.reshape(shape)
+
+
+def _camera(
+    nodes: Nodes,
+    matrix_names: Sequence[str],
+    distortion_names: Sequence[str],
+    size_px: tuple[int, int],
+    path: StrPath,
+) -> CameraIntrinsics:
+    matrix = _matrix(nodes, matrix_names, (3, 3), path)
+    found = _find(nodes, distortion_names)
+    distortion = np.zeros(0) if found is None else found.ravel()
+    if distortion.size not in _DISTORTION_COUNTS:
+        raise FormatError(
+            f"{distortion_names[0]!r} has the wrong size",
+            where=path,
+            got=f"{distortion.size} coefficients",
+            expected="4, 5, 8, 12 or 14",
+        )
+    with naming(path):
+        return CameraIntrinsics(matrix, distortion, *size_px)
+
+
+def _size(nodes: Nodes, given: tuple[int, int] | None, path: StrPath) -> tuple[int, int]:
+    width, height, both = (_find(nodes, names) for names in (_WIDTH, _HEIGHT, _SIZE))
+    if width is not None and height is not None:
+        return int(width), int(height)
+    if both is not None and both.size == 2:
+        return int(both.ravel()[0]), int(both.ravel()[1])
+    if given is None:
+        raise FormatError(
+            "calibration does not tell the size of the pictures",
+            where=path,
+            expected="image_width and image_height",
+        )
+    return given
+
+
+def _find_extrinsics(intrinsics: StrPath, extrinsics: StrPath | None, nodes: Nodes) -> StrPath:
+    """The file that has ``R`` and ``T``."""
+    if extrinsics is not None:
+        return extrinsics
+    path = Path(intrinsics)
+    beside = path.with_name(path.name.replace("intrinsics", "extrinsics"))
+    return beside if _find(nodes, _ROTATION) is None and beside.is_file() else intrinsics
+
+
+def _check_baseline(baseline_m: float, path: StrPath) -> None:
+    if baseline_m > _LONGEST_BASELINE_M:
+        raise CalibrationError(
+            "baseline is longer than any rig",
+            where=path,
+            got=f"{baseline_m:g} m",
+            expected=f"at most {_LONGEST_BASELINE_M:g} m",
+            hint="if the file is in millimetres, pass 0.001 metres per unit",
+        )

@@ -1,0 +1,133 @@
+"""Trajectories: KITTI (12 numbers of the 3×4 pose a line) and TUM (``t x y z qx qy qz qw``)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.errors import FormatError
+from recon.formats.atomic import write_text
+from recon.formats.files import StrPath, read_table
+from recon.geometry.quaternion import quaternion_from_rotation, rotation_from_quaternion
+from recon.geometry.se3 import make_transform, orthonormalise
+from recon.structures import Trajectory
+from recon.structures.arrays import Float64
+
+# Files print rotations with four to seven digits; what is further off is no rotation.
+_RIGID_TOLERANCE = 1e-3
+_UNIT_TOLERANCE = 1e-2
+
+
+def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
+    """Read a KITTI or a TUM trajectory, told apart by the number of columns (12 or 8).
+
+    Args:
+        path: The text file.
+        timestamps_s: float64 (N,), the times of a KITTI file; TUM files have their own.
+
+    Raises:
+        FormatError: As in `read_kitti_poses` and `read_tum`.
+    """
+    table, lines = read_table(path, (12, 8))
+    if table.shape[1] == 12:
+        return _from_kitti(table, lines, path, timestamps_s)
+    return _from_tum(table, lines, path)
+
+
+def read_kitti_poses(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
+    """Read poses of the left camera, one row-major 3×4 matrix a line.
+
+    The printed rotations are made orthonormal again.
+
+    Args:
+        path: The text file.
+        timestamps_s: float64 (N,), one time per pose; without it pose ``i`` gets ``i`` seconds.
+
+    Raises:
+        FormatError: The file is missing, a line has not 12 finite numbers or is no rigid
+            motion, or the number of poses is not that of the timestamps.
+    """
+    return _from_kitti(*read_table(path, (12,)), path, timestamps_s)
+
+
+def read_tum(path: StrPath) -> Trajectory:
+    """Read timestamped poses, ``t tx ty tz qx qy qz qw`` a line.
+
+    Raises:
+        FormatError: The file is missing, a line has not 8 finite numbers, a quaternion is not of
+            unit length, or time runs backwards.
+    """
+    return _from_tum(*read_table(path, (8,)), path)
+
+
+def write_kitti_poses(path: StrPath, trajectory: Trajectory) -> None:
+    """Write poses in KITTI's form, 13 digits, atomically; the timestamps have no place there.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    rows = trajectory.T_world_camera[:, :3, :].reshape(-1, 12)
+    write_text(path, "".join(" ".join(f"{value:.12e}" for value in row) + "\n" for row in rows))
+
+
+def write_tum(path: StrPath, trajectory: Trajectory) -> None:
+    """Write poses in TUM's form, 12 decimals (9 of the time), ``qw ≥ 0``, atomically.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    write_text(
+        path,
+        "".join(
+            _tum_line(T, float(time_s))
+            for T, time_s in zip(trajectory.T_world_camera, trajectory.timestamps_s, strict=True)
+        ),
+    )
+
+
+def _tum_line(T: Float64, time_s: float) -> str:
+    numbers = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
+    return f"{time_s:.9f} " + " ".join(f"{number:.12f}" for number in numbers) + "\n"
+
+
+def _from_kitti(
+    table: Float64, lines: list[int], path: StrPath, timestamps_s: Float64 | None
+) -> Trajectory:
+    times = np.arange(len(table), dtype=np.float64) if timestamps_s is None else timestamps_s
+    if len(times) != len(table):
+        raise FormatError(
+            "number of poses is not that of the timestamps",
+            where=path,
+            got=f"{len(table)} poses",
+            expected=f"{len(times)}",
+        )
+    poses = np.zeros((len(table), 4, 4))
+    poses[:, :3, :] = table.reshape(-1, 3, 4)
+    poses[:, 3, 3] = 1.0
+    for pose, line in zip(poses, lines, strict=True):
+        _check_rotation(pose[:3, :3], f"{path}:{line}")
+    return Trajectory(np.stack([orthonormalise(pose) for pose in poses]), times)
+
+
+def _from_tum(table: Float64, lines: list[int], path: StrPath) -> Trajectory:
+    norms = np.linalg.norm(table[:, 4:], axis=1)
+    for norm, line in zip(norms, lines, strict=True):
+        if abs(norm - 1) > _UNIT_TOLERANCE:
+            raise FormatError(
+                "quaternion is not of unit length", where=f"{path}:{line}", got=f"{norm:g}"
+            )
+    backwards = np.diff(table[:, 0]) < 0
+    if backwards.any():
+        line = lines[int(np.argmax(backwards)) + 1]
+        raise FormatError("time runs backwards", where=f"{path}:{line}")
+    poses = [make_transform(rotation_from_quaternion(row[4:]), row[1:4]) for row in table]
+    return Trajectory(np.stack(poses), table[:, 0].copy())
+
+
+def _check_rotation(rotation: Float64, where: str) -> None:
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_RIGID_TOLERANCE)
+    if not orthonormal or np.linalg.det(rotation) < 0:
+        raise FormatError(
+            "pose is no rigid motion",
+            where=where,
+            expected="a row-major 3x4 matrix of rotation and translation",
+        )

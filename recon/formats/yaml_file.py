@@ -1,0 +1,45 @@
+"""YAML files of settings; OpenCV's dialect is another matter, see `opencv_yaml`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import yaml
+
+from recon.errors import FormatError, OutputError
+from recon.formats.atomic import write_text
+from recon.formats.files import StrPath, read_text
+
+
+def read_yaml(path: StrPath) -> dict[str, Any]:
+    """Read a YAML file whose top level maps names to values.
+
+    Raises:
+        FormatError: The file is missing, no YAML, or no mapping.
+    """
+    try:
+        content = yaml.safe_load(read_text(path))
+    except yaml.YAMLError as error:
+        raise FormatError("not a YAML file", where=_place(path, error)) from error
+    if not isinstance(content, dict):
+        raise FormatError("YAML file is no mapping", where=path, got=type(content).__name__)
+    return {str(key): value for key, value in content.items()}
+
+
+def write_yaml(path: StrPath, values: Mapping[str, Any]) -> None:
+    """Write plain values as YAML, in their order, atomically.
+
+    Raises:
+        OutputError: A value has no YAML form, or the file cannot be written.
+    """
+    try:
+        text = yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True)
+    except yaml.YAMLError as error:
+        raise OutputError("a value has no YAML form", where=path, got=str(error)) from error
+    write_text(path, text)
+
+
+def _place(path: StrPath, error: yaml.YAMLError) -> str:
+    mark = getattr(error, "problem_mark", None)
+    return f"{path}:{mark.line + 1}" if mark is not None else str(path)
