@@ -1,0 +1,228 @@
+"""Turn the pictures of two cameras so that a point lies on the same row in both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from recon.errors import CalibrationError
+from recon.rectification.grey import GreyMode, to_grey
+from recon.settings import Settings
+from recon.structures import (
+    CameraIntrinsics,
+    RectifiedCamera,
+    RectifiedPair,
+    StereoCalibration,
+    StereoPair,
+)
+from recon.structures.arrays import Bool, Float32, Float64, UInt8
+
+_INTERPOLATIONS: Final = {
+    "linear": cv2.INTER_LINEAR,
+    "cubic": cv2.INTER_CUBIC,
+    "lanczos": cv2.INTER_LANCZOS4,
+}
+# Maps of an identity are off by rounding errors, far below what interpolation resolves (1/32 px).
+_BORDER_TOLERANCE_PX: Final = 1e-3
+
+
+class RectificationSettings(Settings):
+    """How raw pictures are rectified and turned grey."""
+
+    alpha: float | None = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="0 = zoomed so that only pixels with a source remain, 1 = every source pixel "
+        "is kept, none = OpenCV's own choice. Without effect on rectified input.",
+    )
+    same_principal_point: bool = Field(
+        True,
+        description="Give both views one principal point, so that disparity 0 is infinitely far. "
+        "Without effect on rectified input.",
+    )
+    interpolation: Literal["linear", "cubic", "lanczos"] = Field(
+        "linear", description="How source pixels are interpolated."
+    )
+    grey: GreyMode = Field("bt601", description="How colours are weighed, see `to_grey`.")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Where the pixels of one rectified view come from.
+
+    Attributes:
+        map_x: float32 (H, W), columns in the raw picture.
+        map_y: float32 (H, W), rows in the raw picture.
+    """
+
+    map_x: Float32
+    map_y: Float32
+
+    @property
+    def inside(self) -> Bool:
+        """bool (H, W), True where the source lies inside the raw picture."""
+        height, width = self.map_x.shape
+        low, e = -_BORDER_TOLERANCE_PX, _BORDER_TOLERANCE_PX
+        return np.asarray(
+            (self.map_x >= low)
+            & (self.map_y >= low)
+            & (self.map_x <= width - 1 + e)
+            & (self.map_y <= height - 1 + e)
+        )
+
+    def warp(self, image: UInt8, interpolation: int) -> UInt8:
+        """Rectify one raw picture; pixels without a source are black."""
+        return np.asarray(cv2.remap(image, self.map_x, self.map_y, interpolation))
+
+
+class Rectifier:
+    """Rectifies the pairs of one rig.
+
+    Args:
+        calibration: The raw cameras, or the camera of pictures that are rectified already; those
+            are only checked for their size and turned grey.
+        settings: How.
+
+    Attributes:
+        camera: Geometry of the rectified views.
+        valid: bool (H, W), where the rectified left view has a source; None = everywhere.
+
+    Raises:
+        CalibrationError: The rig is vertical, or left and right are swapped, or nothing of the
+            scene remains in view.
+    """
+
+    def __init__(
+        self,
+        calibration: RectifiedCamera | StereoCalibration,
+        settings: RectificationSettings | None = None,
+    ) -> None:
+        self.settings = settings or RectificationSettings()
+        self.valid: Bool | None = None
+        self._views: tuple[View, View] | None = None
+        if isinstance(calibration, RectifiedCamera):
+            self.camera = calibration
+            return
+        self.camera, self._views = plan_rectification(calibration, self.settings)
+        self.valid = self._views[0].inside
+        self.valid.flags.writeable = False
+        if not (self.valid.any() and self._views[1].inside.any()):
+            raise CalibrationError(
+                "no pixel of the rectified views has a source",
+                hint="check the distortion and the pose of the right camera",
+            )
+
+    def rectify(self, pair: StereoPair) -> RectifiedPair:
+        """Rectify one pair.
+
+        Raises:
+            CalibrationError: The pictures have another size than the calibration.
+        """
+        self._check_size(pair)
+        left, right = pair.left, pair.right
+        if self._views is not None:
+            how = _INTERPOLATIONS[self.settings.interpolation]
+            left, right = (
+                view.warp(image, how)
+                for view, image in zip(self._views, (left, right), strict=True)
+            )
+        return RectifiedPair(
+            left=to_grey(left, self.settings.grey),
+            right=to_grey(right, self.settings.grey),
+            camera=self.camera,
+            left_rgb=left if left.ndim == 3 else None,
+            valid=self.valid,
+            timestamp_s=pair.timestamp_s,
+            index=pair.index,
+        )
+
+    def _check_size(self, pair: StereoPair) -> None:
+        height_px, width_px = pair.left.shape[:2]
+        if (width_px, height_px) != (self.camera.width_px, self.camera.height_px):
+            raise CalibrationError(
+                "pictures have another size than the calibration",
+                where=pair.name or f"frame {pair.index}",
+                got=f"{width_px}x{height_px}",
+                expected=f"{self.camera.width_px}x{self.camera.height_px}",
+            )
+
+
+def plan_rectification(
+    calibration: StereoCalibration, settings: RectificationSettings
+) -> tuple[RectifiedCamera, tuple[View, View]]:
+    """Find the rectified camera and where its left and right pixels come from.
+
+    Raises:
+        CalibrationError: See `Rectifier`.
+
+    Ref: Bouguet's method, as in OpenCV's ``stereoRectify``.
+    """
+    _check_rig(calibration)
+    left, right = calibration.left, calibration.right
+    size = (left.width_px, left.height_px)
+    try:
+        R1, R2, P1, P2, *_ = cv2.stereoRectify(
+            left.matrix,
+            left.distortion,
+            right.matrix,
+            right.distortion,
+            size,
+            calibration.T_right_left[:3, :3],
+            calibration.T_right_left[:3, 3],
+            flags=cv2.CALIB_ZERO_DISPARITY if settings.same_principal_point else 0,
+            alpha=-1 if settings.alpha is None else settings.alpha,
+        )
+        views = (_make_view(left, R1, P1), _make_view(right, R2, P2))
+    except cv2.error as error:
+        raise CalibrationError("cameras cannot be rectified", got=error.err) from error
+    return _camera_of(P1, P2, size), views
+
+
+def _make_view(camera: CameraIntrinsics, rotation: Float64, projection: Float64) -> View:
+    size = (camera.width_px, camera.height_px)
+    return View(
+        *cv2.initUndistortRectifyMap(
+            camera.matrix, camera.distortion, rotation, projection, size, cv2.CV_32FC1
+        )
+    )
+
+
+def _camera_of(P1: Float64, P2: Float64, size: tuple[int, int]) -> RectifiedCamera:
+    return RectifiedCamera(
+        focal_px=float(P1[0, 0]),
+        cx_px=float(P1[0, 2]),
+        cy_px=float(P1[1, 2]),
+        cx_right_px=float(P2[0, 2]),
+        baseline_m=float(-P2[0, 3] / P2[0, 0]),
+        width_px=size[0],
+        height_px=size[1],
+    )
+
+
+def _check_rig(calibration: StereoCalibration) -> None:
+    left, right = calibration.left, calibration.right
+    if (left.width_px, left.height_px) != (right.width_px, right.height_px):
+        raise CalibrationError(
+            "left and right camera differ in size",
+            got=f"left {left.width_px}x{left.height_px}, right {right.width_px}x{right.height_px}",
+        )
+    x, y, z = calibration.T_right_left[:3, 3]
+    if abs(y) >= abs(x) or abs(z) >= abs(x):
+        raise CalibrationError(
+            "cameras do not stand side by side",
+            got=f"right camera at ({-x:g}, {-y:g}, {-z:g}) m",
+            expected="mostly along x",
+            hint="turn the pictures of a vertical rig by 90 degrees and calibrate again",
+        )
+    if x > 0:
+        raise CalibrationError(
+            "right camera stands to the left of the left one",
+            got=f"T[0] = {x:g} m",
+            expected="< 0 m",
+            hint="swap left and right",
+        )
