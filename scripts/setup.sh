@@ -53,7 +53,7 @@ install_packages() {
         become=(sudo)
         [[ -t 0 ]] || become+=(-n) # nobody is there to type a password
     fi
-    local apt=("${become[@]}" env DEBIAN_FRONTEND=noninteractive apt-get -qq
+    local apt=("${become[@]}" env DEBIAN_FRONTEND=noninteractive DEBCONF_NOWARNINGS=yes apt-get -qq
         -o DPkg::Lock::Timeout=300 -o Dpkg::Use-Pty=0)
     command -v apt-get >/dev/null && command -v "${become[0]:-env}" >/dev/null || return 1
     say "installing with apt: $*"
@@ -62,14 +62,14 @@ install_packages() {
 }
 
 ensure_system() {
-    local -a missing
-    mapfile -t missing < <(missing_packages)
+    local missing
+    missing=($(missing_packages)) # no package has a space in its name
     if ((${#missing[@]})); then
         install_packages "${missing[@]}" ||
             fail "system packages are missing; run as root: apt-get install -y ${missing[*]}"
     fi
     [[ -n $(find_python) ]] ||
-        fail "no Python 3.10 to 3.13 among ${PYTHON:-python3, python3.13 … python3.10}; install one or name it with PYTHON=/path/to/python3"
+        fail "no Python 3.10 to 3.13 found${PYTHON:+ as $PYTHON}; install one and name it with PYTHON=…"
 }
 
 ensure_venv() {
