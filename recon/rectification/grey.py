@@ -40,5 +40,5 @@ def to_grey(image: UInt8, mode: GreyMode = "bt601") -> UInt8:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
     if mode == "mean":
         # A sum of integers is never halfway between two multiples of 3: + 1 rounds to nearest.
-        return ((image.sum(axis=2, dtype=np.uint16) + 1) // 3).astype(np.uint8)
-    return np.clip(np.rint(image @ _PAPER_WEIGHTS), 0, 255).astype(np.uint8)
+        return np.asarray((image.sum(axis=2, dtype=np.uint16) + 1) // 3, dtype=np.uint8)
+    return np.asarray(np.clip(np.rint(image @ _PAPER_WEIGHTS), 0, 255), dtype=np.uint8)

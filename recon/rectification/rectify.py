@@ -34,21 +34,21 @@ class RectificationSettings(Settings):
     """How raw pictures are rectified and turned grey."""
 
     alpha: float | None = Field(
-        0.0,
+        default=0.0,
         ge=0,
         le=1,
         description="0 = zoomed so that only pixels with a source remain, 1 = every source pixel "
         "is kept, none = OpenCV's own choice. Without effect on rectified input.",
     )
     same_principal_point: bool = Field(
-        True,
+        default=True,
         description="Give both views one principal point, so that disparity 0 is infinitely far. "
         "Without effect on rectified input.",
     )
     interpolation: Literal["linear", "cubic", "lanczos"] = Field(
-        "linear", description="How source pixels are interpolated."
+        default="linear", description="How source pixels are interpolated."
     )
-    grey: GreyMode = Field("bt601", description="How colours are weighed, see `to_grey`.")
+    grey: GreyMode = Field(default="bt601", description="How colours are weighed, see `to_grey`.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +173,7 @@ def plan_rectification(
             right.distortion,
             size,
             calibration.T_right_left[:3, :3],
-            calibration.T_right_left[:3, 3],
+            calibration.T_right_left[:3, 3:],
             flags=cv2.CALIB_ZERO_DISPARITY if settings.same_principal_point else 0,
             alpha=-1 if settings.alpha is None else settings.alpha,
         )

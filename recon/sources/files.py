@@ -1,0 +1,84 @@
+"""One pair, given as two picture files and a calibration file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from recon.errors import SourceError
+from recon.formats.calibration import read_calibration
+from recon.formats.files import StrPath
+from recon.formats.image import read_image
+from recon.structures import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
+
+
+class FilesSource:
+    """One pair of pictures.
+
+    Args:
+        left: Left picture.
+        right: Right picture.
+        calibration: Calibration file of any kind that `read_calibration` understands.
+        metres_per_unit: Unit of the translation in an OpenCV file.
+
+    Raises:
+        SourceError: The pictures differ in size.
+        FormatError: A file is missing, damaged or not what it should be.
+        CalibrationError: The calibration cannot give depth.
+    """
+
+    def __init__(
+        self,
+        left: StrPath,
+        right: StrPath,
+        calibration: StrPath,
+        *,
+        metres_per_unit: float = 1.0,
+    ) -> None:
+        self._pair = read_pair(left, right)
+        height_px, width_px = self._pair.left.shape[:2]
+        self._calibration = read_calibration(
+            calibration, width_px, height_px, metres_per_unit=metres_per_unit
+        )
+
+    @property
+    def name(self) -> str:
+        """Name of the left picture."""
+        return self._pair.name
+
+    @property
+    def calibration(self) -> RectifiedCamera | StereoCalibration:
+        """A `RectifiedCamera` where the pictures are rectified already."""
+        return self._calibration
+
+    @property
+    def truth(self) -> SequenceTruth | None:
+        """None."""
+        return None
+
+    def __len__(self) -> int:
+        return 1
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        yield self._pair
+
+
+def read_pair(left: StrPath, right: StrPath) -> StereoPair:
+    """Read two pictures of one moment; where one is grey and one in colours, both become colour.
+
+    Raises:
+        SourceError: The pictures differ in size.
+        FormatError: A picture is missing or damaged.
+    """
+    pictures = [read_image(path) for path in (left, right)]
+    sizes = [f"{picture.shape[1]}x{picture.shape[0]}" for picture in pictures]
+    if sizes[0] != sizes[1]:
+        raise SourceError(
+            "left and right picture differ in size",
+            where=right,
+            got=f"left {sizes[0]}, right {sizes[1]}",
+            hint="both cameras must record the same size",
+        )
+    if pictures[0].ndim != pictures[1].ndim:
+        pictures = [p if p.ndim == 3 else p[:, :, None].repeat(3, axis=2) for p in pictures]
+    return StereoPair(pictures[0], pictures[1], name=Path(left).name)

@@ -1,0 +1,56 @@
+"""A Middlebury scene as a source of one pair."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from recon.errors import CalibrationError
+from recon.formats.files import StrPath
+from recon.formats.middlebury import MiddleburyScene, read_middlebury_scene
+from recon.structures import RectifiedCamera, SequenceTruth, StereoPair
+
+
+class MiddleburySource:
+    """One pair with published geometry.
+
+    Args:
+        folder: Folder of a scene of 2005 (with ``dmin.txt``), 2006 (the same), 2014 or MiddEval3.
+
+    Attributes:
+        scene: All that the folder says, the true disparity among it.
+
+    Raises:
+        FormatError: The folder is no Middlebury scene, or a file in it is damaged.
+        CalibrationError: The scene's geometry is not published, or cannot give depth.
+    """
+
+    def __init__(self, folder: StrPath) -> None:
+        self.scene: MiddleburyScene = read_middlebury_scene(folder)
+        if self.scene.camera is None:
+            raise CalibrationError(
+                "no calibration is published for this scene, so there is no depth",
+                where=folder,
+                expected="calib.txt, or dmin.txt for scenes of 2005 and 2006",
+            )
+        self._camera = self.scene.camera
+
+    @property
+    def name(self) -> str:
+        """Name of the folder."""
+        return self.scene.name
+
+    @property
+    def calibration(self) -> RectifiedCamera:
+        """The rectified camera."""
+        return self._camera
+
+    @property
+    def truth(self) -> SequenceTruth | None:
+        """None: what is true here is a disparity, see ``scene``."""
+        return None
+
+    def __len__(self) -> int:
+        return 1
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        yield self.scene.pair
