@@ -1,0 +1,26 @@
+"""The project's own files, as its house rules see them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    """Folder of the project."""
+    return Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="session")
+def pyproject(root: Path) -> dict[str, Any]:
+    """Content of pyproject.toml."""
+    return tomllib.loads((root / "pyproject.toml").read_text())

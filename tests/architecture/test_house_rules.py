@@ -1,0 +1,89 @@
+"""Rules of the house that no linter knows."""
+
+from __future__ import annotations
+
+import ast
+import re
+import statistics
+from pathlib import Path
+
+import pytest
+
+NO_NAMES = {"utils", "common", "helpers", "misc"}
+MAX_LINES = 400
+TEXT = {"", ".py", ".md", ".toml", ".txt", ".sh", ".yaml", ".yml", ".html", ".js", ".css"}
+OURS = ("recon", "tests", "docs", "examples", "benchmarks", "scripts", ".ci")
+MACHINE_PATH = re.compile(r"(?<![\w.])/(home|root|work|Users|opt|mnt)/\w")
+
+
+def _text_files(root: Path) -> list[Path]:
+    inside = [path for folder in OURS for path in (root / folder).rglob("*")]
+    files = [path for path in [*inside, *root.iterdir()] if path.is_file()]
+    return [path for path in files if path.suffix in TEXT and "__pycache__" not in path.parts]
+
+
+def _modules(root: Path) -> list[Path]:
+    return sorted((root / "recon").rglob("*.py"))
+
+
+def _packages(root: Path) -> list[Path]:
+    return [path for path in _modules(root) if path.name == "__init__.py"]
+
+
+def test_every_module_says_what_it_is(root: Path) -> None:
+    silent = [
+        str(path) for path in _modules(root) if not ast.get_docstring(ast.parse(path.read_text()))
+    ]
+
+    assert silent == []
+
+
+def test_no_package_or_module_is_a_drawer_for_everything(root: Path) -> None:
+    names = {path.stem for path in _modules(root)} | {path.parent.name for path in _packages(root)}
+
+    assert names & NO_NAMES == set()
+
+
+def test_files_are_short(root: Path) -> None:
+    lengths = {
+        str(path.relative_to(root)): len(path.read_text().splitlines())
+        for path in _text_files(root)
+        if path.suffix == ".py"
+    }
+
+    assert {path: length for path, length in lengths.items() if length > MAX_LINES} == {}
+
+
+def test_functions_are_short(root: Path) -> None:
+    """House style: half of all functions within 8 lines, 90 % within 30 (kernels apart)."""
+    lengths = sorted(
+        _body_lines(node)
+        for path in _modules(root)
+        if "kernels" not in path.parts
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef)
+    )
+
+    assert statistics.median(lengths) <= 8
+    assert statistics.quantiles(lengths, n=10)[-1] <= 30
+
+
+def _body_lines(function: ast.FunctionDef) -> int:
+    body = function.body[1:] if ast.get_docstring(function) else function.body
+    return (body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0
+
+
+def test_no_file_names_a_path_of_one_machine(root: Path) -> None:
+    found = [
+        f"{path.relative_to(root)}:{number}: {line.strip()}"
+        for path in _text_files(root)
+        for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1)
+        if MACHINE_PATH.search(line)
+    ]
+
+    assert found == []
+
+
+@pytest.mark.parametrize("script", [".ci/run", "scripts/setup.sh"])
+def test_script_can_be_executed(script: str, root: Path) -> None:
+    assert (root / script).stat().st_mode & 0o111

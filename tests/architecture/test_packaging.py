@@ -1,0 +1,70 @@
+"""What the package declares is what it uses."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from importlib.metadata import packages_distributions
+from pathlib import Path
+from typing import Any
+
+import recon
+
+
+def _normal(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", re.split(r"[\[<>=!~; ]", name)[0]).lower()
+
+
+def _imported(root: Path) -> set[str]:
+    names = set()
+    for path in (root / "recon").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names.add(node.module.split(".")[0])
+    return names - set(sys.stdlib_module_names) - {"recon"}
+
+
+def _declared(pyproject: dict[str, Any]) -> set[str]:
+    return {_normal(entry) for entry in pyproject["project"]["dependencies"]}
+
+
+def test_every_imported_library_is_declared(root: Path, pyproject: dict[str, Any]) -> None:
+    providers = packages_distributions()
+    declared = _declared(pyproject)
+
+    undeclared = {
+        name
+        for name in _imported(root)
+        if not declared & {_normal(provider) for provider in providers.get(name, [name])}
+    }
+
+    assert undeclared == set()
+
+
+def test_every_declared_library_is_imported(root: Path, pyproject: dict[str, Any]) -> None:
+    providers = packages_distributions()
+    used = {
+        _normal(provider) for name in _imported(root) for provider in providers.get(name, [name])
+    }
+
+    assert _declared(pyproject) - used == set()
+
+
+def test_constraints_pin_every_declared_library(root: Path, pyproject: dict[str, Any]) -> None:
+    lines = (root / "constraints.txt").read_text().splitlines()
+    pinned = {_normal(line) for line in lines if "==" in line and not line.startswith("#")}
+    wanted = _declared(pyproject) | {
+        _normal(entry) for entry in pyproject["project"]["optional-dependencies"]["dev"]
+    }
+
+    assert wanted - pinned == set()
+
+
+def test_version_is_the_same_everywhere(root: Path, pyproject: dict[str, Any]) -> None:
+    version = pyproject["project"]["version"]
+
+    assert recon.__version__ == version
+    assert f"## [{version}]" in (root / "CHANGELOG.md").read_text()
