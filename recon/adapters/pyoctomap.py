@@ -1,0 +1,108 @@
+"""OctoMap trees through pyoctomap: arrays in, bytes of a file out, and back.
+
+OctoMap counts cells as we do: cell ``k`` spans ``[k, k + 1) · resolution`` (its own keys are
+shifted by 2^15), so nothing is resampled.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyoctomap
+from numpy.typing import NDArray
+
+from recon.errors import FormatError, MappingError
+from recon.structures.arrays import Float32, Int32
+
+_DEPTH: Final = 16
+KEY_LIMIT: Final = 1 << (_DEPTH - 1)
+"""An OctoMap holds cells in ``[-KEY_LIMIT, KEY_LIMIT)`` on each axis."""
+
+
+def encode_octomap(
+    keys: NDArray[np.int32], log_odds: NDArray[np.float32], resolution_m: float
+) -> tuple[bytes, bytes]:
+    """The contents of an ``.ot`` file (log-odds) and of a ``.bt`` file (occupied or free).
+
+    Args:
+        keys: int32 (N, 3), cells.
+        log_odds: float32 (N,); above 0 = occupied.
+        resolution_m: Edge of a cell.
+
+    Raises:
+        MappingError: A cell lies outside of what an OctoMap can hold.
+    """
+    if len(keys) and (keys.min() < -KEY_LIMIT or keys.max() >= KEY_LIMIT):
+        raise MappingError(
+            "the map is too large for an OctoMap of this resolution",
+            got=f"{np.abs(keys).max() * resolution_m:.0f} m from the origin",
+            expected=f"at most {KEY_LIMIT * resolution_m:.0f} m",
+        )
+    tree = pyoctomap.OcTree(float(resolution_m))
+    # The values are final: a clamp that is narrower than ours would change them.
+    tree.setClampingThresMin(1e-6)
+    tree.setClampingThresMax(1.0 - 1e-6)
+    centres = (keys.astype(np.float64) + 0.5) * resolution_m
+    update = tree.updateNode
+    for centre, value in zip(centres.tolist(), log_odds.tolist(), strict=True):
+        update(centre, value, True)
+    tree.updateInnerOccupancy()
+    # In this order: writeBinary reduces the live tree to its maximum likelihood and prunes it.
+    full = bytes(tree.write())
+    return full, bytes(tree.writeBinary())
+
+
+def decode_octomap(path: Path) -> tuple[Int32, Float32, float]:
+    """Cells, log-odds and resolution of an ``.ot`` or ``.bt`` file, by what its header says.
+
+    Pruned leaves are expanded into the cells that they stand for.
+
+    Raises:
+        FormatError: The file is missing or is no OctoMap.
+    """
+    tree = _read_tree(path)
+    leaves = [
+        (*leaf.getCoordinate(), leaf.getSize(), leaf.current_node.getLogOdds())
+        for leaf in tree.begin_leafs()
+    ]
+    table = np.array(leaves, dtype=np.float64).reshape(-1, 5)
+    resolution = float(tree.getResolution())
+    keys, source = _expand(table[:, :3], table[:, 3], resolution)
+    return keys, table[source, 4].astype(np.float32), resolution
+
+
+def _read_tree(path: Path) -> Any:
+    """The tree of a file."""
+    try:
+        with path.open("rb") as file:
+            header = file.readline()
+    except OSError as error:
+        raise FormatError("cannot read the OctoMap", where=path) from error
+    if header.startswith(b"# Octomap OcTree binary file"):
+        tree = pyoctomap.OcTree(0.1)
+        if tree.readBinary(str(path)):
+            return tree
+    elif header.startswith(b"# Octomap OcTree file"):
+        tree = pyoctomap.OcTree(0.1).read(str(path))
+        if tree is not None:
+            return tree
+    raise FormatError(
+        "the file is not an OctoMap", where=path, got=repr(header[:40]), expected=".bt or .ot"
+    )
+
+
+def _expand(
+    centres: NDArray[np.float64], sizes: NDArray[np.float64], resolution_m: float
+) -> tuple[Int32, NDArray[np.intp]]:
+    """Cells of leaves of any size, and the leaf that each belongs to."""
+    edges = np.rint(sizes / resolution_m).astype(np.int64)
+    corners = np.rint(centres / resolution_m - edges[:, None] / 2).astype(np.int64)
+    keys, source = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.intp)]
+    for edge in np.unique(edges).tolist():
+        which = np.flatnonzero(edges == edge)
+        inside = np.stack(np.unravel_index(np.arange(edge**3), (edge,) * 3), axis=1)
+        keys.append((corners[which][:, None] + inside).reshape(-1, 3))
+        source.append(np.repeat(which, edge**3))
+    return np.concatenate(keys).astype(np.int32), np.concatenate(source)

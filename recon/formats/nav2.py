@@ -1,0 +1,142 @@
+"""Nav2 (ROS) maps: a PGM picture and a YAML file that says how to read it.
+
+Ref: https://docs.nav2.org/configuration/packages/configuring-map-server.html (mode ``trinary``):
+occupancy of a pixel is ``(255 - value) / 255``; above ``occupied_thresh`` it is occupied, below
+``free_thresh`` free, else unknown. The first row of the picture has the largest y.
+"""
+
+from __future__ import annotations
+
+import re
+from os import PathLike
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from recon.errors import FormatError
+from recon.formats.atomic import write_bytes, write_text
+from recon.structures import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from recon.structures.arrays import UInt8
+
+_OCCUPIED_THRESH: Final = 0.65
+# 0.25, often seen, would read the grey of unknown (205: 0.196…) back as free.
+_FREE_THRESH: Final = 0.196
+_GREY: Final = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
+_KEYS: Final = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
+_PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d+)\s+(\d+)\s+(\d+)\s")
+
+
+def write_nav2(path: str | PathLike[str], grid: OccupancyGrid) -> tuple[Path, Path]:
+    """Write ``path.pgm`` and ``path.yaml``, each atomically, the picture first.
+
+    Args:
+        path: Both names without their suffixes, such as ``map/grid``.
+        grid: The grid.
+
+    Returns:
+        The two paths written: picture, YAML.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    stem = Path(path)
+    picture, description = (stem.with_name(f"{stem.name}.{end}") for end in ("pgm", "yaml"))
+    rows, columns = grid.cells.shape
+    grey = np.full((rows, columns), _GREY[UNKNOWN], np.uint8)
+    for cell, value in _GREY.items():
+        grey[grid.cells == cell] = value
+    header = f"P5\n{columns} {rows}\n255\n".encode()
+    write_bytes(picture, header + np.ascontiguousarray(grey[::-1]).tobytes())
+    write_text(description, yaml.safe_dump(_describe(grid, picture.name), sort_keys=False))
+    return picture, description
+
+
+def read_nav2(path: str | PathLike[str]) -> OccupancyGrid:
+    """Read a map by Nav2's rules for mode ``trinary``.
+
+    Args:
+        path: The YAML file.
+
+    Raises:
+        FormatError: A file is missing or damaged, the mode is another, or the map is turned.
+    """
+    path = Path(path)
+    fields = _fields(path)
+    picture = path.parent / str(fields["image"])
+    grey = _read_pgm(picture).astype(np.float64)
+    occupancy = grey / 255 if fields["negate"] else (255 - grey) / 255
+    cells = np.full(grey.shape, UNKNOWN, np.int8)
+    cells[occupancy > float(fields["occupied_thresh"])] = OCCUPIED
+    cells[occupancy < float(fields["free_thresh"])] = FREE
+    x, y, _ = fields["origin"]
+    return OccupancyGrid(
+        np.ascontiguousarray(cells[::-1]), float(fields["resolution"]), (float(x), float(y))
+    )
+
+
+def _describe(grid: OccupancyGrid, image: str) -> dict[str, Any]:
+    """What the YAML file says."""
+    return {
+        "image": image,
+        "mode": "trinary",
+        "resolution": float(grid.resolution_m),
+        "origin": [float(grid.origin_m[0]), float(grid.origin_m[1]), 0.0],
+        "negate": 0,
+        "occupied_thresh": _OCCUPIED_THRESH,
+        "free_thresh": _FREE_THRESH,
+    }
+
+
+def _fields(path: Path) -> dict[str, Any]:
+    """The YAML file's content, checked."""
+    try:
+        fields = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise FormatError("cannot read the map's YAML file", where=path) from error
+    if not isinstance(fields, dict):
+        raise FormatError("the map's YAML file holds no fields", where=path)
+    missing = [key for key in _KEYS if key not in fields]
+    if missing:
+        raise FormatError(f"the map's YAML file has no {missing[0]!r}", where=path)
+    if fields.get("mode", "trinary") != "trinary":
+        raise FormatError(
+            "mode of the map is not supported", where=path, got=fields["mode"], expected="trinary"
+        )
+    _check_numbers(fields, path)
+    return fields
+
+
+def _check_numbers(fields: dict[str, Any], path: Path) -> None:
+    """Refuse fields that are no numbers, and turned maps."""
+    origin = fields["origin"]
+    numbers = [fields[key] for key in ("resolution", "occupied_thresh", "free_thresh")]
+    whole = isinstance(origin, list) and len(origin) == 3
+    if not whole or not all(isinstance(n, (int, float)) for n in (*numbers, *origin)):
+        raise FormatError("the map's YAML file holds something that is no number", where=path)
+    if origin[2] != 0:
+        raise FormatError("the map is turned", where=path, got=f"yaw {origin[2]:g}", expected="0")
+
+
+def _read_pgm(path: Path) -> UInt8:
+    """A binary 8-bit PGM, uint8 (rows, columns)."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise FormatError("cannot read the map's picture", where=path) from error
+    header = _PGM_HEADER.match(content)
+    if header is None or int(header[3]) != 255:
+        raise FormatError("the map's picture is not a binary 8-bit PGM", where=path)
+    columns, rows = int(header[1]), int(header[2])
+    body = content[header.end() :]
+    if len(body) != rows * columns:
+        raise FormatError(
+            "the map's picture is truncated",
+            where=path,
+            got=f"{len(body)} bytes",
+            expected=f"{rows * columns}",
+        )
+    pixels: NDArray[np.uint8] = np.frombuffer(body, np.uint8)
+    return pixels.reshape(rows, columns)

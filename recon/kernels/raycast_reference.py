@@ -1,0 +1,84 @@
+"""The twin of `recon.kernels.raycast`: one ray at a time, cells in a dictionary."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from recon.kernels.raycast import Rays
+from recon.kernels.voxels_reference import Cell
+
+
+def walk_reference(
+    origin: tuple[float, float, float], direction: tuple[float, float, float]
+) -> Iterator[tuple[Cell, float, float]]:
+    """The cells along a ray without end: cell, length at its entry, length at its exit.
+
+    Args:
+        origin: Where the ray starts, in cells.
+        direction: Unit vector.
+    """
+    cell = [math.floor(o) for o in origin]
+    step = [int(np.sign(d)) for d in direction]
+    delta = [1.0 / abs(d) if d else math.inf for d in direction]
+    following = [
+        (c + (d > 0) - o) / d if d else math.inf
+        for c, d, o in zip(cell, direction, origin, strict=True)
+    ]
+    enter = 0.0
+    while True:
+        leave = min(following)
+        yield (cell[0], cell[1], cell[2]), enter, leave
+        enter = leave
+        axis = following.index(leave)
+        cell[axis] += step[axis]
+        following[axis] += delta[axis]
+
+
+def cast_rays_reference(rays: Rays, spread: float) -> dict[Cell, float]:
+    """Evidence of one frame, as `recon.kernels.raycast.cast_rays` defines it."""
+    evidence: dict[Cell, float] = {}
+    for n in range(len(rays.ends)):
+        for cell, value in _ray(rays, n, spread):
+            before = evidence.get(cell, 0.0)
+            if value > 0:
+                evidence[cell] = max(before, value)
+            elif before <= 0:
+                evidence[cell] = min(before, value)
+    return {cell: value for cell, value in evidence.items() if value != 0}
+
+
+def _ray(rays: Rays, n: int, spread: float) -> Iterator[tuple[Cell, float]]:
+    """What one ray says of each cell that it crosses."""
+    x, y, z = (rays.ends[n] - rays.origin).tolist()
+    length = math.sqrt(x * x + y * y + z * z)
+    if length == 0:
+        return
+    free, sigma, hit = float(rays.free[n]), float(rays.sigma[n]), float(rays.hit[n])
+    near = length - spread * sigma if hit > 0 else math.inf
+    stop = max(free, length + spread * sigma) if hit > 0 else free
+    ox, oy, oz = rays.origin.tolist()
+    for cell, enter, leave in walk_reference((ox, oy, oz), (x / length, y / length, z / length)):
+        if leave > near:
+            yield cell, hit * (_below(leave, length, sigma) - _below(enter, length, sigma))
+        elif leave <= free:
+            yield cell, float(rays.miss[n])
+        if leave >= stop:
+            return
+
+
+def _below(value: float, mean: float, sigma: float) -> float:
+    """Share of a normal distribution below ``value``."""
+    if sigma <= 0:
+        return float(value > mean)
+    return 0.5 * (1.0 + math.erf((value - mean) / (sigma * math.sqrt(2.0))))
+
+
+def apply_evidence_reference(
+    log_odds: dict[Cell, float], evidence: dict[Cell, float], lowest: float, highest: float
+) -> None:
+    """Add a frame's evidence to a map and clamp."""
+    for cell, change in evidence.items():
+        log_odds[cell] = min(max(log_odds.get(cell, 0.0) + change, lowest), highest)

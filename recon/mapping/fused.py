@@ -1,0 +1,164 @@
+"""From clouds in the world to one fused cloud: a voxel averages what all frames saw in it."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from pydantic import Field
+
+from recon.errors import MappingError
+from recon.kernels import voxels
+from recon.settings import Settings
+from recon.structures import PointCloud
+from recon.structures.arrays import Bool, Float32
+
+_RGB: Final = slice(0, 3)
+_NORMAL: Final = slice(3, 6)
+_CONFIDENCE: Final = 6
+_VALUES: Final = 7
+
+
+class FusionSettings(Settings):
+    """How clouds are fused."""
+
+    voxel_m: float = Field(0.1, gt=0.0, le=10.0, description="Edge of a voxel.")
+    min_count: int = Field(
+        3, ge=1, le=1000, description="Voxels seen by fewer frames are not exported."
+    )
+    min_sigma_m: float = Field(
+        0.02,
+        gt=0.0,
+        le=10.0,
+        description="Points more precise than this count as this precise: bounds the weight.",
+    )
+    max_sigma_m: float = Field(
+        1.0, gt=0.0, le=100.0, description="Points less precise than this are left out."
+    )
+
+
+class MapBuilder:
+    """Fuses clouds frame by frame.
+
+    A point weighs ``confidence / sigma²``. Time per frame grows with its points alone (on
+    average: stores grow by doubling); memory with the number of voxels. The same clouds in the
+    same order give the same map.
+
+    Args:
+        settings: How to fuse.
+    """
+
+    def __init__(self, settings: FusionSettings) -> None:
+        self._settings = settings
+        self._table = voxels.make_table(1)
+        self._sums = voxels.make_sums(1, _VALUES)
+        self._frames = 0
+        self._known = {"rgb": True, "normals": True, "sigma_m": True, "confidence": True}
+
+    def __len__(self) -> int:
+        """Number of voxels seen by at least one frame."""
+        return int(self._sums.used[0])
+
+    def integrate(self, cloud: PointCloud) -> None:
+        """Add what one frame saw.
+
+        Args:
+            cloud: Points in world axes. ``confidence`` None = 1, ``sigma_m`` None = all equally
+                precise. What one of the clouds does not have, the map does not have.
+
+        Raises:
+            MappingError: The cloud is not in world axes, or a point is not finite or too far
+                away for the voxel size.
+        """
+        self._check(cloud)
+        rows = len(self) + len(cloud)
+        self._table = voxels.reserve_table(self._table, self._sums.keys[: len(self)], rows)
+        self._sums = voxels.reserve_sums(self._sums, rows)
+        for name in self._known:
+            self._known[name] &= getattr(cloud, name) is not None or len(cloud) == 0
+        points = voxels.VoxelPoints(cloud.xyz, self._weights(cloud), _values(cloud))
+        voxels.sum_points(self._table, self._sums, points, self._settings.voxel_m, self._frames)
+        self._frames += 1
+
+    def cloud(self, min_count: int | None = None) -> PointCloud:
+        """The map so far, one point per voxel, in the order in which voxels were first seen.
+
+        Args:
+            min_count: Voxels seen by fewer frames are left out; None = as in the settings.
+
+        Returns:
+            Frame ``world``. ``sigma_m`` treats frames as independent, and the points of one
+            frame in one voxel as one measurement. Voxels whose normals cancel are left out.
+        """
+        least = self._settings.min_count if min_count is None else min_count
+        rows = np.flatnonzero(self._sums.frames[: len(self)] >= least)
+        rows = rows[self._has_direction(rows)]
+        sums = self._sums.sums[rows]
+        weight = sums[:, :1]
+        centres = (voxels.unpack_keys(self._sums.keys[rows]) + 0.5) * self._settings.voxel_m
+        values = sums[:, 4:] / weight
+        known = self._known if self._frames else dict.fromkeys(self._known, False)
+        return PointCloud(
+            xyz=(centres + sums[:, 1:4] / weight).astype(np.float32),
+            rgb=np.rint(values[:, _RGB]).astype(np.uint8) if known["rgb"] else None,
+            normals=_unit(values[:, _NORMAL]) if known["normals"] else None,
+            sigma_m=self._sums.information[rows] ** np.float32(-0.5) if known["sigma_m"] else None,
+            confidence=values[:, _CONFIDENCE].copy() if known["confidence"] else None,
+            weight=weight[:, 0].copy(),
+            count=self._sums.frames[rows],
+            frame="world",
+        )
+
+    def _weights(self, cloud: PointCloud) -> Float32:
+        """Weight of each point; 0 = not used. float32 (N,)."""
+        s = self._settings
+        confidence = np.float32(1) if cloud.confidence is None else cloud.confidence
+        if cloud.sigma_m is None:
+            return np.full(len(cloud), 1.0, np.float32) * confidence
+        bounded = np.maximum(cloud.sigma_m, np.float32(s.min_sigma_m))
+        weights = confidence / bounded**2
+        return np.where(cloud.sigma_m <= s.max_sigma_m, weights, 0).astype(np.float32)
+
+    def _has_direction(self, rows: np.ndarray[tuple[int], np.dtype[np.intp]]) -> Bool:
+        """Which voxels have normals that do not cancel; all, where normals are not known."""
+        if not self._known["normals"]:
+            return np.ones(len(rows), dtype=np.bool_)
+        sums = self._sums.sums[rows]
+        # 1e-3: below, the direction is that of rounding errors.
+        length = np.linalg.norm(sums[:, 4:][:, _NORMAL], axis=1)
+        return np.asarray(length > 1e-3 * sums[:, 0])
+
+    def _check(self, cloud: PointCloud) -> None:
+        """Refuse what would silently spoil the map."""
+        if cloud.frame != "world":
+            raise MappingError(
+                "the fused map takes clouds in world axes", got=cloud.frame, expected="world"
+            )
+        limit_m = self._settings.voxel_m * (voxels.KEY_LIMIT - 1)
+        numbers = (cloud.xyz, cloud.sigma_m, cloud.confidence, cloud.normals)
+        if not all(a is None or np.isfinite(a).all() for a in numbers):
+            raise MappingError("a point to map is not finite")
+        if len(cloud) and np.abs(cloud.xyz).max() > limit_m:
+            raise MappingError(
+                "a point is too far from the origin for this voxel size",
+                got=f"{np.abs(cloud.xyz).max():.0f} m",
+                expected=f"at most {limit_m:.0f} m",
+            )
+
+
+def _values(cloud: PointCloud) -> Float32:
+    """What is averaged of each point: colour, normal, confidence; 0 where unknown. (N, 7)."""
+    values = np.zeros((len(cloud), _VALUES), np.float32)
+    for columns, array in (
+        (_RGB, cloud.rgb),
+        (_NORMAL, cloud.normals),
+        (_CONFIDENCE, cloud.confidence),
+    ):
+        if array is not None:
+            values[:, columns] = array
+    return values
+
+
+def _unit(vectors: Float32) -> Float32:
+    """Vectors (N, 3) at unit length."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -1,0 +1,117 @@
+"""From voxels to the flat grid that robots plan on, by heights above the local ground."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recon.errors import MappingError
+from recon.mapping.ground import GroundSurface
+from recon.settings import Settings
+from recon.structures import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
+from recon.structures.arrays import Bool, Float64
+
+
+class GridSettings(Settings):
+    """How voxels are flattened. Heights are of centres of voxels, above the local ground."""
+
+    min_height_m: float = Field(
+        0.3, ge=0.0, le=10.0, description="Lower end of the band in which obstacles are looked for."
+    )
+    max_height_m: float = Field(
+        2.0, gt=0.0, le=100.0, description="Upper end of the band: what is higher is passed under."
+    )
+    free_height_m: float = Field(
+        1.0,
+        gt=0.0,
+        le=100.0,
+        description="Free voxels below this height make a cell free; higher ones may be seen "
+        "over an obstacle that hides what is behind it.",
+    )
+    occupied_probability: float = Field(
+        0.65, ge=0.5, lt=1.0, description="Voxels at least this probable are obstacles."
+    )
+    free_probability: float = Field(
+        0.35, gt=0.0, le=0.5, description="Voxels at most this probable are free."
+    )
+    min_voxels: int = Field(1, ge=1, description="Occupied voxels in a column that block it.")
+    min_blob_cells: int = Field(
+        3, ge=1, description="Connected blocked cells fewer than this are taken for noise."
+    )
+
+
+def flatten(
+    voxels: OccupancyVoxels, ground: GroundSurface, settings: GridSettings
+) -> OccupancyGrid:
+    """Flatten an occupancy map.
+
+    A cell is occupied where an occupied voxel lies in the height band above the ground of that
+    place. It is free where nothing is occupied and either the ground itself was seen or a free
+    voxel low enough. Everything else, and every cell without a known ground, is unknown.
+
+    Args:
+        voxels: The observed voxels, map axes.
+        ground: Height of the ground, map axes.
+        settings: Band and thresholds.
+
+    Returns:
+        A grid with the resolution of the voxels that spans all of them.
+
+    Raises:
+        MappingError: There are no voxels, or the band is empty.
+    """
+    if len(voxels) == 0:
+        raise MappingError("nothing was observed: there is no map to flatten")
+    if settings.max_height_m <= settings.min_height_m:
+        raise MappingError(
+            "the height band of the grid is empty",
+            got=f"{settings.min_height_m:g} to {settings.max_height_m:g} m",
+        )
+    low = voxels.keys[:, :2].min(axis=0).astype(np.int64)
+    columns, rows = (voxels.keys[:, :2].max(axis=0) - low + 1).tolist()
+    cell = (voxels.keys[:, 1] - low[1]) * columns + voxels.keys[:, 0] - low[0]
+    floor = _floor(ground, low, (rows, columns), voxels.resolution_m)
+    height = (voxels.keys[:, 2] + 0.5) * voxels.resolution_m - floor[cell]
+
+    def any_in(which: Bool, least: int = 1) -> Bool:
+        return np.bincount(cell[which], minlength=rows * columns) >= least
+
+    s = settings
+    full = voxels.log_odds >= _log_odds(s.occupied_probability)
+    empty = voxels.log_odds <= _log_odds(s.free_probability)
+    in_band = (height >= s.min_height_m) & (height <= s.max_height_m)
+    on_ground = np.abs(height) < s.min_height_m
+    blocked = any_in(full & in_band, s.min_voxels)
+    seen = any_in(full & on_ground) | any_in(empty & (height >= 0) & (height <= s.free_height_m))
+    blocked = _without_small_blobs(blocked.reshape(rows, columns), s.min_blob_cells)
+    cells = np.where(seen.reshape(rows, columns), np.int8(FREE), np.int8(UNKNOWN))
+    cells[blocked] = OCCUPIED
+    origin = (float(low[0]) * voxels.resolution_m, float(low[1]) * voxels.resolution_m)
+    return OccupancyGrid(cells.astype(np.int8), voxels.resolution_m, origin)
+
+
+def _floor(
+    ground: GroundSurface, low: NDArray[Any], shape: tuple[int, int], resolution_m: float
+) -> Float64:
+    """Height of the ground at the centre of each cell, row by row; float64 (rows·columns,)."""
+    row, column = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
+    xy = (np.stack([column, row], axis=1) + low + 0.5) * resolution_m
+    return ground.height_at(xy)
+
+
+def _without_small_blobs(blocked: Bool, least: int) -> Bool:
+    """The mask without connected blobs (8 neighbours) of fewer than ``least`` cells."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(
+        blocked.astype(np.uint8), connectivity=8, ltype=cv2.CV_32S
+    )
+    large = stats[:, cv2.CC_STAT_AREA] >= least
+    return np.asarray(blocked & large[labels])
+
+
+def _log_odds(probability: float) -> float:
+    return math.log(probability / (1.0 - probability))

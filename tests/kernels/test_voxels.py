@@ -1,0 +1,87 @@
+"""The voxel hash and its sums agree with a dictionary."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recon.kernels import voxels
+from recon.kernels.voxels_reference import sum_points_reference
+
+
+def _random_frame(rng: np.random.Generator, number: int) -> tuple[np.ndarray, ...]:
+    xyz = rng.uniform(-3, 3, (number, 3)).astype(np.float32)
+    weights = np.where(rng.random(number) < 0.1, 0, rng.uniform(0.1, 5, number))
+    values = rng.uniform(-1, 255, (number, 2))
+    return xyz, weights.astype(np.float32), values.astype(np.float32)
+
+
+def _sum(frames: list[tuple[np.ndarray, ...]], edge: float) -> voxels.VoxelSums:
+    table, sums = voxels.make_table(1), voxels.make_sums(1, 2)
+    for number, frame in enumerate(frames):
+        used = int(sums.used[0])
+        rows = used + len(frame[0])
+        table = voxels.reserve_table(table, sums.keys[:used], rows)
+        sums = voxels.reserve_sums(sums, rows)
+        voxels.sum_points(table, sums, voxels.VoxelPoints(*frame), edge, number)
+    return sums
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    sizes=st.lists(st.integers(0, 60), min_size=1, max_size=4),
+    edge=st.sampled_from([0.1, 0.5, 1.0, 7.0]),
+)
+def test_sums_equal_those_of_the_reference(seed: int, sizes: list[int], edge: float) -> None:
+    rng = np.random.default_rng(seed)
+    frames = [_random_frame(rng, size) for size in sizes]
+    expected = sum_points_reference([(xyz.astype(np.float64), w, v) for xyz, w, v in frames], edge)
+    sums = _sum(frames, edge)
+    used = int(sums.used[0])
+    cells = [tuple(cell) for cell in voxels.unpack_keys(sums.keys[:used]).tolist()]
+    assert cells == list(expected)
+    for row, cell in enumerate(cells):
+        # 1e-4: float32 sums of 60 values below 255 · 5.
+        np.testing.assert_allclose(sums.sums[row], expected[cell]["sums"], rtol=1e-4, atol=1e-2)
+        assert sums.information[row] == pytest.approx(expected[cell]["information"], rel=1e-5)
+        assert sums.frames[row] == expected[cell]["frames"]
+
+
+@given(
+    st.lists(
+        st.tuples(*[st.integers(-voxels.KEY_LIMIT, voxels.KEY_LIMIT - 1)] * 3),
+        min_size=1,
+        max_size=20,
+    )
+)
+def test_unpacking_inverts_packing(cells: list[tuple[int, int, int]]) -> None:
+    keys = np.array([voxels.pack_key(*cell) for cell in cells], np.int64)
+    assert (keys >= 0).all()
+    assert voxels.unpack_keys(keys).tolist() == [list(cell) for cell in cells]
+
+
+def test_growing_keeps_every_row() -> None:
+    cells = np.stack(np.unravel_index(np.arange(8000), (20, 20, 20)), axis=1)
+    keys = np.array([voxels.pack_key(*cell) for cell in cells.tolist()], np.int64)
+    table = voxels.reserve_table(voxels.make_table(1), keys, len(keys))
+    assert len(table.keys) >= 2 * len(keys)
+    rows = [voxels.find_or_add(table, key, -7) for key in keys.tolist()]
+    assert rows == list(range(len(keys)))
+
+
+def test_a_table_with_room_is_not_copied() -> None:
+    table = voxels.make_table(100)
+    assert voxels.reserve_table(table, np.zeros(0, np.int64), 100) is table
+
+
+def test_neighbouring_cells_spread_over_the_table() -> None:
+    # A street is a sheet of neighbouring cells: probing stays short if they do not cluster.
+    cells = np.stack(np.unravel_index(np.arange(90_000), (300, 300, 1)), axis=1)
+    keys = np.array([voxels.pack_key(*cell) for cell in cells.tolist()], np.int64)
+    table = voxels.reserve_table(voxels.make_table(1), keys, len(keys))
+    empty = np.flatnonzero(table.keys == voxels.EMPTY)
+    # At half load a random hash gives a longest run of some tens; clusters give thousands.
+    assert np.diff(empty).max() < 200
