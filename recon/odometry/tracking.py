@@ -1,0 +1,86 @@
+"""Following features from picture to picture, and finding them in the other eye."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from recon.odometry.settings import TrackSettings
+from recon.structures import Disparity
+from recon.structures.arrays import Bool, Float32, UInt8
+
+
+def follow(
+    source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32, settings: TrackSettings
+) -> tuple[Float32, Bool]:
+    """Follow features to another picture, and back again as a check.
+
+    Args:
+        source: Picture in which the features are known.
+        target: Picture in which they are looked for.
+        uv: float32 (N, 2), where they are in ``source``.
+        guess_uv: float32 (N, 2), where they may be in ``target``.
+        settings: Window and tolerances.
+
+    Returns:
+        float32 (N, 2), where they are in ``target``, and bool (N,), True where the way back
+        ends where the way there began.
+
+    Ref:
+        Bouguet, "UInt8al implementation of the Lucas Kanade feature tracker", 2001;
+        Kalal, Mikolajczyk, Matas, "Forward-backward error", ICPR 2010.
+    """
+    if not len(uv):
+        return uv.copy(), np.zeros(0, np.bool_)
+    there, found = _lucas_kanade(source, target, uv, guess_uv, settings)
+    back, found_back = _lucas_kanade(target, source, there, uv, settings)
+    returned = np.abs(back - uv).max(axis=1) <= settings.max_return_px
+    height, width = target.shape
+    inside = (there >= 0).all(axis=1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
+    return there, np.asarray(found & found_back & returned & inside)
+
+
+def sample_disparity(disparity: Disparity, uv: Float32, settings: TrackSettings) -> Float32:
+    """The matcher's disparity of features: the median around each, where that is consistent.
+
+    Tracking features into the right picture would be finer, and worse: patches at the edge of an
+    object see the background too, which pulls their disparity down and the path's scale up.
+
+    Args:
+        disparity: The matcher's result.
+        uv: float32 (N, 2), features of the left picture.
+        settings: Neighbourhood and tolerance.
+
+    Returns:
+        float32 (N,), pixels; NaN where there is no match, or one unlike its neighbours.
+    """
+    height, width = disparity.values.shape
+    column, row = np.rint(uv).astype(np.int64).T
+    offset = np.arange(-settings.neighbour_px, settings.neighbour_px + 1)
+    columns = np.clip(column[:, None, None] + offset, 0, width - 1)
+    rows = np.clip(row[:, None, None] + offset[:, None], 0, height - 1)
+    around = disparity.values[rows, columns].reshape(len(uv), offset.size**2)
+    centre = around[:, around.shape[1] // 2]
+    around = np.where(np.isfinite(around), around, centre[:, None])
+    middle = np.median(around, axis=1)
+    agrees = np.abs(middle - centre) <= settings.max_disparity_step_px
+    return np.where(agrees, middle, np.float32(np.nan)).astype(np.float32)
+
+
+def _lucas_kanade(
+    source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32, settings: TrackSettings
+) -> tuple[Float32, Bool]:
+    """One way of `follow`."""
+    end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
+    there, status, _ = cv2.calcOpticalFlowPyrLK(
+        source,
+        target,
+        uv.reshape(-1, 1, 2),
+        guess_uv.reshape(-1, 1, 2).copy(),
+        winSize=(settings.window_px, settings.window_px),
+        maxLevel=settings.levels,
+        criteria=end,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=settings.min_eigenvalue,
+    )
+    return there.reshape(-1, 2), status.reshape(-1).astype(np.bool_)
