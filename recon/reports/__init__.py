@@ -3,6 +3,7 @@
 from recon.reports.html import ReportContent, render_html
 from recon.reports.map_report import MapReportInputs, map_report
 from recon.reports.pair_report import PairReportInputs, pair_report
+from recon.reports.present import present_disparity, present_map, present_pair
 
 __all__ = [
     "MapReportInputs",
@@ -10,5 +11,8 @@ __all__ = [
     "ReportContent",
     "map_report",
     "pair_report",
+    "present_disparity",
+    "present_map",
+    "present_pair",
     "render_html",
 ]

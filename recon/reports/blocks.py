@@ -41,7 +41,7 @@ def known_figures(summary: Mapping[str, Any], formats: FigureFormats) -> list[tu
 def stereo_blocks(pair: RectifiedPair, disparity: Disparity) -> list[Block]:
     """A pair and all that was found for its pixels."""
     wide = is_wide(disparity.values.shape)
-    share = f"{float(disparity.valid.mean()):.1%}"
+    share = f"{100 * disparity.valid.mean():.1f} %"
     depth_m = depth_from_disparity(disparity.values, pair.camera)
     return [
         FigureBlock(

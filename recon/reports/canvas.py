@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import io
 import math
-from typing import Final
+from typing import Final, Literal
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 WIDE_IN: Final = 11.0
-HALF_IN: Final = 7.2
+HALF_IN: Final = 6.2
 DPI: Final = 120
 
 ESTIMATE: Final = "#0b6bcb"
@@ -22,9 +22,11 @@ FAINT: Final = "#6e7781"
 _LINES: Final = "#d8dee4"
 
 
-def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure of the shared look."""
-    figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+def new_figure(
+    width_in: float, height_in: float, layout: Literal["constrained"] | None = "constrained"
+) -> Figure:
+    """An empty figure of the shared look; ``layout`` None = the caller places its axes."""
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout=layout)
     figure.set_facecolor("white")
     FigureCanvasAgg(figure)
     return figure

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -32,9 +33,14 @@ from recon.reports.colour import (
 from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import UInt8
 
-_BAR_IN = 0.85
+# The strip below a picture: axis label and numbers, the bar, and depths above it.
+_BELOW_IN = 1.0
+_BAR_BOTTOM_IN = 0.5
+_BAR_IN = 0.16
 _WIDE_ASPECT = 2.0
-_DEPTH_STEPS = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
+_LABEL_ROOM = 0.07  # of the length of a scale
+# Marks of a depth scale, the roundest first; the others fill what room is left.
+_DEPTH_STEPS = ((1.0, 2.0, 5.0), (3.0, 4.0, 6.0, 8.0), (1.5, 2.5, 3.5, 4.5, 7.0, 9.0))
 
 
 def is_wide(shape: tuple[int, ...]) -> bool:
@@ -60,8 +66,8 @@ def pair_figure(pair: RectifiedPair) -> bytes:
 def disparity_figure(disparity: Disparity, camera: RectifiedCamera) -> bytes:
     """The disparity map, with a scale in pixels below it and in metres of depth above that."""
     limits = value_range(disparity.values)
-    figure, axes = _picture(colour_disparity(disparity.values, *limits))
-    bar = _colour_bar(figure, axes, DISPARITY_SCALE, limits)
+    figure, _ = _picture(colour_disparity(disparity.values, *limits))
+    bar = _colour_bar(figure, DISPARITY_SCALE, limits)
     bar.set_label("disparity in pixels", color=INK)
     _depth_ticks(bar, limits, camera)
     return to_png(figure)
@@ -76,8 +82,8 @@ def depth_figure(depth_m: NDArray[Any]) -> bytes:
         logarithm = np.log(np.where(depth_m > 0, depth_m, np.nan))
     # Reversed, so that near has the same colour here and in the disparity map.
     scale = f"{DISPARITY_SCALE}_r"
-    figure, axes = _picture(colour_values(logarithm, scale, limits))
-    bar = _colour_bar(figure, axes, scale, limits)
+    figure, _ = _picture(colour_values(logarithm, scale, limits))
+    bar = _colour_bar(figure, scale, limits)
     depths = _spaced(_nice_depths(low, high), np.log, limits)
     bar.set_ticks(list(np.log(depths)), labels=[f"{depth:g}" for depth in depths])
     bar.set_label("depth in metres (logarithmic)", color=INK)
@@ -86,16 +92,16 @@ def depth_figure(depth_m: NDArray[Any]) -> bytes:
 
 def confidence_figure(disparity: Disparity) -> bytes:
     """The confidence of each match, from 0 to 1."""
-    figure, axes = _picture(colour_confidence(disparity.confidence))
-    bar = _colour_bar(figure, axes, CONFIDENCE_SCALE, (0.0, 1.0))
+    figure, _ = _picture(colour_confidence(disparity.confidence))
+    bar = _colour_bar(figure, CONFIDENCE_SCALE, (0.0, 1.0))
     bar.set_label("confidence (dark: no match)", color=INK)
     return to_png(figure)
 
 
 def error_figure(error_px: NDArray[Any], limit_px: float) -> bytes:
     """The size of the disparity error of each pixel, up to ``limit_px``; NaN = not compared."""
-    figure, axes = _picture(colour_error(error_px, limit_px))
-    bar = _colour_bar(figure, axes, ERROR_SCALE, (0.0, limit_px), extend="max")
+    figure, _ = _picture(colour_error(error_px, limit_px))
+    bar = _colour_bar(figure, ERROR_SCALE, (0.0, limit_px), extend="max")
     bar.set_label("absolute disparity error in pixels (dark: not compared)", color=INK)
     return to_png(figure)
 
@@ -113,7 +119,9 @@ def reasons_figure(disparity: Disparity) -> bytes:
         for reason, label in _reason_shares(disparity.reason)
     ]
     columns = 4 if is_wide(disparity.reason.shape) else 3
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns, frameon=False)
+    middle = 0.5 * _BELOW_IN / figure.get_size_inches()[1]
+    legend = figure.legend(handles=handles, loc="center", ncols=columns, frameon=False)
+    legend.set_bbox_to_anchor((0.5, middle))
     return to_png(figure)
 
 
@@ -127,27 +135,35 @@ def reason_shares(reason: UInt8) -> dict[Reason, float]:
 
 def _reason_shares(reason: UInt8) -> list[tuple[Reason, str]]:
     shares = reason_shares(reason)
-    return [(code, f"{REASON_LABELS[code]} {share:.1%}") for code, share in shares.items()]
+    return [(code, f"{REASON_LABELS[code]} {100 * share:.1f} %") for code, share in shares.items()]
 
 
 def _picture(picture: UInt8) -> tuple[Figure, Axes]:
-    """A figure as wide as the picture needs, with room for a scale below."""
+    """A picture that fills the width of its figure, with room for a scale or legend below."""
     height, width = picture.shape[:2]
     width_in = WIDE_IN if is_wide(picture.shape) else HALF_IN
-    figure = new_figure(width_in, width_in * height / width + _BAR_IN)
-    axes = figure.subplots()
-    axes.imshow(picture)
+    height_in = width_in * height / width + _BELOW_IN
+    # Placed by hand: a layout engine does not see the marks on the upper side of a scale.
+    figure = new_figure(width_in, height_in, layout=None)
+    axes = figure.add_axes((0.0, _BELOW_IN / height_in, 1.0, 1.0 - _BELOW_IN / height_in))
+    axes.imshow(picture, aspect="auto")
     axes.set_axis_off()
     return figure, axes
 
 
 def _colour_bar(
-    figure: Figure, axes: Axes, scale: str, limits: tuple[float, float], extend: str = "neither"
+    figure: Figure, scale: str, limits: tuple[float, float], extend: str = "neither"
 ) -> Colorbar:
-    colours = ScalarMappable(Normalize(*limits), cmap=scale)
-    return figure.colorbar(
-        colours, ax=axes, orientation="horizontal", aspect=50, pad=0.02, extend=extend
+    height_in = figure.get_size_inches()[1]
+    place = (0.05, _BAR_BOTTOM_IN / height_in, 0.9, _BAR_IN / height_in)
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(*limits), cmap=scale),
+        cax=figure.add_axes(place),
+        orientation="horizontal",
+        extend=extend,
     )
+    bar.outline.set_visible(False)
+    return bar
 
 
 def _depth_ticks(bar: Colorbar, limits: tuple[float, float], camera: RectifiedCamera) -> None:
@@ -159,27 +175,33 @@ def _depth_ticks(bar: Colorbar, limits: tuple[float, float], camera: RectifiedCa
     # A disparity of about 0 is a depth without end; 1 km is far enough for marks.
     far = min(float(near_far[1]), 1000.0) if np.isfinite(near_far[1]) else 1000.0
     depths = _spaced(
-        _nice_depths(near, far), lambda z: disparity_from_depth(np.asarray(z), camera), limits
+        _nice_depths(near, far),
+        lambda depth: disparity_from_depth(np.asarray(depth), camera),
+        limits,
     )
     upper = bar.ax.twiny()
     upper.set_xlim(*limits)
+    upper.spines[:].set_visible(False)
     places = disparity_from_depth(np.asarray(depths), camera)
     upper.set_xticks(list(places), labels=[f"{depth:g} m" for depth in depths])
     upper.tick_params(length=2, pad=1)
 
 
 def _nice_depths(low: float, high: float) -> list[float]:
-    """Round numbers between two depths, in rising order."""
+    """Round numbers between two depths, the roundest first."""
     powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-    steps = [step * 10.0**power for power in powers for step in _DEPTH_STEPS]
-    return [depth for depth in steps if low <= depth <= high]
+    marks = [step * 10.0**power for tier in _DEPTH_STEPS for power in powers for step in tier]
+    return [depth for depth in marks if low <= depth <= high]
 
 
-def _spaced(depths: list[float], place: Any, limits: tuple[float, float]) -> list[float]:
-    """The depths whose places on a scale leave room for their labels."""
-    room = 0.055 * (limits[1] - limits[0])
-    kept: list[float] = []
+def _spaced(
+    depths: list[float], place: Callable[[float], Any], limits: tuple[float, float]
+) -> list[float]:
+    """The depths, in this order of choice, whose places on a scale leave room for labels."""
+    room = _LABEL_ROOM * (limits[1] - limits[0])
+    kept: dict[float, float] = {}
     for depth in depths:
-        if not kept or abs(float(place(depth)) - float(place(kept[-1]))) >= room:
-            kept.append(depth)
-    return kept
+        there = float(place(depth))
+        if all(abs(there - other) >= room for other in kept.values()):
+            kept[depth] = there
+    return sorted(kept)

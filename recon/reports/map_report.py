@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Final
 
+import numpy as np
+
+from recon.geometry.se3 import apply
 from recon.odometry.protocol import OdometryHealth
 from recon.reports.blocks import (
     FigureFormats,
@@ -54,8 +57,8 @@ class MapReportInputs:
         truth: True path in the same world.
         metrics: How far the two paths are apart.
         grid: The flat map.
-        cloud: The fused cloud, frame ``world``.
-        mesh: The surface, frame ``world``.
+        cloud: The fused cloud, frame ``map``.
+        mesh: The surface, map axes.
         summary: The figures of ``summary.json``.
         command: The command line, or "".
         config: The effective configuration as text.
@@ -116,10 +119,10 @@ def _figures(inputs: MapReportInputs) -> list[tuple[str, str]]:
 
 
 def _map_blocks(inputs: MapReportInputs) -> list[Block]:
-    paths = [("path", inputs.trajectory)]
+    paths = [("path", _in_map_axes(inputs.trajectory, inputs.T_map_world))]
     if inputs.truth is not None:
-        paths.append(("true path", inputs.truth))
-    scene = Scene(inputs.T_map_world, inputs.cloud, inputs.mesh, paths)
+        paths.append(("true path", _in_map_axes(inputs.truth, inputs.T_map_world)))
+    scene = Scene(np.eye(4), inputs.cloud, inputs.mesh, paths)
     blocks = scene_blocks(scene, "The fused cloud in map axes, with the path of the camera.")
     if inputs.grid is not None:
         caption = (
@@ -129,6 +132,10 @@ def _map_blocks(inputs: MapReportInputs) -> list[Block]:
         figure = grid_figure(inputs.grid, inputs.trajectory, inputs.T_map_world)
         blocks.append(FigureBlock("Occupancy grid", figure, caption))
     return blocks
+
+
+def _in_map_axes(path: Trajectory, T_map_world: Float64) -> Float64:
+    return np.asarray(apply(T_map_world, path.positions_m))
 
 
 def _path_blocks(inputs: MapReportInputs) -> list[Block]:

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from recon.geometry.triangulation import depth_from_disparity
 from recon.reports.blocks import (
     FigureFormats,
     known_figures,
@@ -75,7 +76,7 @@ class PairReportInputs:
 def pair_report(inputs: PairReportInputs) -> ReportContent:
     """Compose the report of one pair: what was found, how good it is, and how it looks in 3-D."""
     camera = inputs.pair.camera
-    scene = Scene(T_UPRIGHT_CAMERA, inputs.cloud, inputs.mesh)
+    scene = Scene(T_UPRIGHT_CAMERA, inputs.cloud, inputs.mesh, eye_m=_beside_camera(inputs))
     sections = (
         Section("Disparity", stereo_blocks(inputs.pair, inputs.disparity)),
         Section("Against the truth", _truth_blocks(inputs)),
@@ -97,8 +98,16 @@ def pair_report(inputs: PairReportInputs) -> ReportContent:
     )
 
 
+def _beside_camera(inputs: PairReportInputs) -> tuple[float, float, float]:
+    """A little behind, left of and above the camera: the picture, but with its depth to be seen."""
+    depth_m = depth_from_disparity(inputs.disparity.values, inputs.pair.camera)
+    known = depth_m[np.isfinite(depth_m)]
+    far = float(np.median(known)) if known.size else 1.0
+    return (-0.1 * far, 0.25 * far, 0.25 * far)
+
+
 def _figures(inputs: PairReportInputs) -> list[tuple[str, str]]:
-    figures = [("Pixels with a disparity", f"{float(inputs.disparity.valid.mean()):.1%}")]
+    figures = [("Pixels with a disparity", f"{100 * inputs.disparity.valid.mean():.1f} %")]
     if inputs.metrics is not None:
         figures.append(("Mean error", f"{inputs.metrics.avgerr_px:.2f} px"))
         figures += [

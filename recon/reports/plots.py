@@ -33,6 +33,7 @@ from recon.structures.arrays import Float64
 _X_LABEL = "x, forward at the start (m)"
 _Y_LABEL = "y, left at the start (m)"
 _MARGIN_CELLS = 10
+_PATH_MARGIN_M = 3.0
 
 
 def trajectory_figure(
@@ -107,22 +108,25 @@ def grid_figure(
         T_map_world: (4, 4), turns world to map axes.
     """
     grid = _crop_to_known(grid)
-    rows, columns = grid.cells.shape
     x, y = grid.origin_m
-    width_m, height_m = columns * grid.resolution_m, rows * grid.resolution_m
-    corners = np.asarray([[x, y], [x + width_m, y + height_m]])
+    far = np.asarray(grid.cells.shape[::-1]) * grid.resolution_m + grid.origin_m
+    corners = np.stack([grid.origin_m, far])
+    path = None if trajectory is None else _seen_from_above(trajectory, T_map_world)
+    if path is not None and len(path):
+        corners = np.concatenate([corners, path - _PATH_MARGIN_M, path + _PATH_MARGIN_M])
+    low, high = corners.min(axis=0), corners.max(axis=0)
     figure = new_figure(WIDE_IN, _height_for(corners))
     axes = figure.subplots()
-    axes.imshow(colour_grid(grid), extent=(x, x + width_m, y, y + height_m))
-    if trajectory is not None and len(trajectory):
-        path = _seen_from_above(trajectory, T_map_world)
+    axes.set_facecolor(unit_colour(GRID_UNKNOWN))
+    axes.imshow(colour_grid(grid), extent=(x, float(far[0]), y, float(far[1])))
+    if path is not None:
         axes.plot(*path.T, color=ESTIMATE, linewidth=1.6)
         _mark_ends(axes, path)
     style_plot(axes, _X_LABEL, _Y_LABEL)
     axes.grid(visible=False)
-    axes.set_xlim(x, x + width_m)
-    axes.set_ylim(y, y + height_m)
-    _draw_scale_bar(axes, x, y, width_m, height_m)
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    _draw_scale_bar(axes, low, high - low)
     figure.legend(handles=_grid_legend(), loc="outside lower center", ncols=3, frameon=False)
     return to_png(figure)
 
@@ -175,7 +179,7 @@ def _height_for(points: NDArray[Any]) -> float:
     """Height in inches of a wide figure that shows these (N, 2) points with equal axes."""
     extent = np.ptp(points, axis=0) if len(points) else np.ones(2)
     ratio = float(extent[1]) / max(float(extent[0]), 1e-9)
-    return float(np.clip(WIDE_IN * ratio + 1.2, 3.2, 9.0))
+    return float(np.clip((WIDE_IN - 0.8) * ratio + 1.1, 3.0, 9.0))
 
 
 def _mark_ends(axes: Axes, path: NDArray[Any]) -> None:
@@ -216,12 +220,11 @@ def _crop_to_known(grid: OccupancyGrid) -> OccupancyGrid:
     )
 
 
-def _draw_scale_bar(axes: Axes, x: float, y: float, width_m: float, height_m: float) -> None:
-    length = nice_length(width_m / 6)
-    left, bottom = x + 0.03 * width_m, y + 0.06 * height_m
-    axes.plot(
-        [left, left + length], [bottom, bottom], color=INK, linewidth=4, solid_capstyle="butt"
-    )
+def _draw_scale_bar(axes: Axes, low: NDArray[Any], size_m: NDArray[Any]) -> None:
+    length = nice_length(float(size_m[0]) / 6)
+    left, bottom = low + size_m * (0.03, 0.06)
+    ends = [left, left + length]
+    axes.plot(ends, [bottom, bottom], color=INK, linewidth=4, solid_capstyle="butt")
     axes.annotate(
         f"{length:g} m",
         (left + length / 2, bottom),

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from recon.geometry.se3 import apply
 from recon.reports.colour import scale_colours, value_range
 from recon.reports.decimate import quantise_colours, thin_cloud, thin_mesh
-from recon.structures import PointCloud, Trajectory, TriangleMesh
+from recon.structures import PointCloud, TriangleMesh
 from recon.structures.arrays import Float32, Float64, UInt8
 
 MAX_POINTS: Final = 120_000
@@ -30,6 +30,7 @@ T_UPRIGHT_CAMERA: Final[Float64] = np.array(
 _BACKGROUND = "#14181d"
 _PATH_COLOURS = ("#ff5252", "#ffb74d", "#81c784")
 _OUTLIER_SHARE = 0.002
+_BEHIND_AND_ABOVE = (-0.85, -1.0, 0.62)
 Json = dict[str, Any]
 
 
@@ -41,13 +42,15 @@ class Scene:
         T_view_frame: float64 (4, 4), turns that frame so that x is forward and z is up.
         cloud: Points, or None.
         mesh: A surface, or None.
-        paths: Named paths of the camera.
+        paths: Named positions of the camera, float64 (N, 3).
+        eye_m: Where it is first looked at from, view axes; None = from behind and above.
     """
 
     T_view_frame: Float64
     cloud: PointCloud | None = None
     mesh: TriangleMesh | None = None
-    paths: Sequence[tuple[str, Trajectory]] = ()
+    paths: Sequence[tuple[str, Float64]] = ()
+    eye_m: tuple[float, float, float] | None = None
 
 
 def plot_scene(scene: Scene, max_points: int = MAX_POINTS, max_faces: int = MAX_FACES) -> Json:
@@ -59,45 +62,46 @@ def plot_scene(scene: Scene, max_points: int = MAX_POINTS, max_faces: int = MAX_
         max_faces: The mesh is simplified to about this number of triangles.
     """
     T = scene.T_view_frame
+    cloud = None if scene.cloud is None else _without_outliers(scene.cloud)
     traces: list[Json] = []
     buttons: list[Json] = []
-    if scene.cloud is not None and len(scene.cloud):
-        traces.append(_cloud_trace(_without_outliers(scene.cloud), T, max_points))
-        buttons = traces[0].pop("_buttons")
+    if cloud is not None and len(cloud):
+        trace, buttons = _cloud_trace(cloud, T, max_points)
+        traces.append(trace)
     if scene.mesh is not None and len(scene.mesh.faces):
         traces.append(_mesh_trace(thin_mesh(scene.mesh, max_faces), T, hidden=bool(traces)))
     for number, (name, path) in enumerate(scene.paths):
         traces.append(_path_trace(name, path, T, _PATH_COLOURS[number % len(_PATH_COLOURS)]))
     config = {"displaylogo": False, "responsive": True, "scrollZoom": True}
-    return {"data": traces, "layout": _layout(buttons), "config": config}
+    box = _bounding_box(cloud, scene, T)
+    return {"data": traces, "layout": _layout(buttons, _eye(scene, box), box), "config": config}
 
 
 def pack(array: NDArray[Any]) -> Json:
     """An array (N,) as plotly.js reads it: the name of its type, and base64 of its bytes."""
-    little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+    little = np.asarray(array, dtype=array.dtype.newbyteorder("<"))
     return {
         "dtype": array.dtype.str[1:],
         "bdata": base64.b64encode(little.tobytes()).decode("ascii"),
     }
 
 
-def _cloud_trace(cloud: PointCloud, T: Float64, max_points: int) -> Json:
+def _cloud_trace(cloud: PointCloud, T: Float64, max_points: int) -> tuple[Json, list[Json]]:
+    """The points, and a button for each way to colour them."""
     thinned = thin_cloud(cloud, max_points)
     xyz = apply(T, thinned.xyz)
-    by_height = _height_colouring(xyz)
-    colourings = [("height", by_height)]
+    colourings = [("height", _height_colouring(xyz))]
     if thinned.rgb is not None:
         colourings.insert(0, ("picture", _colouring(*quantise_colours(thinned.rgb))))
-    first = colourings[0][1]
-    return {
+    trace = {
         "type": "scatter3d",
         "mode": "markers",
         "name": f"cloud ({len(thinned):,} of {len(cloud):,} points)",
         "hoverinfo": "skip",
         **_xyz(xyz),
-        "marker": {"size": 1.6, "showscale": False, **first},
-        "_buttons": [_button(name, colouring) for name, colouring in colourings],
+        "marker": {"size": 1.6, "showscale": False, **colourings[0][1]},
     }
+    return trace, [_button(name, colouring) for name, colouring in colourings]
 
 
 def _mesh_trace(mesh: TriangleMesh, T: Float64, *, hidden: bool) -> Json:
@@ -125,8 +129,8 @@ def _mesh_trace(mesh: TriangleMesh, T: Float64, *, hidden: bool) -> Json:
     }
 
 
-def _path_trace(name: str, path: Trajectory, T: Float64, colour: str) -> Json:
-    xyz = apply(T, path.positions_m).astype(np.float32)
+def _path_trace(name: str, path: Float64, T: Float64, colour: str) -> Json:
+    xyz = apply(T, path)
     return {
         "type": "scatter3d",
         "mode": "lines",
@@ -162,15 +166,68 @@ def _button(name: str, colouring: Json) -> Json:
 
 def _without_outliers(cloud: PointCloud) -> PointCloud:
     """Drop the few points far from all others, which would make the rest small."""
+    if not len(cloud):
+        return cloud
     low, high = np.quantile(cloud.xyz, (_OUTLIER_SHARE, 1.0 - _OUTLIER_SHARE), axis=0)
     room = 0.1 * (high - low)
     inside = ((cloud.xyz >= low - room) & (cloud.xyz <= high + room)).all(axis=1)
     return cloud.select(inside)
 
 
-def _layout(buttons: list[Json]) -> Json:
-    axis = {"color": "#aab4be", "gridcolor": "#2c343c", "zeroline": False, "showbackground": False}
-    menu = {
+def _bounding_box(cloud: PointCloud | None, scene: Scene, T: Float64) -> Float64:
+    """float64 (2, 3): least and largest coordinates of what is seen at first, view axes."""
+    parts = [path for _, path in scene.paths]
+    if cloud is not None and len(cloud):
+        parts.append(cloud.xyz.astype(np.float64))
+    elif scene.mesh is not None:
+        parts.append(scene.mesh.vertices.astype(np.float64))
+    seen = apply(T, np.concatenate([np.zeros((0, 3)), *parts]))
+    if not len(seen):
+        return np.array([[-1.0] * 3, [1.0] * 3])
+    middle, half = (seen.max(axis=0) + seen.min(axis=0)) / 2, np.ptp(seen, axis=0) / 2
+    half = np.maximum(half, max(float(half.max()) * 0.02, 0.01))  # nothing is entirely flat
+    return np.stack([middle - 1.02 * half, middle + 1.02 * half])
+
+
+def _scale(box: Float64) -> float:
+    """Units of plotly.js per metre: the longest side of the box gets 2 of them."""
+    return 2.0 / float(np.ptp(box, axis=0).max())
+
+
+def _eye(scene: Scene, box: Float64) -> Float64:
+    """float64 (3,): where to look from, in plotly's units from the middle of the box."""
+    if scene.eye_m is None:
+        return np.array(_BEHIND_AND_ABOVE)
+    return np.asarray((np.asarray(scene.eye_m) - box.mean(axis=0)) * _scale(box))
+
+
+def _layout(buttons: list[Json], eye: Float64, box: Float64) -> Json:
+    aspect = dict(zip("xyz", (_scale(box) * np.ptp(box, axis=0)).tolist(), strict=True))
+    titles = {"x": "x forward (m)", "y": "y left (m)", "z": "z up (m)"}
+    axes = {
+        f"{axis}axis": {
+            "title": {"text": titles[axis]},
+            "range": box[:, n].tolist(),
+            "color": "#aab4be",
+            "gridcolor": "#2c343c",
+            "zeroline": False,
+            "showbackground": False,
+        }
+        for n, axis in enumerate("xyz")
+    }
+    camera = {"eye": dict(zip("xyz", eye.tolist(), strict=True))}
+    return {
+        "paper_bgcolor": _BACKGROUND,
+        "font": {"color": "#dfe5ea"},
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "legend": {"x": 0.0, "y": 0.0, "yanchor": "bottom", "itemsizing": "constant"},
+        "updatemenus": [_menu(buttons)] if len(buttons) > 1 else [],
+        "scene": {"aspectmode": "manual", "aspectratio": aspect, "camera": camera, **axes},
+    }
+
+
+def _menu(buttons: list[Json]) -> Json:
+    return {
         "type": "buttons",
         "direction": "right",
         "x": 0.0,
@@ -181,18 +238,4 @@ def _layout(buttons: list[Json]) -> Json:
         "bgcolor": "#e6ebf0",
         "font": {"size": 12, "color": "#14181d"},
         "pad": {"l": 8, "t": 8},
-    }
-    return {
-        "paper_bgcolor": _BACKGROUND,
-        "font": {"color": "#dfe5ea"},
-        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
-        "legend": {"x": 0.0, "y": 0.0, "yanchor": "bottom", "itemsizing": "constant"},
-        "updatemenus": [menu] if len(buttons) > 1 else [],
-        "scene": {
-            "aspectmode": "data",
-            "camera": {"eye": {"x": -1.1, "y": -0.75, "z": 0.9}},
-            "xaxis": {"title": {"text": "x forward (m)"}, **axis},
-            "yaxis": {"title": {"text": "y left (m)"}, **axis},
-            "zaxis": {"title": {"text": "z up (m)"}, **axis},
-        },
     }

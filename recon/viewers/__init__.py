@@ -1,1 +1,5 @@
-"""Observers of a run; the pipeline knows none of them."""
+"""Observers of a run."""
+
+from recon.viewers.progress import JsonLines, Quiet, RichProgress, choose_viewer
+
+__all__ = ["JsonLines", "Quiet", "RichProgress", "choose_viewer"]

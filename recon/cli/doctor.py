@@ -1,0 +1,32 @@
+"""`recon doctor`: is everything there that a run needs?"""
+
+from __future__ import annotations
+
+import typer
+
+from recon.cli.options import Json
+from recon.cli.session import print_json, session
+
+
+def doctor(json: Json = False) -> None:
+    """Check Python, packages, system libraries, memory and folders.
+
+    Exits with 1 where something is missing that runs need.
+
+    Example: recon doctor --json
+    """
+    with session():
+        from dataclasses import asdict
+
+        from recon.pipeline.doctor import Check, examine
+
+        checks: list[Check] = examine()
+    missing = [check for check in checks if check.needed and not check.ok]
+    if json:
+        print_json({"ok": not missing, "checks": [asdict(check) for check in checks]})
+    else:
+        from recon.viewers.checks import print_checks
+
+        print_checks(checks)
+    if missing:
+        raise typer.Exit(1)

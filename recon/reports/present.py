@@ -1,0 +1,100 @@
+"""What a run leaves to look at in its folder: the report, and pictures in colour."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+
+from recon.formats.atomic import write_text
+from recon.formats.image import write_image
+from recon.pipeline.config import dump_config
+from recon.pipeline.machine import versions
+from recon.pipeline.map_run import MapRun
+from recon.pipeline.pair_run import PairRun
+from recon.pipeline.run_directory import RunDirectory
+from recon.reports.colour import colour_confidence, colour_disparity, colour_reasons
+from recon.reports.html import render_html
+from recon.reports.map_report import MapReportInputs, map_report
+from recon.reports.pair_report import PairReportInputs, pair_report
+
+
+def present_map(run: MapRun, directory: RunDirectory) -> None:
+    """Write ``report.html`` of a drive.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    mapped = run.mapped
+    content = map_report(
+        MapReportInputs(
+            source=_short(run.name),
+            trajectory=mapped.trajectory,
+            T_map_world=mapped.T_map_world,
+            samples=[(mapped.sample.pair, mapped.sample.disparity)],
+            health=mapped.health,
+            truth=None if run.truth is None else run.truth.trajectory,
+            metrics=run.metrics,
+            grid=run.grid,
+            cloud=run.cloud,
+            mesh=run.mesh,
+            summary=run.summary,
+            command=command_line(),
+            config=dump_config(run.config),
+            warnings=run.warnings,
+            versions=versions(),
+        )
+    )
+    write_text(directory.path("report.html"), render_html(content))
+
+
+def present_pair(run: PairRun, directory: RunDirectory) -> None:
+    """Write ``report.html`` of a pair, and its disparity and reasons in colour.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    present_disparity(run, directory)
+    content = pair_report(
+        PairReportInputs(
+            source=_short(run.name),
+            pair=run.pair,
+            disparity=run.disparity,
+            truth=run.truth,
+            metrics=run.metrics,
+            cloud=run.cloud,
+            mesh=run.mesh,
+            summary=run.summary,
+            command=command_line(),
+            config=dump_config(run.config),
+            warnings=run.warnings,
+            versions=versions(),
+        )
+    )
+    write_text(directory.path("report.html"), render_html(content))
+
+
+def present_disparity(run: PairRun, directory: RunDirectory) -> None:
+    """Write disparity, confidence and reasons of a pair as pictures in colour.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    pictures = {
+        "disparity_colour.png": colour_disparity(run.disparity.values),
+        "confidence_colour.png": colour_confidence(run.disparity.confidence),
+        "reason_colour.png": colour_reasons(run.disparity.reason),
+    }
+    for name, picture in pictures.items():
+        write_image(directory.path(f"disparity/{name}"), picture)
+
+
+def command_line() -> str:
+    """The command that this process was started with, or "" where that was not ours."""
+    program = Path(sys.argv[0]).name if sys.argv else ""
+    return shlex.join(["recon", *sys.argv[1:]]) if program in {"recon", "recon.exe"} else ""
+
+
+def _short(name: str) -> str:
+    """The last part of a path; a name that is no path stays."""
+    return Path(name).name or name
