@@ -38,20 +38,22 @@ class Layout:
         right: Right picture.
         truth_left: True disparity of the left view.
         truth_right: True disparity of the right view.
+        calibrated: True where there is a ``calib.txt``, and the truth is in PFM.
     """
 
     left: str
     right: str
     truth_left: str
     truth_right: str
+    calibrated: bool = False
 
 
 _TSUKUBA: Final = Layout("im3", "im4", "disp3", "disp4")
 _MAP: Final = Layout("im0", "im1", "disp0", "disp1")
 _2001_2003: Final = Layout("im2", "im6", "disp2", "disp6")
 _2005: Final = Layout("view1", "view5", "disp1", "disp5")
-_2014: Final = Layout("im0", "im1", "disp0", "disp1")
-_EVAL3: Final = Layout("im0", "im1", "disp0GT", "disp1GT")
+_2014: Final = Layout("im0", "im1", "disp0", "disp1", calibrated=True)
+_EVAL3: Final = Layout("im0", "im1", "disp0GT", "disp1GT", calibrated=True)
 
 
 def find_layout(folder: Path) -> Layout | None:
@@ -74,7 +76,7 @@ def find_picture(folder: Path, stem: str) -> Path | None:
 
 def generation_of(layout: Layout, width_px: int) -> Generation:
     """The year; scenes of 2001 and 2003 share their names and differ in width."""
-    if layout in {_2014, _EVAL3}:
+    if layout.calibrated:
         return "2014"
     if layout == _2005:
         return "2005"

@@ -113,7 +113,8 @@ def _numbers(node: cv2.FileNode) -> Float64 | None:
         numeric = all(part.isInt() or part.isReal() for part in parts)
         return np.array([part.real() for part in parts]) if numeric else None
     if node.isMap() and not node.getNode("data").isNone():
-        return np.asarray(node.mat(), dtype=np.float64)
+        matrix = node.mat()  # None where it has no elements
+        return np.zeros(0) if matrix is None else np.asarray(matrix, dtype=np.float64)
     return None
 
 
