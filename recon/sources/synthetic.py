@@ -1,0 +1,147 @@
+"""The synthetic street drive as a source, and written out in the layout of KITTI."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from recon.formats.atomic import write_text
+from recon.formats.files import StrPath
+from recon.formats.image import write_image
+from recon.formats.trajectory import write_kitti_poses
+from recon.structures import (
+    DisparityTruth,
+    RectifiedCamera,
+    SequenceTruth,
+    StereoPair,
+    Trajectory,
+)
+from recon.structures.arrays import UInt8
+from recon.synthetic.render import StreetCamera, SyntheticFrame
+from recon.synthetic.settings import StreetSettings
+from recon.synthetic.street import StreetWorld, build_street
+from recon.synthetic.truth import OccupancyTruth, true_occupancy, true_surface
+
+_BT601 = np.array([0.299, 0.587, 0.114])
+
+
+class SyntheticSource:
+    """A drive through a street that never was, with the whole truth about it.
+
+    Nothing is built before it is asked for; pictures are rendered while iterating.
+
+    Args:
+        settings: Street, rig and path.
+    """
+
+    def __init__(self, settings: StreetSettings | None = None) -> None:
+        self.settings = StreetSettings() if settings is None else settings
+
+    @property
+    def name(self) -> str:
+        """The seed and the length."""
+        return f"synthetic street {self.settings.seed}, {self.settings.frames} frames"
+
+    @cached_property
+    def world(self) -> StreetWorld:
+        """The street."""
+        return build_street(self.settings)
+
+    @cached_property
+    def camera(self) -> StreetCamera:
+        """The rig in the street; gives any frame with its truth."""
+        return StreetCamera(self.world)
+
+    @property
+    def calibration(self) -> RectifiedCamera:
+        """The rectified camera."""
+        return self.world.camera
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """True poses; unlike `truth` they cost nothing."""
+        return self.world.trajectory
+
+    @cached_property
+    def truth(self) -> SequenceTruth:
+        """True poses, and the surfaces that were in view up to 30 m, every 5 cm."""
+        return SequenceTruth(self.trajectory, true_surface(self.camera))
+
+    def __len__(self) -> int:
+        return self.settings.frames
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return (self.camera.pair(index) for index in range(len(self)))
+
+    def frame(self, index: int) -> SyntheticFrame:
+        """One pair with depth, disparity, pose and ground.
+
+        Raises:
+            SettingsError: There is no such frame.
+        """
+        return self.camera.render(index)
+
+    def disparity_truth(self, index: int) -> DisparityTruth:
+        """True disparity of one frame; NaN = sky.
+
+        Raises:
+            SettingsError: There is no such frame.
+        """
+        return self.camera.disparity_truth(index)
+
+    def occupancy_truth(
+        self, *, resolution_m: float = 0.2, band_m: tuple[float, float] = (0.3, 2.0)
+    ) -> OccupancyTruth:
+        """Where obstacles stand, in exact map axes; see `true_occupancy`."""
+        surface = self.truth.surface
+        if surface is None:  # pragma: no cover - `truth` always has one
+            surface = true_surface(self.camera)
+        return true_occupancy(self.world, surface, resolution_m=resolution_m, band_m=band_m)
+
+
+def write_kitti(source: SyntheticSource, folder: StrPath, *, grey: bool = True) -> None:
+    """Write a drive as a KITTI odometry sequence.
+
+    ::
+
+        folder/
+          image_0/ image_1/   grey (optional)
+          image_2/ image_3/   colour
+          calib.txt  times.txt  poses.txt
+
+    Args:
+        source: The drive.
+        folder: Where to write; made where it is missing.
+        grey: Also write the grey pictures.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    target = Path(folder)
+    for pair in source:
+        name = f"{pair.index:06d}.png"
+        for camera, image in enumerate((pair.left, pair.right)):
+            write_image(target / f"image_{camera + 2}" / name, image)
+            if grey:
+                write_image(target / f"image_{camera}" / name, _grey(image))
+    write_text(target / "calib.txt", _calibration_text(source.calibration))
+    times = source.trajectory.timestamps_s
+    write_text(target / "times.txt", "".join(f"{time_s:.6e}\n" for time_s in times))
+    write_kitti_poses(target / "poses.txt", source.trajectory)
+
+
+def _grey(image: UInt8) -> UInt8:
+    return np.asarray(np.rint(image @ _BT601), dtype=np.uint8)
+
+
+def _calibration_text(camera: RectifiedCamera) -> str:
+    """P0 and P2 of the left, P1 and P3 of the right camera; all stand at the same two places."""
+    left = np.hstack([camera.matrix, np.zeros((3, 1))])
+    right = left.copy()
+    right[0, 2] = camera.cx_right_px
+    right[0, 3] = -camera.focal_px * camera.baseline_m
+    rows = (" ".join(f"{value:.12e}" for value in P.ravel()) for P in (left, right, left, right))
+    return "".join(f"P{number}: {row}\n" for number, row in enumerate(rows))

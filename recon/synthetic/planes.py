@@ -1,0 +1,180 @@
+"""Textured planes with exact disparity: the simplest scenes that a stage can be tested on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon.errors import SettingsError
+from recon.geometry.triangulation import disparity_from_depth
+from recon.kernels.noise import fractal_noise
+from recon.structures import DisparityTruth, RectifiedCamera, RectifiedPair
+from recon.structures.arrays import Bool, Float64, UInt8
+from recon.synthetic.view import View, stereo_views
+
+_CONTRAST_DN = 90.0
+_OCTAVES = 6
+_GAIN = 0.9
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane, or a window of one, in left camera axes.
+
+    Attributes:
+        normal: Any vector that is perpendicular to it; ``normal · xyz = offset_m`` on the plane.
+        offset_m: See ``normal``.
+        window_m: x and y between which it exists, ``(x0, x1, y0, y1)``; None = endless.
+    """
+
+    normal: tuple[float, float, float]
+    offset_m: float
+    window_m: tuple[float, float, float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PlanePair:
+    """A grey pair with its truth.
+
+    Attributes:
+        pair: The pictures.
+        truth: Disparity of the left view, NaN where it sees no plane; points seen by both.
+    """
+
+    pair: RectifiedPair
+    truth: DisparityTruth
+
+
+def fronto_parallel_pair(
+    camera: RectifiedCamera, depth_m: float, *, seed: int = 0, noise_dn: float = 0.0
+) -> PlanePair:
+    """A textured wall straight ahead: one disparity everywhere."""
+    return plane_pair(camera, [Plane((0.0, 0.0, 1.0), depth_m)], seed=seed, noise_dn=noise_dn)
+
+
+def slanted_pair(
+    camera: RectifiedCamera,
+    depth_m: float,
+    slope: tuple[float, float] = (0.5, 0.0),
+    *,
+    seed: int = 0,
+    noise_dn: float = 0.0,
+) -> PlanePair:
+    """A textured plane ``Z = depth_m + slope_x·X + slope_y·Y``: disparity is linear in u and v."""
+    plane = Plane((-slope[0], -slope[1], 1.0), depth_m)
+    return plane_pair(camera, [plane], seed=seed, noise_dn=noise_dn)
+
+
+def step_pair(
+    camera: RectifiedCamera,
+    near_m: float,
+    far_m: float,
+    half_width_px: float,
+    *,
+    seed: int = 0,
+    noise_dn: float = 0.0,
+) -> PlanePair:
+    """A square in the middle of the left view in front of a wall, with its occluded strip.
+
+    Args:
+        camera: The rectified camera.
+        near_m: Depth of the square.
+        far_m: Depth of the wall.
+        half_width_px: Half the edge of the square in the left view.
+        seed: Of the texture.
+        noise_dn: Sensor noise, grey levels.
+    """
+    half = half_width_px * near_m / camera.focal_px
+    x = ((camera.width_px - 1) / 2 - camera.cx_px) * near_m / camera.focal_px
+    y = ((camera.height_px - 1) / 2 - camera.cy_px) * near_m / camera.focal_px
+    square = Plane((0.0, 0.0, 1.0), near_m, (x - half, x + half, y - half, y + half))
+    wall = Plane((0.0, 0.0, 1.0), far_m)
+    return plane_pair(camera, [square, wall], seed=seed, noise_dn=noise_dn)
+
+
+def plane_pair(
+    camera: RectifiedCamera, planes: Sequence[Plane], *, seed: int = 0, noise_dn: float = 0.0
+) -> PlanePair:
+    """Render planes; the nearest hides the others.
+
+    Args:
+        camera: The rectified camera.
+        planes: What there is to see.
+        seed: Of texture and noise.
+        noise_dn: Sensor noise, standard deviation in grey levels.
+
+    Raises:
+        SettingsError: There is no plane.
+    """
+    if not planes:
+        raise SettingsError("no plane to render", expected="at least one")
+    left, right = stereo_views(camera, np.eye(4))
+    depth, nearest = _first_plane(planes, left.origin, left.directions(left.pixels()))
+    size = (camera.height_px, camera.width_px)
+    pictures = [
+        _picture(view, planes, seed, np.random.default_rng([seed, side]), noise_dn)
+        for side, view in enumerate((left, right))
+    ]
+    truth = DisparityTruth(
+        disparity_from_depth(depth, camera).reshape(size),
+        _seen_by(right, planes, left, depth, nearest).reshape(size),
+    )
+    return PlanePair(RectifiedPair(pictures[0], pictures[1], camera), truth)
+
+
+def _picture(
+    view: View, planes: Sequence[Plane], seed: int, rng: np.random.Generator, noise_dn: float
+) -> UInt8:
+    rays = view.directions(view.pixels())
+    depth, nearest = _first_plane(planes, view.origin, rays)
+    known = np.isfinite(depth)
+    grey = np.full(len(rays), 127.5)
+    xyz = view.origin + depth[known, None] * rays[known]
+    # Each plane has its own texture: they are told apart along an axis the noise does not use up.
+    xyz[:, 2] += 1000.0 * nearest[known]
+    width = depth[known] / view.focal_px
+    # Lattice spacings from 16 pixels at the middle of the view downwards, whatever the depth.
+    spacing = np.full(len(xyz), 16.0 * float(np.median(width)) if len(xyz) else 1.0)
+    grain = fractal_noise(xyz, np.zeros_like(xyz), width, spacing, _OCTAVES, _GAIN, seed)
+    grey[known] += _CONTRAST_DN * grain
+    grey += noise_dn * rng.standard_normal(len(grey))
+    levels = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    return np.asarray(levels.reshape(view.height_px, view.width_px))
+
+
+def _first_plane(
+    planes: Sequence[Plane], origin: Float64, rays: Float64
+) -> tuple[Float64, Float64]:
+    """Depth (N,) of the nearest plane on each ray, NaN = none, and its number."""
+    depths = np.stack([_plane_depth(plane, origin, rays) for plane in planes])
+    nearest = depths.argmin(axis=0)
+    depth = depths[nearest, np.arange(len(rays))]
+    return np.where(np.isfinite(depth), depth, np.nan), nearest.astype(np.float64)
+
+
+def _plane_depth(plane: Plane, origin: Float64, rays: Float64) -> Float64:
+    """Depth (N,) along rays of unit depth; inf where they miss the plane."""
+    normal = np.array(plane.normal)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (plane.offset_m - normal @ origin) / (rays @ normal)
+        hit = np.isfinite(depth) & (depth > 0)
+        if plane.window_m is not None:
+            x, y = (origin[:2] + depth[:, None] * rays[:, :2]).T
+            x0, x1, y0, y1 = plane.window_m
+            hit &= (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)
+    return np.where(hit, depth, np.inf)
+
+
+def _seen_by(
+    right: View, planes: Sequence[Plane], left: View, depth: Float64, nearest: Float64
+) -> Bool:
+    """Whether the right camera sees the point of each left pixel."""
+    known = np.flatnonzero(np.isfinite(depth))
+    xyz = left.origin + depth[known, None] * left.directions(left.pixels()[known])
+    reach = xyz - right.origin
+    found = _first_plane(planes, right.origin, reach / reach[:, 2:])[1]
+    seen = np.zeros(len(depth), dtype=np.bool_)
+    seen[known] = (found == nearest[known]) & right.inside(right.project(xyz))
+    return seen

@@ -1,0 +1,82 @@
+"""What a synthetic street drive looks like, and what it is filmed with."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from recon.settings import Settings
+
+
+class StreetSettings(Settings):
+    """A street, a rig, and the path of the rig through the street.
+
+    Two equal settings give bit-identical pictures. A longer drive with the same seed goes
+    further down the same street.
+    """
+
+    seed: int = Field(default=0, ge=0, lt=2**31, description="Another seed is another street.")
+    frames: int = Field(default=40, ge=1, le=2000, description="Number of stereo pairs.")
+    speed_m_per_frame: float = Field(
+        default=1.0, ge=0.0, le=5.0, description="Path between two frames."
+    )
+    frame_rate_hz: float = Field(default=10.0, gt=0.0, description="Sets the timestamps alone.")
+    path: Literal["curve", "straight"] = Field(default="curve", description="Shape of the street.")
+    turn_deg_per_100m: float = Field(
+        default=20.0,
+        ge=-60.0,
+        le=60.0,
+        description="Mean turn of a curved street; positive = to the left.",
+    )
+    sway: float = Field(
+        default=1.0,
+        ge=0.0,
+        le=5.0,
+        description="Drift in the lane and nodding of the car; 0 = on rails.",
+    )
+
+    width_px: int = Field(default=640, ge=16, le=8192, description="Image width.")
+    height_px: int = Field(default=240, ge=16, le=8192, description="Image height.")
+    focal_px: float = Field(default=360.0, gt=0.0, description="Focal length.")
+    baseline_m: float = Field(
+        default=0.54, gt=0.0, le=5.0, description="Distance between the cameras."
+    )
+    camera_height_m: float = Field(
+        default=1.65, ge=0.3, le=4.0, description="Cameras above the road."
+    )
+    pitch_deg: float = Field(
+        default=1.0, ge=-30.0, le=30.0, description="Mounting; positive = down."
+    )
+    yaw_deg: float = Field(
+        default=1.5, ge=-45.0, le=45.0, description="Mounting; positive = right."
+    )
+    roll_deg: float = Field(
+        default=0.3, ge=-30.0, le=30.0, description="Mounting; positive = clockwise."
+    )
+
+    noise_dn: float = Field(
+        default=1.0,
+        ge=0.0,
+        le=50.0,
+        description="Sensor noise, standard deviation in grey levels of 255.",
+    )
+    right_gain: float = Field(
+        default=1.0,
+        gt=0.0,
+        le=4.0,
+        description="Brightness of the right camera relative to the left.",
+    )
+    right_offset_dn: float = Field(
+        default=0.0, ge=-128.0, le=128.0, description="Grey levels added in the right camera."
+    )
+    smooth_edges: bool = Field(
+        default=True,
+        description="Four rays instead of one where neighbouring pixels see different things.",
+    )
+    threads: int = Field(
+        default=0,
+        ge=0,
+        le=256,
+        description="Rendering threads, 0 = one per core; changes no result.",
+    )

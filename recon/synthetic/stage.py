@@ -1,0 +1,117 @@
+"""A lit scene: answers what a ray sees, and in which colour.
+
+All surfaces are Lambertian and the light stands still, so a point has one colour, whoever looks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.adapters.open3d_raycasting import RayScene
+from recon.structures.arrays import Bool, Float64
+from recon.synthetic.materials import albedo, sky_colour
+from recon.synthetic.soup import TriangleSoup
+from recon.synthetic.surface import (
+    SurfacePoints,
+    SurfaceTable,
+    plane_distance,
+    surface_points,
+    surface_table,
+)
+
+_SUN: Final = np.array([1.50, 1.38, 1.18])
+_SKY: Final = np.array([0.52, 0.58, 0.68])
+_SIGHT: Final = 1.0 - 1e-4  # share of the way to a surface that must be clear to see it
+_SKIN_M: Final = 2e-3  # light is traced from this far above a surface
+_REACH_M: Final = 80.0  # shadows are not thrown further
+_SHELTER_M: Final = 1.0  # a floor with something this close above it sees little sky
+
+
+class Sample(NamedTuple):
+    """What rays see.
+
+    Attributes:
+        rgb: float64 (N, 3), linear light.
+        normal: float64 (N, 3), shading normal; 0 for the sky.
+        label: int64 (N,), tells objects, materials and shadow from light.
+    """
+
+    rgb: Float64
+    normal: Float64
+    label: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A scene with its light.
+
+    Attributes:
+        soup: The triangles.
+        table: The same, solved for hits.
+        rays: The same, for the ray caster.
+        to_sun: float64 (3,), unit vector.
+        seed: Of grain and clouds.
+    """
+
+    soup: TriangleSoup
+    table: SurfaceTable
+    rays: RayScene
+    to_sun: Float64
+    seed: int
+
+    def depth(self, origin: Float64, directions: Float64) -> Float64:
+        """float64 (N,), depth along rays of unit depth; NaN where they meet nothing."""
+        faces = self.rays.first_hit(origin, directions)
+        hit = faces >= 0
+        depth = np.full(len(directions), np.nan)
+        depth[hit] = plane_distance(self.table, faces[hit], origin, directions[hit])
+        return depth
+
+    def sees(self, origin: Float64, xyz: Float64) -> Bool:
+        """bool (N,), whether nothing stands between ``origin`` and points."""
+        return ~self.rays.blocked(origin, xyz - origin, far=_SIGHT)
+
+    def look(self, origin: Float64, directions: Float64, pixel: float) -> Sample:
+        """What rays see.
+
+        Args:
+            origin: (3,), centre of the camera.
+            directions: (N, 3), of unit depth.
+            pixel: Width of a pixel at unit depth.
+        """
+        faces = self.rays.first_hit(origin, directions)
+        hit = np.flatnonzero(faces >= 0)
+        sky = np.flatnonzero(faces < 0)
+        rgb, normal = np.empty((len(faces), 3)), np.zeros((len(faces), 3))
+        label = np.full(len(faces), -1, dtype=np.int64)
+        rgb[sky] = sky_colour(directions[sky], pixel, self.seed)
+        points = surface_points(self.table, faces[hit], origin, directions[hit], pixel)
+        light, lit = self._light(points)
+        rgb[hit] = albedo(self.soup, points, self.seed) * light
+        normal[hit] = points.normal
+        part, material = self.soup.part[points.faces], self.soup.material[points.faces]
+        label[hit] = (part.astype(np.int64) * 32 + material) * 2 + lit
+        return Sample(rgb, normal, label)
+
+    def _light(self, points: SurfacePoints) -> tuple[Float64, Bool]:
+        """Light (N, 3) on points, and whether the sun reaches them."""
+        start = points.xyz + _SKIN_M * points.normal
+        facing = points.normal @ self.to_sun
+        lit = facing > 0
+        reach = np.broadcast_to(_REACH_M * self.to_sun, (int(lit.sum()), 3))
+        lit[lit] = ~self.rays.blocked(start[lit], reach)
+        openness = 0.72 + 0.28 * points.normal[:, 2]
+        floor = np.flatnonzero(points.normal[:, 2] > 0.7)
+        above = np.broadcast_to([0.0, 0.0, _SHELTER_M], (len(floor), 3))
+        openness[floor[self.rays.blocked(start[floor], above)]] *= 0.4
+        sun = np.where(lit, facing, 0.0)
+        return openness[:, None] * _SKY + sun[:, None] * _SUN, lit
+
+
+def make_stage(soup: TriangleSoup, to_sun: Float64, seed: int, threads: int = 0) -> Stage:
+    """Light a scene."""
+    return Stage(soup, surface_table(soup), RayScene(soup.vertices, threads), to_sun, seed)
