@@ -1,1 +1,52 @@
-"""The command line: parse, build the configuration, call one pipeline function, print one table."""
+"""The command line: parse, build the configuration, call one pipeline function, print one table.
+
+Nothing heavy is imported before a command runs, so ``recon --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from recon import __version__
+from recon.cli import evaluate
+from recon.cli.demo import demo
+from recon.cli.doctor import doctor
+from recon.cli.map import map_
+from recon.cli.mesh import mesh
+from recon.cli.pair import disparity, pair
+
+app = typer.Typer(
+    name="recon",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Stereo reconstruction and mapping: from pairs of pictures to maps.",
+)
+app.command()(demo)
+app.command()(pair)
+app.command("map")(map_)
+app.command()(mesh)
+app.command()(disparity)
+app.command()(doctor)
+app.add_typer(evaluate.app, name="evaluate")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"recon {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Version.")
+    ] = False,
+) -> None:
+    """Hold the options of the program itself."""
+
+
+def main() -> None:
+    """Run the program."""
+    app()

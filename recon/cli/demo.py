@@ -1,0 +1,46 @@
+"""`recon demo`: the whole flow on a rendered street, with truth to compare against."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli.session import print_json, print_run, session
+
+
+def demo(
+    out: Out = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Frames to render. [40]")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Another seed, another street.")] = None,
+    config: Config = None,
+    set_: Set = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    threads: Threads = None,
+) -> None:
+    """Render a street drive and map it; needs no data.
+
+    Example: recon demo --frames 60 --out outputs/street
+    """
+    with session():
+        from recon.pipeline.config import load_config
+        from recon.pipeline.map_run import MapOptions, run_map
+        from recon.reports import present_map
+        from recon.sources.synthetic import SyntheticSource
+        from recon.viewers import choose_viewer
+
+        given = {"frames": frames, "seed": seed}
+        overrides = [f"street.{key}={value}" for key, value in given.items() if value is not None]
+        settings = load_config(config, [*(set_ or ()), *overrides])
+        options = MapOptions(
+            command="demo",
+            out=out,
+            threads=threads,
+            observers=(choose_viewer(quiet=quiet),),
+            present=present_map,
+        )
+        run = run_map(SyntheticSource(settings.street), settings, options)
+    print_json(run.summary) if json else print_run(run.summary, stages=verbose)

@@ -1,0 +1,63 @@
+"""`recon map`: a drive in, maps out."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli.session import print_json, print_run, session
+
+
+class OdometryName(str, Enum):
+    """Ways to find the poses."""
+
+    fused = "fused"
+    visual = "visual"
+    kiss = "kiss"
+
+
+def map_(
+    source: Annotated[Path, typer.Argument(help="Folder of a drive in KITTI's odometry layout.")],
+    out: Out = None,
+    odometry: Annotated[
+        OdometryName | None,
+        typer.Option(help="Visual prior with gated kiss-icp, or one of them alone. [fused]"),
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="Known poses (KITTI or TUM) to use instead of odometry.")
+    ] = None,
+    mesh: Annotated[bool, typer.Option(help="Reconstruct a surface.")] = True,
+    config: Config = None,
+    set_: Set = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    threads: Threads = None,
+) -> None:
+    """Map a stereo drive: trajectory, fused cloud, Nav2 grid, OctoMap, mesh, report.
+
+    Example: recon map ~/kitti/sequences/06 --out outputs/kitti06
+    """
+    with session():
+        from recon.formats.trajectory import read_trajectory
+        from recon.pipeline.config import load_config
+        from recon.pipeline.map_run import MapOptions, run_map
+        from recon.reports import present_map
+        from recon.sources import open_source
+        from recon.viewers import choose_viewer
+
+        overrides = [*(set_ or ()), *([f"odometry.method={odometry.value}"] if odometry else ())]
+        options = MapOptions(
+            out=out,
+            threads=threads,
+            known_poses=None if poses is None else read_trajectory(poses),
+            mesh=mesh,
+            observers=(choose_viewer(quiet=quiet),),
+            present=present_map,
+        )
+        run = run_map(open_source(source), load_config(config, overrides), options)
+    print_json(run.summary) if json else print_run(run.summary, stages=verbose)

@@ -1,0 +1,36 @@
+"""`recon mesh`: a surface for any cloud."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import Config, Json, Out, Set, Threads, Verbose
+from recon.cli.session import print_json, print_run, session
+
+
+def mesh(
+    cloud: Annotated[Path, typer.Argument(help="PLY with points; normals and colours are used.")],
+    out: Out = None,
+    formats: Annotated[
+        list[str] | None, typer.Option("--format", "-f", help="ply, obj, stl or glb. [ply]")
+    ] = None,
+    config: Config = None,
+    set_: Set = None,
+    json: Json = False,
+    verbose: Verbose = False,
+    threads: Threads = None,
+) -> None:
+    """Screened Poisson surface of a PLY cloud, trimmed to where there is data.
+
+    Example: recon mesh map/cloud.ply --format obj --format glb
+    """
+    with session():
+        from recon.pipeline.config import load_config
+        from recon.pipeline.mesh_run import MeshOptions, run_mesh
+
+        options = MeshOptions(out=out, formats=tuple(formats or ("ply",)), threads=threads)
+        summary = run_mesh(cloud, load_config(config, set_ or ()), options)
+    print_json(summary) if json else print_run(summary, stages=verbose)

@@ -1,0 +1,28 @@
+"""The options that all commands share, each defined once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Out = Annotated[
+    Path | None,
+    typer.Option("--out", "-o", help="Result folder. [default: outputs/<command>/<UTC stamp>]"),
+]
+Config = Annotated[
+    Path | None,
+    typer.Option("--config", "-c", help="YAML file of settings, such as a run's config.yaml."),
+]
+Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", "-s", help="One setting, as key=value: matching.sad.window_px=9."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print seconds per stage.")]
+Threads = Annotated[
+    int | None,
+    typer.Option("--threads", min=1, help="Threads to use. [default: all cores]"),
+]

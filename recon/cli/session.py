@@ -1,0 +1,88 @@
+"""What every command shares: a clean standard output, one line for an error, the exit codes.
+
+0 = good, 1 = an error of ours told in one line, 2 = wrong usage (typer), 130 = interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+
+from recon.errors import ReconError
+
+INTERRUPTED = 130
+
+
+@contextmanager
+def session() -> Iterator[None]:
+    """Run a command's body: errors of ours become one line on standard error and exit code 1.
+
+    While the body runs, file descriptor 1 leads to standard error, so that nothing that a
+    native library prints can get into the output of ``--json``.
+    """
+    try:
+        with _standard_output_kept_clean():
+            yield
+    except ReconError as error:
+        _fail(str(error))
+    except MemoryError:
+        _fail("out of memory; use smaller images, fewer disparities or a coarser map")
+    except OSError as error:
+        name = f"{error.filename}: " if error.filename else ""
+        _fail(f"{name}{error.strerror or error}")
+    except KeyboardInterrupt:
+        typer.echo("interrupted", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def print_json(content: Mapping[str, Any]) -> None:
+    """Print the machine-readable summary, the only thing on standard output."""
+    typer.echo(json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False))
+
+
+def print_figures(title: str, figures: Mapping[str, Any]) -> None:
+    """Print a two-column table of figures; nested values are left to ``--json``."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", show_header=False)
+    for name, value in figures.items():
+        if isinstance(value, str | int | float) and value is not None:
+            table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
+    Console().print(table)
+
+
+def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
+    """Print a run's figures, its warnings, and where its results are."""
+    shown = {key: value for key, value in summary.items() if key != "out"}
+    for group in ("trajectory", "disparity"):
+        shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
+    if stages:
+        shown |= {f"seconds.{key}": value for key, value in summary["stages"].items()}
+    print_figures("", shown)
+    for warning in summary["warnings"]:
+        typer.echo(f"warning: {warning}", err=True)
+    typer.echo(f"results: {summary['out']}")
+
+
+@contextmanager
+def _standard_output_kept_clean() -> Iterator[None]:
+    sys.stdout.flush()
+    saved = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        os.dup2(saved, 1)
+        os.close(saved)
+
+
+def _fail(line: str) -> None:
+    typer.echo(f"error: {line}", err=True)
+    raise typer.Exit(1) from None

@@ -1,0 +1,29 @@
+"""Clouds and meshes from one frame to another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from numpy.typing import NDArray
+
+from recon.geometry.se3 import apply, rotate
+from recon.structures import Frame, PointCloud, TriangleMesh
+
+
+def transform_cloud(cloud: PointCloud, T: NDArray[Any], *, frame: Frame) -> PointCloud:
+    """Move a cloud to another frame; everything but positions and normals stays.
+
+    Args:
+        cloud: Any cloud.
+        T: float64 (4, 4), maps points of ``cloud.frame`` to ``frame``.
+        frame: The name of the new frame.
+    """
+    normals = None if cloud.normals is None else rotate(T, cloud.normals)
+    return replace(cloud, xyz=apply(T, cloud.xyz), normals=normals, frame=frame)
+
+
+def transform_mesh(mesh: TriangleMesh, T: NDArray[Any]) -> TriangleMesh:
+    """Move a mesh by a rigid transform (4, 4); faces and colours stay."""
+    normals = None if mesh.normals is None else rotate(T, mesh.normals)
+    return replace(mesh, vertices=apply(T, mesh.vertices), normals=normals)

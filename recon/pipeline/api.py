@@ -1,0 +1,52 @@
+"""The flow for one pair as plain functions, for those who write Python."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from recon.formats.middlebury import stand_in_camera
+from recon.pipeline.config import PAIR_DEFAULTS, ReconConfig, load_config
+from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
+from recon.structures import Disparity, RectifiedCamera, StereoCalibration, StereoPair
+from recon.structures.arrays import UInt8
+
+Calibration = RectifiedCamera | StereoCalibration
+
+
+def match(
+    left: UInt8, right: UInt8, calibration: Calibration | None = None, **sad: Any
+) -> Disparity:
+    """Disparity of two pictures.
+
+    Args:
+        left: uint8 (H, W) grey or (H, W, 3) RGB.
+        right: The same shape as ``left``.
+        calibration: Needed where the pictures are not rectified; it also tells the range.
+        **sad: Settings of the matcher, such as ``ndisp=64`` or ``window_px=9``.
+
+    Raises:
+        ShapeError: The pictures differ in size.
+        SettingsError: A setting is unknown or out of its range.
+    """
+    height_px, width_px = left.shape[:2]
+    config = ReconConfig.parse({"matching": {"sad": sad}})
+    camera = calibration or stand_in_camera(width_px, height_px)
+    return FrameReconstructor(camera, config).match(StereoPair(left, right))[1]
+
+
+def reconstruct(
+    left: UInt8, right: UInt8, calibration: Calibration, config: ReconConfig | None = None
+) -> ReconstructedFrame:
+    """Rectified pair, disparity and cloud (camera axes, metres) of two pictures.
+
+    Args:
+        left: uint8 (H, W) grey or (H, W, 3) RGB.
+        right: The same shape as ``left``.
+        calibration: Of the two cameras.
+        config: Settings of the stages; None = those of ``recon pair``.
+
+    Raises:
+        ReconError: The pictures, the calibration and the settings do not fit.
+    """
+    settings = config or load_config(defaults=PAIR_DEFAULTS)
+    return FrameReconstructor(calibration, settings).reconstruct(StereoPair(left, right))

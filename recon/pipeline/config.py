@@ -1,0 +1,123 @@
+"""The configuration: the sum of the stages' settings, read from YAML and from the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+from pydantic import Field
+
+from recon.cloud import ANY_SCALE, CloudSettings, EdgeSettings, FilterSettings
+from recon.errors import SettingsError
+from recon.mapping import (
+    AxesSettings,
+    FusionSettings,
+    GridSettings,
+    GroundSettings,
+    OccupancySettings,
+)
+from recon.matching import MatchingSettings
+from recon.meshing import MeshSettings
+from recon.odometry import OdometrySettings
+from recon.rectification import RectificationSettings
+from recon.settings import Settings
+from recon.synthetic import StreetSettings
+
+
+class ReconConfig(Settings):
+    """All that decides a result. Written beside every result as ``config.yaml``."""
+
+    rectification: RectificationSettings = Field(default_factory=RectificationSettings)
+    matching: MatchingSettings = Field(default_factory=MatchingSettings)
+    edges: EdgeSettings = Field(default_factory=EdgeSettings)
+    cloud: CloudSettings = Field(default_factory=CloudSettings)
+    filters: FilterSettings = Field(default_factory=FilterSettings)
+    odometry: OdometrySettings = Field(default_factory=OdometrySettings)
+    axes: AxesSettings = Field(default_factory=AxesSettings)
+    fusion: FusionSettings = Field(default_factory=FusionSettings)
+    occupancy: OccupancySettings = Field(default_factory=OccupancySettings)
+    ground: GroundSettings = Field(default_factory=GroundSettings)
+    grid: GridSettings = Field(default_factory=GridSettings)
+    mesh: MeshSettings = Field(default_factory=MeshSettings)
+    street: StreetSettings = Field(default_factory=StreetSettings)
+
+
+PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
+    "cloud": {"max_range_m": None, "max_relative_sigma": None},
+    "filters": ANY_SCALE.model_dump(),
+}
+"""What one pair sets differently from a drive: nobody knows the scale of its scene beforehand."""
+
+
+def load_config(
+    path: Path | None = None,
+    overrides: Sequence[str] = (),
+    defaults: Mapping[str, Any] | None = None,
+) -> ReconConfig:
+    """Build the configuration; what comes later wins: defaults, file, overrides.
+
+    Args:
+        path: A YAML file with any part of the configuration, such as a run's ``config.yaml``.
+        overrides: ``key=value`` texts with dotted keys, such as ``matching.sad.window_px=9``.
+        defaults: What a command sets differently from the stages.
+
+    Raises:
+        SettingsError: The file cannot be read, a key is unknown, or a value is out of range.
+    """
+    values: dict[str, Any] = {}
+    _merge(values, defaults or {})
+    if path is not None:
+        _merge(values, _read_yaml(path))
+    for text in overrides:
+        _merge(values, _parse_override(text))
+    return ReconConfig.parse(values, where=str(path) if path else None)
+
+
+def dump_config(config: ReconConfig) -> str:
+    """The configuration as YAML; `load_config` gives the same configuration back."""
+    return str(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
+
+
+def _merge(base: dict[str, Any], update: Mapping[str, Any]) -> None:
+    """Merge nested mappings into ``base``; other values replace what was there."""
+    for key, value in update.items():
+        if isinstance(value, Mapping):
+            below = base.get(key)
+            base[key] = dict(below) if isinstance(below, Mapping) else {}
+            _merge(base[key], value)
+        else:
+            base[key] = value
+
+
+def _read_yaml(path: Path) -> Mapping[str, Any]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not text"
+        raise SettingsError("configuration cannot be read", where=path, got=reason) from error
+    except yaml.YAMLError as error:
+        raise SettingsError("configuration is not YAML", where=path, got=error) from error
+    if content is None:
+        return {}
+    if not isinstance(content, Mapping):
+        raise SettingsError(
+            "configuration is not a mapping", where=path, got=type(content).__name__
+        )
+    return content
+
+
+def _parse_override(text: str) -> dict[str, Any]:
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise SettingsError(
+            "cannot read this setting", where="--set", got=repr(text), expected="key=value"
+        )
+    try:
+        nested: Any = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise SettingsError(f"value of {key!r} is not YAML", where="--set", got=value) from error
+    for part in reversed(key.strip().split(".")):
+        nested = {part: nested}
+    return dict(nested)

@@ -1,0 +1,55 @@
+"""What the run may use of the machine, and what it used."""
+
+from __future__ import annotations
+
+import os
+import platform
+import resource
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from typing import Final
+
+import cv2
+
+_RECORDED: Final = (
+    "recon",
+    "numpy",
+    "numba",
+    "opencv-python-headless",
+    "open3d",
+    "kiss-icp",
+    "pymeshlab",
+    "pyoctomap",
+)
+
+
+def use_threads(threads: int | None) -> int:
+    """Limit OpenCV to ``threads`` (None = all cores) and return the number in use."""
+    count = threads or available_cores()
+    cv2.setNumThreads(count)
+    return count
+
+
+def available_cores() -> int:
+    """Cores that this process may use, which in a container are fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, in 10⁶ bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide results."""
+    return {"python": platform.python_version(), **{name: _version(name) for name in _RECORDED}}
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"

@@ -1,0 +1,235 @@
+"""`recon map` without its command line: a source in, a folder of maps out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from recon.errors import EvaluationError, MeshingError
+from recon.evaluation import evaluate_trajectory
+from recon.formats.atomic import write_text
+from recon.formats.mesh import write_mesh
+from recon.formats.mlp import write_mlp
+from recon.formats.nav2 import write_nav2
+from recon.formats.octomap import write_octomap
+from recon.formats.ply import write_ply
+from recon.formats.trajectory import write_kitti_poses, write_tum
+from recon.geometry.transform import transform_cloud
+from recon.geometry.se3 import apply
+from recon.mapping import estimate_ground_surface, flatten
+from recon.meshing import reconstruct_mesh
+from recon.pipeline.config import ReconConfig, dump_config
+from recon.pipeline.machine import use_threads
+from recon.pipeline.observer import Observer
+from recon.pipeline.record import fingerprint, write_record
+from recon.pipeline.run_directory import RunDirectory
+from recon.pipeline.sequence import MappedSequence, map_sequence
+from recon.pipeline.stopwatch import Stopwatch
+from recon.pipeline.summary import cost, health_warnings, plain
+from recon.sources import StereoSource
+from recon.structures import (
+    OccupancyGrid,
+    PointCloud,
+    SequenceTruth,
+    Trajectory,
+    TrajectoryMetrics,
+    TriangleMesh,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MapRun:
+    """All that a run knows when its maps are made; reports are made from it.
+
+    Attributes:
+        name: What a user calls the source.
+        config: The configuration.
+        mapped: Trajectory, health, fused cloud, voxels.
+        cloud: The fused cloud, frame ``map``.
+        grid: The flat grid.
+        mesh: The surface, map axes, or None where none was asked for or none could be made.
+        truth: What is known of the true path and surface.
+        metrics: Distance to the true path, or None without one.
+        summary: The figures of ``summary.json``.
+        warnings: What went less than well.
+    """
+
+    name: str
+    config: ReconConfig
+    mapped: MappedSequence
+    cloud: PointCloud
+    grid: OccupancyGrid
+    mesh: TriangleMesh | None
+    truth: SequenceTruth | None
+    metrics: TrajectoryMetrics | None
+    summary: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """How a run is made, apart from the configuration.
+
+    Attributes:
+        command: Named in the record and in the default folder.
+        out: Result folder; None = a new one below ``outputs/``.
+        threads: Threads to use; None = all cores. Changes no result.
+        known_poses: Poses to use instead of odometry, one per frame.
+        mesh: Whether to reconstruct a surface.
+        observers: Told of the progress.
+        present: Writes pictures and the report of the run into its folder.
+    """
+
+    command: str = "map"
+    out: Path | None = None
+    threads: int | None = None
+    known_poses: Trajectory | None = None
+    mesh: bool = True
+    observers: tuple[Observer, ...] = ()
+    present: Callable[[MapRun, RunDirectory], None] | None = None
+
+
+def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> MapRun:
+    """Map a source; write trajectory, clouds, grids, mesh, report, summary and record.
+
+    Raises:
+        ReconError: The source cannot be read or registered, or the folder not be written; then
+            nothing is left behind.
+    """
+    start = time.perf_counter()
+    threads = use_threads(options.threads)
+    watch = Stopwatch()
+    with RunDirectory.for_command(options.command, options.out) as directory:
+        mapped = map_sequence(
+            source,
+            config,
+            known_poses=options.known_poses,
+            observers=options.observers,
+            threads=threads,
+            stopwatch=watch,
+        )
+        run = _finish(source, config, mapped, options, watch)
+        with watch.stage("write"):
+            _write(run, directory)
+        if options.present is not None:
+            _tell(options.observers, "report")
+            with watch.stage("report"):
+                options.present(run, directory)
+        run.summary.update(cost(watch, time.perf_counter() - start))
+        run.summary["out"] = str(directory.folder)
+        directory.write_json("summary.json", run.summary)
+        with watch.stage("hash"):
+            inputs = fingerprint(source.files)
+        write_record(
+            directory,
+            options.command,
+            {
+                "source": source.name,
+                "inputs": inputs,
+                "T_map_world": mapped.T_map_world.tolist(),
+                "timings": watch.seconds,
+                "peak_memory_mb": run.summary["peak_memory_mb"],
+                "warnings": list(run.warnings),
+            },
+        )
+    return run
+
+
+def _finish(
+    source: StereoSource,
+    config: ReconConfig,
+    mapped: MappedSequence,
+    options: MapOptions,
+    watch: Stopwatch,
+) -> MapRun:
+    """Make the products that need the whole drive."""
+    warnings = health_warnings(mapped.health)
+    cloud = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
+    _tell(options.observers, "grid")
+    with watch.stage("grid"):
+        path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
+        ground = estimate_ground_surface(cloud, path_m, config.ground)
+        grid = flatten(mapped.voxels, ground, config.grid)
+    mesh = None
+    if options.mesh:
+        _tell(options.observers, "mesh")
+        with watch.stage("mesh"):
+            mesh = _mesh(cloud, config, warnings)
+    truth = source.truth
+    metrics = _compare(mapped.trajectory, truth, warnings)
+    run = MapRun(
+        name=source.name,
+        config=config,
+        mapped=mapped,
+        cloud=cloud,
+        grid=grid,
+        mesh=mesh,
+        truth=truth,
+        metrics=metrics,
+        summary={},
+        warnings=tuple(warnings),
+    )
+    run.summary.update(_summary(run))
+    return run
+
+
+def _mesh(cloud: PointCloud, config: ReconConfig, warnings: list[str]) -> TriangleMesh | None:
+    """The surface; a map without one is still a map, so its failure is a warning."""
+    try:
+        return reconstruct_mesh(cloud, config.mesh)
+    except MeshingError as error:
+        warnings.append(f"no mesh: {error}")
+        return None
+
+
+def _compare(
+    trajectory: Trajectory, truth: SequenceTruth | None, warnings: list[str]
+) -> TrajectoryMetrics | None:
+    if truth is None or truth.trajectory is None:
+        return None
+    try:
+        return evaluate_trajectory(trajectory, truth.trajectory)
+    except EvaluationError as error:
+        warnings.append(f"not compared with the true path: {error}")
+        return None
+
+
+def _summary(run: MapRun) -> dict[str, Any]:
+    frames, seconds = len(run.mapped.trajectory), run.mapped.seconds
+    figures: dict[str, Any] = {
+        "source": run.name,
+        "frames": frames,
+        "fps": frames / seconds if seconds > 0 else None,
+        "path_length_m": run.mapped.trajectory.path_length_m,
+        "points": len(run.cloud),
+        "voxels": len(run.mapped.voxels),
+        "faces": 0 if run.mesh is None else len(run.mesh.faces),
+        "frames_not_measured": sum(not record.ok for record in run.mapped.health),
+        "T_map_world": run.mapped.T_map_world.tolist(),
+        "warnings": list(run.warnings),
+    }
+    if run.metrics is not None:
+        figures["trajectory"] = plain(run.metrics)
+    return figures
+
+
+def _write(run: MapRun, directory: RunDirectory) -> None:
+    path = directory.path
+    write_kitti_poses(path("trajectory_kitti.txt"), run.mapped.trajectory)
+    write_tum(path("trajectory_tum.txt"), run.mapped.trajectory)
+    write_ply(path("map/cloud.ply"), run.cloud)
+    write_nav2(path("map/grid.yaml"), run.grid)
+    write_octomap(path("map/octomap.bt"), run.mapped.voxels)
+    write_octomap(path("map/octomap.ot"), run.mapped.voxels)
+    if run.mesh is not None:
+        write_mesh(path("mesh/mesh.ply"), run.mesh)
+        write_mlp(path("mesh/mesh.mlp"), [path("mesh/mesh.ply"), path("map/cloud.ply")])
+    write_text(path("config.yaml"), dump_config(run.config))
+
+
+def _tell(observers: Iterable[Observer], stage: str) -> None:
+    for observer in observers:
+        observer.on_stage(stage)

@@ -1,0 +1,229 @@
+"""`recon pair` without its command line: two pictures in, disparity, cloud and mesh out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon.errors import MeshingError
+from recon.evaluation import evaluate_disparity
+from recon.formats.atomic import write_text
+from recon.formats.disparity_png import fitting_scale, write_disparity_png
+from recon.formats.image import write_image
+from recon.formats.mesh import write_mesh
+from recon.formats.mlp import write_mlp
+from recon.formats.pfm import write_pfm
+from recon.formats.ply import write_ply
+from recon.geometry.triangulation import depth_from_disparity
+from recon.meshing import reconstruct_mesh
+from recon.pipeline.config import ReconConfig, dump_config
+from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
+from recon.pipeline.machine import use_threads
+from recon.pipeline.record import fingerprint, write_record
+from recon.pipeline.run_directory import RunDirectory
+from recon.pipeline.stopwatch import Stopwatch
+from recon.pipeline.summary import cost, plain
+from recon.structures import (
+    Disparity,
+    DisparityMetrics,
+    DisparityTruth,
+    PointCloud,
+    Reason,
+    RectifiedCamera,
+    RectifiedPair,
+    StereoCalibration,
+    StereoPair,
+    TriangleMesh,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class PairInput:
+    """One pair, with all that is known of it.
+
+    Attributes:
+        pair: The pictures.
+        calibration: Of the two cameras.
+        files: What they were read from.
+        truth: True disparity of the rectified left view, or None.
+    """
+
+    pair: StereoPair
+    calibration: RectifiedCamera | StereoCalibration
+    files: tuple[Path, ...] = ()
+    truth: DisparityTruth | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PairRun:
+    """All that a run knows when its results are made; reports are made from it.
+
+    Attributes:
+        name: What a user calls the pair.
+        config: The configuration.
+        pair: The rectified pictures.
+        disparity: Its disparity.
+        cloud: Its points in camera axes, or None where only the disparity was asked for.
+        mesh: The surface, camera axes, or None.
+        truth: True disparity, or None.
+        metrics: Distance to it, or None.
+        summary: The figures of ``summary.json``.
+        warnings: What went less than well.
+    """
+
+    name: str
+    config: ReconConfig
+    pair: RectifiedPair
+    disparity: Disparity
+    cloud: PointCloud | None
+    mesh: TriangleMesh | None
+    truth: DisparityTruth | None
+    metrics: DisparityMetrics | None
+    summary: dict[str, Any]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """How a run is made, apart from the configuration.
+
+    Attributes:
+        command: ``pair``, or ``disparity`` for the disparity alone.
+        out: Result folder; None = a new one below ``outputs/``.
+        threads: Threads to use; None = all cores. Changes no result.
+        present: Writes pictures and the report of the run into its folder.
+    """
+
+    command: str = "pair"
+    out: Path | None = None
+    threads: int | None = None
+    present: Callable[[PairRun, RunDirectory], None] | None = None
+
+
+def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> PairRun:
+    """Reconstruct one pair and write what it gives.
+
+    ``pair`` writes disparity, depth, reasons, cloud, mesh and report; ``disparity`` the first
+    and the third alone.
+
+    Raises:
+        ReconError: The pair cannot be matched, or the folder not be written; then nothing is
+            left behind.
+    """
+    start = time.perf_counter()
+    threads, watch = use_threads(options.threads), Stopwatch()
+    with RunDirectory.for_command(options.command, options.out) as directory:
+        reconstructor = FrameReconstructor(
+            given.calibration, config, threads=threads, stopwatch=watch
+        )
+        if options.command == "disparity":
+            run = _run(given, config, *reconstructor.match(given.pair))
+        else:
+            run = _reconstruct(given, config, reconstructor, watch)
+        with watch.stage("write"):
+            _write(run, directory)
+        if options.present is not None:
+            with watch.stage("report"):
+                options.present(run, directory)
+        run.summary["warnings"] = list(run.warnings)
+        run.summary.update(cost(watch, time.perf_counter() - start))
+        run.summary["out"] = str(directory.folder)
+        directory.write_json("summary.json", run.summary)
+        record = {
+            "source": run.name,
+            "inputs": fingerprint(given.files),
+            "timings": watch.seconds,
+            "peak_memory_mb": run.summary["peak_memory_mb"],
+            "warnings": list(run.warnings),
+        }
+        write_record(directory, options.command, record)
+    return run
+
+
+def _reconstruct(
+    given: PairInput, config: ReconConfig, reconstructor: FrameReconstructor, watch: Stopwatch
+) -> PairRun:
+    """The run of a pair with cloud and mesh; without a mesh it is still a run."""
+    frame = reconstructor.reconstruct(given.pair)
+    mesh, warnings = None, ()
+    try:
+        with watch.stage("mesh"):
+            mesh = reconstruct_mesh(frame.cloud, config.mesh)
+    except MeshingError as error:
+        warnings = (f"no mesh: {error}",)
+    run = _run(given, config, frame.pair, frame.disparity)
+    figures = _metric_summary(frame, mesh)
+    return replace(
+        run, cloud=frame.cloud, mesh=mesh, summary=run.summary | figures, warnings=warnings
+    )
+
+
+def _run(
+    given: PairInput, config: ReconConfig, pair: RectifiedPair, disparity: Disparity
+) -> PairRun:
+    """The run of a disparity."""
+    metrics = None if given.truth is None else evaluate_disparity(disparity, given.truth)
+    summary = _summary(given.pair.name, disparity)
+    if metrics is not None:
+        summary["disparity"] = plain(metrics)
+    return PairRun(
+        name=given.pair.name,
+        config=config,
+        pair=pair,
+        disparity=disparity,
+        cloud=None,
+        mesh=None,
+        truth=given.truth,
+        metrics=metrics,
+        summary=summary,
+        warnings=(),
+    )
+
+
+def _summary(name: str, disparity: Disparity) -> dict[str, Any]:
+    found = disparity.values[disparity.valid]
+    shares = np.bincount(disparity.reason.ravel(), minlength=len(Reason)) / disparity.reason.size
+    return {
+        "pair": name,
+        "width_px": disparity.values.shape[1],
+        "height_px": disparity.values.shape[0],
+        "valid_percent": 100.0 * float(disparity.valid.mean()),
+        "reasons_percent": {r.name.lower(): 100.0 * float(shares[r]) for r in Reason},
+        "disparity_median_px": float(np.median(found)) if len(found) else None,
+    }
+
+
+def _metric_summary(frame: ReconstructedFrame, mesh: TriangleMesh | None) -> dict[str, Any]:
+    camera, z = frame.pair.camera, frame.cloud.xyz[:, 2]
+    return {
+        "points": len(frame.cloud),
+        "depth_median_m": float(np.median(z)) if len(z) else None,
+        "faces": 0 if mesh is None else len(mesh.faces),
+        "focal_px": camera.focal_px,
+        "baseline_m": camera.baseline_m,
+        "doffs_px": camera.doffs_px,
+    }
+
+
+def _write(run: PairRun, directory: RunDirectory) -> None:
+    path, disparity = directory.path, run.disparity
+    write_pfm(path("disparity/disparity.pfm"), disparity.values)
+    scale = fitting_scale(disparity.values)
+    write_disparity_png(path("disparity/disparity.png"), disparity.values, scale=scale)
+    write_pfm(path("disparity/confidence.pfm"), disparity.confidence)
+    write_image(path("disparity/reason.png"), disparity.reason)
+    write_text(path("config.yaml"), dump_config(run.config))
+    run.summary["disparity_png_scale"] = scale
+    if run.cloud is None:
+        return
+    depth_m = depth_from_disparity(disparity.values, run.pair.camera)
+    write_pfm(path("disparity/depth.pfm"), depth_m)
+    write_ply(path("clouds/cloud.ply"), run.cloud)
+    if run.mesh is not None:
+        write_mesh(path("mesh/mesh.ply"), run.mesh)
+        write_mlp(path("mesh/mesh.mlp"), [path("mesh/mesh.ply"), path("clouds/cloud.ply")])

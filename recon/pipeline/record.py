@@ -1,0 +1,37 @@
+"""What is written beside every result: versions, inputs and their hashes, command, timings."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from recon.pipeline.machine import versions
+from recon.pipeline.run_directory import RECORD, RunDirectory
+
+
+def fingerprint(files: Iterable[Path]) -> dict[str, Any]:
+    """Number, size and one SHA-256 of a list of files, in that order.
+
+    The hash covers each file's name and bytes, so a renamed frame changes it too.
+    """
+    digest, count, size = hashlib.sha256(), 0, 0
+    for path in files:
+        content = path.read_bytes()
+        digest.update(path.name.encode() + b"\0" + len(content).to_bytes(8, "little") + content)
+        count, size = count + 1, size + len(content)
+    return {"files": count, "bytes": size, "sha256": digest.hexdigest()}
+
+
+def write_record(run: RunDirectory, command: str, content: Mapping[str, Any]) -> None:
+    """Write ``run.json``; the last file of a run, since it lists the others."""
+    record = {
+        "command": command,
+        "finished_utc": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "versions": versions(),
+        **content,
+        "files": [*run.files(), RECORD],
+    }
+    run.write_json(RECORD, record)

@@ -1,0 +1,162 @@
+"""A drive, frame by frame: reconstruct, register, integrate."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from recon.errors import RegistrationError
+from recon.geometry.transform import transform_cloud
+from recon.mapping import MapBuilder, OccupancyBuilder, estimate_ground, map_axes
+from recon.odometry import KnownPoses, Odometry, OdometryFrame, OdometryHealth, make_odometry
+from recon.pipeline.config import ReconConfig
+from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
+from recon.pipeline.lookahead import look_ahead
+from recon.pipeline.observer import FrameResult, Observer
+from recon.pipeline.stopwatch import Stopwatch
+from recon.sources import StereoSource
+from recon.structures import OccupancyVoxels, PointCloud, RectifiedCamera, Trajectory
+from recon.structures.arrays import Float64
+
+
+@dataclass(frozen=True, eq=False)
+class MappedSequence:
+    """What a drive gives before anything is written.
+
+    Attributes:
+        trajectory: Pose of the left camera in each frame.
+        health: How far each pose can be trusted.
+        cloud: Fused cloud, frame ``world``.
+        voxels: 3-D occupancy, map axes.
+        T_map_world: float64 (4, 4).
+        camera: The rectified camera.
+        sample: The frame in the middle of the drive, to look at.
+        seconds: Wall-clock time from the first frame to the last.
+    """
+
+    trajectory: Trajectory
+    health: tuple[OdometryHealth, ...]
+    cloud: PointCloud
+    voxels: OccupancyVoxels
+    T_map_world: Float64
+    camera: RectifiedCamera
+    sample: ReconstructedFrame
+    seconds: float
+
+
+def map_sequence(
+    source: StereoSource,
+    config: ReconConfig,
+    *,
+    known_poses: Trajectory | None = None,
+    observers: Iterable[Observer] = (),
+    threads: int | None = None,
+    stopwatch: Stopwatch | None = None,
+) -> MappedSequence:
+    """Register and fuse all frames of a source.
+
+    The next frames are matched while this one is registered; the result does not depend on it.
+
+    Args:
+        source: Where the pairs come from.
+        config: The configuration.
+        known_poses: Poses to use instead of odometry, one per frame of the source.
+        observers: Told of the progress.
+        threads: Threads to use; None = all cores. Changes no result.
+        stopwatch: Told the seconds per stage.
+
+    Raises:
+        ReconError: A frame cannot be read, matched or registered.
+    """
+    watch = stopwatch or Stopwatch()
+    audience = tuple(observers)
+    reconstructor = FrameReconstructor(source.calibration, config, threads=threads, stopwatch=watch)
+    odometry = _odometry(config, known_poses)
+    mapper = _Mapper(config, odometry, watch, sample_at=len(source) // 2)
+    for observer in audience:
+        observer.on_start(source.name, len(source))
+    start = last = time.perf_counter()
+    try:
+        for frame in look_ahead(reconstructor.reconstruct, source):
+            result = mapper.add(frame, total=len(source))
+            now = time.perf_counter()
+            last, result = now, replace(result, seconds=now - last)
+            for observer in audience:
+                observer.on_frame(result)
+    finally:
+        for observer in audience:
+            observer.on_finish()
+    return mapper.finish(reconstructor.camera, seconds=last - start)
+
+
+class _Mapper:
+    """The part of the flow that holds state: odometry and the two maps."""
+
+    def __init__(
+        self, config: ReconConfig, odometry: Odometry, stopwatch: Stopwatch, *, sample_at: int
+    ) -> None:
+        self._config = config
+        self._odometry = odometry
+        self._stopwatch = stopwatch
+        self._sample_at = sample_at
+        self._fused = MapBuilder(config.fusion)
+        self._occupancy: OccupancyBuilder | None = None
+        self._T_map_world = np.eye(4)
+        self._poses: list[Float64] = []
+        self._times_s: list[float] = []
+        self._health: list[OdometryHealth] = []
+        self._sample: ReconstructedFrame | None = None
+
+    def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
+        index, stage = len(self._poses), self._stopwatch.stage
+        with stage("odometry"):
+            registered = self._odometry.register(OdometryFrame(frame.pair, frame.disparity))
+        T_world_camera = registered.T_world_camera
+        with stage("fuse"):
+            self._fused.integrate(transform_cloud(frame.cloud, T_world_camera, frame="world"))
+        with stage("occupancy"):
+            self._occupancy_of(frame).integrate(frame.cloud, T_world_camera)
+        self._poses.append(T_world_camera)
+        self._times_s.append(frame.pair.timestamp_s)
+        self._health.append(registered.health)
+        if index <= self._sample_at:
+            self._sample = frame
+        valid_share = float(np.mean(frame.disparity.valid))
+        return FrameResult(
+            index, total, 0.0, valid_share, len(frame.cloud), T_world_camera, registered.health
+        )
+
+    def finish(self, camera: RectifiedCamera, *, seconds: float) -> MappedSequence:
+        if self._sample is None or self._occupancy is None:
+            raise RegistrationError("the source has no frame")
+        trajectory = Trajectory(np.stack(self._poses), np.array(self._times_s))
+        with self._stopwatch.stage("export"):
+            cloud = self._fused.cloud()
+            voxels = self._occupancy.voxels()
+        return MappedSequence(
+            trajectory=trajectory,
+            health=tuple(self._health),
+            cloud=cloud,
+            voxels=voxels,
+            T_map_world=self._T_map_world,
+            camera=camera,
+            sample=self._sample,
+            seconds=seconds,
+        )
+
+    def _occupancy_of(self, frame: ReconstructedFrame) -> OccupancyBuilder:
+        """The occupancy map, whose axes are fixed by the first frame."""
+        if self._occupancy is None:
+            ground = estimate_ground(frame.cloud, self._config.axes)
+            self._T_map_world = map_axes(ground, self._config.axes)
+            self._occupancy = OccupancyBuilder(self._config.occupancy, self._T_map_world)
+        return self._occupancy
+
+
+def _odometry(config: ReconConfig, known_poses: Trajectory | None) -> Odometry:
+    if known_poses is not None:
+        return KnownPoses(known_poses)
+    return make_odometry(config.odometry.method, config.odometry)

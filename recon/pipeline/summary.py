@@ -1,0 +1,56 @@
+"""The figures of a run, as ``summary.json`` holds them and ``--json`` prints them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, is_dataclass
+from typing import Any
+
+from recon.odometry import OdometryHealth
+from recon.pipeline.machine import peak_memory_mb
+from recon.pipeline.stopwatch import Stopwatch
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON can hold it: dataclasses as mappings, NaN and infinity as null."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(asdict(value))
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def cost(stopwatch: Stopwatch, total_seconds: float) -> dict[str, Any]:
+    """What a run took: seconds per stage (stages overlap in time), in all, and memory."""
+    return {
+        "seconds": round(total_seconds, 3),
+        "stages": {name: round(value, 3) for name, value in stopwatch.seconds.items()},
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+    }
+
+
+def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:
+    """One line for each stretch of frames whose pose rests on no measurement."""
+    bad = [index for index, record in enumerate(health) if not record.ok]
+    lines = []
+    for first, last in _stretches(bad):
+        frames = f"frame {first}" if first == last else f"frames {first}-{last}"
+        why = "; ".join(dict.fromkeys(health[first].notes)) or "no reason recorded"
+        lines.append(f"{frames}: pose not measured, extrapolated from the frames before ({why})")
+    return lines
+
+
+def _stretches(indices: Sequence[int]) -> list[tuple[int, int]]:
+    """Runs of consecutive numbers as (first, last)."""
+    stretches: list[tuple[int, int]] = []
+    for index in indices:
+        if stretches and index == stretches[-1][1] + 1:
+            stretches[-1] = (stretches[-1][0], index)
+        else:
+            stretches.append((index, index))
+    return stretches

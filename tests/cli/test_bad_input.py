@@ -1,0 +1,191 @@
+"""Bad input gets one clear line, exit code 1, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.synthetic import StreetSettings
+
+
+@pytest.fixture(scope="module")
+def good_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("drive")
+    settings = StreetSettings(frames=3, width_px=128, height_px=64, focal_px=72.0)
+    write_kitti(SyntheticSource(settings), folder)
+    return folder
+
+
+@pytest.fixture
+def drive(good_drive: Path, tmp_path: Path) -> Path:
+    copy = tmp_path / "drive"
+    for file in good_drive.rglob("*"):
+        if file.is_file():
+            target = copy / file.relative_to(good_drive)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(file.read_bytes())
+    return copy
+
+
+def recon(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "recon", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+
+
+def assert_one_line(done: subprocess.CompletedProcess[str], *words: str) -> None:
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("{")]
+    assert done.returncode == 1, done.stderr
+    assert done.stdout == ""
+    assert len(lines) == 1, done.stderr
+    assert lines[0].startswith("error: ")
+    for word in words:
+        assert word in lines[0]
+
+
+def right_pictures(drive: Path) -> list[Path]:
+    return sorted(next(p for p in (drive / "image_3", drive / "image_1") if p.is_dir()).iterdir())
+
+
+def lose_a_right_picture(drive: Path) -> str:
+    victim = right_pictures(drive)[1]
+    for side in ("image_1", "image_3"):
+        (drive / side / victim.name).unlink(missing_ok=True)
+    return "image_"
+
+
+def shrink_right_pictures(drive: Path) -> str:
+    for side in ("image_1", "image_3"):
+        for path in (drive / side).glob("*.png"):
+            cv2.imwrite(str(path), np.zeros((32, 64, 3), np.uint8))
+    return "64x32"
+
+
+def truncate_a_picture(drive: Path) -> str:
+    for side in ("image_0", "image_2"):
+        for path in sorted((drive / side).glob("*.png"))[1:2]:
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    return "000001.png"
+
+
+def forget_the_right_cameras(drive: Path) -> str:
+    calib = drive / "calib.txt"
+    lines = [line for line in calib.read_text().splitlines() if line[:2] in {"P0", "P2"}]
+    calib.write_text("\n".join(lines) + "\n")
+    return "calib.txt"
+
+
+def lose_the_baseline(drive: Path) -> str:
+    calib = drive / "calib.txt"
+    lines = []
+    for line in calib.read_text().splitlines():
+        name, *numbers = line.split()
+        if name.startswith("P"):
+            numbers[3] = "0"
+        lines.append(" ".join([name, *numbers]))
+    calib.write_text("\n".join(lines) + "\n")
+    return "baseline"
+
+
+def empty_the_folder(drive: Path) -> str:
+    for file in drive.rglob("*"):
+        if file.is_file():
+            file.unlink()
+    for folder in drive.iterdir():
+        folder.rmdir()
+    return "empty"
+
+
+def break_a_pose(drive: Path) -> str:
+    poses = drive / "poses.txt"
+    lines = poses.read_text().splitlines()
+    lines[1] = " ".join(["nan", *lines[1].split()[1:]])
+    poses.write_text("\n".join(lines) + "\n")
+    return "poses.txt"
+
+
+FAULTS: dict[str, Callable[[Path], str]] = {
+    "missing right image": lose_a_right_picture,
+    "sizes that differ": shrink_right_pictures,
+    "truncated PNG": truncate_a_picture,
+    "calib.txt without P1 and P3": forget_the_right_cameras,
+    "zero baseline": lose_the_baseline,
+    "empty folder": empty_the_folder,
+    "NaN poses": break_a_pose,
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_faulty_drive_is_refused(drive: Path, tmp_path: Path, fault: str) -> None:
+    word = FAULTS[fault](drive)
+    done = recon("map", drive, "--out", tmp_path / "out", "--json")
+    assert_one_line(done, word)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unwritable_output_folder_is_refused(drive: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    done = recon("map", drive, "--out", tmp_path / "file" / "out", "--json")
+    assert_one_line(done, str(tmp_path / "file"))
+    assert (tmp_path / "file").read_text() == "no folder"
+
+
+def test_nan_in_known_poses_is_refused(drive: Path, tmp_path: Path) -> None:
+    poses = tmp_path / "poses.txt"
+    poses.write_text("nan 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    done = recon("map", drive, "--poses", poses, "--out", tmp_path / "out")
+    assert_one_line(done, "poses.txt")
+    assert not (tmp_path / "out").exists()
+
+
+def test_too_few_known_poses_are_refused(drive: Path, tmp_path: Path) -> None:
+    poses = tmp_path / "poses.txt"
+    poses.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    done = recon("map", drive, "--poses", poses, "--out", tmp_path / "out")
+    assert_one_line(done, "pose")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "word"),
+    [
+        ("matching.sad.no_such_setting=1", "no_such_setting"),
+        ("matching.sad.window_px=-3", "window_px"),
+        ("nonsense", "key=value"),
+    ],
+)
+def test_a_wrong_setting_is_refused(drive: Path, tmp_path: Path, option: str, word: str) -> None:
+    done = recon("map", drive, "--out", tmp_path / "out", "--set", option)
+    assert_one_line(done, word)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_pair_of_two_sizes_is_refused(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "left.png"), np.zeros((40, 60), np.uint8))
+    cv2.imwrite(str(tmp_path / "right.png"), np.zeros((40, 50), np.uint8))
+    done = recon("disparity", tmp_path / "left.png", tmp_path / "right.png")
+    assert_one_line(done, "60x40", "50x40")
+
+
+def test_a_cloud_that_is_none_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "cloud.ply").write_text("ply\nformat ascii 1.0\nelement vertex 3\n")
+    done = recon("mesh", tmp_path / "cloud.ply", "--out", tmp_path / "out")
+    assert_one_line(done, "cloud.ply")
+    assert not (tmp_path / "out").exists()
+
+
+def test_evaluating_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "ref.ply").write_text("ply\n")
+    done = recon("evaluate", "map", tmp_path, tmp_path / "ref.ply", "--json")
+    assert_one_line(done, str(tmp_path))
+
+
+def test_wrong_usage_exits_with_two(tmp_path: Path) -> None:
+    assert recon("map").returncode == 2
+    assert recon("map", tmp_path, "--no-such-option").returncode == 2

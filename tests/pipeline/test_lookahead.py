@@ -1,0 +1,59 @@
+"""Looking ahead changes when things are computed, never what or in which order."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recon.pipeline.lookahead import look_ahead
+
+
+@given(st.lists(st.integers()), st.integers(min_value=1, max_value=5))
+def test_results_come_in_order(items: list[int], depth: int) -> None:
+    assert list(look_ahead(lambda x: x + 1, items, depth=depth)) == [x + 1 for x in items]
+
+
+def test_at_most_depth_items_are_drawn_ahead() -> None:
+    drawn: list[int] = []
+
+    def items() -> Iterator[int]:
+        for item in range(100):
+            drawn.append(item)
+            yield item
+
+    results = look_ahead(lambda x: x, items(), depth=3)
+    assert next(results) == 0
+    results.close()
+    assert len(drawn) <= 5
+
+
+def test_an_error_is_raised_at_its_turn() -> None:
+    def fail_at_two(item: int) -> int:
+        if item == 2:
+            raise KeyError(item)
+        return item
+
+    results = look_ahead(fail_at_two, range(5))
+    assert [next(results), next(results)] == [0, 1]
+    with pytest.raises(KeyError):
+        next(results)
+
+
+def test_an_error_of_the_source_is_raised_at_its_turn() -> None:
+    def items() -> Iterator[int]:
+        yield 0
+        raise OSError("disk gone")
+
+    results = look_ahead(lambda x: x, items())
+    assert next(results) == 0
+    with pytest.raises(OSError, match="disk gone"):
+        next(results)
+
+
+def test_work_happens_in_another_thread() -> None:
+    [thread] = look_ahead(lambda _: threading.current_thread().name, [0])
+    assert thread.startswith("look-ahead")
