@@ -1,0 +1,87 @@
+"""OctoMap files are read back by pyoctomap with the same cells, values and axes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyoctomap
+import pytest
+
+from recon.errors import FormatError, OutputError
+from recon.formats.octomap import read_octomap, write_octomap
+from recon.structures import OccupancyVoxels
+
+
+def _scene() -> OccupancyVoxels:
+    """Cells without symmetry, on both sides of every axis, with one full block of 8 to prune."""
+    rng = np.random.default_rng(0)
+    keys = np.unique(rng.integers((-40, -7, -3), (90, 30, 12), (3000, 3)), axis=0)
+    block = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1) + [200, 0, 0]
+    log_odds = rng.choice([-1.9, -0.41, 0.3, 3.4], len(keys))
+    return OccupancyVoxels(
+        np.vstack([keys, block]).astype(np.int32),
+        np.concatenate([log_odds, np.full(8, 2.5)]).astype(np.float32),
+        0.2,
+    )
+
+
+def _sorted(voxels: OccupancyVoxels) -> tuple[np.ndarray, np.ndarray]:
+    order = np.lexsort(voxels.keys.T)
+    return voxels.keys[order], voxels.log_odds[order]
+
+
+def test_an_ot_file_keeps_cells_and_log_odds(tmp_path: Path) -> None:
+    scene = _scene()
+    _, full = write_octomap(tmp_path / "octomap", scene)
+    back = read_octomap(full)
+    assert back.resolution_m == 0.2
+    for ours, theirs in zip(_sorted(scene), _sorted(back), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_bt_file_keeps_cells_and_what_is_occupied(tmp_path: Path) -> None:
+    scene = _scene()
+    binary, _ = write_octomap(tmp_path / "octomap", scene)
+    back = read_octomap(binary)
+    assert back.resolution_m == 0.2
+    (keys, log_odds), (keys_back, log_odds_back) = _sorted(scene), _sorted(back)
+    np.testing.assert_array_equal(keys, keys_back)
+    np.testing.assert_array_equal(log_odds > 0, log_odds_back > 0)
+
+
+def test_pyoctomap_finds_each_cell_at_its_centre(tmp_path: Path) -> None:
+    scene = _scene()
+    binary, _ = write_octomap(tmp_path / "octomap", scene)
+    tree = pyoctomap.OcTree(0.1)
+    assert tree.readBinary(str(binary))
+    for centre, value in zip(scene.centres_m[::50], scene.log_odds[::50], strict=True):
+        assert tree.isNodeOccupied(tree.search(centre)) == (value > 0)
+
+
+def test_files_are_what_their_headers_say(tmp_path: Path) -> None:
+    binary, full = write_octomap(tmp_path / "octomap", _scene())
+    assert (binary.name, full.name) == ("octomap.bt", "octomap.ot")
+    assert binary.read_bytes().startswith(b"# Octomap OcTree binary file\n")
+    assert full.read_bytes().startswith(b"# Octomap OcTree file\n")
+
+
+def test_an_empty_map_is_written_and_read(tmp_path: Path) -> None:
+    empty = OccupancyVoxels(np.zeros((0, 3), np.int32), np.zeros(0, np.float32), 0.5)
+    for path in write_octomap(tmp_path / "empty", empty):
+        assert len(read_octomap(path)) == 0
+
+
+def test_writing_into_a_file_is_an_output_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError):
+        write_octomap(tmp_path / "file" / "octomap", _scene())
+
+
+@pytest.mark.parametrize("content", [b"", b"PLY", b"# Octomap OcTree"])
+def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "x.bt").write_bytes(content)
+    with pytest.raises(FormatError):
+        read_octomap(tmp_path / "x.bt")
+    with pytest.raises(FormatError):
+        read_octomap(tmp_path / "missing.bt")
