@@ -1,0 +1,122 @@
+"""Open3D's mesh files and mesh surgery: arrays in, arrays out, its complaints turned into ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from recon.errors import FormatError, MeshingError, OutputError
+from recon.structures import TriangleMesh
+from recon.structures.arrays import Float32, Int32
+
+
+def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
+    """Write OBJ, STL or GLB, as the suffix says.
+
+    Raises:
+        OutputError: Open3D could not write the file.
+    """
+    with _quiet():
+        written = o3d.io.write_triangle_mesh(Path(path), _legacy(mesh))
+    if not written:
+        raise OutputError("Open3D could not write the mesh", where=path)
+
+
+def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
+    """Read OBJ, STL, GLB and what else Open3D knows by its suffix.
+
+    Raises:
+        FormatError: Open3D found no triangle in the file.
+    """
+    with _quiet():
+        mesh = o3d.io.read_triangle_mesh(Path(path))
+    if not mesh.has_triangles():
+        raise FormatError("the file holds no triangle that Open3D can read", where=path)
+    return TriangleMesh(
+        vertices=np.asarray(mesh.vertices).astype(np.float32),
+        faces=np.asarray(mesh.triangles).astype(np.int32),
+        normals=_normals(mesh),
+        rgb=_colours(mesh),
+    )
+
+
+def component_labels(vertices: NDArray[Any], faces: NDArray[Any]) -> tuple[Int32, Int32]:
+    """Which connected component each face belongs to.
+
+    Args:
+        vertices: (V, 3).
+        faces: int (F, 3).
+
+    Returns:
+        int32 (F,) number of the component of each face, and int32 (C,) faces of each component.
+    """
+    with _quiet():
+        labels, sizes, _ = _surface(vertices, faces).cluster_connected_triangles()
+    return np.asarray(labels).astype(np.int32), np.asarray(sizes).astype(np.int32)
+
+
+def decimate(
+    vertices: NDArray[Any], faces: NDArray[Any], target_faces: int
+) -> tuple[Float32, Int32]:
+    """Collapse edges until about ``target_faces`` are left, keeping shape and border.
+
+    Raises:
+        MeshingError: Nothing is left.
+
+    Ref: Garland & Heckbert, "Surface simplification using quadric error metrics", 1997.
+    """
+    with _quiet():
+        smaller = _surface(vertices, faces).simplify_quadric_decimation(
+            target_faces, boundary_weight=3.0
+        )
+    if not smaller.has_triangles():
+        raise MeshingError("decimation left no face", got=f"target of {target_faces} faces")
+    return (
+        np.asarray(smaller.vertices).astype(np.float32),
+        np.asarray(smaller.triangles).astype(np.int32),
+    )
+
+
+def _surface(vertices: NDArray[Any], faces: NDArray[Any]) -> Any:
+    """Open3D's mesh of copies; it takes neither read-only nor single-precision arrays."""
+    return o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(np.array(vertices, dtype=np.float64)),
+        o3d.utility.Vector3iVector(np.array(faces, dtype=np.int32)),
+    )
+
+
+def _legacy(mesh: TriangleMesh) -> Any:
+    surface = _surface(mesh.vertices, mesh.faces)
+    if mesh.normals is not None:
+        normals = np.array(mesh.normals, dtype=np.float64)
+        surface.vertex_normals = o3d.utility.Vector3dVector(normals)
+    if mesh.rgb is not None:
+        surface.vertex_colors = o3d.utility.Vector3dVector(mesh.rgb.astype(np.float64) / 255)
+    surface.compute_triangle_normals()
+    return surface
+
+
+def _normals(mesh: Any) -> Float32 | None:
+    if not mesh.has_vertex_normals():
+        return None
+    return np.asarray(mesh.vertex_normals).astype(np.float32)
+
+
+def _colours(mesh: Any) -> NDArray[np.uint8] | None:
+    if not mesh.has_vertex_colors():
+        return None
+    return np.asarray(np.rint(np.asarray(mesh.vertex_colors) * 255), dtype=np.uint8)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Open3D's warnings off standard output; what matters is checked and raised."""
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        yield

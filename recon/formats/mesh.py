@@ -1,0 +1,120 @@
+"""Meshes as PLY, OBJ, STL and GLB files, chosen by the suffix."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.errors import FormatError, OutputError
+from recon.formats.atomic import atomic_path
+from recon.formats.ply import colours_of, fill_vertices, normals_of, vertex_dtype
+from recon.formats.ply_tables import Table, list_length, read_tables, write_tables
+from recon.structures import TriangleMesh
+from recon.structures.arrays import Int32
+
+MESH_SUFFIXES: Final = (".ply", ".obj", ".stl", ".glb")
+#: The property of a face has two names in the wild.
+_INDICES: Final = ("vertex_indices", "vertex_index")
+
+
+def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
+    """Write a mesh; it appears whole or not at all.
+
+    PLY is binary with float vertices; OBJ and GLB carry normals and colours too; STL knows
+    neither. GLB is glTF 2.0 in one file.
+
+    Args:
+        path: The file; its suffix (.ply, .obj, .stl or .glb) says the format.
+        mesh: The mesh.
+
+    Raises:
+        OutputError: The suffix is unknown, the mesh has no face, or the file cannot be written.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise OutputError("unknown kind of mesh file", where=path, expected=" ".join(MESH_SUFFIXES))
+    if len(mesh.faces) == 0:
+        raise OutputError("the mesh has no face", where=path)
+    if suffix == ".ply":
+        write_tables(path, _tables(mesh))
+        return
+    # Open3D takes two seconds to load: a PLY does not wait for it.
+    from recon.adapters import open3d_meshes  # noqa: PLC0415
+
+    with atomic_path(path) as temporary:
+        open3d_meshes.write_mesh(temporary, mesh)
+
+
+def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
+    """Read a mesh.
+
+    Args:
+        path: The file; its suffix (.ply, .obj, .stl or .glb) says the format.
+
+    Raises:
+        FormatError: The file is missing, of an unknown kind, truncated, has faces that are not
+            triangles or that name vertices which do not exist, or has no faces.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise FormatError("unknown kind of mesh file", where=path, expected=" ".join(MESH_SUFFIXES))
+    if suffix == ".ply":
+        mesh = _read_ply(path)
+    elif Path(path).is_file():
+        from recon.adapters import open3d_meshes  # noqa: PLC0415
+
+        mesh = open3d_meshes.read_mesh(path)
+    else:
+        raise FormatError("no such file", where=path)
+    return _checked(mesh, path)
+
+
+def _tables(mesh: TriangleMesh) -> dict[str, Table]:
+    """The two tables of a PLY mesh."""
+    fields = vertex_dtype(normals=mesh.normals is not None, colours=mesh.rgb is not None)
+    vertices = np.zeros(len(mesh.vertices), fields)
+    fill_vertices(vertices, mesh.vertices, mesh.normals, mesh.rgb)
+    name = _INDICES[0]
+    faces = np.zeros(len(mesh.faces), [(list_length(name), "u1"), (name, "<i4", (3,))])
+    faces[list_length(name)] = 3
+    faces[name] = mesh.faces
+    return {"vertex": vertices, "face": faces}
+
+
+def _read_ply(path: str | PathLike[str]) -> TriangleMesh:
+    _, tables = read_tables(path, ["vertex", "face"])
+    vertex, faces = tables.get("vertex"), _faces(tables.get("face"))
+    if vertex is None or faces is None or len(faces) == 0:
+        raise FormatError("the PLY file has no faces: it is a cloud", where=path)
+    if not {"x", "y", "z"} <= set(vertex.dtype.names or ()):
+        raise FormatError("the PLY file has no vertices with x, y and z", where=path)
+    return TriangleMesh(
+        vertices=np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float32),
+        faces=faces,
+        normals=normals_of(vertex),
+        rgb=colours_of(vertex),
+    )
+
+
+def _faces(table: Table | None) -> Int32 | None:
+    for name in _INDICES:
+        if table is not None and name in (table.dtype.names or ()):
+            return table[name].astype(np.int32)
+    return None
+
+
+def _checked(mesh: TriangleMesh, path: str | PathLike[str]) -> TriangleMesh:
+    """The mesh, if its faces name vertices that exist and its vertices are finite."""
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise FormatError(
+            "a face names a vertex that does not exist",
+            where=path,
+            got=f"{int(mesh.faces.max())}",
+            expected=f"less than {len(mesh.vertices)}",
+        )
+    if not np.isfinite(mesh.vertices).all():
+        raise FormatError("a vertex of the mesh is not finite", where=path)
+    return mesh

@@ -1,0 +1,178 @@
+"""From a cloud with normals to a surface: screened Poisson, cut back to where there is data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from pydantic import Field
+
+from recon.adapters import open3d_clouds, open3d_meshes
+from recon.adapters.pymeshlab import screened_poisson
+from recon.errors import MeshingError
+from recon.meshing.surgery import drop_small_components, keep_vertices, vertex_normals
+from recon.settings import Settings
+from recon.structures import PointCloud, TriangleMesh
+from recon.structures.arrays import Bool, Float32, Int32
+
+_MIN_POINTS = 50
+_MIN_DEPTH = 5
+_SPACING_NEIGHBOURS = 7
+_SPACING_SAMPLES = 20_000
+#: MeshLab's octree is this much wider than the cloud.
+_OCTREE_SCALE = 1.1
+Point = tuple[float, float, float]
+
+
+class MeshSettings(Settings):
+    """How a surface is reconstructed, and how much of it is believed."""
+
+    depth: int | None = Field(
+        default=None,
+        ge=4,
+        le=12,
+        description="octree depth; null = cells as wide as the points are apart, up to max_depth",
+    )
+    max_depth: int = Field(default=10, ge=4, le=12, description="limit of a depth chosen so")
+    samples_per_node: float = Field(
+        default=1.5, ge=1, le=50, description="points that an octree cell should hold"
+    )
+    point_weight: float = Field(
+        default=4.0, ge=0, description="weight of the points against their normals"
+    )
+    trim_density_quantile: float = Field(
+        default=0.01, ge=0, lt=1, description="share of the vertices cut off as least supported"
+    )
+    max_distance_spacings: float | None = Field(
+        default=3.0,
+        gt=0,
+        description="farthest a vertex may lie from the points, in local point spacings; "
+        "null = keep all",
+    )
+    min_component_faces: int = Field(
+        default=100, ge=1, description="connected pieces with fewer faces are dropped"
+    )
+    target_faces: int | None = Field(
+        default=None, ge=4, description="simplify to about so many faces; null = do not"
+    )
+    normals_neighbours: int = Field(
+        default=20, ge=3, le=1000, description="neighbours for normals where the cloud has none"
+    )
+
+
+def reconstruct_mesh(
+    cloud: PointCloud, settings: MeshSettings, viewpoint_m: Point | None = None
+) -> TriangleMesh:
+    """Reconstruct the surface that a cloud was sampled from.
+
+    Poisson's surface is closed: it bridges every gap with a balloon. What lies farther from the
+    points than they lie from each other, or is hardly supported, is cut off again, so holes in
+    the data stay holes in the mesh.
+
+    Args:
+        cloud: Points, with normals if possible; colours go to the vertices.
+        settings: How.
+        viewpoint_m: Where the points were seen from, in the frame of the cloud; used only where
+            the cloud has no normals. None = neighbours agree, the sign of the whole is a guess.
+
+    Returns:
+        The mesh, with unit normals out of the surface, and colours if the cloud has any.
+
+    Raises:
+        MeshingError: The points are too few, in one place or in one line; Poisson failed; or
+            trimming left nothing.
+
+    Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
+    """
+    cloud = _oriented(_usable(cloud), settings, viewpoint_m)
+    depth = settings.depth or _fitting_depth(cloud.xyz, settings.max_depth)
+    vertices, faces, density = screened_poisson(
+        cloud.xyz,
+        _required(cloud.normals),
+        depth=depth,
+        samples_per_node=settings.samples_per_node,
+        point_weight=settings.point_weight,
+    )
+    supported = density >= np.quantile(density, settings.trim_density_quantile)
+    if settings.max_distance_spacings is not None:
+        supported &= _near_data(vertices, cloud.xyz, settings.max_distance_spacings)
+    vertices, faces = keep_vertices(vertices, faces, supported)
+    vertices, faces = drop_small_components(vertices, faces, settings.min_component_faces)
+    if settings.target_faces is not None and len(faces) > settings.target_faces:
+        vertices, faces = open3d_meshes.decimate(vertices, faces, settings.target_faces)
+    return TriangleMesh(
+        vertices=vertices,
+        faces=faces,
+        normals=vertex_normals(vertices, faces),
+        rgb=None if cloud.rgb is None else cloud.rgb[_nearest_points(vertices, cloud.xyz)],
+    )
+
+
+def _usable(cloud: PointCloud) -> PointCloud:
+    """The finite points of a cloud, if a surface can go through them."""
+    finite = np.isfinite(cloud.xyz).all(axis=1)
+    if finite.sum() < _MIN_POINTS:
+        raise MeshingError(
+            "too few points for a surface",
+            got=int(finite.sum()),
+            expected=f"at least {_MIN_POINTS} finite points",
+        )
+    cloud = cloud.select(finite)
+    centred = cloud.xyz.astype(np.float64) - cloud.xyz.mean(axis=0, dtype=np.float64)
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred)), 0))
+    # 1e-5 of the extent is what float32 coordinates resolve.
+    if spread[1] <= 1e-5 * max(spread[2], float(np.abs(cloud.xyz).max())):
+        raise MeshingError("all points lie in one place or on one line", got=f"{len(cloud)} points")
+    return cloud
+
+
+def _oriented(cloud: PointCloud, settings: MeshSettings, viewpoint_m: Point | None) -> PointCloud:
+    """The points that have a normal, or all of them with normals estimated."""
+    if cloud.normals is not None:
+        # NaN fails the comparison, so it counts as none.
+        known = np.asarray(np.linalg.norm(cloud.normals, axis=1) > 0.5)
+        if known.sum() >= _MIN_POINTS:
+            return cloud.select(known)
+    normals = open3d_clouds.estimate_normals(cloud.xyz, settings.normals_neighbours)
+    if viewpoint_m is None:
+        normals = open3d_clouds.agree_normals(cloud.xyz, normals, settings.normals_neighbours)
+    else:
+        away = np.einsum("ij,ij->i", normals, np.asarray(viewpoint_m) - cloud.xyz) < 0
+        normals = np.where(away[:, None], -normals, normals)
+    return replace(cloud, normals=normals)
+
+
+def _required(normals: Float32 | None) -> Float32:
+    if normals is None:
+        raise MeshingError("the cloud has no normals")
+    return normals
+
+
+def _fitting_depth(xyz: Float32, max_depth: int) -> int:
+    """Depth of the octree whose cells are about as wide as the points are apart."""
+    step = max(1, len(xyz) // _SPACING_SAMPLES)
+    spacing_m = float(np.median(_spacing(xyz[::step], xyz)))
+    extent_m = float(np.ptp(xyz, axis=0).max()) * _OCTREE_SCALE
+    depth = math.ceil(math.log2(extent_m / max(spacing_m, extent_m * 2.0**-max_depth)))
+    return int(np.clip(depth, _MIN_DEPTH, max_depth))
+
+
+def _spacing(some_xyz: Float32, xyz: Float32) -> Float32:
+    """float32 (N,): how far points of a cloud are from their neighbours in it."""
+    return open3d_clouds.nearest(some_xyz, xyz, _SPACING_NEIGHBOURS)[1][:, -1]
+
+
+def _near_data(vertices: Float32, xyz: Float32, spacings: float) -> Bool:
+    """bool (V,): vertices no farther from the nearest point than points are from each other."""
+    index, distance_m = open3d_clouds.nearest(vertices, xyz)
+    near, where = np.unique(index[:, 0], return_inverse=True)
+    local_m = _spacing(xyz[near], xyz)
+    # A lone point is far from its neighbours, which must not earn it a large patch of surface.
+    local_m = np.minimum(local_m, 2 * np.median(local_m))
+    return np.asarray(distance_m[:, 0] <= spacings * local_m[where])
+
+
+def _nearest_points(vertices: Float32, xyz: Float32) -> Int32:
+    """int32 (V,): the point nearest to each vertex."""
+    return open3d_clouds.nearest(vertices, xyz)[0][:, 0]

@@ -1,0 +1,59 @@
+"""Cutting meshes: vertices kept, small pieces dropped, normals of what is left."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.adapters import open3d_meshes
+from recon.errors import MeshingError
+from recon.structures.arrays import Bool, Float32, Int32
+
+
+def keep_vertices(vertices: Float32, faces: Int32, keep: Bool) -> tuple[Float32, Int32]:
+    """The part of a mesh whose faces have all three vertices in ``keep``.
+
+    Args:
+        vertices: float32 (V, 3).
+        faces: int32 (F, 3).
+        keep: bool (V,).
+
+    Returns:
+        The remaining vertices that a face uses, and the faces, renumbered.
+
+    Raises:
+        MeshingError: No face is left.
+    """
+    return _compact(vertices, faces[keep[faces].all(axis=1)])
+
+
+def drop_small_components(vertices: Float32, faces: Int32, min_faces: int) -> tuple[Float32, Int32]:
+    """The connected pieces of a mesh that have at least ``min_faces`` faces.
+
+    Raises:
+        MeshingError: No piece is large enough.
+    """
+    labels, sizes = open3d_meshes.component_labels(vertices, faces)
+    return _compact(vertices, faces[sizes[labels] >= min_faces])
+
+
+def vertex_normals(vertices: Float32, faces: Int32) -> Float32:
+    """float32 (V, 3): unit normals of the vertices, the mean of their faces' by area."""
+    corners = vertices[faces].astype(np.float64)
+    # The cross product is as long as twice the area: the weight comes by itself.
+    of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    flat = faces.ravel()
+    sums = [np.bincount(flat, np.repeat(axis, 3), len(vertices)) for axis in of_faces.T]
+    normals = np.stack(sums, axis=1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(normals / np.maximum(length, 1e-30), dtype=np.float32)
+
+
+def _compact(vertices: Float32, faces: Int32) -> tuple[Float32, Int32]:
+    """Drop the vertices that no face uses and renumber the rest."""
+    if len(faces) == 0:
+        raise MeshingError(
+            "trimming left no face of the surface",
+            hint="the points may be too sparse: raise max_distance_spacings or use fewer filters",
+        )
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return vertices[used], renumbered.reshape(-1, 3).astype(np.int32)
