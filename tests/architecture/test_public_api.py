@@ -26,4 +26,4 @@ def test_public_name_explains_itself(name: str) -> None:
     value = getattr(recon, name)
 
     if inspect.isfunction(value) or inspect.isclass(value):
-        assert value.__doc__ and value.__doc__.strip()
+        assert inspect.getdoc(value)

@@ -6,7 +6,20 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.synthetic.settings import StreetSettings
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture
+def kitti_drive(tmp_path: Path) -> Path:
+    """Six frames of the synthetic street as a KITTI folder."""
+    folder = tmp_path / "drive"
+    write_kitti(SyntheticSource(StreetSettings(frames=6)), folder)
+    return folder
 
 
 def _run(name: str, *arguments: str) -> str:
