@@ -74,23 +74,31 @@ def decode_octomap(path: Path) -> tuple[Int32, Float32, float]:
 
 
 def _read_tree(path: Path) -> Any:
-    """The tree of a file."""
+    """The tree of a file, whole."""
+    header = _read_header(path)
+    if header[0] == b"# Octomap OcTree binary file":
+        tree = pyoctomap.OcTree(0.1)
+        whole = tree.readBinary(str(path))
+    elif header[0] == b"# Octomap OcTree file":
+        tree = pyoctomap.OcTree(0.1).read(str(path))
+        # A truncated file is read without complaint, and its last nodes are noise.
+        whole = tree is not None and b"size %d" % tree.calcNumNodes() in header
+    else:
+        raise FormatError(
+            "the file is not an OctoMap", where=path, got=header[0][:40], expected=".bt or .ot"
+        )
+    if not whole:
+        raise FormatError("the OctoMap is truncated or damaged", where=path)
+    return tree
+
+
+def _read_header(path: Path) -> list[bytes]:
+    """The first lines of a file."""
     try:
         with path.open("rb") as file:
-            header = file.readline()
+            return [file.readline(200).strip() for _ in range(8)]
     except OSError as error:
         raise FormatError("cannot read the OctoMap", where=path) from error
-    if header.startswith(b"# Octomap OcTree binary file"):
-        tree = pyoctomap.OcTree(0.1)
-        if tree.readBinary(str(path)):
-            return tree
-    elif header.startswith(b"# Octomap OcTree file"):
-        tree = pyoctomap.OcTree(0.1).read(str(path))
-        if tree is not None:
-            return tree
-    raise FormatError(
-        "the file is not an OctoMap", where=path, got=repr(header[:40]), expected=".bt or .ot"
-    )
 
 
 def _expand(

@@ -47,7 +47,20 @@ def test_a_map_too_large_for_octomap_is_refused(cell: int) -> None:
         encode_octomap(np.array([[0, cell, 0]], np.int32), np.ones(1, np.float32), 0.2)
 
 
-def test_a_damaged_file_is_a_format_error(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", [0, 1])
+@pytest.mark.parametrize("keep", [0.3, 0.6, 0.95])
+def test_a_truncated_file_is_a_format_error(tmp_path: Path, kind: int, keep: float) -> None:
+    rng = np.random.default_rng(0)
+    keys = np.unique(rng.integers(-50, 50, (4000, 3)), axis=0).astype(np.int32)
+    log_odds = rng.uniform(-2, 2, len(keys)).astype(np.float32)
+    content = encode_octomap(keys, log_odds, 0.2)[kind]
+    path = tmp_path / "cut"
+    path.write_bytes(content[: int(len(content) * keep)])
+    with pytest.raises(FormatError, match="truncated"):
+        decode_octomap(path)
+
+
+def test_a_header_without_a_tree_is_a_format_error(tmp_path: Path) -> None:
     (tmp_path / "a.ot").write_bytes(b"# Octomap OcTree file\n# cut\n")
     with pytest.raises(FormatError):
         decode_octomap(tmp_path / "a.ot")

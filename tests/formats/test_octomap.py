@@ -17,10 +17,10 @@ def _scene() -> OccupancyVoxels:
     """Cells without symmetry, on both sides of every axis, with one full block of 8 to prune."""
     rng = np.random.default_rng(0)
     keys = np.unique(rng.integers((-40, -7, -3), (90, 30, 12), (3000, 3)), axis=0)
-    block = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1) + [200, 0, 0]
+    block = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=1)
     log_odds = rng.choice([-1.9, -0.41, 0.3, 3.4], len(keys))
     return OccupancyVoxels(
-        np.vstack([keys, block]).astype(np.int32),
+        np.vstack([keys, block + np.array([200, 0, 0])]).astype(np.int32),
         np.concatenate([log_odds, np.full(8, 2.5)]).astype(np.float32),
         0.2,
     )

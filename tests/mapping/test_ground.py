@@ -65,7 +65,7 @@ def test_boxes_and_walls_do_not_lift_the_ground() -> None:
 
 def test_normals_tell_the_ground_from_the_rest() -> None:
     ground = _ground(n=20_000)
-    hedge = ground + [0, 0, 0.25]
+    hedge = ground + np.array([0, 0, 0.25])
     normals = np.zeros((40_000, 3), np.float32)
     normals[:20_000, 2] = 1
     normals[20_000:, 1] = 1
