@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -10,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from recon.errors import CalibrationError
+from recon.geometry.se3 import angle_rad
 from recon.rectification.grey import GreyMode, to_grey
 from recon.settings import Settings
 from recon.structures import (
@@ -28,6 +30,8 @@ _INTERPOLATIONS: Final = {
 }
 # Maps of an identity are off by rounding errors, far below what interpolation resolves (1/32 px).
 _BORDER_TOLERANCE_PX: Final = 1e-3
+# Beyond it the two views of a pinhole camera hardly overlap.
+_LARGEST_ANGLE_RAD: Final = math.radians(60)
 
 
 class RectificationSettings(Settings):
@@ -218,6 +222,13 @@ def _check_rig(calibration: StereoCalibration) -> None:
             got=f"right camera at ({-x:g}, {-y:g}, {-z:g}) m",
             expected="mostly along x",
             hint="turn the pictures of a vertical rig by 90 degrees and calibrate again",
+        )
+    apart_rad = float(angle_rad(calibration.T_right_left))
+    if apart_rad > _LARGEST_ANGLE_RAD:
+        raise CalibrationError(
+            "cameras look apart",
+            got=f"{math.degrees(apart_rad):.0f} deg",
+            expected=f"at most {math.degrees(_LARGEST_ANGLE_RAD):.0f} deg",
         )
     if x > 0:
         raise CalibrationError(
