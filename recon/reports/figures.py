@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -77,14 +78,14 @@ def depth_figure(depth_m: NDArray[Any]) -> bytes:
     """A depth map (H, W) in metres, NaN = unknown; the scale is logarithmic, near is red."""
     low, high = value_range(np.where(depth_m > 0, depth_m, np.nan))
     low = max(low, 1e-3)
-    limits = (float(np.log(low)), float(np.log(max(high, low * 1.01))))
+    limits = (math.log(low), math.log(max(high, low * 1.01)))
     with np.errstate(invalid="ignore", divide="ignore"):
         logarithm = np.log(np.where(depth_m > 0, depth_m, np.nan))
     # Reversed, so that near has the same colour here and in the disparity map.
     scale = f"{DISPARITY_SCALE}_r"
     figure, _ = _picture(colour_values(logarithm, scale, limits))
     bar = _colour_bar(figure, scale, limits)
-    depths = _spaced(_nice_depths(low, high), np.log, limits)
+    depths = depth_marks(low, high, math.log, limits)
     bar.set_ticks(list(np.log(depths)), labels=[f"{depth:g}" for depth in depths])
     bar.set_label("depth in metres (logarithmic)", color=INK)
     return to_png(figure)
@@ -123,6 +124,32 @@ def reasons_figure(disparity: Disparity) -> bytes:
     legend = figure.legend(handles=handles, loc="center", ncols=columns, frameon=False)
     legend.set_bbox_to_anchor((0.5, middle))
     return to_png(figure)
+
+
+def depth_marks(
+    low_m: float, high_m: float, place: Callable[[float], float], limits: tuple[float, float]
+) -> list[float]:
+    """Round depths to mark on a scale, as many as leave room for their labels.
+
+    Args:
+        low_m: Least depth on the scale, > 0.
+        high_m: Largest depth.
+        place: Where on the scale a depth lies.
+        limits: Where the scale begins and ends.
+
+    Returns:
+        The depths, rising; the roundest are preferred.
+    """
+    powers = range(math.floor(math.log10(low_m)), math.ceil(math.log10(high_m)) + 1)
+    choices = [step * 10.0**power for tier in _DEPTH_STEPS for power in powers for step in tier]
+    room = _LABEL_ROOM * (limits[1] - limits[0])
+    marks: dict[float, float] = {}
+    for depth in choices:
+        there = place(depth)
+        free = all(abs(there - other) >= room for other in marks.values())
+        if low_m <= depth <= high_m and free:
+            marks[depth] = there
+    return sorted(marks)
 
 
 def reason_shares(reason: UInt8) -> dict[Reason, float]:
@@ -174,34 +201,15 @@ def _depth_ticks(bar: Colorbar, limits: tuple[float, float], camera: RectifiedCa
         return
     # A disparity of about 0 is a depth without end; 1 km is far enough for marks.
     far = min(float(near_far[1]), 1000.0) if np.isfinite(near_far[1]) else 1000.0
-    depths = _spaced(
-        _nice_depths(near, far),
-        lambda depth: disparity_from_depth(np.asarray(depth), camera),
-        limits,
-    )
+
+    def place(depth_m: float) -> float:
+        return float(disparity_from_depth(np.asarray(depth_m), camera))
+
+    depths = depth_marks(near, far, place, limits)
     upper = bar.ax.twiny()
     upper.set_xlim(*limits)
     upper.spines[:].set_visible(False)
-    places = disparity_from_depth(np.asarray(depths), camera)
-    upper.set_xticks(list(places), labels=[f"{depth:g} m" for depth in depths])
+    upper.set_xticks(
+        [place(depth) for depth in depths], labels=[f"{depth:g} m" for depth in depths]
+    )
     upper.tick_params(length=2, pad=1)
-
-
-def _nice_depths(low: float, high: float) -> list[float]:
-    """Round numbers between two depths, the roundest first."""
-    powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-    marks = [step * 10.0**power for tier in _DEPTH_STEPS for power in powers for step in tier]
-    return [depth for depth in marks if low <= depth <= high]
-
-
-def _spaced(
-    depths: list[float], place: Callable[[float], Any], limits: tuple[float, float]
-) -> list[float]:
-    """The depths, in this order of choice, whose places on a scale leave room for labels."""
-    room = _LABEL_ROOM * (limits[1] - limits[0])
-    kept: dict[float, float] = {}
-    for depth in depths:
-        there = float(place(depth))
-        if all(abs(there - other) >= room for other in kept.values()):
-            kept[depth] = there
-    return sorted(kept)

@@ -91,8 +91,12 @@ def present_disparity(run: PairRun, directory: RunDirectory) -> None:
 
 def command_line() -> str:
     """The command that this process was started with, or "" where that was not ours."""
-    program = Path(sys.argv[0]).name if sys.argv else ""
-    return shlex.join(["recon", *sys.argv[1:]]) if program in {"recon", "recon.exe"} else ""
+    program = Path(sys.argv[0] if sys.argv else "")
+    started = program.name in {"recon", "recon.exe"} or program.parts[-2:] == (
+        "recon",
+        "__main__.py",
+    )
+    return shlex.join(["recon", *sys.argv[1:]]) if started else ""
 
 
 def _short(name: str) -> str:
