@@ -61,7 +61,7 @@ def print_figures(title: str, figures: Mapping[str, Any]) -> None:
 def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
     """Print a run's figures, its warnings, and where its results are."""
     shown = {key: value for key, value in summary.items() if key != "out"}
-    for group in ("trajectory", "disparity"):
+    for group in ("trajectory", "map", "disparity"):
         shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
     if stages:
         shown |= {f"seconds.{key}": value for key, value in summary["stages"].items()}

@@ -1,1 +1,23 @@
 """From posed clouds to a fused cloud, 3-D occupancy and a flat grid."""
+
+from recon.mapping.axes import AxesSettings, GroundPlane, estimate_ground, map_axes
+from recon.mapping.fused import FusionSettings, MapBuilder
+from recon.mapping.grid import GridSettings, flatten
+from recon.mapping.ground import GroundSettings, GroundSurface, estimate_ground_surface
+from recon.mapping.occupancy import OccupancyBuilder, OccupancySettings
+
+__all__ = [
+    "AxesSettings",
+    "FusionSettings",
+    "GridSettings",
+    "GroundPlane",
+    "GroundSettings",
+    "GroundSurface",
+    "MapBuilder",
+    "OccupancyBuilder",
+    "OccupancySettings",
+    "estimate_ground",
+    "estimate_ground_surface",
+    "flatten",
+    "map_axes",
+]

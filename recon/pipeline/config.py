@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import yaml
-from pydantic import Field
-
 from recon.cloud import ANY_SCALE, CloudSettings, EdgeSettings, FilterSettings
 from recon.errors import SettingsError
 from recon.mapping import (
@@ -29,19 +27,19 @@ from recon.synthetic import StreetSettings
 class ReconConfig(Settings):
     """All that decides a result. Written beside every result as ``config.yaml``."""
 
-    rectification: RectificationSettings = Field(default_factory=RectificationSettings)
-    matching: MatchingSettings = Field(default_factory=MatchingSettings)
-    edges: EdgeSettings = Field(default_factory=EdgeSettings)
-    cloud: CloudSettings = Field(default_factory=CloudSettings)
-    filters: FilterSettings = Field(default_factory=FilterSettings)
-    odometry: OdometrySettings = Field(default_factory=OdometrySettings)
-    axes: AxesSettings = Field(default_factory=AxesSettings)
-    fusion: FusionSettings = Field(default_factory=FusionSettings)
-    occupancy: OccupancySettings = Field(default_factory=OccupancySettings)
-    ground: GroundSettings = Field(default_factory=GroundSettings)
-    grid: GridSettings = Field(default_factory=GridSettings)
-    mesh: MeshSettings = Field(default_factory=MeshSettings)
-    street: StreetSettings = Field(default_factory=StreetSettings)
+    rectification: RectificationSettings = RectificationSettings()
+    matching: MatchingSettings = MatchingSettings()
+    edges: EdgeSettings = EdgeSettings()
+    cloud: CloudSettings = CloudSettings()
+    filters: FilterSettings = FilterSettings()
+    odometry: OdometrySettings = OdometrySettings()
+    axes: AxesSettings = AxesSettings()
+    fusion: FusionSettings = FusionSettings()
+    occupancy: OccupancySettings = OccupancySettings()
+    ground: GroundSettings = GroundSettings()
+    grid: GridSettings = GridSettings()
+    mesh: MeshSettings = MeshSettings()
+    street: StreetSettings = StreetSettings()
 
 
 PAIR_DEFAULTS: Final[Mapping[str, Any]] = {

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from recon.errors import EvaluationError, MeshingError
-from recon.evaluation import evaluate_trajectory
+from recon.evaluation import evaluate_map, evaluate_trajectory
 from recon.formats.atomic import write_text
 from recon.formats.mesh import write_mesh
 from recon.formats.mlp import write_mlp
@@ -31,6 +31,7 @@ from recon.pipeline.stopwatch import Stopwatch
 from recon.pipeline.summary import cost, health_warnings, plain
 from recon.sources import StereoSource
 from recon.structures import (
+    MapMetrics,
     OccupancyGrid,
     PointCloud,
     SequenceTruth,
@@ -38,6 +39,9 @@ from recon.structures import (
     TrajectoryMetrics,
     TriangleMesh,
 )
+
+SURFACE_THRESHOLD_M: Final = 0.2
+"""Distance to the true surface below which a point of the map counts as right."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +57,7 @@ class MapRun:
         mesh: The surface, map axes, or None where none was asked for or none could be made.
         truth: What is known of the true path and surface.
         metrics: Distance to the true path, or None without one.
+        map_metrics: Distance to the true surface, or None without one.
         summary: The figures of ``summary.json``.
         warnings: What went less than well.
     """
@@ -65,6 +70,7 @@ class MapRun:
     mesh: TriangleMesh | None
     truth: SequenceTruth | None
     metrics: TrajectoryMetrics | None
+    map_metrics: MapMetrics | None
     summary: dict[str, Any]
     warnings: tuple[str, ...]
 
@@ -159,7 +165,9 @@ def _finish(
         with watch.stage("mesh"):
             mesh = _mesh(cloud, config, warnings)
     truth = source.truth
-    metrics = _compare(mapped.trajectory, truth, warnings)
+    with watch.stage("compare"):
+        metrics = _compare_paths(mapped.trajectory, truth, warnings)
+        map_metrics = _compare_surfaces(mapped.cloud, truth, warnings)
     run = MapRun(
         name=source.name,
         config=config,
@@ -169,6 +177,7 @@ def _finish(
         mesh=mesh,
         truth=truth,
         metrics=metrics,
+        map_metrics=map_metrics,
         summary={},
         warnings=tuple(warnings),
     )
@@ -185,7 +194,7 @@ def _mesh(cloud: PointCloud, config: ReconConfig, warnings: list[str]) -> Triang
         return None
 
 
-def _compare(
+def _compare_paths(
     trajectory: Trajectory, truth: SequenceTruth | None, warnings: list[str]
 ) -> TrajectoryMetrics | None:
     if truth is None or truth.trajectory is None:
@@ -194,6 +203,18 @@ def _compare(
         return evaluate_trajectory(trajectory, truth.trajectory)
     except EvaluationError as error:
         warnings.append(f"not compared with the true path: {error}")
+        return None
+
+
+def _compare_surfaces(
+    cloud: PointCloud, truth: SequenceTruth | None, warnings: list[str]
+) -> MapMetrics | None:
+    if truth is None or truth.surface is None:
+        return None
+    try:
+        return evaluate_map(cloud, truth.surface, SURFACE_THRESHOLD_M)
+    except EvaluationError as error:
+        warnings.append(f"not compared with the true surface: {error}")
         return None
 
 
@@ -213,6 +234,8 @@ def _summary(run: MapRun) -> dict[str, Any]:
     }
     if run.metrics is not None:
         figures["trajectory"] = plain(run.metrics)
+    if run.map_metrics is not None:
+        figures["map"] = plain(run.map_metrics)
     return figures
 
 
@@ -226,7 +249,8 @@ def _write(run: MapRun, directory: RunDirectory) -> None:
     write_octomap(path("map/octomap.ot"), run.mapped.voxels)
     if run.mesh is not None:
         write_mesh(path("mesh/mesh.ply"), run.mesh)
-        write_mlp(path("mesh/mesh.mlp"), [path("mesh/mesh.ply"), path("map/cloud.ply")])
+        layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("map/cloud.ply")}
+        write_mlp(path("mesh/mesh.mlp"), layers)
     write_text(path("config.yaml"), dump_config(run.config))
 
 

@@ -59,7 +59,7 @@ def run_mesh(cloud_path: Path, config: ReconConfig, options: MeshOptions) -> dic
             for suffix in dict.fromkeys(("ply", *options.formats)):
                 write_mesh(directory.path(f"mesh/mesh.{suffix}"), mesh)
             write_ply(directory.path("mesh/cloud.ply"), cloud)
-            layers = [directory.path("mesh/mesh.ply"), directory.path("mesh/cloud.ply")]
+            layers = {name: directory.path(f"mesh/{name}.ply") for name in ("mesh", "cloud")}
             write_mlp(directory.path("mesh/mesh.mlp"), layers)
             write_text(directory.path("config.yaml"), dump_config(config))
         summary = {

@@ -150,7 +150,8 @@ def _reconstruct(
 ) -> PairRun:
     """The run of a pair with cloud and mesh; without a mesh it is still a run."""
     frame = reconstructor.reconstruct(given.pair)
-    mesh, warnings = None, ()
+    mesh: TriangleMesh | None = None
+    warnings: tuple[str, ...] = ()
     try:
         with watch.stage("mesh"):
             mesh = reconstruct_mesh(frame.cloud, config.mesh)
@@ -226,4 +227,5 @@ def _write(run: PairRun, directory: RunDirectory) -> None:
     write_ply(path("clouds/cloud.ply"), run.cloud)
     if run.mesh is not None:
         write_mesh(path("mesh/mesh.ply"), run.mesh)
-        write_mlp(path("mesh/mesh.mlp"), [path("mesh/mesh.ply"), path("clouds/cloud.ply")])
+        layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("clouds/cloud.ply")}
+        write_mlp(path("mesh/mesh.mlp"), layers)
