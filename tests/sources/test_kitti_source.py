@@ -1,0 +1,223 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.errors import CalibrationError, FormatError, ReconError, SourceError
+from recon.formats.image import write_image
+from recon.formats.trajectory import read_kitti_poses
+from recon.sources.kitti import KittiSource
+from recon.sources.protocol import StereoSource
+
+CALIB = {
+    0: "700 0 16 0 0 700 8 0 0 0 1 0",
+    1: "700 0 16 -350 0 700 8 0 0 0 1 0",
+    2: "700 0 16 70 0 700 8 0 0 0 1 0",  # 0.1 m to the left of camera 0
+    3: "700 0 16 -280 0 700 8 0 0 0 1 0",
+}
+IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0\n"
+# A quarter turn to the right about the y axis, and a metre ahead.
+TURNED = "0 0 1 0 0 1 0 0 -1 0 0 1\n"
+
+
+def make_drive(
+    folder: Path, frames: int = 3, cameras: tuple[int, ...] = (0, 1), poses: str | None = None
+) -> Path:
+    rng = np.random.default_rng(0)
+    for camera in cameras:
+        for frame in range(frames):
+            shape = (16, 32) if camera < 2 else (16, 32, 3)
+            picture = rng.integers(0, 256, shape, dtype=np.uint8)
+            write_image(folder / f"image_{camera}" / f"{frame:06d}.png", picture)
+    (folder / "calib.txt").write_text("".join(f"P{c}: {CALIB[c]}\n" for c in cameras))
+    (folder / "times.txt").write_text("".join(f"{0.1 * frame:.6f}\n" for frame in range(frames)))
+    if poses is not None:
+        (folder / "poses.txt").write_text(poses)
+    return folder
+
+
+def test_a_drive_gives_its_pairs_in_order_with_times_and_names(tmp_path: Path) -> None:
+    source = KittiSource(make_drive(tmp_path / "drive"))
+    assert isinstance(source, StereoSource)
+    pairs = list(source)
+    assert (source.name, len(source), len(pairs)) == ("drive", 3, 3)
+    assert [pair.index for pair in pairs] == [0, 1, 2]
+    assert [pair.timestamp_s for pair in pairs] == [0, 0.1, 0.2]
+    assert pairs[1].name == "000001.png"
+    assert not np.array_equal(pairs[0].left, pairs[0].right)
+    assert (source.calibration.width_px, source.calibration.height_px) == (32, 16)
+    assert source.calibration.baseline_m == 0.5
+    assert source.truth is None
+
+
+def test_a_source_can_be_iterated_again(tmp_path: Path) -> None:
+    source = KittiSource(make_drive(tmp_path))
+    assert len(list(source)) == len(list(source)) == 3
+
+
+def test_the_grey_pair_is_taken_unless_only_the_colour_pair_is_whole(tmp_path: Path) -> None:
+    both = make_drive(tmp_path / "both", cameras=(0, 1, 2, 3))
+    assert next(iter(KittiSource(both))).left.ndim == 2
+    assert next(iter(KittiSource(both, cameras=(2, 3)))).left.ndim == 3
+    colour = make_drive(tmp_path / "colour", cameras=(0, 2, 3))
+    assert next(iter(KittiSource(colour))).left.ndim == 3
+
+
+def test_truth_starts_at_the_identity(tmp_path: Path) -> None:
+    truth = KittiSource(make_drive(tmp_path, 2, poses=TURNED + TURNED)).truth
+    assert truth is not None
+    assert truth.trajectory is not None
+    expected = np.stack([np.eye(4)] * 2)
+    np.testing.assert_allclose(truth.trajectory.T_world_camera, expected, atol=1e-12)
+    np.testing.assert_array_equal(truth.trajectory.timestamps_s, [0, 0.1])
+
+
+def test_truth_of_the_colour_pair_is_that_of_its_own_left_camera(tmp_path: Path) -> None:
+    folder = make_drive(tmp_path, 2, cameras=(2, 3), poses=IDENTITY + TURNED)
+    truth = KittiSource(folder).truth
+    assert truth is not None
+    assert truth.trajectory is not None
+    # Camera 2 sits at x = -0.1 m. Turned to the right about camera 0 it comes to z = 1 + 0.1 m.
+    np.testing.assert_allclose(truth.trajectory.positions_m, [[0, 0, 0], [0.1, 0, 1.1]], atol=1e-12)
+
+
+def test_poses_of_the_official_download_are_found_beside_the_sequences(tmp_path: Path) -> None:
+    folder = make_drive(tmp_path / "sequences" / "06")
+    (tmp_path / "poses").mkdir()
+    (tmp_path / "poses" / "06.txt").write_text(IDENTITY * 3)
+    assert KittiSource(folder).truth is not None
+
+
+def test_lines_beyond_the_last_picture_are_ignored(tmp_path: Path) -> None:
+    folder = make_drive(tmp_path, 3, poses=IDENTITY * 5)
+    (folder / "times.txt").write_text("0\n1\n2\n3\n4\n")
+    source = KittiSource(folder)
+    assert source.truth is not None
+    assert source.truth.trajectory is not None
+    assert len(source) == len(source.truth.trajectory) == 3
+
+
+def test_other_files_among_the_pictures_are_no_frames(tmp_path: Path) -> None:
+    folder = make_drive(tmp_path)
+    (folder / "image_0" / "Thumbs.db").write_text("x")
+    (folder / "image_0" / "._000000.png").write_text("x")
+    assert len(KittiSource(folder)) == 3
+
+
+def remove(name: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).unlink()
+
+
+def write(name: str, text: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).write_text(text) and None
+
+
+def empty(name: str) -> Callable[[Path], None]:
+    return lambda folder: [path.unlink() for path in (folder / name).iterdir()] and None
+
+
+def drop_folder(name: str) -> Callable[[Path], None]:
+    def spoil(folder: Path) -> None:
+        empty(name)(folder)
+        (folder / name).rmdir()
+
+    return spoil
+
+
+def empty_both(folder: Path) -> None:
+    empty("image_0")(folder)
+    empty("image_1")(folder)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "message"),
+    [
+        (remove("image_1/000001.png"), SourceError,
+         r"image_1/000001\.png: picture is missing \(got 3 left and 2 right pictures\)"),
+        (remove("image_0/000002.png"), SourceError, r"image_0/000002\.png: picture is missing"),
+        (empty("image_1"), SourceError, r"image_1/000000\.png: picture is missing"),
+        (empty_both, SourceError, "image_0: folder holds no pictures"),
+        (drop_folder("image_1"), SourceError, "folder of the other camera is missing.*image_1"),
+        (remove("calib.txt"), SourceError, r"calib\.txt: calibration is missing"),
+        (write("calib.txt", f"P0: {CALIB[0]}\n"), FormatError, r"calib\.txt: .*has no P1"),
+        (write("calib.txt", f"P0: {CALIB[0]}\nP1: {CALIB[0]}\n"), CalibrationError,
+         r"calib\.txt: baseline is zero"),
+        (write("calib.txt", f"P0: {CALIB[1]}\nP1: {CALIB[0]}\n"), CalibrationError,
+         r"calib\.txt: baseline is negative.*swapped"),
+        (remove("times.txt"), SourceError, r"times\.txt: times are missing"),
+        (write("times.txt", "0\n0.1\n"), SourceError,
+         r"times\.txt: fewer times than pictures \(got 2 times, expected 3\)"),
+        (write("times.txt", "0\n0.2\n0.1\n"), FormatError, r"times\.txt:3: time runs backwards"),
+        (write("times.txt", "0\nnan\n1\n"), FormatError, r"times\.txt:2: number is not finite"),
+        (write("poses.txt", IDENTITY), SourceError,
+         r"poses\.txt: fewer poses than pictures \(got 1 poses, expected 3\)"),
+        (write("poses.txt", IDENTITY * 2 + "nan " * 12), FormatError,
+         r"poses\.txt:3: number is not finite"),
+        (write("poses.txt", "2" + IDENTITY[1:]), FormatError, r"poses\.txt:1: .*no rigid motion"),
+        (write("image_0/000000.png", "text"), FormatError, r"000000\.png: not an image"),
+    ],
+)  # fmt: skip
+def test_a_spoiled_drive_is_refused_before_the_run_with_one_line_that_names_the_file(
+    tmp_path: Path, spoil: Callable[[Path], None], error: type[ReconError], message: str
+) -> None:
+    folder = make_drive(tmp_path, poses=IDENTITY * 3)
+    spoil(folder)
+    with pytest.raises(error, match=message) as caught:
+        KittiSource(folder)
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["image_0/000002.png", "image_1/000001.png"])
+def test_a_picture_of_another_size_is_named_when_its_turn_comes(tmp_path: Path, name: str) -> None:
+    folder = make_drive(tmp_path)
+    write_image(folder / name, np.zeros((16, 31), dtype=np.uint8))
+    source = KittiSource(folder)
+    with pytest.raises(FormatError, match=rf"{name}: .*another size.*got 31x16, expected 32x16"):
+        list(source)
+
+
+def test_a_truncated_picture_is_named_when_its_turn_comes(tmp_path: Path) -> None:
+    folder = make_drive(tmp_path)
+    path = folder / "image_1" / "000001.png"
+    path.write_bytes(path.read_bytes()[:100])
+    pairs = iter(KittiSource(folder))
+    next(pairs)
+    with pytest.raises(FormatError, match=r"000001\.png: PNG image is truncated"):
+        next(pairs)
+
+
+def test_a_missing_folder_is_told(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="drive: folder does not exist"):
+        KittiSource(tmp_path / "drive")
+    with pytest.raises(SourceError, match="image_2: folder does not exist"):
+        KittiSource(make_drive(tmp_path), cameras=(2, 3))
+    (tmp_path / "other").mkdir()
+    with pytest.raises(SourceError, match="other: folder has no pictures in KITTI's layout"):
+        KittiSource(tmp_path / "other")
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("drive", "frames", "size", "baseline_m"),
+    [("kitti_raw_0013", 144, (1242, 375), 0.5372), ("kitti_06_51", 51, (1226, 370), 0.5372)],
+)
+def test_real_drives_open_with_their_truth(
+    recon_data: Path, drive: str, frames: int, size: tuple[int, int], baseline_m: float
+) -> None:
+    folder = recon_data / "driven" / drive
+    source = KittiSource(folder)
+    camera = source.calibration
+    assert (len(source), (camera.width_px, camera.height_px)) == (frames, size)
+    assert camera.baseline_m == pytest.approx(baseline_m, abs=1e-4)
+    assert source.truth is not None
+    assert source.truth.trajectory is not None
+    published = read_kitti_poses(folder / "poses.txt")
+    assert source.truth.trajectory.path_length_m == pytest.approx(published.path_length_m, abs=1e-6)
+    first = next(iter(source))
+    assert first.left.shape == (size[1], size[0])
+    # The drives are recorded at about 10 Hz.
+    assert 0.09 < np.median(np.diff(source.truth.trajectory.timestamps_s)) < 0.12

@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.errors import CalibrationError, FormatError, ReconError, SourceError
+from recon.formats.image import write_image
+from recon.sources.files import FilesSource, read_pair
+from recon.sources.kitti import KittiSource
+from recon.sources.middlebury import MiddleburySource
+from recon.sources.protocol import StereoSource
+from recon.sources.registry import SOURCES, open_source
+
+KITTI = "P0: 700 0 16 0 0 700 8 0 0 0 1 0\nP1: 700 0 16 -350 0 700 8 0 0 0 1 0\n"
+MIDDLEBURY = (
+    "cam0=[700 0 16; 0 700 8; 0 0 1]\ncam1=[700 0 18; 0 700 8; 0 0 1]\n"
+    "doffs=2\nbaseline=500\nwidth=32\nheight=16\nndisp=20\n"
+)
+
+
+def picture(width: int = 32, *, colour: bool = False) -> np.ndarray:
+    shape = (16, width, 3) if colour else (16, width)
+    return np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
+
+
+def make_kitti(folder: Path) -> Path:
+    for camera in (0, 1):
+        write_image(folder / f"image_{camera}" / "000000.png", picture())
+    (folder / "calib.txt").write_text(KITTI)
+    (folder / "times.txt").write_text("0\n")
+    return folder
+
+
+def make_middlebury(folder: Path) -> Path:
+    for name in ("im0.png", "im1.png"):
+        write_image(folder / name, picture(colour=True))
+    (folder / "calib.txt").write_text(MIDDLEBURY)
+    return folder
+
+
+def make_files(folder: Path, right_width: int = 32) -> tuple[Path, Path, Path]:
+    write_image(folder / "left.png", picture())
+    write_image(folder / "right.png", picture(right_width))
+    (folder / "calib.txt").write_text(KITTI)
+    return folder / "left.png", folder / "right.png", folder / "calib.txt"
+
+
+@pytest.mark.parametrize(("kind", "make"), [("kitti", make_kitti), ("middlebury", make_middlebury)])
+def test_each_kind_is_recognised_by_its_files_and_keeps_the_protocol(
+    tmp_path: Path, kind: str, make: type
+) -> None:
+    folder = make(tmp_path / "folder")
+    for source in (open_source(folder), open_source(folder, kind)):
+        assert type(source) is SOURCES[kind]
+        assert isinstance(source, StereoSource)
+        assert source.name == "folder"
+        assert len(source) == len(list(source)) == 1
+
+
+def test_a_middlebury_scene_has_its_geometry_and_no_path(tmp_path: Path) -> None:
+    source = MiddleburySource(make_middlebury(tmp_path))
+    assert (source.calibration.baseline_m, source.calibration.doffs_px) == (0.5, 2)
+    assert source.truth is None
+    assert source.scene.ndisp == 20
+
+
+def test_a_middlebury_scene_without_published_geometry_is_refused(tmp_path: Path) -> None:
+    for name in ("im2.png", "im6.png"):
+        write_image(tmp_path / name, picture())
+    with pytest.raises(CalibrationError, match=r"no calibration is published.*expected calib\.txt"):
+        open_source(tmp_path)
+
+
+def test_one_pair_of_files_is_a_source(tmp_path: Path) -> None:
+    source = FilesSource(*make_files(tmp_path))
+    assert isinstance(source, StereoSource)
+    assert (source.name, len(source), source.truth) == ("left.png", 1, None)
+    assert len(list(source)) == 1
+    assert source.calibration.baseline_m == 0.5
+
+
+def test_a_grey_and_a_coloured_picture_make_a_coloured_pair(tmp_path: Path) -> None:
+    write_image(tmp_path / "l.png", picture())
+    write_image(tmp_path / "r.png", picture(colour=True))
+    pair = read_pair(tmp_path / "l.png", tmp_path / "r.png")
+    assert pair.left.shape == pair.right.shape == (16, 32, 3)
+    np.testing.assert_array_equal(pair.left[:, :, 1], picture())
+
+
+def test_files_of_different_size_are_refused_with_both_sizes(tmp_path: Path) -> None:
+    files = make_files(tmp_path, right_width=31)
+    with pytest.raises(SourceError, match=r"right\.png: .*got left 32x16, right 31x16"):
+        FilesSource(*files)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("left.png", r"left\.png: file does not exist"),
+        ("right.png", r"right\.png: file does not exist"),
+        ("calib.txt", r"calib\.txt: file does not exist"),
+    ],
+)
+def test_a_missing_file_of_a_pair_is_named(tmp_path: Path, name: str, message: str) -> None:
+    files = make_files(tmp_path)
+    (tmp_path / name).unlink()
+    with pytest.raises(FormatError, match=message):
+        FilesSource(*files)
+
+
+def make_nothing(folder: Path) -> None:
+    del folder
+
+
+def make_file(folder: Path) -> None:
+    folder.write_text("x")
+
+
+def make_empty(folder: Path) -> None:
+    folder.mkdir()
+
+
+def make_other(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "notes.txt").write_text("x")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (make_nothing, "folder does not exist"),
+        (make_file, "not a folder"),
+        (make_empty, "folder is empty"),
+        (make_other, "folder is no source of stereo pairs.*KITTI drive.*Middlebury scene"),
+    ],
+)
+def test_what_is_no_source_is_one_clear_line(tmp_path: Path, make: type, message: str) -> None:
+    make(tmp_path / "input")
+    with pytest.raises(SourceError, match=rf"input: {message}"):
+        open_source(tmp_path / "input")
+
+
+def test_an_unknown_kind_gets_the_choices(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"got euroc, expected kitti, middlebury"):
+        open_source(tmp_path, "euroc")
+
+
+def test_half_a_drive_is_told_as_a_drive_and_not_as_unknown(tmp_path: Path) -> None:
+    folder = make_kitti(tmp_path)
+    (folder / "image_1" / "000000.png").unlink()
+    (folder / "image_1").rmdir()
+    with pytest.raises(SourceError, match="folder of the other camera is missing"):
+        open_source(folder)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("path", "kind"),
+    [
+        ("driven/kitti_06_51", KittiSource),
+        ("middlebury/MiddEval3/trainingQ/Piano", MiddleburySource),
+        ("middlebury/2005/Art", MiddleburySource),
+        ("middlebury/2003/Cones", None),
+    ],
+)
+def test_real_folders_are_recognised(recon_data: Path, path: str, kind: type | None) -> None:
+    if kind is None:
+        with pytest.raises(ReconError, match="no calibration is published"):
+            open_source(recon_data / path)
+    else:
+        assert isinstance(open_source(recon_data / path), kind)
