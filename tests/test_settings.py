@@ -1,0 +1,49 @@
+from __future__ import annotations
+
+import pytest
+from pydantic import Field, ValidationError
+
+from recon.errors import SettingsError
+from recon.settings import Settings
+
+
+class Inner(Settings):
+    window_px: int = Field(default=9, ge=1, description="Window.")
+
+
+class Outer(Settings):
+    inner: Inner = Inner()
+    name: str = Field(default="a", description="Name.")
+
+
+def test_settings_come_from_plain_values_and_give_them_back() -> None:
+    settings = Outer.parse({"inner": {"window_px": 5}})
+    assert settings == Outer(inner=Inner(window_px=5))
+    assert Outer.parse(settings.model_dump()) == settings
+
+
+def test_settings_cannot_be_changed() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        Outer().name = "b"
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"nmae": "b"}, r"config\.yaml: unknown setting 'nmae'; .*lists them all"),
+        ({"inner": {"window": 3}}, r"config\.yaml: unknown setting 'inner\.window'"),
+        ({"inner": {"window_px": 0}}, r"setting 'inner\.window_px': .*greater than.*\(got 0\)"),
+        ({"inner": {"window_px": "wide"}}, r"setting 'inner\.window_px': .*integer.*got 'wide'"),
+    ],
+)
+def test_a_bad_setting_is_named_with_its_path(values: dict[str, object], message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        Outer.parse(values, where="config.yaml")
+
+
+def test_a_default_outside_its_bounds_is_refused() -> None:
+    class Wrong(Settings):
+        window_px: int = Field(default=0, ge=1, description="Window.")
+
+    with pytest.raises(ValidationError):
+        Wrong()
