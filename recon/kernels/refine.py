@@ -1,0 +1,193 @@
+"""From the minima of a search to disparities: sub-pixel fit, checks, how sure and how exact.
+
+Works on what any search over whole disparities leaves behind (`recon.kernels.minima.Minima`).
+The twin in plain numpy is `recon.kernels.refine_reference.refine_minima_reference`.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from recon.kernels.minima import NO_COST, Minima
+
+VALID, LOW_TEXTURE, AMBIGUOUS, LEFT_RIGHT, OCCLUDED, OUT_OF_RANGE, BORDER = range(7)
+"""The codes of `recon.structures.Reason`; a test holds them equal."""
+
+NO_FIT, EQUIANGULAR, PARABOLA = range(3)
+"""Ways to place the minimum between candidates."""
+
+SIGMA_LARGEST_PX: Final = 2.0
+"""A flat minimum tells no more than this."""
+
+HALF_SURE: Final = 0.06
+"""Margin at which the confidence is one half (see `refine_minima`)."""
+
+
+class Rules(NamedTuple):
+    """What the checks ask for.
+
+    Attributes:
+        ndisp: Number of candidates.
+        minimum: Disparity of candidate 0, pixels.
+        fit: NO_FIT, EQUIANGULAR or PARABOLA.
+        texture: Least texture of a pixel that is kept.
+        uniqueness: By how many per cent the second best cost must exceed the best.
+        left_right: Largest difference between the two views, candidates; negative = unchecked.
+        window_pixels: Number of pixels that a cost sums up.
+        sigma_floor_px: Smallest standard deviation.
+    """
+
+    ndisp: int
+    minimum: int
+    fit: int
+    texture: float
+    uniqueness: int
+    left_right: int
+    window_pixels: int
+    sigma_floor_px: float
+
+
+class Refined(NamedTuple):
+    """Disparities, as in `recon.structures.Disparity`, all (H, W).
+
+    Attributes:
+        values: float32, pixels; NaN = none.
+        confidence: float32 in [0, 1].
+        sigma_px: float32; NaN = none.
+        reason: uint8.
+    """
+
+    values: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    sigma_px: NDArray[np.float32]
+    reason: NDArray[np.uint8]
+
+
+def empty_refined(height: int, width: int) -> Refined:
+    """Arrays for `refine_minima` to write to."""
+    shape = (height, width)
+    return Refined(
+        values=np.empty(shape, np.float32),
+        confidence=np.empty(shape, np.float32),
+        sigma_px=np.empty(shape, np.float32),
+        reason=np.empty(shape, np.uint8),
+    )
+
+
+@njit(cache=True, nogil=True)
+def refine_minima(
+    minima: Minima,
+    texture: NDArray[np.float32],
+    rules: Rules,
+    first: int,
+    end: int,
+    refined: Refined,
+) -> None:
+    """Judge the minima of some rows, and measure those that stand.
+
+    The first of these that applies is the reason of a pixel: no candidate, or one that ends at
+    the border of the right picture (BORDER); too little texture (LOW_TEXTURE); the minimum at
+    an end of the range (OUT_OF_RANGE); the right view disagrees, and finds no pixel here
+    (OCCLUDED) or does (LEFT_RIGHT); a second best that is too good (AMBIGUOUS).
+
+    The sub-pixel offset is that of two equally steep lines (EQUIANGULAR, the shape of a sum of
+    absolute differences) or of a parabola. The standard deviation is that of a displacement
+    estimated from N pixels with gradient g and noise n, here in its least-absolute form,
+    ``pi/2 · mean|n| / (mean|g| · sqrt(N))``; the cost at the vertex of the lines is N·mean|n|,
+    their slope is N·mean|g|. A floor is added (squared) for what the model leaves out. The
+    confidence is ``m / (m + HALF_SURE)`` of the margin ``m = (second - best) / (N + best)``: the
+    distance of the two costs in units of the noise, one grey level added.
+
+    Args:
+        minima: What the search found.
+        texture: float32 (H, W), in the unit of ``rules.texture``; NaN = no picture there (BORDER).
+        rules: What is asked for.
+        first: First row to do.
+        end: The row after the last.
+        refined: Written: the rows ``first`` to ``end - 1``.
+
+    Ref: H. Hirschmüller, "Stereo processing by semiglobal matching and mutual information",
+    PAMI 30, 2008, section 2.6 (occluded or mismatched); M. Shimizu, M. Okutomi, "Sub-pixel
+    estimation error cancellation on area-based matching", IJCV 63, 2005 (equiangular fit);
+    L. Matthies, "Stereo vision for planetary rovers: stochastic modeling to near real-time
+    implementation", IJCV 8, 1992 (variance).
+    """
+    claimed = np.empty(minima.winner.shape[1], np.bool_)
+    for y in range(first, end):
+        _claim(minima.right_winner[y], rules, claimed)
+        for x in range(minima.winner.shape[1]):
+            reason = _judge(minima, texture[y, x], claimed[x], rules, y, x)
+            refined.reason[y, x] = np.uint8(reason)
+            refined.values[y, x] = np.float32(np.nan)
+            refined.sigma_px[y, x] = np.float32(np.nan)
+            refined.confidence[y, x] = np.float32(0)
+            if reason == VALID:
+                _measure(minima, rules, y, x, refined)
+
+
+@njit(cache=True, nogil=True)
+def _claim(right_winner: NDArray[np.uint16], rules: Rules, claimed: NDArray[np.bool_]) -> None:
+    """Mark the columns of the left view where a pixel of the right view has its best match.
+
+    Their neighbours count too: a slanted surface that is wider in the left view leaves gaps.
+    """
+    width = claimed.size
+    claimed[:] = False
+    for x_right in range(width):
+        x = x_right + rules.minimum + np.int64(right_winner[x_right])
+        if right_winner[x_right] < rules.ndisp:
+            claimed[max(x - 1, 0) : min(x + 2, width)] = True
+
+
+@njit(cache=True, nogil=True)
+def _judge(minima: Minima, texture: float, claimed: bool, rules: Rules, y: int, x: int) -> int:
+    """The reason of one pixel, before speckles are looked for."""
+    k = np.int64(minima.winner[y, x])
+    if k == rules.ndisp or np.isnan(texture):
+        return BORDER
+    if texture < rules.texture:
+        return LOW_TEXTURE
+    if max(minima.costs[1, y, x], minima.costs[2, y, x]) == NO_COST:
+        return OUT_OF_RANGE if k in (0, rules.ndisp - 1) else BORDER
+    if rules.left_right >= 0:
+        other = np.int64(minima.right_winner[y, x - rules.minimum - k])
+        if abs(other - k) > rules.left_right:
+            return LEFT_RIGHT if claimed else OCCLUDED
+    best, second = np.int64(minima.costs[0, y, x]), np.int64(minima.costs[3, y, x])
+    if rules.uniqueness > 0 and 100 * second <= best * (100 + rules.uniqueness):
+        return AMBIGUOUS
+    return VALID
+
+
+@njit(cache=True, nogil=True)
+def _measure(minima: Minima, rules: Rules, y: int, x: int, refined: Refined) -> None:
+    """Write disparity, standard deviation and confidence of one pixel; float64 inside."""
+    best, second = np.float64(minima.costs[0, y, x]), np.float64(minima.costs[3, y, x])
+    before, after = np.float64(minima.costs[1, y, x]), np.float64(minima.costs[2, y, x])
+    offset = _offset(best, before, after, rules.fit)
+    refined.values[y, x] = np.float32(rules.minimum + np.float64(minima.winner[y, x]) + offset)
+    slope = max(before, after) - best
+    vertex = max(best - 0.5 * abs(before - after), 0.0)
+    sigma = SIGMA_LARGEST_PX
+    if slope > 0.0:
+        noise = 0.5 * np.pi * vertex / (slope * np.sqrt(rules.window_pixels))
+        sigma = min(np.sqrt(rules.sigma_floor_px**2 + noise * noise), sigma)
+    refined.sigma_px[y, x] = np.float32(sigma)
+    if second < NO_COST:
+        margin = (second - best) / (rules.window_pixels + best)
+        refined.confidence[y, x] = np.float32(margin / (margin + HALF_SURE))
+
+
+@njit(cache=True, nogil=True)
+def _offset(best: float, before: float, after: float, fit: int) -> float:
+    """Where the minimum lies between candidates, in [-0.5, 0.5]."""
+    steepness = max(before, after) - best
+    if fit == PARABOLA:
+        steepness = before + after - 2.0 * best
+    if fit == NO_FIT or steepness <= 0.0:
+        return 0.0
+    return 0.5 * (before - after) / steepness

@@ -1,0 +1,67 @@
+"""`recon.kernels.sad` in plain numpy: slow, short, and the definition of its results."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.kernels.minima import NO_COST, Minima
+from recon.kernels.sad import Search
+
+
+def sad_minima_reference(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search
+) -> Minima:
+    """All rows of `recon.kernels.sad.sad_minima`, from pictures (H, W) that are not mirrored."""
+    return minima_reference(window_costs_reference(left, right, search), search.minimum)
+
+
+def window_costs_reference(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search
+) -> NDArray[np.int64]:
+    """int64 (H, W, ndisp), the cost of each candidate, as if both pictures went on for ever."""
+    height, width = left.shape
+    costs = np.zeros((height, width, search.ndisp), np.int64)
+    disparities = search.minimum + np.arange(search.ndisp)
+    y, x = np.arange(height), np.arange(width)
+    for dy in range(-search.rows_radius, search.rows_radius + 1):
+        rows = np.clip(y + dy, 0, height - 1)[:, None]
+        for dx in range(-search.radius, search.radius + 1):
+            columns = np.clip(x + dx, 0, width - 1)
+            others = np.clip(x[:, None] + dx - disparities, 0, width - 1)
+            a = left[rows, columns].astype(np.int64)[:, :, None]
+            b = right[rows[:, :, None], others[None]].astype(np.int64)
+            costs += np.minimum(np.abs(a - b), search.cost_cap)
+    return costs
+
+
+def minima_reference(costs: NDArray[np.int64], minimum: int) -> Minima:
+    """The minima of costs (H, W, ndisp) in both views."""
+    width, ndisp = costs.shape[1:]
+    k = np.arange(ndisp)
+    x = np.arange(width)[:, None]
+    inside = (x - minimum - k >= 0) & (x - minimum - k < width)
+    open_costs = np.where(inside, costs, NO_COST)
+    winner = np.where(inside.any(axis=1), open_costs.argmin(axis=2), ndisp)
+    picked = np.stack(
+        [
+            _cost_at(open_costs, winner),
+            _cost_at(open_costs, winner - 1),
+            _cost_at(open_costs, np.where(winner < ndisp, winner + 1, ndisp)),
+            np.where(np.abs(k - winner[:, :, None]) < 2, NO_COST, open_costs).min(axis=2),
+        ]
+    )
+    # Column x_right of the right view sees left column x_right + minimum + k as candidate k.
+    seen = x + minimum + k
+    clipped = np.clip(seen, 0, width - 1)
+    right_costs = np.where(seen == clipped, costs[:, clipped, k], NO_COST)
+    right = np.where((seen == clipped).any(axis=1), right_costs.argmin(axis=2), ndisp)
+    return Minima(winner.astype(np.uint16), picked.astype(np.uint16), right.astype(np.uint16))
+
+
+def _cost_at(costs: NDArray[np.int64], k: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Costs (H, W) of one candidate of each pixel; `NO_COST` outside the range."""
+    ndisp = costs.shape[2]
+    there = np.clip(k, 0, ndisp - 1)[:, :, None]
+    cost = np.take_along_axis(costs, there, axis=2)[:, :, 0]
+    return np.where((k >= 0) & (k < ndisp), cost, NO_COST)

@@ -1,0 +1,160 @@
+"""The compiled checks equal their twin, and the codes are those of the values."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from recon.kernels import refine
+from recon.kernels.minima import NO_COST, Minima
+from recon.kernels.refine import (
+    EQUIANGULAR,
+    PARABOLA,
+    Refined,
+    Rules,
+    empty_refined,
+    refine_minima,
+)
+from recon.kernels.refine_reference import refine_minima_reference
+from recon.structures import Reason
+
+RULES = Rules(
+    ndisp=8,
+    minimum=0,
+    fit=EQUIANGULAR,
+    texture=0.0,
+    uniqueness=0,
+    left_right=1,
+    window_pixels=25,
+    sigma_floor_px=0.1,
+)
+
+
+def refine_all(minima: Minima, texture: np.ndarray, rules: Rules) -> Refined:
+    refined = empty_refined(*minima.winner.shape)
+    refine_minima(minima, texture, rules, 0, len(texture), refined)
+    return refined
+
+
+def one_pixel(costs: tuple[int, int, int, int]) -> Minima:
+    """A row of eight pixels whose candidate 3 won with ``costs``."""
+    return Minima(
+        winner=np.full((1, 8), 3, np.uint16),
+        costs=np.tile(np.array(costs, np.uint16)[:, None, None], (1, 1, 8)),
+        right_winner=np.full((1, 8), 3, np.uint16),
+    )
+
+
+def refine_one(minima: Minima, rules: Rules = RULES) -> tuple[float, float, float, int]:
+    refined = refine_all(minima, np.ones((1, 8), np.float32), rules)
+    value, confidence, sigma, reason = (part[0, 5].item() for part in refined)
+    return value, confidence, sigma, reason
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> tuple[Minima, np.ndarray, Rules]:
+    height, width = draw(st.tuples(st.integers(1, 4), st.integers(1, 9)))
+    ndisp, minimum = draw(st.integers(1, 9)), draw(st.integers(-4, 4))
+    x = np.arange(width)
+    low = np.clip(x - minimum - (width - 1), 0, ndisp)
+    high = np.clip(x - minimum, -1, ndisp - 1)
+    share = draw(hnp.arrays(np.float64, (height, width), elements=st.floats(0, 1)))
+    inside = np.rint(low + share * np.maximum(high - low, 0))
+    winner = np.where(low <= high, inside, ndisp)
+    cost = st.one_of(st.integers(0, 40), st.just(NO_COST))
+    costs = np.sort(draw(hnp.arrays(np.uint16, (4, height, width), elements=cost)), axis=0)
+    right = draw(hnp.arrays(np.uint16, (height, width), elements=st.integers(0, ndisp)))
+    grey = st.one_of(st.floats(0, 4, width=32), st.just(math.nan))
+    texture = draw(hnp.arrays(np.float32, (height, width), elements=grey))
+    rules = RULES._replace(
+        ndisp=ndisp,
+        minimum=minimum,
+        fit=draw(st.integers(0, 2)),
+        texture=draw(st.sampled_from([0.0, 2.0])),
+        uniqueness=draw(st.sampled_from([0, 15])),
+        left_right=draw(st.integers(-1, 1)),
+    )
+    return Minima(winner.astype(np.uint16), costs, right), texture, rules
+
+
+@settings(deadline=None)  # the first call compiles
+@given(cases())
+def test_refinement_equals_its_twin(case: tuple[Minima, np.ndarray, Rules]) -> None:
+    found, expected = refine_all(*case), refine_minima_reference(*case)
+    for name in Refined._fields:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(cases())
+def test_results_lie_within_their_bounds(case: tuple[Minima, np.ndarray, Rules]) -> None:
+    minima, _, rules = case
+    refined = refine_all(*case)
+    kept = refined.reason == refine.VALID
+    np.testing.assert_array_equal(np.isfinite(refined.values), kept)
+    np.testing.assert_array_equal(np.isfinite(refined.sigma_px), kept)
+    assert (refined.confidence[~kept] == 0).all()
+    assert ((refined.confidence >= 0) & (refined.confidence <= 1)).all()
+    # The floor is float64 in the rules and float32 in the result.
+    assert (refined.sigma_px[kept] >= np.float32(rules.sigma_floor_px)).all()
+    assert (refined.sigma_px[kept] <= refine.SIGMA_LARGEST_PX).all()
+    whole = minima.winner[kept] + float(rules.minimum)
+    assert (np.abs(refined.values[kept] - whole) <= 0.5).all()
+
+
+def test_codes_are_those_of_the_values() -> None:
+    names = ("VALID", "LOW_TEXTURE", "AMBIGUOUS", "LEFT_RIGHT", "OCCLUDED", "OUT_OF_RANGE")
+    for name in (*names, "BORDER"):
+        assert getattr(refine, name) == Reason[name]
+
+
+def test_vertex_of_two_equal_slopes_is_found_exactly() -> None:
+    # Costs of |d - 3.25| · 40 + 10 at 2, 3 and 4.
+    value, _, _, reason = refine_one(one_pixel((20, 60, 40, 100)))
+    assert reason == Reason.VALID
+    assert value == 3.25
+
+
+def test_vertex_of_a_parabola_is_found_exactly() -> None:
+    # Costs of 16·(d - 3.25)² + 9 at 2, 3 and 4.
+    value, *_ = refine_one(one_pixel((10, 34, 18, 100)), RULES._replace(fit=PARABOLA))
+    assert value == 3.25
+
+
+@pytest.mark.parametrize(("claimant", "reason"), [(None, Reason.OCCLUDED), (4, Reason.LEFT_RIGHT)])
+def test_pixel_is_occluded_where_no_pixel_of_the_right_view_has_its_match(
+    claimant: int | None, reason: Reason
+) -> None:
+    minima = one_pixel((20, 60, 40, 100))
+    # Left pixel 5 looks at right pixel 2, which has its match elsewhere (2 + 6 = 8).
+    minima.right_winner[:] = 8
+    minima.right_winner[0, 2] = 6
+    if claimant is not None:
+        minima.right_winner[0, claimant] = 5 - claimant
+    assert refine_one(minima)[3] == reason
+
+
+def test_second_best_within_the_margin_is_ambiguous() -> None:
+    rules = RULES._replace(uniqueness=10)
+    assert refine_one(one_pixel((20, 60, 40, 22)), rules)[3] == Reason.AMBIGUOUS
+    assert refine_one(one_pixel((20, 60, 40, 23)), rules)[3] == Reason.VALID
+
+
+def test_confidence_grows_with_the_margin_and_is_nought_without_a_rival() -> None:
+    close, far = (refine_one(one_pixel((20, 60, 40, n)))[1] for n in (30, 100))
+    assert 0 < close < far < 1
+    assert refine_one(one_pixel((20, 60, 40, NO_COST)))[1] == 0
+
+
+@pytest.mark.parametrize(("steeper", "sigma_px"), [(1, 2.0), (2, 0.1)])
+def test_sigma_is_the_floor_without_noise_and_the_limit_without_slope(
+    steeper: int, sigma_px: float
+) -> None:
+    costs = (20, 20, 20, 100) if steeper == 1 else (0, 50, 50, 100)
+    # 1e-6: float32.
+    assert refine_one(one_pixel(costs))[2] == pytest.approx(sigma_px, abs=1e-6)

@@ -1,0 +1,92 @@
+"""The compiled search equals its twin, for any picture, window and range."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
+
+from recon.kernels.minima import NO_COST, Minima, empty_minima
+from recon.kernels.sad import Search, mirror_right, sad_minima
+from recon.kernels.sad_reference import sad_minima_reference
+
+Image = NDArray[np.uint8]
+
+
+def search_all(left: Image, right: Image, search: Search, strips: int = 1) -> Minima:
+    minima = empty_minima(*left.shape)
+    mirrored = mirror_right(right, search)
+    edges = np.linspace(0, len(left), strips + 1).astype(int)
+    for first, end in itertools.pairwise(edges):
+        sad_minima(left, mirrored, search, int(first), int(end), minima)
+    return minima
+
+
+def assert_equal(found: Minima, expected: Minima) -> None:
+    for name in Minima._fields:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+
+
+@st.composite
+def pairs(draw: st.DrawFn) -> tuple[Image, Image]:
+    shape = draw(st.tuples(st.integers(1, 9), st.integers(1, 13)))
+    # Few grey levels make ties, many make overflows.
+    levels = draw(st.sampled_from([1, 3, 255]))
+    grey = hnp.arrays(np.uint8, shape, elements=st.integers(0, levels))
+    return draw(grey), draw(grey)
+
+
+searches = st.builds(
+    Search,
+    ndisp=st.integers(1, 18),
+    minimum=st.integers(-16, 16),
+    radius=st.integers(0, 4),
+    rows_radius=st.integers(0, 4),
+    cost_cap=st.sampled_from([1, 20, 255]),
+)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(pairs(), searches)
+def test_search_equals_its_twin(pair: tuple[Image, Image], search: Search) -> None:
+    assert_equal(search_all(*pair, search), sad_minima_reference(*pair, search))
+
+
+@settings(deadline=None)  # the first call compiles
+@given(pairs(), searches, st.integers(2, 4))
+def test_strips_do_not_change_the_result(
+    pair: tuple[Image, Image], search: Search, strips: int
+) -> None:
+    assert_equal(search_all(*pair, search, strips), search_all(*pair, search))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
+def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
+    grey = np.zeros(shape, np.uint8)
+    search = Search(ndisp=4, minimum=0, radius=3, rows_radius=3, cost_cap=31)
+    minima = search_all(grey, grey, search)
+    assert_equal(minima, sad_minima_reference(grey, grey, search))
+    assert (minima.winner == 0).all()
+
+
+def test_largest_costs_do_not_overflow() -> None:
+    left, right = np.full((40, 40), 255, np.uint8), np.zeros((40, 40), np.uint8)
+    search = Search(ndisp=3, minimum=0, radius=7, rows_radius=8, cost_cap=255)
+    costs = search_all(left, right, search).costs[0]
+    assert (costs == 15 * 17 * 255).all()
+    assert costs.max() < NO_COST
+
+
+def test_pixels_without_a_candidate_have_no_winner() -> None:
+    grey = np.zeros((2, 8), np.uint8)
+    search = Search(ndisp=3, minimum=5, radius=1, rows_radius=1, cost_cap=31)
+    minima = search_all(grey, grey, search)
+    # Disparity 5 needs a right pixel at x - 5.
+    assert (minima.winner[:, :5] == 3).all()
+    assert (minima.winner[:, 5:] == 0).all()
+    assert (minima.costs[:, :, :5] == NO_COST).all()

@@ -1,0 +1,244 @@
+"""The SAD matcher on pictures whose disparity is known exactly."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.errors import MatchingError, SettingsError
+from recon.matching import Matcher, SadMatcher, SadSettings
+from recon.matching.sad import usual_ndisp
+from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
+from recon.structures.arrays import Float32, Float64, UInt8
+
+HEIGHT, WIDTH = 60, 120
+PLAIN = SadSettings(ndisp=32)
+
+
+def make_pair(left: UInt8, right: UInt8, valid: np.ndarray | None = None) -> RectifiedPair:
+    height, width = left.shape
+    camera = RectifiedCamera(
+        focal_px=100.0,
+        cx_px=width / 2,
+        cy_px=height / 2,
+        cx_right_px=width / 2,
+        baseline_m=0.5,
+        width_px=width,
+        height_px=height,
+    )
+    return RectifiedPair(left, right, camera, valid=valid)
+
+
+def noise(height: int = HEIGHT, width: int = WIDTH, seed: int = 0) -> UInt8:
+    grey = np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
+    return np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.0), dtype=np.uint8)
+
+
+def smooth_texture(x: Float64, y: Float64) -> UInt8:
+    """A texture that is known between pixels: waves of several directions and lengths."""
+    waves = np.random.default_rng(1).uniform(-1.2, 1.2, (24, 2))
+    phases = np.random.default_rng(2).uniform(0, 2 * np.pi, 24)
+    total = sum(np.sin(a * x + b * y + p) for (a, b), p in zip(waves, phases, strict=True))
+    return np.asarray(np.clip(128 + 18 * total, 0, 255).round(), dtype=np.uint8)
+
+
+def warped_pair(disparity: Float64) -> RectifiedPair:
+    """Left view of a surface whose disparity is given on the grid of the *right* view."""
+    y, x = np.mgrid[: disparity.shape[0], : disparity.shape[1]].astype(np.float64)
+    return make_pair(smooth_texture(x, y), smooth_texture(x + disparity, y))
+
+
+def inner(array: np.ndarray, left: int = 40, margin: int = 8) -> np.ndarray:
+    return array[margin:-margin, left:-margin]
+
+
+def test_whole_shift_is_found_exactly() -> None:
+    scene = noise(width=WIDTH + 9)
+    found = SadMatcher(PLAIN).match(make_pair(scene[:, :WIDTH], scene[:, 9:]))
+    values = inner(found.values)
+    assert np.isfinite(values).all()
+    # The fit moves a perfect match by up to half the difference of two neighbouring costs.
+    assert np.median(np.abs(values - 9)) < 0.05
+    assert (np.rint(values) == 9).all()
+
+
+def test_whole_shift_without_fit_has_no_error_at_all() -> None:
+    scene = noise(width=WIDTH + 9)
+    settings = SadSettings(ndisp=32, subpixel="none")
+    values = SadMatcher(settings).match(make_pair(scene[:, :WIDTH], scene[:, 9:])).values
+    assert (inner(values) == 9).all()
+
+
+@pytest.mark.parametrize("shift", [-6, -1, 0])
+def test_negative_disparities_are_found(shift: int) -> None:
+    scene = noise(width=WIDTH + 16)
+    left, right = scene[:, 8 : 8 + WIDTH], scene[:, 8 + shift : 8 + shift + WIDTH]
+    settings = SadSettings(min_disparity_px=-10, ndisp=20, subpixel="none")
+    values = SadMatcher(settings).match(make_pair(left, right)).values
+    assert (inner(values, margin=20) == shift).all()
+
+
+@pytest.mark.parametrize("shift", [5.25, 7.5, 10.8])
+@pytest.mark.parametrize("fit", ["equiangular", "parabola"])
+def test_fraction_of_a_pixel_is_recovered(shift: float, fit: str) -> None:
+    settings = SadSettings.parse({"ndisp": 32, "subpixel": fit})
+    pair = warped_pair(np.full((HEIGHT, WIDTH), shift))
+    values = inner(SadMatcher(settings).match(pair).values)
+    # A tenth of a pixel is what the fits reach on clean pictures; 0.25 is the mean without a fit.
+    assert np.nanmedian(np.abs(values - shift)) < 0.1
+    assert np.isfinite(values).mean() > 0.95
+
+
+def test_slanted_plane_is_followed() -> None:
+    row = np.arange(HEIGHT, dtype=np.float64)[:, None]
+    truth = np.broadcast_to(4 + 0.2 * row, (HEIGHT, WIDTH))
+    found = SadMatcher(PLAIN).match(warped_pair(truth))
+    # The disparity is constant along a row, so it is the same on the grid of both views.
+    error = inner(np.abs(found.values - truth))
+    assert np.nanmedian(error) < 0.15
+    assert np.isfinite(error).mean() > 0.9
+
+
+def square_before_wall() -> tuple[RectifiedPair, np.ndarray]:
+    """A square (disparity 20) before a wall (disparity 4), and the mask of its half shadow."""
+    wall, square = noise(80, 160, seed=3), noise(40, 50, seed=4)
+    left, right = wall[:, :144].copy(), wall[:, 4:148].copy()
+    left[20:60, 70:120] = square
+    right[20:60, 50:100] = square
+    # The square hides wall columns 50 to 99 of the right view, 54 to 103 of the left one.
+    hidden = np.zeros(left.shape, bool)
+    hidden[20:60, 54:70] = True
+    return make_pair(left, right), hidden
+
+
+def test_half_occluded_wall_is_occluded_and_not_given_a_value() -> None:
+    pair, hidden = square_before_wall()
+    found = SadMatcher(SadSettings(ndisp=32, min_texture=0)).match(pair)
+    # Windows that reach over the edge of the square may take its side: half a window aside.
+    core = np.zeros_like(hidden)
+    core[24:56, 54:62] = True
+    assert (found.reason[core] == Reason.OCCLUDED).mean() > 0.8
+    assert found.valid[core].mean() < 0.1
+    assert np.nanmedian(found.values[25:55, 80:110]) == pytest.approx(20, abs=0.1)
+    assert np.nanmedian(found.values[25:55, 10:45]) == pytest.approx(4, abs=0.1)
+
+
+def test_left_border_columns_are_searched_as_far_as_the_right_picture_reaches() -> None:
+    scene = noise(width=WIDTH + 3)
+    found = SadMatcher(SadSettings(ndisp=64)).match(make_pair(scene[:, :WIDTH], scene[:, 3:]))
+    # Far left of column 63, where a matcher that wants all 64 disparities gives nothing.
+    assert np.isfinite(found.values[:, 6:63]).mean() > 0.97
+    assert np.nanmax(np.abs(found.values[:, 6:63] - 3)) < 0.5
+
+
+def test_flat_picture_has_low_texture_everywhere() -> None:
+    grey = np.full((20, 40), 90, np.uint8)
+    found = SadMatcher(PLAIN).match(make_pair(grey, grey))
+    assert (found.reason == Reason.LOW_TEXTURE).all()
+    assert not found.confidence.any()
+
+
+def test_repeated_pattern_is_ambiguous() -> None:
+    stripes = np.tile(np.repeat(np.array([40, 200], np.uint8), 4), (40, 20))
+    found = SadMatcher(PLAIN).match(make_pair(stripes, stripes))
+    assert not inner(found.valid).any()
+
+
+def test_shift_beyond_the_range_is_mostly_refused_and_never_trusted() -> None:
+    scene = noise(width=WIDTH + 20)
+    pair = make_pair(scene[:, :WIDTH], scene[:, 20:])
+    settings = SadSettings(ndisp=12, uniqueness_percent=15)
+    wrong, right = (SadMatcher(s).match(pair) for s in (settings, PLAIN))
+    # Chance alone lets windows of noise resemble each other in both views.
+    assert inner(wrong.valid).mean() < 0.2
+    assert np.max(inner(wrong.confidence)) < np.median(inner(right.confidence))
+
+
+def test_minimum_at_an_end_of_the_range_is_out_of_range() -> None:
+    scene = noise(width=WIDTH + 7)
+    found = SadMatcher(SadSettings(ndisp=8)).match(make_pair(scene[:, :WIDTH], scene[:, 7:]))
+    assert (inner(found.reason) == Reason.OUT_OF_RANGE).mean() > 0.99
+
+
+def test_pixels_without_a_picture_are_border() -> None:
+    scene = noise()
+    valid = np.ones(scene.shape, bool)
+    valid[:, 50:60] = False
+    found = SadMatcher(PLAIN).match(make_pair(scene, scene, valid))
+    assert (found.reason[:, 50:60] == Reason.BORDER).all()
+
+
+@pytest.mark.parametrize("threads", [2, 3, 7])
+def test_number_of_threads_does_not_change_the_result(threads: int) -> None:
+    pair, _ = square_before_wall()
+    one, many = SadMatcher(PLAIN, 1).match(pair), SadMatcher(PLAIN, threads).match(pair)
+    for name in ("values", "confidence", "sigma_px", "reason"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(many, name))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 30), (30, 1), (3, 5)])
+def test_tiny_pictures_give_a_map_of_their_size(shape: tuple[int, int]) -> None:
+    grey = np.zeros(shape, np.uint8)
+    found = SadMatcher(SadSettings(ndisp=40)).match(make_pair(grey, grey))
+    assert found.values.shape == shape
+    assert not found.valid.any()
+
+
+def test_range_wider_than_the_picture_is_searched_where_it_can_be() -> None:
+    scene = noise(width=WIDTH + 9)
+    settings = SadSettings(min_disparity_px=-300, ndisp=600, subpixel="none")
+    found = SadMatcher(settings).match(make_pair(scene[:, :WIDTH], scene[:, 9:]))
+    assert (inner(found.values) == 9).mean() > 0.99
+
+
+def normalised_errors(found: Disparity, truth: float) -> Float32:
+    """Errors of the inner part in units of sigma, gross errors left out."""
+    error = inner(found.values - np.float32(truth))
+    kept = np.abs(error) < 1
+    return np.asarray(np.abs(error / inner(found.sigma_px))[kept])
+
+
+@pytest.mark.parametrize("grey_noise", [2.0, 6.0])
+def test_sigma_covers_the_errors_of_noisy_pictures(grey_noise: float) -> None:
+    clean = warped_pair(np.full((HEIGHT, WIDTH), 7.3))
+    rng = np.random.default_rng(5)
+    left, right = (
+        np.clip(image + rng.normal(0, grey_noise, image.shape), 0, 255).astype(np.uint8)
+        for image in (clean.left, clean.right)
+    )
+    errors = normalised_errors(SadMatcher(PLAIN).match(make_pair(left, right)), 7.3)
+    # Of a normal distribution 95 % lie within two sigma; a sigma of no use would give 100 %
+    # within a fifth of one.
+    assert (errors < 2).mean() > 0.9
+    assert (errors < 0.2).mean() < 0.8
+
+
+def test_range_outside_the_picture_is_an_error() -> None:
+    grey = noise()
+    matcher = SadMatcher(SadSettings(min_disparity_px=200))
+    with pytest.raises(MatchingError, match="200 to 215 px"):
+        matcher.match(make_pair(grey, grey))
+
+
+@pytest.mark.parametrize(("width", "ndisp"), [(1, 16), (160, 16), (640, 64), (1242, 128)])
+def test_usual_range_is_a_tenth_of_the_width(width: int, ndisp: int) -> None:
+    assert usual_ndisp(width) == ndisp
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({"window_px": 10}, "odd"),
+        ({"window_px": 61, "window_height_px": 61}, "65535"),
+        ({"window": 9}, "unknown setting"),
+        ({"left_right_px": -1}, "left_right_px"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(values: dict[str, int], complaint: str) -> None:
+    with pytest.raises(SettingsError, match=complaint):
+        SadSettings.parse(values)
+
+
+def test_it_is_a_matcher() -> None:
+    assert isinstance(SadMatcher(PLAIN), Matcher)
