@@ -35,6 +35,7 @@ class FilesSource:
         *,
         metres_per_unit: float = 1.0,
     ) -> None:
+        self._files = (Path(left), Path(right), Path(calibration))
         self._pair = read_pair(left, right)
         height_px, width_px = self._pair.left.shape[:2]
         self._calibration = read_calibration(
@@ -55,6 +56,11 @@ class FilesSource:
     def truth(self) -> SequenceTruth | None:
         """None."""
         return None
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Left picture, right picture, calibration."""
+        return self._files
 
     def __len__(self) -> int:
         return 1

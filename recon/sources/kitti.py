@@ -14,7 +14,7 @@ found there too.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -88,6 +88,13 @@ class KittiSource:
     def truth(self) -> SequenceTruth | None:
         """The poses of the left camera, the first one the identity, where there are any."""
         return self._truth
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """Calibration, times, poses and pictures."""
+        pictures = [path for frame in self._frames for path in (frame.left, frame.right)]
+        texts = [self._path / "calib.txt", self._path / "times.txt", _find_poses(self._path)]
+        return [path for path in texts if path is not None and path.exists()] + pictures
 
     def __len__(self) -> int:
         return len(self._frames)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from recon.errors import CalibrationError
 from recon.formats.files import StrPath
@@ -33,6 +34,7 @@ class MiddleburySource:
                 expected="calib.txt, or dmin.txt for scenes of 2005 and 2006",
             )
         self._camera = self.scene.camera
+        self._folder = Path(folder)
 
     @property
     def name(self) -> str:
@@ -48,6 +50,11 @@ class MiddleburySource:
     def truth(self) -> SequenceTruth | None:
         """None: what is true here is a disparity, see ``scene``."""
         return None
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """All files of the scene."""
+        return sorted(path for path in self._folder.iterdir() if path.is_file())
 
     def __len__(self) -> int:
         return 1

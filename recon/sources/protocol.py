@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from recon.structures import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
@@ -25,6 +26,11 @@ class StereoSource(Protocol):
     @property
     def truth(self) -> SequenceTruth | None:
         """What is known of the true path and surface, or None."""
+        ...
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """The files that its pairs and its calibration are read from, for the record of a run."""
         ...
 
     def __len__(self) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -69,6 +69,11 @@ class SyntheticSource:
     def truth(self) -> SequenceTruth:
         """True poses, and the surfaces that were in view up to 30 m, every 5 cm."""
         return SequenceTruth(self.trajectory, true_surface(self.camera))
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """None: the settings alone decide the pictures."""
+        return ()
 
     def __len__(self) -> int:
         return self.settings.frames

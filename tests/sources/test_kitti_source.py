@@ -53,6 +53,16 @@ def test_a_drive_gives_its_pairs_in_order_with_times_and_names(tmp_path: Path) -
     assert source.truth is None
 
 
+def test_all_files_that_are_read_are_listed_and_exist(tmp_path: Path) -> None:
+    folder = make_drive(tmp_path, 2, poses=IDENTITY * 2)
+    (folder / "notes.md").write_text("not read")
+    names = [path.relative_to(folder).as_posix() for path in KittiSource(folder).files]
+    assert names[:3] == ["calib.txt", "times.txt", "poses.txt"]
+    assert names[3:5] == ["image_0/000000.png", "image_1/000000.png"]
+    assert len(names) == len(set(names)) == 7
+    assert all((folder / name).is_file() for name in names)
+
+
 def test_a_source_can_be_iterated_again(tmp_path: Path) -> None:
     source = KittiSource(make_drive(tmp_path))
     assert len(list(source)) == len(list(source)) == 3

@@ -56,6 +56,7 @@ def test_each_kind_is_recognised_by_its_files_and_keeps_the_protocol(
         assert type(source) is SOURCES[kind]
         assert isinstance(source, StereoSource)
         assert source.name == "folder"
+        assert folder / "calib.txt" in source.files
         assert len(source) == len(list(source)) == 1
 
 
@@ -78,6 +79,7 @@ def test_one_pair_of_files_is_a_source(tmp_path: Path) -> None:
     assert isinstance(source, StereoSource)
     assert (source.name, len(source), source.truth) == ("left.png", 1, None)
     assert len(list(source)) == 1
+    assert [path.name for path in source.files] == ["left.png", "right.png", "calib.txt"]
     assert source.calibration.baseline_m == 0.5
 
 
