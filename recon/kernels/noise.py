@@ -52,7 +52,7 @@ def _value_noise(x, y, z, seed):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _octaves(x, y, z, width, wavelength, octaves, gain, seed):  # type: ignore[no-untyped-def]
     """Sum of octaves at one point, those finer than two widths faded out."""
-    total, power, amplitude = 0.0, 0.0, 1.0
+    total, amplitude = 0.0, 1.0
     for octave in range(octaves):
         # An orthogonal matrix per octave keeps the lattices from lining up with the walls.
         x, y, z = (
@@ -60,16 +60,15 @@ def _octaves(x, y, z, width, wavelength, octaves, gain, seed):  # type: ignore[n
             (6.0 * x + 2.0 * y - 3.0 * z) / 7.0,
             (3.0 * x - 6.0 * y + 2.0 * z) / 7.0,
         )
-        fade = min(max(wavelength / width - 1.0, 0.0), 1.0)
-        if fade > 0.0:
-            value = _value_noise(
-                x / wavelength, y / wavelength, z / wavelength, seed + np.uint64(octave)
-            )
-            total += amplitude * fade * value
-        power += amplitude * amplitude
+        fade = min(wavelength / width - 1.0, 1.0)
+        if fade <= 0.0:
+            break
+        scale = 1.0 / wavelength
+        value = _value_noise(x * scale, y * scale, z * scale, seed + np.uint64(octave))
+        total += amplitude * fade * value
         amplitude *= gain
         wavelength *= 0.5
-    return total / np.sqrt(power)
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -102,6 +101,10 @@ def fractal_noise(
     """
     out = np.empty(len(width))
     key = np.uint64(seed)
+    power = 0.0
+    for octave in range(octaves):
+        power += gain ** (2 * octave)
+    unit = 1.0 / np.sqrt(power)
     for i in range(len(width)):
         length = np.sqrt(smear[i, 0] ** 2 + smear[i, 1] ** 2 + smear[i, 2] ** 2)
         taps = int(min(max(np.ceil(length / width[i]), 1.0), float(MAX_TAPS)))
@@ -119,7 +122,7 @@ def fractal_noise(
                 gain,
                 key,
             )
-        out[i] = total / taps
+        out[i] = unit * total / taps
     return out
 
 

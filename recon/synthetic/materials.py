@@ -9,12 +9,15 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from recon.kernels.noise import fractal_noise, lattice_values
+from recon.kernels.surface import SurfaceHits
 from recon.structures.arrays import Float64, Int32
 from recon.synthetic.patterns import both, stripe, stripes, tile_joints, tile_tone
 from recon.synthetic.soup import Material, TriangleSoup
-from recon.synthetic.surface import SurfacePoints
 
-_OCTAVES = 7
+GAMMA: Final = 2.2
+"""Displayed colour to linear light."""
+_OCTAVES: Final = 7
+_ROUGHNESS: Final = 0.8  # amplitude of each octave relative to the next coarser
 ROAD_HALF_M: Final = 5.2
 _LANE_HALF_M = 3.05
 
@@ -87,45 +90,39 @@ class Patch:
 Recipe = Callable[[Patch], Float64]
 
 
-def albedo(soup: TriangleSoup, points: SurfacePoints, seed: int) -> Float64:
+def albedo(soup: TriangleSoup, faces: Int32, hits: SurfaceHits, seed: int) -> Float64:
     """Diffuse colour of points.
 
     Args:
         soup: The scene.
-        points: Where rays met it.
+        faces: int32 (N,), the triangles that rays met.
+        hits: Where they met them.
         seed: Of the grain.
 
     Returns:
         float64 (N, 3), linear light, in [0, 1].
     """
-    material = soup.material[points.faces]
+    material = soup.material[faces]
     grain = fractal_noise(
-        points.xyz, points.smear, points.width, _WAVELENGTHS[material], _OCTAVES, 0.8, seed
+        hits.xyz, hits.smear, hits.width, _WAVELENGTHS[material], _OCTAVES, _ROUGHNESS, seed
     )
-    rgb = soup.rgb[points.faces] ** 2.2
-    rgb *= np.exp(_CONTRASTS[material] * grain)[:, None]
-    part = soup.part[points.faces]
+    rgb = soup.rgb[faces] ** GAMMA * np.exp(_CONTRASTS[material] * grain)[:, None]
+    part = soup.part[faces]
     order = np.argsort(material, kind="stable")
     ends = np.searchsorted(material[order], np.arange(len(Material) + 1))
     for kind, recipe in RECIPES.items():
         which = order[ends[kind] : ends[kind + 1]]
         if len(which):
-            patch = Patch(
-                points.uv[which],
-                points.spread[which],
-                points.xyz[which, 2],
-                grain[which],
-                rgb[which],
-                part[which],
-            )
-            rgb[which] = recipe(patch)
+            height = hits.xyz[which, 2]
+            uv, spread = hits.uv[which], hits.spread[which]
+            rgb[which] = recipe(Patch(uv, spread, height, grain[which], rgb[which], part[which]))
     return np.clip(rgb, 0.0, 1.0)
 
 
 def _blend(rgb: Float64, paint: tuple[float, float, float], share: Float64) -> Float64:
     """Cover a share (N,) of each footprint with a displayed colour."""
     cover = share[:, None]
-    return np.asarray(rgb * (1.0 - cover) + np.array(paint) ** 2.2 * cover)
+    return np.asarray(rgb * (1.0 - cover) + np.array(paint) ** GAMMA * cover)
 
 
 def _variation(patch: Patch, channel: int) -> Float64:
@@ -238,7 +235,7 @@ def _car_glass(p: Patch) -> Float64:
     pillars = stripe(np.abs(p.u + 0.25), 0.0, 0.05, p.spread[:, 0])
     pillars = both(pillars, stripe(p.v, 1.36, 9.0, p.spread[:, 1]))
     cover = pillars[:, None]
-    dark = np.array([0.16, 0.18, 0.2]) ** 2.2 * np.exp(0.8 * p.grain)[:, None]
+    dark = np.array([0.16, 0.18, 0.2]) ** GAMMA * np.exp(0.8 * p.grain)[:, None]
     dark = dark * (1.0 + 2.0 * np.clip(p.v - 1.0, 0.0, 0.5))[:, None]
     return np.asarray(dark * (1.0 - cover) + p.rgb * cover)
 
@@ -294,8 +291,8 @@ def sky_colour(directions: Float64, pixel: float, seed: int) -> Float64:
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     climb = np.clip(unit[:, 2:], 0.0, 1.0)
     haze = np.exp(-climb / 0.22)
-    blue = np.array([0.36, 0.55, 0.83]) ** 2.2
-    white = np.array([0.86, 0.89, 0.93]) ** 2.2
+    blue = np.array([0.36, 0.55, 0.83]) ** GAMMA
+    white = np.array([0.86, 0.89, 0.93]) ** GAMMA
     flat = unit * [1.0, 1.0, 2.5]
     n = len(unit)
     clouds = fractal_noise(

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from recon.structures.arrays import Bool, Float64, UInt8
+from recon.synthetic.materials import GAMMA
 from recon.synthetic.stage import Sample, Stage
 from recon.synthetic.view import View
 
@@ -33,7 +34,7 @@ def take_picture(stage: Stage, view: View, smooth_edges: bool) -> Float64:
     if smooth_edges:
         edge = _edges(sample, size)
         light[edge] = _four_rays(stage, view, pixels[edge])
-    return np.asarray(light ** (1.0 / 2.2)).reshape(*size, 3)
+    return np.asarray(light ** (1.0 / GAMMA)).reshape(*size, 3)
 
 
 def record(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,13 @@ class Plane:
     normal: tuple[float, float, float]
     offset_m: float
     window_m: tuple[float, float, float, float] | None = None
+
+
+class _Texture(NamedTuple):
+    """The noise on all planes."""
+
+    spacing_m: float
+    seed: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,15 +114,19 @@ def plane_pair(
         noise_dn: Sensor noise, standard deviation in grey levels.
 
     Raises:
-        SettingsError: There is no plane.
+        SettingsError: There is no plane, or none is in view.
     """
     if not planes:
         raise SettingsError("no plane to render", expected="at least one")
     left, right = stereo_views(camera, np.eye(4))
     depth, nearest = _first_plane(planes, left.origin, left.directions(left.pixels()))
+    if not np.isfinite(depth).any():
+        raise SettingsError("no plane is in view", hint="they must lie in front of the camera")
     size = (camera.height_px, camera.width_px)
+    # Lattice spacings from 16 pixels in the left view downwards, whatever the depth.
+    texture = _Texture(16.0 * float(np.nanmedian(depth)) / camera.focal_px, seed)
     pictures = [
-        _picture(view, planes, seed, np.random.default_rng([seed, side]), noise_dn)
+        _picture(view, planes, texture, np.random.default_rng([seed, side]), noise_dn)
         for side, view in enumerate((left, right))
     ]
     truth = DisparityTruth(
@@ -125,7 +137,11 @@ def plane_pair(
 
 
 def _picture(
-    view: View, planes: Sequence[Plane], seed: int, rng: np.random.Generator, noise_dn: float
+    view: View,
+    planes: Sequence[Plane],
+    texture: _Texture,
+    rng: np.random.Generator,
+    noise_dn: float,
 ) -> UInt8:
     rays = view.directions(view.pixels())
     depth, nearest = _first_plane(planes, view.origin, rays)
@@ -134,10 +150,8 @@ def _picture(
     xyz = view.origin + depth[known, None] * rays[known]
     # Each plane has its own texture: they are told apart along an axis the noise does not use up.
     xyz[:, 2] += 1000.0 * nearest[known]
-    width = depth[known] / view.focal_px
-    # Lattice spacings from 16 pixels at the middle of the view downwards, whatever the depth.
-    spacing = np.full(len(xyz), 16.0 * float(np.median(width)) if len(xyz) else 1.0)
-    grain = fractal_noise(xyz, np.zeros_like(xyz), width, spacing, _OCTAVES, _GAIN, seed)
+    width, spacing = depth[known] / view.focal_px, np.full(len(xyz), texture.spacing_m)
+    grain = fractal_noise(xyz, np.zeros_like(xyz), width, spacing, _OCTAVES, _GAIN, texture.seed)
     grey[known] += _CONTRAST_DN * grain
     grey += noise_dn * rng.standard_normal(len(grey))
     levels = np.clip(np.rint(grey), 0, 255).astype(np.uint8)

@@ -55,14 +55,15 @@ def frustum(low: Any, high: Any, inset: tuple[float, float, float], paint: Paint
         paint: Of the walls.
     """
     (x0, y0, z0), (x1, y1, z1), (back, front, side) = low, high, inset
-    bottom = np.array([[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]])
+    bottom = np.array([[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]], dtype=np.float64)
     top = np.array(
         [
             [x0 + back, y0 + side, z1],
             [x1 - front, y0 + side, z1],
             [x1 - front, y1 - side, z1],
             [x0 + back, y1 - side, z1],
-        ]
+        ],
+        dtype=np.float64,
     )
     walls = []
     for k in range(4):
@@ -136,7 +137,17 @@ def bumpy_ball(
     hills += 0.5 * value_noise_reference(flat * (2.0 / wavelength), seed + 1)
     surface = flat * (1.0 + bump * hills)[:, None] * np.asarray(radii_m)
     corners = surface[places.ravel()].reshape(-1, 3, 3)
-    return painted(corners, corners[..., :2].copy(), paint)
+    return painted(
+        corners, corners[..., :2].copy(), paint, _smooth_normals(corners, places.ravel())
+    )
+
+
+def _smooth_normals(corners: Float64, places: NDArray[np.int64]) -> Float64:
+    """Normals (F, 3, 3), the mean of all triangles that meet at a corner, by area."""
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros((int(places.max()) + 1, 3))
+    np.add.at(total, places, np.repeat(flat, 3, axis=0))
+    return _unit(total)[places].reshape(-1, 3, 3)
 
 
 def icosphere(splits: int) -> Float64:

@@ -12,16 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.adapters.open3d_raycasting import RayScene
+from recon.kernels.surface import SurfaceHits, SurfaceTable, describe_hits
 from recon.structures.arrays import Bool, Float64
 from recon.synthetic.materials import albedo, sky_colour
 from recon.synthetic.soup import TriangleSoup
-from recon.synthetic.surface import (
-    SurfacePoints,
-    SurfaceTable,
-    plane_distance,
-    surface_points,
-    surface_table,
-)
+from recon.synthetic.surface import plane_distance, surface_table
 
 _SUN: Final = np.array([1.50, 1.38, 1.18])
 _SKY: Final = np.array([0.52, 0.58, 0.68])
@@ -89,15 +84,16 @@ class Stage:
         rgb, normal = np.empty((len(faces), 3)), np.zeros((len(faces), 3))
         label = np.full(len(faces), -1, dtype=np.int64)
         rgb[sky] = sky_colour(directions[sky], pixel, self.seed)
-        points = surface_points(self.table, faces[hit], origin, directions[hit], pixel)
-        light, lit = self._light(points)
-        rgb[hit] = albedo(self.soup, points, self.seed) * light
-        normal[hit] = points.normal
-        part, material = self.soup.part[points.faces], self.soup.material[points.faces]
+        met = faces[hit]
+        hits = describe_hits(self.table, met, origin, directions[hit], pixel)
+        light, lit = self._light(hits)
+        rgb[hit] = albedo(self.soup, met, hits, self.seed) * light
+        normal[hit] = hits.normal
+        part, material = self.soup.part[met], self.soup.material[met]
         label[hit] = (part.astype(np.int64) * 32 + material) * 2 + lit
         return Sample(rgb, normal, label)
 
-    def _light(self, points: SurfacePoints) -> tuple[Float64, Bool]:
+    def _light(self, points: SurfaceHits) -> tuple[Float64, Bool]:
         """Light (N, 3) on points, and whether the sun reaches them."""
         start = points.xyz + _SKIN_M * points.normal
         facing = points.normal @ self.to_sun

@@ -246,8 +246,10 @@ def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[
 def _furniture(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
     """Lamp posts at even distances; signs, bollards, bins and pillars where chance puts them."""
     kerb = side * (ROAD_HALF_M + 0.45)
+    # A stream of their own: the number of posts must not change what stands between them.
+    lamps, rng = rng.spawn(2)
     for at in np.arange(-12.0 + 12.0 * (side > 0), _end(road), 24.0):
-        yield move(props.lamp_post(side, rng), road.place(float(at), kerb, KERB_M))
+        yield move(props.lamp_post(side, lamps), road.place(float(at), kerb, KERB_M))
     at = -8.0
     while at < _end(road):
         at += float(rng.uniform(2.5, 9.0))

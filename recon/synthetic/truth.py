@@ -24,8 +24,8 @@ class OccupancyTruth:
     """Where obstacles really stand, and which cells a camera could know about.
 
     Attributes:
-        grid: OCCUPIED where an obstacle reaches into the height band, else FREE; houses are
-            hollow. Map axes.
+        grid: OCCUPIED where an obstacle reaches into the height band, else FREE; what is taller
+            than the band, such as a house, is hollow. Map axes.
         seen: bool, the shape of the grid: some pixel of the drive looked at a surface in this
             cell, at or below the top of the band.
     """
