@@ -11,7 +11,7 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from recon.errors import SettingsError, ShapeError
-from recon.structures.arrays import Bool, Float32, Int32
+from recon.structures.arrays import Bool, Float32, Float64, Int32
 
 
 def voxel_downsample(
@@ -135,7 +135,8 @@ def nearest(
         metres, nearest first.
 
     Raises:
-        ShapeError: There are fewer reference points than neighbours asked for.
+        ShapeError: There are fewer reference points than neighbours asked for, or a point is
+            not finite.
     """
     if len(reference) < neighbours:
         raise ShapeError(
@@ -146,10 +147,11 @@ def nearest(
         return empty.astype(np.int32), empty.astype(np.float32)
     # Far from the origin float32 squares lose centimetres: both clouds move to the reference.
     centre = np.mean(reference, axis=0, dtype=np.float64)
+    near_origin, points = _tensor(_finite(reference) - centre), _tensor(_finite(query) - centre)
     with _quiet():
-        search = o3d.core.nns.NearestNeighborSearch(_tensor(reference - centre))
+        search = o3d.core.nns.NearestNeighborSearch(near_origin)
         search.knn_index()
-        index, squared = search.knn_search(_tensor(query - centre), neighbours)
+        index, squared = search.knn_search(points, neighbours)
     return index.numpy().astype(np.int32), np.sqrt(squared.numpy()).astype(np.float32)
 
 
@@ -166,10 +168,15 @@ def _voxelised(cloud: Any, voxel_m: float) -> Any:
 
 def _legacy(xyz: NDArray[Any]) -> Any:
     """Open3D's cloud of a copy of the points; it takes neither read-only nor float32 arrays."""
-    copied = np.array(xyz, dtype=np.float64)
-    if not np.isfinite(copied).all():
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(_finite(xyz).copy()))
+
+
+def _finite(xyz: NDArray[Any]) -> Float64:
+    """The points as float64, if they are all finite."""
+    points = np.asarray(xyz, dtype=np.float64)
+    if not np.isfinite(points).all():
         raise ShapeError("a point of the cloud is not finite")
-    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(copied))
+    return points
 
 
 def _tensor(xyz: NDArray[Any]) -> Any:

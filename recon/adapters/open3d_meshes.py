@@ -18,7 +18,7 @@ from recon.structures.arrays import Float32, Int32
 
 
 def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
-    """Write OBJ, STL or GLB, as the suffix says.
+    """Write OBJ or STL, as the suffix says.
 
     Raises:
         OutputError: Open3D could not write the file.

@@ -46,8 +46,12 @@ def screened_poisson(
         around each vertex, in octree levels (one more = four times as dense).
 
     Raises:
-        MeshingError: MeshLab failed, ran out of memory, or found no surface.
+        MeshingError: A point or normal is not finite, MeshLab failed or ran out of memory, or
+            found no surface.
     """
+    # One NaN can make MeshLab return nothing, or a surface that is wrong everywhere.
+    if not (np.isfinite(xyz).all() and np.isfinite(normals).all()):
+        raise MeshingError("a point or normal of the cloud is not finite")
     options = {
         "depth": depth,
         "samplespernode": samples_per_node,

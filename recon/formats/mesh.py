@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Final
@@ -10,6 +11,7 @@ import numpy as np
 
 from recon.errors import FormatError, OutputError
 from recon.formats.atomic import atomic_path
+from recon.formats.glb import srgb_from_linear, write_glb
 from recon.formats.ply import colours_of, fill_vertices, normals_of, vertex_dtype
 from recon.formats.ply_tables import Table, list_length, read_tables, write_tables
 from recon.structures import TriangleMesh
@@ -40,12 +42,14 @@ def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
         raise OutputError("the mesh has no face", where=path)
     if suffix == ".ply":
         write_tables(path, _tables(mesh))
-        return
-    # Open3D takes two seconds to load: a PLY does not wait for it.
-    from recon.adapters import open3d_meshes  # noqa: PLC0415
+    elif suffix == ".glb":
+        write_glb(path, mesh)
+    else:
+        # Open3D takes two seconds to load: a PLY does not wait for it.
+        from recon.adapters import open3d_meshes  # noqa: PLC0415
 
-    with atomic_path(path) as temporary:
-        open3d_meshes.write_mesh(temporary, mesh)
+        with atomic_path(path) as temporary:
+            open3d_meshes.write_mesh(temporary, mesh)
 
 
 def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
@@ -67,6 +71,8 @@ def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
         from recon.adapters import open3d_meshes  # noqa: PLC0415
 
         mesh = open3d_meshes.read_mesh(path)
+        if suffix == ".glb" and mesh.rgb is not None:
+            mesh = replace(mesh, rgb=srgb_from_linear(mesh.rgb))
     else:
         raise FormatError("no such file", where=path)
     return _checked(mesh, path)

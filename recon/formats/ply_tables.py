@@ -119,7 +119,7 @@ def _write_rows(stream: IO[bytes], table: Table) -> None:
     """Rows of text; nine digits give a float32 back bit by bit."""
     columns, formats = [], []
     for name, field in _fields(table.dtype):
-        column = table[name].reshape(len(table), -1)
+        column = table[name].reshape(len(table), int(np.prod(field.shape)))
         columns.append(column.astype(np.float64))
         formats += ["%.9g" if field.base.kind == "f" else "%d"] * column.shape[1]
     np.savetxt(stream, np.concatenate(columns, axis=1), fmt=formats)

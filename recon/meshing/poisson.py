@@ -45,7 +45,7 @@ class MeshSettings(Settings):
         default=0.01, ge=0, lt=1, description="share of the vertices cut off as least supported"
     )
     max_distance_spacings: float | None = Field(
-        default=3.0,
+        default=2.0,
         gt=0,
         description="farthest a vertex may lie from the points, in local point spacings; "
         "null = keep all",
@@ -111,7 +111,7 @@ def reconstruct_mesh(
 
 def _usable(cloud: PointCloud) -> PointCloud:
     """The finite points of a cloud, if a surface can go through them."""
-    finite = np.isfinite(cloud.xyz).all(axis=1)
+    finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
     if finite.sum() < _MIN_POINTS:
         raise MeshingError(
             "too few points for a surface",

@@ -1,0 +1,76 @@
+"""Disparity figures, counted by hand and by their own definitions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recon.errors import EvaluationError
+from recon.evaluation.disparity import evaluate_disparity
+from recon.structures import DisparityTruth
+
+NAN = float("nan")
+
+
+def truth(values: list[float], nonocc: list[bool] | None = None) -> DisparityTruth:
+    array = np.array([values], dtype=np.float32)
+    seen = np.ones(array.shape, dtype=bool) if nonocc is None else np.array([nonocc])
+    return DisparityTruth(array, seen)
+
+
+def estimate(values: list[float]) -> np.ndarray:
+    return np.array([values], dtype=np.float32)
+
+
+def test_a_case_counted_by_hand() -> None:
+    # Errors 0, 0.5, 1, 3, none; the sixth truth is unknown, the seventh occluded.
+    result = evaluate_disparity(
+        estimate([10, 10.5, 9, 13, NAN, 4, 90]),
+        truth([10, 10, 10, 10, 10, NAN, 10], [True] * 6 + [False]),
+    )
+    assert result.pixels == 5
+    assert result.bad == pytest.approx({0.5: 40.0, 1.0: 20.0, 2.0: 20.0, 4.0: 0.0})
+    assert result.invalid == pytest.approx(20.0)
+    assert result.avgerr_px == pytest.approx(4.5 / 4)
+    assert result.rms_px == pytest.approx(np.sqrt((0.25 + 1 + 9) / 4))
+
+
+def test_occluded_pixels_count_when_asked_for() -> None:
+    args = estimate([10, 90]), truth([10, 10], [True, False])
+    assert evaluate_disparity(*args).bad[4.0] == 0
+    assert evaluate_disparity(*args, occluded=True).bad[4.0] == pytest.approx(50)
+
+
+def test_an_error_of_exactly_the_threshold_is_not_bad() -> None:
+    assert evaluate_disparity(estimate([12.0]), truth([10.0]), (2.0,)).bad == {2.0: 0.0}
+
+
+def test_nothing_matched_is_all_invalid_and_has_no_mean() -> None:
+    result = evaluate_disparity(estimate([NAN, NAN]), truth([1, 2]))
+    assert result.invalid == 100
+    assert set(result.bad.values()) == {0.0}
+    assert np.isnan(result.avgerr_px)
+    assert np.isnan(result.rms_px)
+
+
+@given(st.integers(0, 2**16))
+def test_bad_falls_with_the_threshold_and_shares_stay_shares(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.normal(20, 3, (6, 9)).astype(np.float32)
+    values[rng.random(values.shape) < 0.3] = np.nan
+    known = DisparityTruth(np.full((6, 9), 20, np.float32), rng.random((6, 9)) < 0.9)
+    result = evaluate_disparity(values, known)
+    bad = [result.bad[t] for t in sorted(result.bad)]
+    assert bad == sorted(bad, reverse=True)
+    assert 0 <= bad[0] + result.invalid <= 100 + 1e-9
+    if np.isfinite(result.rms_px):
+        assert result.avgerr_px <= result.rms_px + 1e-9
+
+
+def test_sizes_that_differ_and_truth_that_is_unknown_are_refused() -> None:
+    with pytest.raises(EvaluationError, match="differ in size"):
+        evaluate_disparity(estimate([1, 2]), truth([1]))
+    with pytest.raises(EvaluationError, match="no pixel has a known truth"):
+        evaluate_disparity(estimate([1]), truth([NAN]))
