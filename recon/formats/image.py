@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from threading import Lock
 from typing import Any, Final
 
 import cv2
@@ -12,9 +15,10 @@ from numpy.typing import NDArray
 from recon.errors import FormatError, OutputError, ShapeError
 from recon.formats.atomic import write_bytes
 from recon.formats.files import StrPath, read_bytes
-from recon.formats.image_integrity import check_image_bytes
+from recon.formats.image_integrity import check_image_bytes, is_tiff
 from recon.structures.arrays import UInt8
 
+_LOG_LEVEL_LOCK: Final = Lock()
 _GREY_ONLY: Final = frozenset({".pgm"})
 _COLOUR_ONLY: Final = frozenset({".ppm"})
 _EIGHT_BIT_ONLY: Final = frozenset({".jpg", ".jpeg"})
@@ -55,7 +59,8 @@ def read_levels(path: StrPath) -> NDArray[Any]:
     content = read_bytes(path)
     check_image_bytes(content, path)
     try:
-        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        with _silent_opencv() if is_tiff(content) else nullcontext():
+            image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise FormatError("image cannot be decoded", where=path, got=error.err) from error
     if image is None:
@@ -106,6 +111,22 @@ def write_image(path: StrPath, image: NDArray[Any]) -> None:
     if not done:
         raise OutputError("image cannot be encoded", where=path)
     write_bytes(path, content.tobytes())
+
+
+@contextmanager
+def _silent_opencv() -> Iterator[None]:
+    """Keep OpenCV from writing to standard error what is raised as an error anyway.
+
+    Only a damaged TIFF gets that far; the level is one for all threads, hence the lock.
+    """
+    log = cv2.utils.logging
+    with _LOG_LEVEL_LOCK:
+        before = log.getLogLevel()
+        log.setLogLevel(log.LOG_LEVEL_SILENT)
+        try:
+            yield
+        finally:
+            log.setLogLevel(before)
 
 
 def _swap_red_and_blue(image: NDArray[Any]) -> NDArray[Any]:

@@ -42,8 +42,13 @@ def check_image_bytes(content: bytes, path: StrPath) -> None:
         _check_jpeg(content, path)
     elif content[:1] == b"P" and content[1:2] in b"2356":
         _check_pnm(content, path)
-    elif not content.startswith(_TIFF_STARTS):
+    elif not is_tiff(content):
         raise FormatError("not an image", where=path, expected=UNDERSTOOD)
+
+
+def is_tiff(content: bytes) -> bool:
+    """Tell a TIFF by its first bytes."""
+    return content.startswith(_TIFF_STARTS)
 
 
 def _truncated(kind: str, path: StrPath, got: str) -> FormatError:

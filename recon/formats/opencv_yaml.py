@@ -98,7 +98,7 @@ def _read_nodes(path: StrPath) -> Nodes:
     try:
         # Nodes point into the storage: it stays alive until all are copied.
         storage = cv2.FileStorage(text, flags)
-        root = storage.root()
+        root = storage.root() if storage.isOpened() else cv2.FileNode()
         nodes = {name: _numbers(root.getNode(name)) for name in root.keys()}  # noqa: SIM118
     except (cv2.error, SystemError) as error:  # the bindings raise both for one syntax error
         raise FormatError("not a file of OpenCV's FileStorage", where=path) from error

@@ -167,6 +167,17 @@ def test_what_is_no_picture_is_one_clear_line(
         read_image(path)
 
 
+def test_a_damaged_tiff_is_told_by_the_error_alone(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_image(tmp_path / "a.tif", picture(60, 80))
+    content = (tmp_path / "a.tif").read_bytes()
+    (tmp_path / "a.tif").write_bytes(content[: len(content) // 2])
+    with pytest.raises(FormatError, match=r"a\.tif: image cannot be decoded"):
+        read_image(tmp_path / "a.tif")
+    assert capfd.readouterr() == ("", "")
+
+
 def test_floating_point_pixels_are_refused(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.tif"), np.ones((3, 3), dtype=np.float32))
     with pytest.raises(FormatError, match=r"pixel type.*got float32, expected 8 or 16 bits"):
