@@ -36,7 +36,7 @@ def write_glb(path: str | PathLike[str], mesh: TriangleMesh) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    attributes = {"POSITION": (mesh.vertices, _FLOAT)}
+    attributes: dict[str, tuple[NDArray[Any], int]] = {"POSITION": (mesh.vertices, _FLOAT)}
     if mesh.normals is not None:
         attributes["NORMAL"] = (mesh.normals, _FLOAT)
     if mesh.rgb is not None:
@@ -60,7 +60,8 @@ def _linear(rgb: UInt8) -> NDArray[np.uint16]:
     share = rgb / 255
     curve = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     opaque = np.ones((len(rgb), 1))
-    return np.rint(np.concatenate([curve, opaque], axis=1) * 65535).astype(np.uint16)
+    whole = np.rint(np.concatenate([curve, opaque], axis=1) * 65535)
+    return np.asarray(whole, dtype=np.uint16)
 
 
 def _document(
@@ -68,7 +69,9 @@ def _document(
 ) -> tuple[dict[str, Any], bytes]:
     """The JSON part, and the arrays that it describes one after the other."""
     arrays = [*attributes.values(), (mesh.faces.astype(np.uint32).reshape(-1, 1), _UINT)]
-    views, accessors, offset = [], [], 0
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    offset = 0
     for values, component in arrays:
         target = _INDICES if component == _UINT else _VERTICES
         views.append(

@@ -48,6 +48,6 @@ def test_a_child_that_dies_is_told_in_one_line(
         "import os, signal\nos.kill(os.getpid(), signal.SIGABRT)"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(MeshingError, match="failed in MeshLab.*exit code -6") as caught:
+    with pytest.raises(MeshingError, match=r"failed in MeshLab.*exit code -6") as caught:
         reconstruct(ball(), ball())
     assert "\n" not in str(caught.value)

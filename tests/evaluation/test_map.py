@@ -57,7 +57,7 @@ def test_precision_and_recall_change_places_with_the_clouds() -> None:
 
 def test_density_does_not_weigh() -> None:
     rng = np.random.default_rng(0)
-    dense_wrong = rng.uniform(0, 0.05, (5000, 3)) + [0, 0, 4]
+    dense_wrong = rng.uniform([0, 0, 4], [0.05, 0.05, 4.05], (5000, 3))
     result = evaluate_map(cloud(np.concatenate([grid(), dense_wrong])), cloud(grid()), 0.2)
     assert result.precision >= 400 / 408  # the heap fills at most eight voxels
 
