@@ -6,10 +6,11 @@ y into the house, z up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.structures.arrays import Float64
 from recon.synthetic.shapes import boxes, quads
@@ -96,8 +97,8 @@ def house(plan: HousePlan, rng: np.random.Generator) -> TriangleSoup:
     """Build a house: its axes are those of the module."""
     holes, door = _openings(plan, rng)
     parts = [_facade(plan, np.vstack([holes, door])), _leaf(door, plan.door)]
-    parts += [_window(hole, plan, int(rng.integers(2**30))) for hole in holes]
-    parts += [_reveals(np.vstack([holes, door]), plan.trim), _ledges(plan, holes)]
+    parts += [_windows(holes, rng), _reveals(np.vstack([holes, door]), plan.trim)]
+    parts.append(_ledges(plan, holes))
     parts += [_blind_walls(plan), _gable(plan) if plan.pitched else _flat_roof(plan)]
     parts.append(_downpipe(plan, rng))
     return merge(parts)
@@ -135,15 +136,15 @@ def _facade(plan: HousePlan, holes: Float64) -> TriangleSoup:
     in_x = (px > holes[:, 0]) & (px < holes[:, 2])
     in_hole = (in_x & (pz > holes[:, 1]) & (pz < holes[:, 3])).any(axis=-1)
     column, row = gx[~in_hole], gz[~in_hole]
-    x0, x1 = xs[column] - _OVERLAP_M, xs[column + 1] + _OVERLAP_M
-    z0, z1 = zs[row] - _OVERLAP_M, zs[row + 1] + _OVERLAP_M
-    zero = np.zeros(len(column))
+    low = np.column_stack([xs[column], zs[row]]) - _OVERLAP_M
+    high = np.column_stack([xs[column + 1], zs[row + 1]]) + _OVERLAP_M
+    size, zero = high - low, np.zeros(len(low))
     return quads(
-        np.stack([x0, zero, z0], axis=1),
-        np.stack([x1 - x0, zero, zero], axis=1),
-        np.stack([zero, zero, z1 - z0], axis=1),
+        np.column_stack([low[:, 0], zero, low[:, 1]]),
+        np.column_stack([size[:, 0], zero, zero]),
+        np.column_stack([zero, zero, size[:, 1]]),
         plan.wall,
-        np.stack([x0, z0], axis=1),
+        low,
     )
 
 
@@ -152,11 +153,12 @@ def _leaf(door: Float64, paint: Paint) -> TriangleSoup:
     return quads([x0, _REVEAL_M, z0], [x1 - x0, 0, 0], [0, 0, z1 - z0], paint)
 
 
-def _window(hole: Float64, plan: HousePlan, part: int) -> TriangleSoup:
-    """Glass behind a frame with one mullion and one transom."""
-    x0, z0, x1, z1 = hole
-    w, h, f = x1 - x0, z1 - z0, _FRAME_M
-    glass = Paint(Material.GLASS, (0.22, 0.25, 0.29), part)
+def _windows(holes: Float64, rng: np.random.Generator) -> TriangleSoup:
+    """Glass behind frames with one mullion and one transom; each window has its own number."""
+    parts = rng.integers(1, 2**30, len(holes))
+    x0, z0, x1, z1 = holes.T
+    w, h, f = x1 - x0, z1 - z0, np.full(len(holes), _FRAME_M)
+    # Left end, lower end, width and height of the six bars of each window.
     bars = np.array(
         [
             [x0, z0, w, f],
@@ -167,15 +169,29 @@ def _window(hole: Float64, plan: HousePlan, part: int) -> TriangleSoup:
             [x0, z0 + 0.68 * h, w, f],
         ]
     )
-    zero = np.zeros(len(bars))
-    y = np.full(len(bars), _REVEAL_M - 0.03)
-    frame = quads(
-        np.stack([bars[:, 0], y, bars[:, 1]], axis=1),
-        np.stack([bars[:, 2], zero, zero], axis=1),
-        np.stack([zero, zero, bars[:, 3]], axis=1),
-        Paint(Material.PLAIN, (0.86, 0.85, 0.82), part),
+    bars = bars.transpose(2, 0, 1).reshape(-1, 4)
+    glass = Paint(Material.GLASS, (0.22, 0.25, 0.29))
+    wood = Paint(Material.PLAIN, (0.86, 0.85, 0.82))
+    panes = np.column_stack([x0, z0, w, h])
+    return merge(
+        [
+            _upright(panes, _REVEAL_M, glass, parts),
+            _upright(bars, _REVEAL_M - 0.03, wood, np.repeat(parts, 6)),
+        ]
     )
-    return merge([quads([x0, _REVEAL_M, z0], [w, 0, 0], [0, 0, h], glass), frame])
+
+
+def _upright(rectangles: Float64, y: float, paint: Paint, parts: NDArray[Any]) -> TriangleSoup:
+    """Rectangles (N, 4) of x, z, width and height, parallel to the facade."""
+    x, z, width, height = rectangles.T
+    zero = np.zeros(len(x))
+    soup = quads(
+        np.column_stack([x, zero + y, z]),
+        np.column_stack([width, zero, zero]),
+        np.column_stack([zero, zero, height]),
+        paint,
+    )
+    return replace(soup, part=np.repeat(parts, 2).astype(np.int32))
 
 
 def _reveals(holes: Float64, paint: Paint) -> TriangleSoup:
@@ -191,15 +207,13 @@ def _reveals(holes: Float64, paint: Paint) -> TriangleSoup:
 
 
 def _ledges(plan: HousePlan, holes: Float64) -> TriangleSoup:
-    """A plinth, a string course per floor, a cornice, and a sill under each window."""
+    """A string course per floor, a cornice, and a sill under each opening."""
     w = plan.width
     levels = 0.4 + plan.storey * np.arange(1, plan.floors)
-    bands = [(0.0, 0.45, 0.05), (plan.eaves - 0.25, plan.eaves + 0.1, 0.3)]
+    bands = [(plan.eaves - 0.25, plan.eaves + 0.1, 0.3)]
     bands += [(z - 0.08, z + 0.08, 0.08) for z in levels]
     low = np.array([[0.0, -out, z0] for z0, _, out in bands])
     high = np.array([[w, 0.02, z1] for _, z1, _ in bands])
-    # The plinth would bar the door; it is let into the ground there.
-    low, high = low[1:], high[1:]
     x0, z0, x1 = holes[:, 0], holes[:, 1], holes[:, 2]
     flat = np.full(len(holes), 0.02)
     sills = boxes(

@@ -106,7 +106,7 @@ def albedo(soup: TriangleSoup, faces: Int32, hits: SurfaceHits, seed: int) -> Fl
     grain = fractal_noise(
         hits.xyz, hits.smear, hits.width, _WAVELENGTHS[material], _OCTAVES, _ROUGHNESS, seed
     )
-    rgb = soup.rgb[faces] ** GAMMA * np.exp(_CONTRASTS[material] * grain)[:, None]
+    rgb: Float64 = soup.rgb[faces] ** GAMMA * np.exp(_CONTRASTS[material] * grain)[:, None]
     part = soup.part[faces]
     order = np.argsort(material, kind="stable")
     ends = np.searchsorted(material[order], np.arange(len(Material) + 1))

@@ -101,8 +101,8 @@ def _lamps(length: float, width: float, part: int) -> list[TriangleSoup]:
     return lamps
 
 
-def tree(rng: np.random.Generator, splits: int = 3) -> TriangleSoup:
-    """A trunk and a crown of several bumpy balls, whose faces are split ``splits`` times."""
+def tree(rng: np.random.Generator) -> TriangleSoup:
+    """A trunk and a crown of several bumpy balls."""
     part = int(rng.integers(1, 2**30))
     height = float(rng.uniform(2.1, 2.9))
     bark = Paint(Material.BARK, (0.36, 0.30, 0.24), part)
@@ -115,7 +115,7 @@ def tree(rng: np.random.Generator, splits: int = 3) -> TriangleSoup:
         away[2] = abs(away[2]) * 1.3 + 0.75 * spread
         shade = tuple(float(c) for c in np.clip(green * rng.uniform(0.85, 1.15), 0, 1))
         leaves = Paint(Material.LEAVES, (shade[0], shade[1], shade[2]), part + k)
-        ball = bumpy_ball(radii, leaves, bump=0.22, wavelength=0.28, seed=part + k, splits=splits)
+        ball = bumpy_ball(radii, leaves, bump=0.22, wavelength=0.28, seed=part + k)
         parts.append(move(ball, _at(away[0], away[1], away[2] + height)))
     return merge(parts)
 

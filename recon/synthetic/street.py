@@ -217,10 +217,9 @@ def _stand(
 def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
     """Cars in about half of the bays, most of them in the direction of their lane."""
     for bay in np.arange(-18.0, _end(road), 6.0):
-        soup, empty = props.car(rng), rng.random() < 0.45
-        jitter = rng.normal(0.0, [0.25, 0.1, 0.02])
-        if empty:
+        if rng.random() < 0.45:
             continue
+        soup, jitter = props.car(rng), rng.normal(0.0, [0.25, 0.1, 0.02])
         T = road.place(float(bay) + 3.0 + jitter[0], side * _CAR_LANE_M + jitter[1])
         backwards = (side > 0) != (rng.random() < 0.1)
         turn = se3.exp_so3(np.array([0.0, 0.0, jitter[2] + np.pi * backwards]))
@@ -229,18 +228,19 @@ def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Ite
 
 def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
     """Street trees along the kerb, grown from a few seedlings, and a row at the far end."""
-    grown = [props.tree(rng) for _ in range(_SEEDLINGS)]
+    seedlings = [props.tree(rng) for _ in range(_SEEDLINGS)]
+
+    def grow(at_m: float, lateral_m: float) -> TriangleSoup:
+        turn = se3.exp_so3(np.array([0.0, 0.0, float(rng.uniform(0.0, 2.0 * np.pi))]))
+        T = road.place(at_m, lateral_m, KERB_M) @ se3.make_transform(turn, np.zeros(3))
+        return move(seedlings[int(rng.integers(_SEEDLINGS))], T)
+
     at = -10.0 + float(rng.uniform(0.0, 8.0))
     while at < _end(road):
-        T = road.place(at, side * (ROAD_HALF_M + 0.75), KERB_M)
-        turn = se3.exp_so3(np.array([0.0, 0.0, float(rng.uniform(0.0, 6.28))]))
-        turned = T @ se3.make_transform(turn, np.zeros(3))
-        yield move(grown[int(rng.integers(_SEEDLINGS))], turned)
+        yield grow(at, side * (ROAD_HALF_M + 0.75))
         at += float(rng.uniform(9.0, 22.0))
     for lateral in np.arange(1.0, 26.0, 3.2):
-        height = float(rng.uniform(-0.6, 0.2))
-        T = road.place(_end(road) + 8.0 + float(rng.uniform(0.0, 4.0)), side * lateral, height)
-        yield move(props.tree(rng, splits=2), T)
+        yield grow(_end(road) + 8.0 + float(rng.uniform(0.0, 4.0)), side * float(lateral))
 
 
 def _furniture(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:

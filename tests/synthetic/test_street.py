@@ -61,9 +61,8 @@ def test_poses_are_rigid():
     assert np.allclose(np.linalg.det(rotation), 1.0)
 
 
-def test_the_same_settings_build_the_same_street():
-    settings = StreetSettings(seed=5, frames=2)
-    one, two = build_street(settings), build_street(settings)
+def test_the_same_settings_build_the_same_street(street, small_settings):
+    one, two = street.world, build_street(small_settings)
     for name in ("vertices", "normals", "uv", "rgb", "material", "part"):
         assert np.array_equal(getattr(one.soup, name), getattr(two.soup, name))
     assert np.array_equal(one.T_street_camera, two.T_street_camera)
