@@ -68,6 +68,23 @@ def exp_so3(w: NDArray[Any]) -> Float64:
     return np.eye(3) + a * K + b * K @ K
 
 
+def log_so3(R: NDArray[Any]) -> Float64:
+    """Rotation vector (3,), radians, of a rotation matrix; inverse of `exp_so3` up to an angle π.
+
+    At π the axis has two signs, both right; either may come.
+    """
+    sine_axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine, cosine = float(np.linalg.norm(sine_axis)), 0.5 * (float(np.trace(R)) - 1.0)
+    if cosine > 0.0:
+        return sine_axis * (math.asin(min(sine, 1.0)) / sine if sine > 1e-12 else 1.0)
+    # Near π the sine vanishes; R + Rᵀ still holds the axis, but not its sign.
+    outer = 0.5 * (R + R.T) - cosine * np.eye(3)
+    column = outer[:, int(np.argmax(np.diag(outer)))]
+    axis = column / np.linalg.norm(column)
+    sign = -1.0 if axis @ sine_axis < 0.0 else 1.0
+    return np.asarray(sign * math.atan2(sine, cosine) * axis)
+
+
 def orthonormalise(T: NDArray[Any]) -> Float64:
     """The rigid transform nearest to ``T``: its rotation part made orthonormal again (SVD)."""
     U, _, Vt = np.linalg.svd(T[:3, :3])

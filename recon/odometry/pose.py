@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -11,9 +13,22 @@ from recon.structures import RectifiedCamera
 from recon.structures.arrays import Bool, Float64
 
 
+@dataclass(frozen=True, eq=False)
+class LocatedCamera:
+    """Where a camera stands, by points whose places are known.
+
+    Attributes:
+        T_world_camera: float64 (4, 4).
+        agree: bool (N,), True for the points that agree with it.
+    """
+
+    T_world_camera: Float64
+    agree: Bool
+
+
 def locate_camera(
     xyz_world: Float64, uv: Float64, camera: RectifiedCamera, settings: PoseSettings
-) -> tuple[Float64, Bool] | None:
+) -> LocatedCamera | None:
     """Where a camera stands that sees known points, by the largest set that agrees.
 
     OpenCV's RANSAC seeds its own generator, so equal input gives equal output.
@@ -25,7 +40,7 @@ def locate_camera(
         settings: Tolerance, samples, and how many must agree.
 
     Returns:
-        T_world_camera and bool (N,), True for the points that agree; None where too few do.
+        The pose; None where too few points agree on one.
 
     Ref:
         Fischler and Bolles, "Random sample consensus", CACM 1981.
@@ -50,4 +65,4 @@ def locate_camera(
     if agree.sum() < enough or not np.isfinite(translation).all():
         return None
     R, _ = cv2.Rodrigues(rotation)
-    return invert(make_transform(R, translation)), agree
+    return LocatedCamera(invert(make_transform(R, translation)), agree)

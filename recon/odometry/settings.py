@@ -85,3 +85,116 @@ class VisualSettings(Settings):
     tracks: TrackSettings = TrackSettings()
     pose: PoseSettings = PoseSettings()
     window: WindowSettings = WindowSettings()
+
+
+class PointSettings(Settings):
+    """Which pixels go to ICP."""
+
+    min_gradient: float = Field(
+        100.0, ge=0.0, description="Least change along the row, 3x3 Sobel of grey values"
+    )
+    max_disparity_step_px: float = Field(
+        0.5, gt=0.0, description="Largest difference of a disparity to its neighbours' median"
+    )
+    min_range_m: float = Field(1.0, ge=0.0, description="Nearer points are left")
+    max_range_m: float = Field(30.0, gt=0.0, description="Farther points are left")
+    max_sigma_m: float = Field(1.0, gt=0.0, description="Points with a less certain depth are left")
+
+
+class KissSettings(Settings):
+    """kiss-icp as it comes, on the whole cloud: for comparison."""
+
+    max_range_m: float = Field(30.0, gt=0.0, description="Farther points are left")
+    voxel_m: float = Field(0.5, gt=0.0, description="Edge of a voxel of the map")
+    initial_threshold_m: float = Field(
+        2.0, gt=0.0, description="First value of the adaptive threshold"
+    )
+    min_motion_m: float = Field(
+        0.1, gt=0.0, description="Deviation from the motion model that the threshold ignores"
+    )
+    min_points: int = Field(1000, ge=10, description="Frames with fewer points are skipped")
+
+
+class IcpSettings(Settings):
+    """ICP of selected points against a local map, from the visual prior."""
+
+    source_range_m: float = Field(
+        24.0, gt=0.0, description="Points up to here are aligned; shorter than the map's range"
+    )
+    voxel_m: float = Field(0.3, gt=0.0, description="Edge of a voxel of the map")
+    threshold_m: float = Field(
+        0.3, gt=0.0, description="Scale of the robust kernel; points pair up to thrice as far"
+    )
+    lost_threshold_m: float = Field(
+        1.0, gt=0.0, description="The same where there is no visual prior"
+    )
+    iterations: int = Field(50, ge=1, description="ICP steps at most")
+    convergence: float = Field(1e-3, gt=0.0, description="Length of a step that is the last")
+    min_points: int = Field(300, ge=10, description="Frames with fewer points are left to vision")
+    surface_m: float = Field(
+        1.0, gt=0.0, description="Edge of the cells in which the map is described by its surfaces"
+    )
+
+
+class GateSettings(Settings):
+    """When an ICP correction is taken, and how much of it."""
+
+    min_overlap: float = Field(
+        0.5, ge=0.0, le=1.0, description="Share of points that must have a surface of the map near"
+    )
+    min_residual_gain: float = Field(
+        0.02, ge=0.0, lt=1.0, description="Share by which the median residual must fall"
+    )
+    max_sigmas: float = Field(
+        4.7,
+        gt=0.0,
+        description="Corrections farther from the prior, by both uncertainties, are refused "
+        "(4.7: 0.1 % of right ones, six degrees of freedom)",
+    )
+    min_share: float = Field(
+        0.1,
+        ge=0.0,
+        le=1.0,
+        description="In directions where ICP would move the prior by less than this share of its "
+        "correction, it knows no better, and the prior stays",
+    )
+    icp_independence: float = Field(
+        0.05, gt=0.0, le=1.0, description="Share of points whose errors count as independent"
+    )
+    visual_independence: float = Field(
+        0.25, gt=0.0, le=1.0, description="Share of tracks whose errors count as independent"
+    )
+    icp_floor_m: float = Field(
+        0.02, gt=0.0, description="Standard deviation of ICP that more points do not improve"
+    )
+    icp_floor_deg: float = Field(0.05, gt=0.0, description="The same for its rotation")
+    lost_sigma_m: float = Field(
+        0.3, gt=0.0, description="Standard deviation of a motion extrapolated over one frame"
+    )
+    lost_sigma_deg: float = Field(1.0, gt=0.0, description="The same for its rotation")
+    offset_frames: int = Field(
+        30,
+        ge=1,
+        description="Frames over which ICP's standing offset is averaged: what ICP says in every "
+        "frame alike is the bias of stereo depth with range, not news",
+    )
+
+
+class FusedSettings(Settings):
+    """Visual odometry, and ICP corrections that earn their place."""
+
+    points: PointSettings = PointSettings()
+    icp: IcpSettings = IcpSettings()
+    gate: GateSettings = GateSettings()
+
+
+OdometryName = Literal["visual", "kiss", "fused"]
+
+
+class OdometrySettings(Settings):
+    """The odometries: which one, and how each works."""
+
+    method: OdometryName = Field("fused", description="visual, kiss or fused")
+    visual: VisualSettings = VisualSettings()
+    kiss: KissSettings = KissSettings()
+    fused: FusedSettings = FusedSettings()

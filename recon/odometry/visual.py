@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from recon.geometry.projection import project, unproject
 from recon.geometry.se3 import apply, invert
+from recon.geometry.triangulation import depth_from_disparity
 from recon.odometry.corners import find_corners
 from recon.odometry.pose import locate_camera
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
 from recon.odometry.settings import VisualSettings
-from recon.odometry.tracking import (
-    follow,
-    sample_disparity,
-)
-from recon.odometry.window import TrackWindow, adjust, reprojection
+from recon.odometry.tracking import follow, sample_disparity
+from recon.odometry.window import TrackWindow, adjust, misfits, pose_information, reprojection
 from recon.structures import RectifiedCamera
-from recon.structures.arrays import Bool, Float32, Float64, UInt8
+from recon.structures.arrays import Float32, Float64, UInt8
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,13 +25,27 @@ class VisualState:
 
     Attributes:
         window: The last frames and the points seen in them.
-        left: The last left picture.
-        motion: float64 (4, 4), last motion, ``T_previous_camera``.
+        left: uint8 (H, W), the last left picture.
+        motion: float64 (4, 4), the last motion, ``T_previous_camera``.
     """
 
     window: TrackWindow
     left: UInt8
     motion: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class VisualEstimate:
+    """A pose, and how well it is known.
+
+    Attributes:
+        result: Pose and health.
+        information: float64 (6, 6) of a step (translation in metres, rotation vector in
+            radians) in camera axes; None where the pose is extrapolated.
+    """
+
+    result: OdometryResult
+    information: Float64 | None
 
 
 class VisualOdometry:
@@ -49,49 +61,51 @@ class VisualOdometry:
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
         """Register the next frame; without a visual motion, the last one is assumed to go on."""
-        left, right = frame.pair.left, frame.pair.right
-        if self._state is None:
-            window, health = self._empty(np.eye(4)), OdometryHealth(notes=("first frame",))
-            motion = np.eye(4)
-        else:
-            window, health = self._advance(self._state, frame, left, right)
-            motion = invert(self._state.window.T_world_camera[-1]) @ window.T_world_camera[-1]
-        window = self._replenish(window.trimmed(self._settings.window.frames), frame, left, right)
-        self._state = VisualState(window, left, motion)
-        return OdometryResult(window.T_world_camera[-1].copy(), health)
+        return self.track(frame).result
 
-    def _empty(self, T_world_camera: Float64) -> TrackWindow:
-        return TrackWindow(T_world_camera[None], np.zeros((1, 0, 3)), np.zeros((0, 3)))
+    def track(self, frame: OdometryFrame) -> VisualEstimate:
+        """The same, with what is known about the pose."""
+        if self._state is None:
+            window, motion = _empty(np.eye(4)), np.eye(4)
+            health, information = OdometryHealth(), None
+        else:
+            window, health, information = self._advance(self._state, frame)
+            motion = invert(self._state.window.T_world_camera[-1]) @ window.T_world_camera[-1]
+        T_world_camera = window.T_world_camera[-1].copy()
+        window = self._replenish(window.trimmed(self._settings.window.frames), frame)
+        self._state = VisualState(window, frame.pair.left, motion)
+        return VisualEstimate(OdometryResult(T_world_camera, health), information)
 
     def _advance(
-        self, state: VisualState, frame: OdometryFrame, left: UInt8, right: UInt8
-    ) -> tuple[TrackWindow, OdometryHealth]:
+        self, state: VisualState, frame: OdometryFrame
+    ) -> tuple[TrackWindow, OdometryHealth, Float64 | None]:
+        """The window with the new frame in it, or a new one where the old is lost."""
         predicted = state.window.T_world_camera[-1] @ state.motion
+        camera, settings = frame.pair.camera, self._settings
         uvd = self._observe(state, frame, predicted)
-        seen = np.isfinite(uvd[:, 0])
+        tracks = np.flatnonzero(np.isfinite(uvd[:, 0]))
         found = locate_camera(
-            state.window.xyz_world[seen], uvd[seen, :2], frame.pair.camera, self._settings.pose
+            state.window.xyz_world[tracks], uvd[tracks, :2], camera, settings.pose
         )
-        tracks = int(seen.sum())
         if found is None:
-            health = OdometryHealth(ok=False, tracks=tracks, notes=("lost",))
-            return self._empty(predicted), health
-        T_world_camera, agree = found
-        uvd[np.flatnonzero(seen)[~agree]] = np.nan
-        window = state.window.with_frame(T_world_camera, uvd)
-        window = self._refine(window, frame.pair.camera)
-        return window, self._health(window, tracks, frame.pair.camera)
+            note = f"lost: {len(tracks)} tracks, too few agree on a motion; the last one goes on"
+            return _empty(predicted), OdometryHealth(False, len(tracks), notes=(note,)), None
+        uvd[tracks[~found.agree]] = np.nan
+        window = adjust(state.window.with_frame(found.T_world_camera, uvd), camera, settings.window)
+        window = window.without_newest(misfits(window, camera, settings.window))
+        health = _health(window, len(tracks), camera)
+        return window, health, pose_information(window, camera, settings.window)
 
     def _observe(self, state: VisualState, frame: OdometryFrame, predicted: Float64) -> Float64:
         """Column, row and disparity (N, 3) in the new frame of the points of the window."""
-        window, settings = state.window, self._settings
-        uvd = np.full((window.uvd.shape[1], 3), np.nan)
+        window = state.window
+        uvd = np.full((len(window.xyz_world), 3), np.nan)
         alive = np.flatnonzero(window.seen[-1])
         uv = window.uvd[-1, alive, :2].astype(np.float32)
         u, v, _ = project(apply(invert(predicted), window.xyz_world[alive]), frame.pair.camera)
         guess = np.stack([u, v], axis=1)
         guess = np.where(np.isfinite(guess), guess, uv).astype(np.float32)
-        there, found = follow(state.left, frame.pair.left, uv, guess, settings.tracks)
+        there, found = follow(state.left, frame.pair.left, uv, guess, self._settings.tracks)
         uvd[alive[found], :2] = there[found]
         uvd[alive[found], 2] = self._disparity(frame, there[found])
         return uvd
@@ -102,27 +116,27 @@ class VisualOdometry:
         far = d + frame.pair.camera.doffs_px < self._settings.pose.min_disparity_px
         return np.where(far, np.nan, d)
 
-    def _refine(self, window: TrackWindow, camera: RectifiedCamera) -> TrackWindow:
-        settings = self._settings.window
-        window = adjust(window, camera, settings)
-        sigmas = np.array([settings.sigma_uv_px, settings.sigma_uv_px, settings.sigma_d_px])
-        with np.errstate(invalid="ignore"):
-            wrong = np.nansum((reprojection(window, camera) / sigmas)**2, axis=2) > settings.max_sigmas**2
-        wrong[:-1] = False
-        return window.without(wrong)
-
-    def _health(self, window, tracks, camera):
-        error = reprojection(window, camera)[-1, :, :2]
-        error = np.linalg.norm(error[np.isfinite(error[:, 0])], axis=1)
-        return OdometryHealth(tracks=tracks, inliers=len(error), reprojection_px=float(np.median(error)))
-
-    def _replenish(self, window, frame, left, right):
+    def _replenish(self, window: TrackWindow, frame: OdometryFrame) -> TrackWindow:
+        """The window with new points where the newest frame has room for them."""
         taken = window.uvd[-1, window.seen[-1], :2].astype(np.float32)
         uv = find_corners(frame.pair.left, taken, self._settings.corners)
         d = self._disparity(frame, uv)
-        good = np.isfinite(d)
-        uv, d = uv[good].astype(float), d[good].astype(float)
-        cam = frame.pair.camera
-        z = cam.focal_px * cam.baseline_m / (d + cam.doffs_px)
-        xyz = unproject(uv[:, 0], uv[:, 1], z, cam)
-        return window.with_points(np.column_stack([uv, d]), apply(window.T_world_camera[-1], xyz))
+        uvd = np.column_stack([uv, d])[np.isfinite(d)]
+        depth = depth_from_disparity(uvd[:, 2], frame.pair.camera).astype(np.float64)
+        xyz_camera = unproject(uvd[:, 0], uvd[:, 1], depth, frame.pair.camera)
+        return window.with_points(uvd, apply(window.T_world_camera[-1], xyz_camera))
+
+
+def _empty(T_world_camera: Float64) -> TrackWindow:
+    """A window of one frame without points."""
+    return TrackWindow(T_world_camera[None], np.zeros((1, 0, 3)), np.zeros((0, 3)))
+
+
+def _health(window: TrackWindow, tracks: int, camera: RectifiedCamera) -> OdometryHealth:
+    newest = window.seen[-1]
+    error = reprojection(window, camera)[-1, newest, :2]
+    return OdometryHealth(
+        tracks=tracks,
+        inliers=int(newest.sum()),
+        reprojection_px=float(np.median(np.linalg.norm(error, axis=1))),
+    )

@@ -63,15 +63,24 @@ class TrackWindow:
         keep = seen[-1] | (seen.sum(axis=0) >= 2)
         return TrackWindow(self.T_world_camera[-frames:], uvd[:, keep], self.xyz_world[keep])
 
-    def without(self, wrong: Bool) -> TrackWindow:
-        """Without the observations of a mask (W, N)."""
-        return replace(self, uvd=np.where(wrong[:, :, None], np.nan, self.uvd))
+    def without_newest(self, wrong: Bool) -> TrackWindow:
+        """Without the newest observations of the points of a mask (N,): their tracks end."""
+        uvd = self.uvd.copy()
+        uvd[-1, wrong] = np.nan
+        return replace(self, uvd=uvd)
 
 
 def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
     """Observed minus predicted column, row and disparity (W, N, 3); NaN = not seen."""
     residual, _ = _residuals(window, camera)
     return np.where(np.isfinite(window.uvd), residual, np.nan)
+
+
+def misfits(window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings) -> Bool:
+    """bool (N,), points whose newest observation is too far from its prediction."""
+    residual, _ = _residuals(window, camera)
+    square = np.square(residual[-1] / _sigmas(settings)).sum(axis=1)
+    return np.asarray(square > settings.max_sigmas**2)
 
 
 def adjust(
@@ -113,54 +122,80 @@ def _levenberg_marquardt(
     return window
 
 
+def pose_information(
+    window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings
+) -> Float64:
+    """What the newest frame's observations tell about its pose, given the frames before.
+
+    Returns:
+        float64 (6, 6), information of a step (translation in metres, rotation vector in radians)
+        in the axes of the newest frame.
+    """
+    usable = window.seen[-1] & (window.seen.sum(axis=0) >= 2)
+    part = TrackWindow(window.T_world_camera, window.uvd[:, usable], window.xyz_world[usable])
+    normal = _normal_equations(part, camera, settings)
+    folded = np.einsum("inj,njk->ink", normal.H_cross[-1], np.linalg.inv(_damped(normal.H_point)))
+    return np.asarray(normal.H_pose[-1] - np.einsum("ink,jnk->ij", folded, normal.H_cross[-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class _NormalEquations:
+    """Blocks of the Gauss-Newton system: poses (W, 6), points (N, 3), and what ties them."""
+
+    H_pose: Float64
+    g_pose: Float64
+    H_point: Float64
+    g_point: Float64
+    H_cross: Float64
+
+
+def _normal_equations(
+    window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings
+) -> _NormalEquations:
+    residual, xyz_camera = _residuals(window, camera)
+    white, weight = _whiten(residual, window.seen, settings)
+    J_camera = _projection_jacobian(xyz_camera, camera) / _sigmas(settings)[:, None]
+    J_camera *= np.isfinite(window.uvd)[:, :, :, None]
+    J_point = J_camera @ invert(window.T_world_camera)[:, None, :3, :3]
+    J_pose = _pose_jacobian(J_camera, xyz_camera)
+    weighted_pose = J_pose * weight[:, :, None, None]
+    weighted_point = J_point * weight[:, :, None, None]
+    return _NormalEquations(
+        H_pose=np.einsum("wnki,wnkj->wij", weighted_pose, J_pose),
+        g_pose=np.einsum("wnki,wnk->wi", weighted_pose, white),
+        H_point=np.einsum("wnki,wnkj->nij", weighted_point, J_point),
+        g_point=np.einsum("wnki,wnk->ni", weighted_point, white),
+        H_cross=np.einsum("wnki,wnkj->winj", weighted_pose, J_point),
+    )
+
+
 def _step(
     window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings, damping: float
 ) -> TrackWindow:
     """One damped Gauss-Newton step of all poses but the oldest, and of all points."""
-    residual, xyz_camera = _residuals(window, camera)
-    white, weight = _whiten(residual, window.seen, settings)
-    J_point_camera = _projection_jacobian(xyz_camera, camera) / _sigmas(settings)[:, None]
-    J_point_camera *= np.isfinite(window.uvd)[:, :, :, None]
-    J_point = J_point_camera @ invert(window.T_world_camera)[:, None, :3, :3]
-    J_pose = _pose_jacobian(J_point_camera, xyz_camera)
-    Jw_pose = J_pose * weight[:, :, None, None]
-    Jw_point = J_point * weight[:, :, None, None]
-
-    H_pose = np.einsum("wnki,wnkj->wij", Jw_pose, J_pose)
-    g_pose = np.einsum("wnki,wnk->wi", Jw_pose, white)
-    H_point = np.einsum("wnki,wnkj->nij", Jw_point, J_point)
-    g_point = np.einsum("wnki,wnk->ni", Jw_point, white)
-    H_cross = np.einsum("wnki,wnkj->winj", Jw_pose, J_point)
-
-    step_pose, step_point = _solve(H_pose, g_pose, H_point, g_point, H_cross, damping)
+    step_pose, step_point = _solve(_normal_equations(window, camera, settings), damping)
     poses = np.stack(
         [_moved(T, step) for T, step in zip(window.T_world_camera, step_pose, strict=True)]
     )
     return replace(window, T_world_camera=poses, xyz_world=window.xyz_world + step_point)
 
 
-def _solve(
-    H_pose: Float64,
-    g_pose: Float64,
-    H_point: Float64,
-    g_point: Float64,
-    H_cross: Float64,
-    damping: float,
-) -> tuple[Float64, Float64]:
+def _solve(normal: _NormalEquations, damping: float) -> tuple[Float64, Float64]:
     """Steps of the poses (W, 6) and of the points (N, 3); the first pose's is zero."""
-    free = 6 * (len(H_pose) - 1)
-    inverse = np.linalg.inv(_damped(H_point, damping))
-    cross = H_cross[1:].reshape(free, -1)
-    folded = np.einsum("anj,njk->ank", H_cross[1:].reshape(free, -1, 3), inverse)
-    folded = folded.reshape(free, -1)
-    S = _block_diagonal(_damped(H_pose[1:], damping)) - folded @ cross.T
-    step_pose = np.linalg.solve(S, g_pose[1:].reshape(-1) - folded @ g_point.reshape(-1))
-    rest = g_point - (cross.T @ step_pose).reshape(-1, 3)
+    free = 6 * (len(normal.H_pose) - 1)
+    inverse = np.linalg.inv(_damped(normal.H_point, damping))
+    cross = normal.H_cross[1:].reshape(free, -1, 3)
+    folded = np.einsum("anj,njk->ank", cross, inverse).reshape(free, -1)
+    cross = cross.reshape(free, -1)
+    S = _block_diagonal(_damped(normal.H_pose[1:], damping)) - folded @ cross.T
+    g = normal.g_pose[1:].reshape(-1) - folded @ normal.g_point.reshape(-1)
+    step_pose = np.linalg.solve(S, g)
+    rest = normal.g_point - (cross.T @ step_pose).reshape(-1, 3)
     step_point = np.einsum("nij,nj->ni", inverse, rest)
     return np.concatenate([np.zeros((1, 6)), step_pose.reshape(-1, 6)]), step_point
 
 
-def _damped(H: Float64, damping: float) -> Float64:
+def _damped(H: Float64, damping: float = 0.0) -> Float64:
     """Blocks (N, K, K) with their diagonals raised, so that each can be inverted."""
     diagonal = np.einsum("nii->ni", H)
     raised = H.copy()

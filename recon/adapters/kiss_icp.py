@@ -1,0 +1,222 @@
+"""The one file that knows kiss-icp: arrays in, arrays out, its exceptions turned into ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from kiss_icp.config import KISSConfig
+from kiss_icp.config.config import (
+    AdaptiveThresholdConfig,
+    DataConfig,
+    MappingConfig,
+    RegistrationConfig,
+)
+from kiss_icp.kiss_icp import KissICP
+from numpy.typing import NDArray
+
+from recon.errors import RegistrationError
+from recon.geometry.se3 import orthonormalise
+from recon.structures.arrays import Float64
+
+
+@dataclass(frozen=True)
+class KissIcpOptions:
+    """Every choice that kiss-icp leaves open.
+
+    Attributes:
+        max_range_m: Points farther from the sensor are left, and the map is clipped there.
+        source_range_m: Points farther away are added to the map, but not aligned to it.
+        voxel_m: Edge of a voxel of the map.
+        points_per_voxel: Points that a voxel of the map keeps.
+        iterations: ICP steps at most.
+        convergence: Length of a step that ends the iterations.
+        initial_threshold_m: First value of the adaptive threshold.
+        min_motion_m: Deviation from the motion model that the adaptive threshold ignores.
+    """
+
+    max_range_m: float
+    source_range_m: float
+    voxel_m: float
+    points_per_voxel: int = 20
+    iterations: int = 500
+    convergence: float = 1e-4
+    initial_threshold_m: float = 2.0
+    min_motion_m: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class IcpAlignment:
+    """What ICP says about one frame.
+
+    Attributes:
+        T_world_camera: float64 (4, 4), the aligned pose.
+        source: float64 (N, 3), the points that were aligned, camera axes.
+    """
+
+    T_world_camera: Float64
+    source: Float64
+
+
+class KissIcp:
+    """kiss-icp and its local map.
+
+    Points in OpenCV's camera axes give poses of the camera. One thread keeps sums in one order,
+    so that equal input gives equal output.
+
+    Args:
+        options: Every choice that kiss-icp leaves open.
+
+    Raises:
+        RegistrationError: kiss-icp refuses the options.
+    """
+
+    def __init__(self, options: KissIcpOptions) -> None:
+        with _our_errors():
+            self._icp = _RangedKissIcp(_config(options), options.source_range_m)
+
+    def register(self, xyz_camera: NDArray[np.floating]) -> IcpAlignment:
+        """Register a frame as kiss-icp does by itself: its motion model, its threshold, its map.
+
+        Args:
+            xyz_camera: (N, 3), metres, finite; not empty.
+
+        Raises:
+            RegistrationError: There are no points, or kiss-icp fails.
+        """
+        points = _points(xyz_camera)
+        with _our_errors():
+            _, source = self._icp.register_frame(points, np.zeros(0))
+        return IcpAlignment(_pose(self._icp.last_pose), np.array(source))
+
+    def align(
+        self,
+        xyz_camera: NDArray[np.floating],
+        T_world_guess: NDArray[np.floating],
+        threshold_m: float,
+    ) -> IcpAlignment:
+        """Align a frame to the map, which stays as it is: the caller decides what to believe.
+
+        Args:
+            xyz_camera: (N, 3), metres, finite; not empty.
+            T_world_guess: (4, 4), where the camera may be.
+            threshold_m: Scale of the robust kernel; points pair up to thrice as far.
+
+        Raises:
+            RegistrationError: There are no points, or kiss-icp fails.
+        """
+        points = _points(xyz_camera)
+        guess = _pose(T_world_guess)
+        with _our_errors():
+            source, _ = self._icp.voxelize(self._icp.clip(points))
+            pose = self._icp.align(source, guess, threshold_m)
+        return IcpAlignment(_pose(pose), np.array(source))
+
+    def update(
+        self, xyz_camera: NDArray[np.floating], T_world_camera: NDArray[np.floating]
+    ) -> None:
+        """Add a frame to the map, at the pose that was decided.
+
+        Raises:
+            RegistrationError: There are no points, or kiss-icp fails.
+        """
+        points = _points(xyz_camera)
+        pose = _pose(T_world_camera)
+        with _our_errors():
+            _, frame = self._icp.voxelize(self._icp.clip(points))
+            self._icp.settle(frame, pose)
+
+    def map_points(self) -> Float64:
+        """float64 (M, 3), the points of the local map, world axes."""
+        with _our_errors():
+            return np.array(self._icp.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3)
+
+
+class _RangedKissIcp(KissICP):  # type: ignore[misc]
+    """kiss-icp whose source is cut shorter than its map, and whose steps can be taken apart."""
+
+    def __init__(self, config: KISSConfig, source_range_m: float) -> None:
+        super().__init__(config)
+        self._source_range_m = source_range_m
+
+    def voxelize(self, iframe: Float64) -> tuple[Float64, Float64]:
+        """Source and map points; points at the rim of the map would be pulled inwards."""
+        source, frame = super().voxelize(iframe)
+        near = np.linalg.norm(source, axis=1) <= self._source_range_m
+        return source[near], frame
+
+    def clip(self, points: Float64) -> Float64:
+        """Points within range."""
+        clipped: Float64 = self.preprocessor.preprocess(points, np.zeros(0), np.eye(4))
+        return clipped
+
+    def align(self, source: Float64, guess: Float64, threshold_m: float) -> Float64:
+        """Pose of a source by the map alone; the guess where there is nothing to align."""
+        # The prior goes the way that kiss-icp's own motion model goes: last pose times last delta.
+        self.last_delta = orthonormalise(np.linalg.inv(self.last_pose) @ guess)
+        if not len(source) or self.local_map.empty():
+            return guess
+        pose: Float64 = self.registration.align_points_to_map(
+            points=source,
+            voxel_map=self.local_map,
+            initial_guess=orthonormalise(self.last_pose @ self.last_delta),
+            max_correspondance_distance=3 * threshold_m,
+            kernel=threshold_m,
+        )
+        return pose
+
+    def settle(self, frame: Float64, pose: Float64) -> None:
+        """Take a pose as decided and its frame into the map."""
+        self.last_delta = orthonormalise(np.linalg.inv(self.last_pose) @ pose)
+        self.last_pose = pose
+        self.local_map.update(frame, pose)
+
+
+def _config(options: KissIcpOptions) -> KISSConfig:
+    """The whole configuration; ``model_construct`` keeps environment variables out of it."""
+    return KISSConfig.model_construct(
+        out_dir="",
+        data=DataConfig(max_range=options.max_range_m, min_range=0.0, deskew=False),
+        registration=RegistrationConfig(
+            max_num_iterations=options.iterations,
+            convergence_criterion=options.convergence,
+            max_num_threads=1,
+        ),
+        mapping=MappingConfig(
+            voxel_size=options.voxel_m, max_points_per_voxel=options.points_per_voxel
+        ),
+        adaptive_threshold=AdaptiveThresholdConfig(
+            fixed_threshold=None,
+            initial_threshold=options.initial_threshold_m,
+            min_motion_th=options.min_motion_m,
+        ),
+    )
+
+
+def _points(xyz: NDArray[np.floating]) -> Float64:
+    """A writable float64 copy (kiss-icp refuses read-only arrays), checked."""
+    points = np.array(xyz, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        # An empty frame raises nothing in kiss-icp, but moves its pose.
+        raise RegistrationError("no points to register", got=points.shape, expected="(N, 3)")
+    if not np.isfinite(points).all():
+        raise RegistrationError("points to register are not finite")
+    return points
+
+
+def _pose(T: NDArray[np.floating]) -> Float64:
+    """A writable rigid copy: a rotation that is not orthonormal would abort the process."""
+    pose = np.array(T, dtype=np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise RegistrationError("pose for ICP is not a finite 4x4 matrix", got=pose.shape)
+    return orthonormalise(pose)
+
+
+@contextmanager
+def _our_errors() -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, TypeError, RuntimeError, MemoryError, ArithmeticError) as error:
+        raise RegistrationError("kiss-icp failed", got=str(error)) from error

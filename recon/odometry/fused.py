@@ -1,0 +1,147 @@
+"""Visual odometry, corrected by kiss-icp where ICP knows better."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from recon.adapters.kiss_icp import IcpAlignment, KissIcp, KissIcpOptions
+from recon.geometry.se3 import apply, invert, orthonormalise
+from recon.odometry.gate import (
+    Correction,
+    Verdict,
+    as_step,
+    as_transform,
+    judge,
+    step_covariance,
+)
+from recon.odometry.points import select_points
+from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
+from recon.odometry.settings import FusedSettings, VisualSettings
+from recon.odometry.surfaces import describe_surfaces, fit_surfaces
+from recon.odometry.visual import VisualEstimate, VisualOdometry
+from recon.structures import PointCloud
+from recon.structures.arrays import Float64
+
+
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    """Where the camera is before ICP is asked.
+
+    Attributes:
+        T_world_camera: float64 (4, 4), the last pose moved on by the visual motion.
+        covariance: float64 (6, 6) of a step of it.
+        visual: What the visual odometry said.
+    """
+
+    T_world_camera: Float64
+    covariance: Float64
+    visual: VisualEstimate
+
+    @property
+    def seen(self) -> bool:
+        """Whether the motion was seen, not extrapolated."""
+        return self.visual.information is not None
+
+
+class FusedOdometry:
+    """A visual prior for every frame, and a kiss-icp correction that must earn its place.
+
+    Args:
+        settings: Points, ICP and the gate.
+        visual: The visual odometry.
+    """
+
+    def __init__(self, settings: FusedSettings, visual: VisualSettings) -> None:
+        self._settings = settings
+        self._visual = VisualOdometry(visual)
+        self._icp = KissIcp(
+            KissIcpOptions(
+                max_range_m=settings.points.max_range_m,
+                source_range_m=settings.icp.source_range_m,
+                voxel_m=settings.icp.voxel_m,
+                iterations=settings.icp.iterations,
+                convergence=settings.icp.convergence,
+            )
+        )
+        self._T_visual = np.eye(4)
+        self._T_world_camera = np.eye(4)
+        self._offset = np.zeros(6)
+        self._measured = 0
+        self._mapped = False
+
+    def register(self, frame: OdometryFrame) -> OdometryResult:
+        """Register the next frame.
+
+        Without a visual motion the last one goes on and ICP may correct it; without either the
+        health says that the pose rests on no measurement, and the map is left as it is.
+        """
+        prior = self._prior(self._visual.track(frame))
+        points = select_points(frame, self._settings.points)
+        result = self._corrected(prior, points)
+        self._T_visual = prior.visual.result.T_world_camera
+        self._T_world_camera = result.T_world_camera
+        if result.health.ok and len(points) >= self._settings.icp.min_points:
+            self._icp.update(points.xyz, result.T_world_camera)
+            self._mapped = True
+        return result
+
+    def _prior(self, visual: VisualEstimate) -> _Prior:
+        gate = self._settings.gate
+        T = self._T_world_camera @ invert(self._T_visual) @ visual.result.T_world_camera
+        if visual.information is None:
+            covariance = step_covariance(gate.lost_sigma_m, gate.lost_sigma_deg)
+        else:
+            covariance = np.linalg.inv(gate.visual_independence * visual.information)
+        return _Prior(orthonormalise(T), covariance, visual)
+
+    def _corrected(self, prior: _Prior, points: PointCloud) -> OdometryResult:
+        """The prior, moved by as much of ICP's correction as was earned."""
+        health = prior.visual.result.health
+        if not self._mapped or len(points) < self._settings.icp.min_points:
+            note = "no map for ICP yet" if not self._mapped else "too few points for ICP"
+            health = replace(health, icp_points=len(points), notes=(*health.notes, note))
+            return OdometryResult(prior.T_world_camera, health)
+        icp = self._settings.icp
+        threshold_m = icp.threshold_m if prior.seen else icp.lost_threshold_m
+        alignment = self._icp.align(points.xyz, prior.T_world_camera, threshold_m)
+        correction = self._measure(prior, alignment)
+        verdict = judge(correction, self._offset, prior.covariance, self._settings.gate)
+        self._learn_offset(prior, correction)
+        T = orthonormalise(prior.T_world_camera @ as_transform(verdict.step))
+        return OdometryResult(T, _health(health, alignment, correction, verdict))
+
+    def _measure(self, prior: _Prior, alignment: IcpAlignment) -> Correction:
+        """What ICP would change, and how the frame fits the map on both sides of it."""
+        T_prior_icp = invert(prior.T_world_camera) @ alignment.T_world_camera
+        near = apply(invert(prior.T_world_camera), self._icp.map_points())
+        surfaces = describe_surfaces(near, self._settings.icp.surface_m)
+        return Correction(
+            step=as_step(T_prior_icp),
+            before=fit_surfaces(alignment.source, surfaces),
+            after=fit_surfaces(apply(T_prior_icp, alignment.source), surfaces),
+        )
+
+    def _learn_offset(self, prior: _Prior, correction: Correction) -> None:
+        """Average what ICP says in every frame alike, where the prior is good."""
+        if prior.seen and correction.after.overlap >= self._settings.gate.min_overlap:
+            self._measured += 1
+            share = 1.0 / min(self._measured, self._settings.gate.offset_frames)
+            self._offset = (1.0 - share) * self._offset + share * correction.step
+
+
+def _health(
+    visual: OdometryHealth, alignment: IcpAlignment, correction: Correction, verdict: Verdict
+) -> OdometryHealth:
+    return replace(
+        visual,
+        ok=visual.ok or verdict.accepted,
+        icp_points=len(alignment.source),
+        overlap=correction.after.overlap,
+        residual_m=correction.after.residual_m,
+        correction_m=float(np.linalg.norm(correction.step[:3])),
+        correction_deg=float(np.rad2deg(np.linalg.norm(correction.step[3:]))),
+        accepted=verdict.accepted,
+        notes=(*visual.notes, *([verdict.note] if verdict.note else [])),
+    )

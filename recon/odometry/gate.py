@@ -1,0 +1,115 @@
+"""Which part of an ICP correction is taken: as much as it knows better than the prior."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon.geometry.se3 import exp_so3, log_so3, make_transform
+from recon.odometry.settings import GateSettings
+from recon.odometry.surfaces import Fit
+from recon.structures.arrays import Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What ICP would do to the prior, and how the frame fits the map with and without it.
+
+    Attributes:
+        step: float64 (6,), translation in metres and rotation vector in radians, in camera axes
+            of the prior.
+        before: The frame against the map, at the prior.
+        after: The same at ICP's pose.
+    """
+
+    step: Float64
+    before: Fit
+    after: Fit
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What is taken of a correction.
+
+    Attributes:
+        step: float64 (6,), the part that is taken; zero where it was refused.
+        accepted: True where any was taken.
+        note: Why it was refused; empty where it was not.
+    """
+
+    step: Float64
+    accepted: bool
+    note: str = ""
+
+
+def judge(
+    correction: Correction, offset: Float64, prior_covariance: Float64, settings: GateSettings
+) -> Verdict:
+    """Weigh an ICP correction against its prior.
+
+    A Kalman update: along each direction the correction counts by how sure ICP is there against
+    how sure the prior is. Along a corridor ICP knows nothing and takes nothing.
+
+    Args:
+        correction: What ICP would do.
+        offset: float64 (6,), the standing part of ICP's corrections, which is no news.
+        prior_covariance: float64 (6, 6) of a step of the prior, metres and radians.
+        settings: Limits, and how far each side's own confidence is believed.
+    """
+    if correction.after.overlap < settings.min_overlap:
+        return _refused(f"overlap {correction.after.overlap:.2f} under {settings.min_overlap:g}")
+    fall = 1.0 - correction.after.residual_m / max(correction.before.residual_m, 1e-12)
+    if not fall >= settings.min_residual_gain:
+        return _refused(f"residual fell by {100 * fall:.1f} % only")
+    news = correction.step - offset
+    covariance = icp_covariance(correction.after, settings)
+    both = prior_covariance + covariance
+    sigmas = float(np.sqrt(news @ np.linalg.solve(both, news)))
+    if sigmas > settings.max_sigmas:
+        return _refused(f"correction is {sigmas:.1f} sigma from the prior")
+    step = _worthwhile(prior_covariance, both, news, settings.min_share)
+    if not step.any():
+        return _refused("ICP knows no better than the prior")
+    return Verdict(step, accepted=True)
+
+
+def icp_covariance(fit: Fit, settings: GateSettings) -> Float64:
+    """Covariance (6, 6) of ICP: from the surfaces it rests on, with a floor for their bias."""
+    # The smallest information stands for 100 m or rad, so that free directions can be inverted.
+    information = settings.icp_independence * fit.information + 1e-4 * np.eye(6)
+    floor = step_covariance(settings.icp_floor_m, settings.icp_floor_deg)
+    return np.asarray(np.linalg.inv(information) + floor)
+
+
+def step_covariance(sigma_m: float, sigma_deg: float) -> Float64:
+    """Covariance (6, 6) of a step that is equally uncertain in all directions."""
+    return np.diag(np.repeat([sigma_m**2, np.deg2rad(sigma_deg) ** 2], 3))
+
+
+def as_step(T: Float64) -> Float64:
+    """A small rigid motion as translation and rotation vector (6,)."""
+    return np.concatenate([T[:3, 3], log_so3(T[:3, :3])])
+
+
+def as_transform(step: Float64) -> Float64:
+    """Inverse of `as_step`."""
+    return make_transform(exp_so3(step[3:]), step[:3])
+
+
+def _worthwhile(prior: Float64, both: Float64, news: Float64, min_share: float) -> Float64:
+    """The Kalman step, without the directions in which little of the news would be taken.
+
+    With ``both = L·Lᵀ`` the gain ``prior·both⁻¹`` becomes symmetric, and its eigenvalues are the
+    shares taken in independent directions.
+    """
+    L = np.linalg.cholesky(both)
+    half = np.linalg.solve(L, prior)
+    share, axes = np.linalg.eigh(np.linalg.solve(L, half.T))
+    kept = np.where(share >= min_share, share, 0.0)
+    step: Float64 = L @ (axes * kept) @ axes.T @ np.linalg.solve(L, news)
+    return step
+
+
+def _refused(note: str) -> Verdict:
+    return Verdict(np.zeros(6), accepted=False, note=note)

@@ -1,0 +1,55 @@
+"""kiss-icp as it comes, on the whole stereo cloud: for comparison."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.adapters.kiss_icp import KissIcp, KissIcpOptions
+from recon.geometry.se3 import invert
+from recon.odometry.points import all_points
+from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
+from recon.odometry.settings import KissSettings
+from recon.structures.arrays import Float64
+
+
+class KissOdometry:
+    """Gives kiss-icp every point, as a LiDAR would; it loses motion on dense stereo clouds.
+
+    Args:
+        settings: Range, voxel, threshold.
+    """
+
+    def __init__(self, settings: KissSettings) -> None:
+        self._settings = settings
+        self._icp = KissIcp(
+            KissIcpOptions(
+                max_range_m=settings.max_range_m,
+                source_range_m=settings.max_range_m,
+                voxel_m=settings.voxel_m,
+                initial_threshold_m=settings.initial_threshold_m,
+                min_motion_m=settings.min_motion_m,
+            )
+        )
+        self._poses: list[Float64] = []
+
+    def register(self, frame: OdometryFrame) -> OdometryResult:
+        """Register the next frame; one with too few points is left out and extrapolated."""
+        points = all_points(frame, self._settings.max_range_m)
+        if len(points) < self._settings.min_points:
+            note = f"{len(points)} points are too few for ICP; the last motion goes on"
+            health = OdometryHealth(ok=not self._poses, icp_points=len(points), notes=(note,))
+            return self._keep(self._extrapolated(), health)
+        alignment = self._icp.register(points.xyz)
+        health = OdometryHealth(icp_points=len(alignment.source), accepted=True)
+        return self._keep(alignment.T_world_camera, health)
+
+    def _keep(self, T_world_camera: Float64, health: OdometryHealth) -> OdometryResult:
+        self._poses = [*self._poses[-1:], T_world_camera]
+        return OdometryResult(T_world_camera, health)
+
+    def _extrapolated(self) -> Float64:
+        """The last pose, moved on by the last motion."""
+        if len(self._poses) < 2:
+            return self._poses[-1] if self._poses else np.eye(4)
+        before, last = self._poses
+        return np.asarray(last @ invert(before) @ last)

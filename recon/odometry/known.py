@@ -1,0 +1,45 @@
+"""Poses that are known already, given out frame by frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.errors import RegistrationError
+from recon.geometry.se3 import invert
+from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
+from recon.structures import Trajectory
+
+
+class KnownPoses:
+    """An odometry that looks poses up by the number of the frame.
+
+    Args:
+        trajectory: One pose for each frame of the source. They are re-based, so that the first
+            frame that is registered stands at the identity.
+    """
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self._poses = trajectory.T_world_camera
+        self._T_first_world = np.eye(4)
+        self._begun = False
+
+    def register(self, frame: OdometryFrame) -> OdometryResult:
+        """The known pose of the frame.
+
+        Raises:
+            RegistrationError: There is no pose for the frame.
+        """
+        index = frame.pair.index
+        if not 0 <= index < len(self._poses):
+            raise RegistrationError(
+                "no known pose for this frame",
+                where=f"frame {index}",
+                got=f"{len(self._poses)} poses",
+                expected="one for each frame",
+                hint="the pose file must list every frame of the source",
+            )
+        if not self._begun:
+            self._T_first_world = invert(self._poses[index])
+            self._begun = True
+        health = OdometryHealth(notes=("known pose",))
+        return OdometryResult(self._T_first_world @ self._poses[index], health)

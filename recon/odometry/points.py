@@ -1,0 +1,66 @@
+"""Which pixels go to ICP: the ones that stereo measures well."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from recon.geometry.projection import unproject
+from recon.geometry.triangulation import depth_from_disparity, depth_sigma
+from recon.odometry.protocol import OdometryFrame
+from recon.odometry.settings import PointSettings
+from recon.structures import Disparity, PointCloud
+from recon.structures.arrays import Bool, Float32, UInt8
+
+
+def select_points(frame: OdometryFrame, settings: PointSettings) -> PointCloud:
+    """Textured points whose disparity agrees with its neighbours, near enough to be exact.
+
+    Dense stereo clouds are smeared along the ray where there is no texture across it, and
+    extend the ground towards the camera; aligned as they are, they lose forward motion.
+
+    Args:
+        frame: Pictures and disparity.
+        settings: Texture, consistency, range and accuracy that are asked for.
+
+    Returns:
+        Points in camera axes with ``sigma_m``; perhaps none.
+    """
+    camera = frame.pair.camera
+    depth = depth_from_disparity(frame.disparity.values, camera)
+    sigma = depth_sigma(depth, frame.disparity.sigma_px, camera)
+    with np.errstate(invalid="ignore"):
+        good = (depth >= settings.min_range_m) & (depth <= settings.max_range_m)
+        good &= sigma <= settings.max_sigma_m
+    good &= textured(frame.pair.left, settings.min_gradient)
+    good &= consistent(frame.disparity, settings.max_disparity_step_px)
+    return _cloud(frame, depth, sigma, good)
+
+
+def all_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
+    """Every pixel with a depth up to a range, as a LiDAR odometry would take them."""
+    camera = frame.pair.camera
+    depth = depth_from_disparity(frame.disparity.values, camera)
+    sigma = depth_sigma(depth, frame.disparity.sigma_px, camera)
+    return _cloud(frame, depth, sigma, np.asarray(depth <= max_range_m))
+
+
+def textured(grey: UInt8, min_gradient: float) -> Bool:
+    """bool (H, W), where the picture changes along the row: only that fixes a disparity."""
+    gradient = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3)
+    return np.asarray(np.abs(gradient) > min_gradient)
+
+
+def consistent(disparity: Disparity, max_step_px: float) -> Bool:
+    """bool (H, W), where a disparity is close to the median of its 5×5 neighbours.
+
+    Pixels without a match count as far away, so the rims of matched regions fall out too.
+    """
+    values = np.where(disparity.valid, disparity.values, np.float32(-1e6)).astype(np.float32)
+    return np.asarray(disparity.valid & (np.abs(cv2.medianBlur(values, 5) - values) <= max_step_px))
+
+
+def _cloud(frame: OdometryFrame, depth: Float32, sigma: Float32, where: Bool) -> PointCloud:
+    v, u = np.nonzero(where)
+    xyz = unproject(u, v, depth[where], frame.pair.camera)
+    return PointCloud(xyz=xyz, sigma_m=sigma[where], frame="camera")

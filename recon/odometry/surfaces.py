@@ -1,0 +1,139 @@
+"""The local map as surfaces: what a point that lies near it can say about the pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.structures.arrays import Bool, Float64
+
+MIN_POINTS = 6
+"""Fewer points of a cell do not tell a surface."""
+
+THIN_SHARE = 0.15
+"""A cell is thin along an axis where its points spread by less than this share of its edge.
+
+Points that fill a cell evenly spread by 0.29 of its edge (1/√12)."""
+
+NOISE_M = 0.02
+"""No surface is known better than this."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Cells of a map, each with its middle and with what it fixes.
+
+    Attributes:
+        edge_m: Edge of a cell.
+        keys: int64 (M,), packed cell indices, ascending.
+        means: float64 (M, 3), middle of the points of each cell.
+        information: float64 (M, 3, 3), inverse covariance along the thin axes, zero along the
+            others: a wall fixes one direction, a pole two, a bush none.
+    """
+
+    edge_m: float
+    keys: NDArray[np.int64]
+    means: Float64
+    information: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """How points fit surfaces.
+
+    Attributes:
+        overlap: Share of points that lie in a cell with a surface.
+        residual_m: Median distance from those points to their surfaces; NaN = none.
+        information: float64 (6, 6), what the points tell about a step (translation in metres,
+            rotation vector in radians) of their frame.
+    """
+
+    overlap: float
+    residual_m: float
+    information: Float64
+
+
+def describe_surfaces(xyz: Float64, edge_m: float) -> Surfaces:
+    """Sum a cloud up by the surfaces in its cells.
+
+    Args:
+        xyz: float64 (N, 3).
+        edge_m: Edge of a cell.
+
+    Ref:
+        Biber and Straßer, "The normal distributions transform", IROS 2003.
+    """
+    keys, cell, count = np.unique(_keys(xyz, edge_m), return_inverse=True, return_counts=True)
+    means = _sums(cell, xyz, len(keys)) / count[:, None]
+    off = xyz - means[cell]
+    products = np.einsum("ni,nj->nij", off, off).reshape(-1, 9)
+    covariance = _sums(cell, products, len(keys)).reshape(-1, 3, 3) / count[:, None, None]
+    known = count >= MIN_POINTS
+    information = _thin_information(covariance[known], edge_m)
+    some = information.any(axis=(1, 2))
+    return Surfaces(edge_m, keys[known][some], means[known][some], information[some])
+
+
+def fit_surfaces(xyz: Float64, surfaces: Surfaces) -> Fit:
+    """How points (N, 3), in the axes of the surfaces, fit them."""
+    cell, hit = _look_up(xyz, surfaces)
+    if not hit.any():
+        return Fit(0.0, float("nan"), np.zeros((6, 6)))
+    near, information = xyz[hit], surfaces.information[cell[hit]]
+    off = near - surfaces.means[cell[hit]]
+    residual_m = float(np.median(_distance_m(off, information)))
+    J = _step_jacobian(near)
+    total = np.einsum("nki,nkl,nlj->ij", J, information, J, optimize=True)
+    return Fit(float(hit.mean()), residual_m, total)
+
+
+def _thin_information(covariance: Float64, edge_m: float) -> Float64:
+    """Inverse covariance (M, 3, 3) along the axes on which the points hardly spread."""
+    spread, axes = np.linalg.eigh(covariance)
+    thin = np.sqrt(np.maximum(spread, 0.0)) < THIN_SHARE * edge_m
+    strength = np.where(thin, 1.0 / (np.maximum(spread, 0.0) + NOISE_M**2), 0.0)
+    information: Float64 = np.einsum("mik,mk,mjk->mij", axes, strength, axes)
+    return information
+
+
+def _distance_m(off: Float64, information: Float64) -> Float64:
+    """Distances (N,) along the thin axes: the Mahalanobis distance, in units of the surface."""
+    square = np.einsum("ni,nij,nj->n", off, information, off)
+    strength = np.einsum("nii->n", information)
+    distance: Float64 = np.sqrt(np.maximum(square, 0.0) / strength)
+    return distance
+
+
+def _step_jacobian(xyz: Float64) -> Float64:
+    """Derivative (N, 3, 6) of points by a step of their frame: [I, -hat(xyz)]."""
+    J = np.zeros((len(xyz), 3, 6))
+    J[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    x, y, z = xyz.T
+    J[:, 0, 4], J[:, 0, 5] = z, -y
+    J[:, 1, 3], J[:, 1, 5] = -z, x
+    J[:, 2, 3], J[:, 2, 4] = y, -x
+    return J
+
+
+def _look_up(xyz: Float64, surfaces: Surfaces) -> tuple[NDArray[np.int64], Bool]:
+    """Index of the cell of each point, and whether there is one."""
+    if not len(surfaces.keys):
+        return np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.bool_)
+    keys = _keys(xyz, surfaces.edge_m)
+    cell = np.minimum(np.searchsorted(surfaces.keys, keys), len(surfaces.keys) - 1)
+    return cell, surfaces.keys[cell] == keys
+
+
+def _keys(xyz: Float64, edge_m: float) -> NDArray[np.int64]:
+    """Cell of each point as one number; 21 bits an axis are enough for a thousand kilometres."""
+    index = np.floor(xyz / edge_m).astype(np.int64) + (1 << 20)
+    keys: NDArray[np.int64] = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+    return keys
+
+
+def _sums(cell: NDArray[np.int64], values: Float64, cells: int) -> Float64:
+    """Sum of the rows of ``values`` in each cell."""
+    columns = [np.bincount(cell, weights=column, minlength=cells) for column in values.T]
+    return np.stack(columns, axis=1)
