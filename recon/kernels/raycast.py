@@ -7,7 +7,8 @@ OctoMap's rule (Hornung et al. 2013). Then the frame is added to the log-odds.
 A measurement is not a point but a normal distribution along its ray: a cell is hit by the share
 of the distribution that lies in it, and only what lies well before it is free.
 
-All lengths are in cells. The twins in plain Python stand in `recon.kernels.raycast_reference`.
+All lengths are in cells, but for those of the points that come in. The twins in plain Python
+stand in `recon.kernels.raycast_reference`.
 
 Ref: J. Amanatides and A. Woo, "A fast voxel traversal algorithm for ray tracing", Eurographics
 1987; A. Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on
@@ -17,48 +18,43 @@ octrees", Autonomous Robots 34, 2013.
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.kernels.voxels import VoxelTable, copy_rows, find_or_add, pack_key
+from recon.kernels.voxels import (
+    EMPTY,
+    copy_rows,
+    enter_keys,
+    find_or_add,
+    make_table,
+    pack_key,
+)
 
 BLOCK_BITS: Final = 3
 BLOCK_EDGE: Final = 1 << BLOCK_BITS
 BLOCK_CELLS: Final = BLOCK_EDGE**3
 _LOW: Final = BLOCK_EDGE - 1
+MIN_DEPTH_M: Final = 1e-3
 _SQRT2: Final = math.sqrt(2.0)
 
 
 class Blocks(NamedTuple):
-    """The map: one row per block of cells.
+    """Blocks of cells, one row each: the map (log-odds), or what one frame says (evidence).
 
     Attributes:
+        table: int64 (C, 2), hash from packed block index to row.
         keys: int64 (B,), packed index of each block.
-        log_odds: float32 (B, 512), natural logarithm; NaN = never observed. Cell (i, j, k) of a
-            block is column ``(i·8 + j)·8 + k``.
-        slots: int32 (B,), row of the block in the evidence of this frame; -1 = not touched.
+        values: float32 (B, 512). In the map: log-odds; NaN = never observed. In the evidence:
+            change of the log-odds; 0 = not touched. Cell (i, j, k) of a block is column
+            ``(i·8 + j)·8 + k``.
         used: int64 (1,), number of rows in use.
     """
 
+    table: NDArray[np.int64]
     keys: NDArray[np.int64]
-    log_odds: NDArray[np.float32]
-    slots: NDArray[np.int32]
-    used: NDArray[np.int64]
-
-
-class Evidence(NamedTuple):
-    """What one frame says: one row per block that it touches.
-
-    Attributes:
-        rows: int32 (E,), row in the map of each block touched.
-        values: float32 (E, 512), change of the log-odds; 0 = the cell is not touched.
-        used: int64 (1,), number of rows in use.
-    """
-
-    rows: NDArray[np.int32]
     values: NDArray[np.float32]
     used: NDArray[np.int64]
 
@@ -83,49 +79,92 @@ class Rays(NamedTuple):
     miss: NDArray[np.float32]
 
 
-def make_blocks(rows: int) -> Blocks:
-    """An empty map with room for ``rows`` blocks."""
+def measure_points(
+    xyz: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    T: NDArray[np.float64],
+    max_range: float,
+    margin: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Turn points of a camera into ends of rays, and what is known of each ray.
+
+    A point farther than ``max_range`` is moved along its ray to that range, and hits nothing.
+
+    Args:
+        xyz: float32 (N, 3), camera axes, metres.
+        sigma: float32 (N,), standard deviation of the depth, metres.
+        confidence: float32 (N,), handed through.
+        T: float64 (4, 4), from camera axes in metres to cells of the map: a rotation times a scale.
+        max_range: Range of a hit, in cells.
+        margin: Standard deviations before a point where free space ends.
+
+    Returns:
+        float32 (N, 3), ends in cells of the map, and float32 (N, 4): standard deviation of the
+        length and free length (cells), confidence, and 1 where the ray hits or 0.
+    """
+    ends = np.empty((len(xyz), 3), np.float32)
+    values = np.empty((len(xyz), 4), np.float32)
+    scale = float(np.linalg.norm(T[0, :3]))
+    limits = (scale, max_range, margin)
+    _measure_points(xyz, sigma, confidence, T, limits, (ends, values))
+    return ends, values
+
+
+@njit(cache=True, nogil=True)
+def _measure_points(
+    xyz: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    T: NDArray[np.float64],
+    limits: tuple[float, float, float],
+    out: tuple[NDArray[np.float32], NDArray[np.float32]],
+) -> None:
+    """The loop of `measure_points`."""
+    scale, max_range, margin = limits
+    ends, values = out
+    for n in range(len(xyz)):
+        x, y, z = np.float64(xyz[n, 0]), np.float64(xyz[n, 1]), np.float64(xyz[n, 2])
+        metres = math.sqrt(x * x + y * y + z * z)
+        length = scale * metres
+        # The error lies along the optical axis: along an oblique ray it is longer.
+        spread = scale * sigma[n] * metres / max(abs(z), MIN_DEPTH_M)
+        near = length <= max_range
+        shrink = 1.0 if near else max_range / length
+        for axis in range(3):
+            turned = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z
+            ends[n, axis] = T[axis, 3] + shrink * turned
+        values[n, 0] = spread
+        # A ray without a hit ends a cell before the range, where a hit could still be.
+        values[n, 1] = min(length - margin * spread, max_range - 1.0)
+        values[n, 2] = confidence[n]
+        values[n, 3] = 1.0 if near else 0.0
+
+
+def make_blocks(rows: int, fill: float) -> Blocks:
+    """No blocks yet, room for ``rows``, whose cells will start as ``fill``."""
     return Blocks(
+        table=make_table(rows),
         keys=np.zeros(rows, np.int64),
-        log_odds=np.full((rows, BLOCK_CELLS), np.nan, np.float32),
-        slots=np.full(rows, -1, np.int32),
+        values=np.full((rows, BLOCK_CELLS), fill, np.float32),
         used=np.zeros(1, np.int64),
     )
 
 
-def make_evidence(rows: int) -> Evidence:
-    """Evidence of a frame that touches at most ``rows`` blocks."""
-    values = np.zeros((rows, BLOCK_CELLS), np.float32)
-    return Evidence(np.zeros(rows, np.int32), values, np.zeros(1, np.int64))
-
-
-def reserve_blocks(blocks: Blocks, rows: int) -> Blocks:
-    """A map with room for ``rows`` blocks: the same, or one of twice the size (or more)."""
+def reserve_blocks(blocks: Blocks, rows: int, fill: float) -> Blocks:
+    """Room for ``rows`` blocks: the same, or twice as much (or more) with the same content."""
     have, used = len(blocks.keys), int(blocks.used[0])
     if rows <= have:
         return blocks
-    larger = make_blocks(max(rows, 2 * have))
+    larger = make_blocks(max(rows, 2 * have), fill)
+    copy_rows(blocks[1:-1], larger[1:-1], used)
     larger.used[0] = used
-    copy_rows(blocks[:-1], larger[:-1], used)
+    enter_keys(larger.table, larger.keys[:used])
     return larger
 
 
-def reserve_evidence(evidence: Evidence, rows: int) -> Evidence:
-    """Evidence with room for ``rows`` blocks: the same, or one of twice the size (or more)."""
-    have, used = len(evidence.rows), int(evidence.used[0])
-    if rows <= have:
-        return evidence
-    larger = make_evidence(max(rows, 2 * have))
-    larger.used[0] = used
-    copy_rows(evidence[:-1], larger[:-1], used)
-    return larger
-
-
-@njit(cache=True, nogil=True)
-def cast_rays(
-    table: VoxelTable, blocks: Blocks, evidence: Evidence, rays: Rays, start: int, spread: float
-) -> int:
-    """Collect the evidence of rays until they end or room runs out.
+def cast_rays(evidence: Blocks, rays: Rays, spread: float) -> Blocks:
+    """Collect the evidence of the rays of one frame.
 
     The cells that a ray leaves before its length reaches ``free`` are missed. Where it hits,
     the cells that touch ``length ± spread·sigma`` get ``hit`` times the share of the normal
@@ -133,78 +172,87 @@ def cast_rays(
     several misses the strongest, and a hit outweighs misses; so the order of rays is irrelevant.
 
     Args:
-        table: Hash of the blocks; written.
-        blocks: The map; gets new, unobserved blocks.
-        evidence: Evidence of this frame; written.
+        evidence: Written, or replaced by larger stores where they are full.
         rays: The rays, all finite; a ray of zero length says nothing.
-        start: First ray to cast.
         spread: Half width of the zone of a hit, in standard deviations.
 
     Returns:
-        The first ray that was not cast for want of room in ``table``, ``blocks`` or
-        ``evidence``; the number of rays when all were. Casting a ray twice changes nothing.
+        The stores that hold the evidence.
     """
-    for n in range(start, len(rays.ends)):
-        if not _cast(table, blocks, evidence, rays, n, spread):
-            return n
-    return len(rays.ends)
+    done = 0
+    while True:
+        # Plain tuples: numba's cache on disk would remember the classes by name, and break when
+        # one is renamed.
+        done = _cast_rays(tuple(evidence), tuple(rays), done, spread)
+        if done == len(rays.ends):
+            return evidence
+        evidence = reserve_blocks(evidence, len(evidence.keys) + 1, 0.0)
 
 
 @njit(cache=True, nogil=True)
-def _cast(
-    table: VoxelTable, blocks: Blocks, evidence: Evidence, rays: Rays, n: int, spread: float
-) -> bool:
-    """Collect the evidence of ray ``n``; False where room runs out."""
-    ox, oy, oz = rays.origin[0], rays.origin[1], rays.origin[2]
-    dx, dy, dz = rays.ends[n, 0] - ox, rays.ends[n, 1] - oy, rays.ends[n, 2] - oz
-    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    if length == 0:
-        return True
-    free, sigma, hit, miss = rays.free[n], rays.sigma[n], rays.hit[n], rays.miss[n]
-    near = length - spread * sigma if hit > 0 else np.inf
-    stop = max(free, length + spread * sigma) if hit > 0 else free
-
-    i, j, k = math.floor(ox), math.floor(oy), math.floor(oz)
-    step_x, next_x, delta_x = _axis(ox, dx / length, i)
-    step_y, next_y, delta_y = _axis(oy, dy / length, j)
-    step_z, next_z, delta_z = _axis(oz, dz / length, k)
-    enter, below = 0.0, _normal_cdf(0.0, length, sigma)
-    slot, block = -1, -1
-    while True:
-        leave = min(next_x, next_y, next_z)
-        missed = leave <= free
-        touched = leave > near
-        if missed or touched:
-            key = pack_key(i >> BLOCK_BITS, j >> BLOCK_BITS, k >> BLOCK_BITS)
-            if key != block:
-                slot = _slot(table, blocks, evidence, key)
-                if slot < 0:
-                    return False
-                block = key
-            cell = ((i & _LOW) << 6) | ((j & _LOW) << 3) | (k & _LOW)
-            value = evidence.values[slot, cell]
-            if touched:
-                if enter <= near:
-                    below = _normal_cdf(enter, length, sigma)
-                above = _normal_cdf(leave, length, sigma)
-                gain = np.float32(hit * (above - below))
-                below = above
-                if gain > 0 and gain > value:
-                    evidence.values[slot, cell] = gain
-            elif value <= 0 and miss < value:
-                evidence.values[slot, cell] = miss
-        if leave >= stop:
-            return True
-        enter = leave
-        if next_x <= next_y and next_x <= next_z:
-            i += step_x
-            next_x += delta_x
-        elif next_y <= next_z:
-            j += step_y
-            next_y += delta_y
-        else:
-            k += step_z
-            next_z += delta_z
+def _cast_rays(
+    evidence: tuple[NDArray[Any], ...], rays: tuple[NDArray[Any], ...], start: int, spread: float
+) -> int:
+    """Cast from ray ``start`` on; returns the first that finds no room (and may be cast again)."""
+    # Arrays are taken out of their tuples once: inside the loops that would count references.
+    table, keys, values, used = evidence
+    origin, ends, frees, sigmas, hits, misses = rays
+    rows = used[0]
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    for n in range(start, len(ends)):
+        dx, dy, dz = ends[n, 0] - ox, ends[n, 1] - oy, ends[n, 2] - oz
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        if length == 0:
+            continue
+        free, sigma, hit, miss = frees[n], sigmas[n], hits[n], misses[n]
+        near = length - spread * sigma if hit > 0 else np.inf
+        stop = max(free, length + spread * sigma) if hit > 0 else free
+        i, j, k = math.floor(ox), math.floor(oy), math.floor(oz)
+        step_x, next_x, delta_x = _axis(ox, dx / length, i)
+        step_y, next_y, delta_y = _axis(oy, dy / length, j)
+        step_z, next_z, delta_z = _axis(oz, dz / length, k)
+        enter, below, block, row = 0.0, -1.0, -1, 0
+        while True:
+            leave = min(next_x, next_y, next_z)
+            touched = leave > near
+            if touched or leave <= free:
+                key = pack_key(i >> BLOCK_BITS, j >> BLOCK_BITS, k >> BLOCK_BITS)
+                if key != block:
+                    if rows == len(keys):
+                        used[0] = rows
+                        return n
+                    row = find_or_add(table, key, rows)
+                    if row == rows:
+                        keys[row] = key
+                        rows += 1
+                    block = key
+                cell = ((i & _LOW) << (2 * BLOCK_BITS)) | ((j & _LOW) << BLOCK_BITS) | (k & _LOW)
+                value = values[row, cell]
+                if not touched:
+                    if value <= 0 and miss < value:
+                        values[row, cell] = miss
+                else:
+                    if below < 0:
+                        below = _normal_cdf(enter, length, sigma)
+                    above = _normal_cdf(leave, length, sigma)
+                    gain = np.float32(hit * (above - below))
+                    below = above
+                    if gain > 0 and gain > value:
+                        values[row, cell] = gain
+            if leave >= stop:
+                break
+            enter = leave
+            if next_x <= next_y and next_x <= next_z:
+                i += step_x
+                next_x += delta_x
+            elif next_y <= next_z:
+                j += step_y
+                next_y += delta_y
+            else:
+                k += step_z
+                next_z += delta_z
+    used[0] = rows
+    return len(ends)
 
 
 @njit(cache=True, nogil=True)
@@ -225,39 +273,47 @@ def _normal_cdf(value: float, mean: float, sigma: float) -> float:
     return 0.5 * (1.0 + math.erf((value - mean) / (sigma * _SQRT2)))
 
 
-@njit(cache=True, nogil=True)
-def _slot(table: VoxelTable, blocks: Blocks, evidence: Evidence, key: int) -> int:
-    """Row of a block in the evidence of this frame, made where it is new; -1 = no room."""
-    used, touched = blocks.used[0], evidence.used[0]
-    full = used == len(blocks.keys) or 2 * (used + 1) > len(table.keys)
-    if full or touched == len(evidence.rows):
-        return -1
-    row = find_or_add(table, key, used)
-    if row == used:
-        blocks.keys[row] = key
-        blocks.used[0] = used + 1
-    if blocks.slots[row] < 0:
-        blocks.slots[row] = touched
-        evidence.rows[touched] = row
-        evidence.used[0] = touched + 1
-    return int(blocks.slots[row])
+def apply_evidence(blocks: Blocks, evidence: Blocks, lowest: float, highest: float) -> Blocks:
+    """Add a frame's evidence to the map and clamp; clear the evidence for the next frame.
+
+    Args:
+        blocks: The map; written, or replaced by larger stores where they are full.
+        evidence: What the frame says; empty afterwards.
+        lowest: Log-odds never fall below.
+        highest: Log-odds never rise above.
+
+    Returns:
+        The stores that hold the map.
+    """
+    rows = int(blocks.used[0]) + int(evidence.used[0])
+    blocks = reserve_blocks(blocks, rows, np.nan)
+    _apply_evidence(tuple(blocks), tuple(evidence), lowest, highest)
+    return blocks
 
 
 @njit(cache=True, nogil=True)
-def apply_evidence(blocks: Blocks, evidence: Evidence, lowest: float, highest: float) -> None:
-    """Add a frame's evidence to the map, clamp, and clear the evidence for the next frame."""
+def _apply_evidence(
+    blocks: tuple[NDArray[Any], ...],
+    evidence: tuple[NDArray[Any], ...],
+    lowest: float,
+    highest: float,
+) -> None:
+    """The loop of `apply_evidence`; the map has room for every block."""
+    table, keys, log_odds, used = blocks
+    frame_table, frame_keys, changes, frame_used = evidence
     low, high = np.float32(lowest), np.float32(highest)
-    for touched in range(evidence.used[0]):
-        row = evidence.rows[touched]
-        values = evidence.values[touched]
-        log_odds = blocks.log_odds[row]
+    for touched in range(frame_used[0]):
+        row = find_or_add(table, frame_keys[touched], used[0])
+        if row == used[0]:
+            keys[row] = frame_keys[touched]
+            used[0] += 1
         for cell in range(BLOCK_CELLS):
-            change = values[cell]
+            change = changes[touched, cell]
             if change == 0:
                 continue
-            before = log_odds[cell]
+            before = log_odds[row, cell]
             after = change if np.isnan(before) else before + change
-            log_odds[cell] = min(max(after, low), high)
-            values[cell] = 0
-        blocks.slots[row] = -1
-    evidence.used[0] = 0
+            log_odds[row, cell] = min(max(after, low), high)
+            changes[touched, cell] = 0
+    frame_table[:, 0] = EMPTY
+    frame_used[0] = 0

@@ -4,11 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from recon.kernels.raycast import Rays
+from recon.kernels.raycast import MIN_DEPTH_M, Rays
 from recon.kernels.voxels_reference import Cell
+
+
+def measure_points_reference(
+    xyz: NDArray[Any],
+    sigma: NDArray[Any],
+    confidence: NDArray[Any],
+    T: NDArray[Any],
+    max_range: float,
+    margin: float,
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Ends of rays (N, 3) and values (N, 4), as `recon.kernels.raycast.measure_points` says."""
+    scale = np.linalg.norm(T[0, :3])
+    metres = np.linalg.norm(xyz, axis=1)
+    spread = scale * sigma * metres / np.maximum(np.abs(xyz[:, 2]), MIN_DEPTH_M)
+    near = scale * metres <= max_range
+    shrink = np.where(near, 1.0, max_range / np.maximum(scale * metres, max_range))
+    ends = T[:3, 3] + shrink[:, None] * (xyz @ T[:3, :3].T)
+    free = np.minimum(scale * metres - margin * spread, max_range - 1.0)
+    return ends, np.stack([spread, free, confidence, near.astype(float)], axis=1)
 
 
 def walk_reference(

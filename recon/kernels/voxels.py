@@ -11,6 +11,7 @@ The twins in plain Python stand in `recon.kernels.voxels_reference`.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -25,22 +26,11 @@ _MASK: Final = (1 << KEY_BITS) - 1
 _MIN_CAPACITY: Final = 1 << 10
 
 
-class VoxelTable(NamedTuple):
-    """Open-addressing hash from packed cell to row.
-
-    Attributes:
-        keys: int64 (C,), packed cells; `EMPTY` = unused. C is a power of two.
-        rows: int32 (C,), row of each.
-    """
-
-    keys: NDArray[np.int64]
-    rows: NDArray[np.int32]
-
-
 class VoxelSums(NamedTuple):
     """What is summed up per voxel; one row each.
 
     Attributes:
+        table: int64 (C, 2), hash from packed cell to row (`make_table`).
         keys: int64 (R,), packed cells.
         sums: float32 (R, 4 + C): sum of weights; weighted sums of the offset from the voxel's
             centre (x, y, z, metres) and of the C values of each point.
@@ -51,6 +41,7 @@ class VoxelSums(NamedTuple):
         used: int64 (1,), number of rows in use.
     """
 
+    table: NDArray[np.int64]
     keys: NDArray[np.int64]
     sums: NDArray[np.float32]
     information: NDArray[np.float32]
@@ -74,17 +65,23 @@ class VoxelPoints(NamedTuple):
     values: NDArray[np.float32]
 
 
-def make_table(rows: int) -> VoxelTable:
-    """An empty table with room for ``rows`` entries."""
+def make_table(rows: int) -> NDArray[np.int64]:
+    """An empty hash with room for ``rows`` entries.
+
+    Returns:
+        int64 (C, 2), C a power of two: packed cell and row of each entry; a cell of `EMPTY` marks
+        an unused place.
+    """
     capacity = _MIN_CAPACITY
     while capacity < 2 * rows:
         capacity *= 2
-    return VoxelTable(np.full(capacity, EMPTY, np.int64), np.zeros(capacity, np.int32))
+    return np.full((capacity, 2), EMPTY, np.int64)
 
 
 def make_sums(rows: int, values: int) -> VoxelSums:
     """Empty rows for voxels whose points carry ``values`` numbers each."""
     return VoxelSums(
+        table=make_table(rows),
         keys=np.zeros(rows, np.int64),
         sums=np.zeros((rows, 4 + values), np.float32),
         information=np.zeros(rows, np.float32),
@@ -95,29 +92,15 @@ def make_sums(rows: int, values: int) -> VoxelSums:
     )
 
 
-def reserve_table(table: VoxelTable, keys: NDArray[np.int64], rows: int) -> VoxelTable:
-    """A table with room for ``rows`` entries: the same one, or a larger one that holds ``keys``.
-
-    Args:
-        table: The table that there is.
-        keys: int64 (U,), packed cells of rows 0 … U - 1.
-        rows: Number of entries that must fit.
-    """
-    if 2 * rows <= len(table.keys):
-        return table
-    larger = make_table(rows)
-    _fill(larger, keys)
-    return larger
-
-
-def reserve_sums(sums: VoxelSums, rows: int) -> VoxelSums:
+def reserve_sums(voxels: VoxelSums, rows: int) -> VoxelSums:
     """Rows for ``rows`` voxels: the same ones, or twice as many (or more) with the same content."""
-    have = len(sums.keys)
+    have, used = len(voxels.keys), int(voxels.used[0])
     if rows <= have:
-        return sums
-    larger = make_sums(max(rows, 2 * have), sums.sums.shape[1] - 4)
-    copy_rows(sums[:-1], larger[:-1], int(sums.used[0]))
-    larger.used[0] = sums.used[0]
+        return voxels
+    larger = make_sums(max(rows, 2 * have), voxels.sums.shape[1] - 4)
+    copy_rows(voxels[1:-1], larger[1:-1], used)
+    larger.used[0] = used
+    enter_keys(larger.table, larger.keys[:used])
     return larger
 
 
@@ -141,59 +124,79 @@ def pack_key(i: int, j: int, k: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def find_or_add(table: VoxelTable, key: int, next_row: int) -> int:
+def find_or_add(table: NDArray[np.int64], key: int, next_row: int) -> int:
     """Row of a packed cell; where it is new it is entered with ``next_row``.
 
-    The table must have an unused place.
+    The hash must have an unused place.
     """
-    keys, rows = table
-    mask = len(keys) - 1
-    # Fibonacci hashing of the key folded to 31 bits: the product stays below 2^63.
-    folded = (key ^ (key >> 19) ^ (key >> 38)) & 0x7FFFFFFF
-    place = ((folded * 0x9E3779B1) >> 20) & mask
-    while keys[place] != EMPTY:
-        if keys[place] == key:
-            return int(rows[place])
+    mask = len(table) - 1
+    # Two rounds of multiplicative hashing; 32-bit factors keep the products inside an int64.
+    mixed = ((key >> 32) * 0x9E3779B1 ^ key) & 0x7FFFFFFF
+    place = ((mixed * 0x85EBCA6B) >> 22) & mask
+    while table[place, 0] != EMPTY:
+        if table[place, 0] == key:
+            return int(table[place, 1])
         place = (place + 1) & mask
-    keys[place] = key
-    rows[place] = next_row
+    table[place, 0] = key
+    table[place, 1] = next_row
     return next_row
 
 
 @njit(cache=True, nogil=True)
-def _fill(table: VoxelTable, keys: NDArray[np.int64]) -> None:
-    """Enter the cells of rows 0 … N - 1 into an empty table."""
+def enter_keys(table: NDArray[np.int64], keys: NDArray[np.int64]) -> None:
+    """Enter the cells of rows 0 … N - 1 into an empty hash."""
     for row in range(len(keys)):
         find_or_add(table, keys[row], row)
 
 
-@njit(cache=True, nogil=True)
-def sum_points(
-    table: VoxelTable, voxels: VoxelSums, points: VoxelPoints, edge: float, frame: int
-) -> None:
+def add_points(voxels: VoxelSums, points: VoxelPoints, edge: float, frame: int) -> VoxelSums:
     """Add the points of one frame to the voxels that they fall into.
 
     Args:
-        table: Hash of the voxels, with room for one more entry per point; written.
-        voxels: The rows, with room for one more per point; written.
+        voxels: The rows; written, or replaced by larger ones where they are full.
         points: The points; as many values each as the rows have.
         edge: Edge of a voxel, in the unit of the points.
         frame: Number of the frame; frames come in order.
+
+    Returns:
+        The rows that hold the result.
     """
-    keys, sums, information, best, frames, last, used = voxels
+    done = 0
+    while True:
+        # Plain tuples: numba's cache on disk would remember the classes by name, and break when
+        # one is renamed.
+        done = _add_points(tuple(voxels), tuple(points), edge, frame, done)
+        if done == len(points.xyz):
+            return voxels
+        voxels = reserve_sums(voxels, len(voxels.keys) + 1)
+
+
+@njit(cache=True, nogil=True)
+def _add_points(
+    voxels: tuple[NDArray[Any], ...],
+    points: tuple[NDArray[Any], ...],
+    edge: float,
+    frame: int,
+    start: int,
+) -> int:
+    """Add points from ``start`` on; returns the first that finds no room."""
+    table, keys, sums, information, best, frames, last, used = voxels
     xyz, weights, values = points
-    columns = values.shape[1]
-    for n in range(len(xyz)):
+    columns, rows = values.shape[1], used[0]
+    for n in range(start, len(xyz)):
         w = weights[n]
         if not w > 0:
             continue
+        if rows == len(keys):
+            used[0] = rows
+            return n
         x, y, z = xyz[n, 0] / edge, xyz[n, 1] / edge, xyz[n, 2] / edge
-        i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+        i, j, k = math.floor(x), math.floor(y), math.floor(z)
         key = pack_key(i, j, k)
-        row = find_or_add(table, key, used[0])
-        if row == used[0]:
+        row = find_or_add(table, key, rows)
+        if row == rows:
             keys[row] = key
-            used[0] += 1
+            rows += 1
         sums[row, 0] += w
         sums[row, 1] += w * np.float32((x - i - 0.5) * edge)
         sums[row, 2] += w * np.float32((y - j - 0.5) * edge)
@@ -207,3 +210,5 @@ def sum_points(
         if w > best[row]:
             information[row] += w - best[row]
             best[row] = w
+    used[0] = rows
+    return len(xyz)

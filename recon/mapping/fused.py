@@ -50,7 +50,6 @@ class MapBuilder:
 
     def __init__(self, settings: FusionSettings) -> None:
         self._settings = settings
-        self._table = voxels.make_table(1)
         self._sums = voxels.make_sums(1, _VALUES)
         self._frames = 0
         self._known = {"rgb": True, "normals": True, "sigma_m": True, "confidence": True}
@@ -71,13 +70,10 @@ class MapBuilder:
                 away for the voxel size.
         """
         self._check(cloud)
-        rows = len(self) + len(cloud)
-        self._table = voxels.reserve_table(self._table, self._sums.keys[: len(self)], rows)
-        self._sums = voxels.reserve_sums(self._sums, rows)
         for name in self._known:
             self._known[name] &= getattr(cloud, name) is not None or len(cloud) == 0
         points = voxels.VoxelPoints(cloud.xyz, self._weights(cloud), _values(cloud))
-        voxels.sum_points(self._table, self._sums, points, self._settings.voxel_m, self._frames)
+        self._sums = voxels.add_points(self._sums, points, self._settings.voxel_m, self._frames)
         self._frames += 1
 
     def cloud(self, min_count: int | None = None) -> PointCloud:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from recon.errors import MappingError
-from recon.geometry.se3 import apply
 from recon.kernels import raycast, voxels
 from recon.settings import Settings
 from recon.structures import OccupancyVoxels, PointCloud
@@ -65,9 +64,8 @@ class OccupancyBuilder:
     def __init__(self, settings: OccupancySettings, T_map_world: NDArray[Any]) -> None:
         self._settings = settings
         self._T_map_world = np.asarray(T_map_world, dtype=np.float64)
-        self._blocks = raycast.make_blocks(256)
-        self._table = voxels.make_table(256)
-        self._evidence = raycast.make_evidence(256)
+        self._map = raycast.make_blocks(256, np.nan)
+        self._evidence = raycast.make_blocks(256, 0.0)
 
     def integrate(self, cloud: PointCloud, T_world_camera: NDArray[Any]) -> None:
         """Add what one frame saw.
@@ -81,20 +79,19 @@ class OccupancyBuilder:
                 too far away.
         """
         _check(cloud, T_world_camera, self._settings.resolution_m)
-        T_map_camera = self._T_map_world @ T_world_camera
-        rays = self._rays(cloud, T_map_camera)
-        self._cast(rays)
+        rays = self._rays(cloud, self._T_map_world @ T_world_camera)
         s = self._settings
+        self._evidence = raycast.cast_rays(self._evidence, rays, s.spread_sigmas)
         low, high = _log_odds(s.min_probability), _log_odds(s.max_probability)
-        raycast.apply_evidence(self._blocks, self._evidence, low, high)
+        self._map = raycast.apply_evidence(self._map, self._evidence, low, high)
 
     def voxels(self) -> OccupancyVoxels:
         """Every voxel that was observed so far, block by block as first touched."""
-        used = int(self._blocks.used[0])
-        log_odds = self._blocks.log_odds[:used]
+        used = int(self._map.used[0])
+        log_odds = self._map.values[:used]
         block, cell = np.nonzero(~np.isnan(log_odds))
         edge = raycast.BLOCK_EDGE
-        corner = voxels.unpack_keys(self._blocks.keys[:used]) * edge
+        corner = voxels.unpack_keys(self._map.keys[:used]) * edge
         local = np.stack(np.unravel_index(cell, (edge, edge, edge)), axis=1)
         return OccupancyVoxels(
             keys=(corner[block] + local).astype(np.int32),
@@ -103,70 +100,39 @@ class OccupancyBuilder:
         )
 
     def _rays(self, cloud: PointCloud, T_map_camera: Float64) -> raycast.Rays:
-        """One ray per end voxel, in voxels; points out of range become rays that hit nothing."""
+        """One ray per voxel in which enough points end; lengths in voxels."""
         s = self._settings
-        origin = T_map_camera[:3, 3]
-        range_m, sigma, confidence = _measurements(cloud)
-        xyz = apply(T_map_camera, cloud.xyz.astype(np.float64))
-        beyond = range_m > s.max_range_m
-        # What lies beyond is moved to the end of the range before it is reduced, so that a
-        # distant hedge does not cost a ray per voxel.
-        shrink = np.where(beyond, s.max_range_m / np.maximum(range_m, s.max_range_m), 1.0)
-        xyz = origin + (xyz - origin) * shrink[:, None]
-        free = np.minimum(range_m - s.free_margin_sigmas * sigma, s.max_range_m - s.resolution_m)
-        values = np.stack([sigma, free, confidence], axis=1).astype(np.float32)
-        hit_ends, hit_means = _reduce(xyz[~beyond], values[~beyond], s)
-        far_ends, far_means = _reduce(xyz[beyond], values[beyond], s)
-        ends = np.concatenate([hit_ends, far_ends]) / s.resolution_m
-        sigma, free, confidence = np.concatenate([hit_means, far_means]).T.astype(np.float64)
-        hit = np.where(np.arange(len(ends)) < len(hit_ends), _log_odds(s.hit_probability), 0.0)
+        T = T_map_camera.copy()
+        T[:3] /= s.resolution_m
+        n = len(cloud)
+        ends, values = raycast.measure_points(
+            cloud.xyz,
+            np.zeros(n, np.float32) if cloud.sigma_m is None else cloud.sigma_m,
+            np.ones(n, np.float32) if cloud.confidence is None else cloud.confidence,
+            T,
+            s.max_range_m / s.resolution_m,
+            s.free_margin_sigmas,
+        )
+        means, values = _reduce(ends, values, s.min_points)
+        sigma, free, confidence, hit = np.ascontiguousarray(values.T)
         return raycast.Rays(
-            origin=origin / s.resolution_m,
-            ends=ends,
-            free=free / s.resolution_m,
-            sigma=sigma / s.resolution_m,
-            hit=(hit * confidence).astype(np.float32),
-            miss=(_log_odds(s.miss_probability) * confidence).astype(np.float32),
+            origin=T[:3, 3].copy(),
+            ends=means,
+            free=free.astype(np.float64),
+            sigma=sigma.astype(np.float64),
+            hit=np.float32(_log_odds(s.hit_probability)) * confidence * hit,
+            miss=np.float32(_log_odds(s.miss_probability)) * confidence,
         )
 
-    def _cast(self, rays: raycast.Rays) -> None:
-        """Collect the evidence of all rays; grow the stores where they are full."""
-        done, spread = 0, self._settings.spread_sigmas
-        while True:
-            done = raycast.cast_rays(self._table, self._blocks, self._evidence, rays, done, spread)
-            if done == len(rays.ends):
-                return
-            self._grow()
 
-    def _grow(self) -> None:
-        """Make room for at least one more block everywhere."""
-        used = int(self._blocks.used[0])
-        self._blocks = raycast.reserve_blocks(self._blocks, used + 1)
-        self._evidence = raycast.reserve_evidence(self._evidence, int(self._evidence.used[0]) + 1)
-        self._table = voxels.reserve_table(self._table, self._blocks.keys[:used], used + 1)
-
-
-def _measurements(cloud: PointCloud) -> tuple[Float64, Float64, Float64]:
-    """Range, its standard deviation, and confidence of each point; float64 (N,), metres."""
-    xyz = cloud.xyz.astype(np.float64)
-    range_m = np.sqrt(np.einsum("ij,ij->i", xyz, xyz))
-    n = len(cloud)
-    # sigma_z lies along the optical axis: along an oblique ray it is longer.
-    stretch = range_m / np.maximum(np.abs(xyz[:, 2]), 1e-3)
-    sigma = np.zeros(n) if cloud.sigma_m is None else cloud.sigma_m * stretch
-    confidence = np.ones(n) if cloud.confidence is None else cloud.confidence.astype(np.float64)
-    return range_m, sigma, confidence
-
-
-def _reduce(xyz: Float64, values: Float32, settings: OccupancySettings) -> tuple[Float64, Float32]:
-    """Means of the points (M, 3) and values (M, C) of each voxel that holds enough points."""
-    edge = settings.resolution_m
-    table, sums = voxels.make_table(len(xyz)), voxels.make_sums(len(xyz), values.shape[1])
-    points = voxels.VoxelPoints(xyz, np.ones(len(xyz), np.float32), values)
-    voxels.sum_points(table, sums, points, edge, 0)
-    enough = np.flatnonzero(sums.sums[: sums.used[0], 0] >= settings.min_points)
+def _reduce(ends: Float32, values: Float32, least: int) -> tuple[Float64, Float32]:
+    """Means of the ends (M, 3) and values (M, C) in each voxel with ``least`` trusted points."""
+    trusted = (values[:, 2] > 0).astype(np.float32)
+    points = voxels.VoxelPoints(ends, trusted, values)
+    sums = voxels.add_points(voxels.make_sums(4096, values.shape[1]), points, 1.0, 0)
+    enough = np.flatnonzero(sums.sums[: sums.used[0], 0] >= least)
     means = sums.sums[enough, 1:] / sums.sums[enough, :1]
-    centres = (voxels.unpack_keys(sums.keys[enough]) + 0.5) * edge
+    centres = voxels.unpack_keys(sums.keys[enough]) + 0.5
     return centres + means[:, :3], means[:, 3:]
 
 

@@ -19,13 +19,10 @@ def _random_frame(rng: np.random.Generator, number: int) -> tuple[np.ndarray, ..
 
 
 def _sum(frames: list[tuple[np.ndarray, ...]], edge: float) -> voxels.VoxelSums:
-    table, sums = voxels.make_table(1), voxels.make_sums(1, 2)
+    sums = voxels.make_sums(1, 2)
     for number, frame in enumerate(frames):
-        used = int(sums.used[0])
-        rows = used + len(frame[0])
-        table = voxels.reserve_table(table, sums.keys[:used], rows)
-        sums = voxels.reserve_sums(sums, rows)
-        voxels.sum_points(table, sums, voxels.VoxelPoints(*frame), edge, number)
+        points = voxels.VoxelPoints(*frame)
+        sums = voxels.add_points(sums, points, edge, number)
     return sums
 
 
@@ -66,22 +63,26 @@ def test_unpacking_inverts_packing(cells: list[tuple[int, int, int]]) -> None:
 def test_growing_keeps_every_row() -> None:
     cells = np.stack(np.unravel_index(np.arange(8000), (20, 20, 20)), axis=1)
     keys = np.array([voxels.pack_key(*cell) for cell in cells.tolist()], np.int64)
-    table = voxels.reserve_table(voxels.make_table(1), keys, len(keys))
-    assert len(table.keys) >= 2 * len(keys)
-    rows = [voxels.find_or_add(table, key, -7) for key in keys.tolist()]
+    sums = voxels.make_sums(len(keys), 0)
+    sums.keys[:] = keys
+    sums.used[0] = len(keys)
+    sums = voxels.reserve_sums(sums, len(keys) + 1)
+    assert len(sums.table) >= 2 * len(sums.keys) >= 4 * len(keys)
+    rows = [voxels.find_or_add(sums.table, key, -7) for key in keys.tolist()]
     assert rows == list(range(len(keys)))
 
 
-def test_a_table_with_room_is_not_copied() -> None:
-    table = voxels.make_table(100)
-    assert voxels.reserve_table(table, np.zeros(0, np.int64), 100) is table
+def test_rows_with_room_are_not_copied() -> None:
+    sums = voxels.make_sums(100, 2)
+    assert voxels.reserve_sums(sums, 100) is sums
 
 
 def test_neighbouring_cells_spread_over_the_table() -> None:
     # A street is a sheet of neighbouring cells: probing stays short if they do not cluster.
     cells = np.stack(np.unravel_index(np.arange(90_000), (300, 300, 1)), axis=1)
     keys = np.array([voxels.pack_key(*cell) for cell in cells.tolist()], np.int64)
-    table = voxels.reserve_table(voxels.make_table(1), keys, len(keys))
-    empty = np.flatnonzero(table.keys == voxels.EMPTY)
+    table = voxels.make_table(len(keys))
+    voxels.enter_keys(table, keys)
+    empty = np.flatnonzero(table[:, 0] == voxels.EMPTY)
     # At half load a random hash gives a longest run of some tens; clusters give thousands.
     assert np.diff(empty).max() < 200
