@@ -17,7 +17,7 @@ from recon.structures import PointCloud, TriangleMesh
 from recon.structures.arrays import Bool, Float32, Int32
 
 _MIN_POINTS = 50
-_MIN_DEPTH = 5
+_MIN_DEPTH = 4
 _SPACING_NEIGHBOURS = 7
 _SPACING_SAMPLES = 20_000
 #: MeshLab's octree is this much wider than the cloud.
@@ -32,7 +32,13 @@ class MeshSettings(Settings):
         default=None,
         ge=4,
         le=12,
-        description="octree depth; null = cells as wide as the points are apart, up to max_depth",
+        description="octree depth; null = chosen by cell_spacings, up to max_depth",
+    )
+    cell_spacings: float = Field(
+        default=1.5,
+        gt=0,
+        le=20,
+        description="widest octree cell, in point spacings; noise in smaller cells becomes ripples",
     )
     max_depth: int = Field(default=10, ge=4, le=12, description="limit of a depth chosen so")
     samples_per_node: float = Field(
@@ -86,7 +92,7 @@ def reconstruct_mesh(
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
     cloud = _oriented(_usable(cloud), settings, viewpoint_m)
-    depth = settings.depth or _fitting_depth(cloud.xyz, settings.max_depth)
+    depth = settings.depth or _fitting_depth(cloud.xyz, settings)
     vertices, faces, density = screened_poisson(
         cloud.xyz,
         _required(cloud.normals),
@@ -149,13 +155,14 @@ def _required(normals: Float32 | None) -> Float32:
     return normals
 
 
-def _fitting_depth(xyz: Float32, max_depth: int) -> int:
-    """Depth of the octree whose cells are about as wide as the points are apart."""
+def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
+    """The least depth of the octree whose cells are no wider than the settings allow."""
     step = max(1, len(xyz) // _SPACING_SAMPLES)
-    spacing_m = float(np.median(_spacing(xyz[::step], xyz)))
+    cell_m = settings.cell_spacings * float(np.median(_spacing(xyz[::step], xyz)))
     extent_m = float(np.ptp(xyz, axis=0).max()) * _OCTREE_SCALE
-    depth = math.ceil(math.log2(extent_m / max(spacing_m, extent_m * 2.0**-max_depth)))
-    return int(np.clip(depth, _MIN_DEPTH, max_depth))
+    if cell_m * 2**settings.max_depth <= extent_m:
+        return settings.max_depth
+    return int(np.clip(math.ceil(math.log2(extent_m / cell_m)), _MIN_DEPTH, settings.max_depth))
 
 
 def _spacing(some_xyz: Float32, xyz: Float32) -> Float32:

@@ -159,7 +159,7 @@ def test_a_quality_that_is_no_confidence_is_left_out(tmp_path: Path) -> None:
             "PLY header",
         ),
         (
-            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty int x\nproperty int x\nend_header\n",
+            b"ply\nformat ascii 1.0\nelement v 1\nproperty int x\nproperty int x\nend_header\n",
             "twice",
         ),
         (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon.errors import MeshingError
-from recon.meshing.poisson import MeshSettings, reconstruct_mesh
+from recon.meshing.poisson import MeshSettings, _fitting_depth, reconstruct_mesh
 from recon.structures import PointCloud, TriangleMesh
 
 
@@ -144,3 +144,11 @@ def test_the_working_directory_and_standard_output_stay_as_they_were(
     reconstruct_mesh(sphere(1000), MeshSettings(depth=5))
     assert os.getcwd() == before  # noqa: PTH109
     assert capfd.readouterr() == ("", "")
+
+
+def test_the_depth_follows_the_spacing_of_the_points() -> None:
+    coarse, fine = sphere(1000), sphere(16000)  # spacings differ by four: two levels
+    chosen = [_fitting_depth(cloud.xyz, MeshSettings()) for cloud in (coarse, fine)]
+    assert chosen[1] - chosen[0] == 2
+    assert _fitting_depth(fine.xyz, MeshSettings(max_depth=4)) == 4
+    assert _fitting_depth((100 * fine.xyz).astype(np.float32), MeshSettings()) == chosen[1]
