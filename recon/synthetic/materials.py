@@ -17,7 +17,7 @@ from recon.synthetic.soup import Material, TriangleSoup
 GAMMA: Final = 2.2
 """Displayed colour to linear light."""
 _OCTAVES: Final = 7
-_ROUGHNESS: Final = 0.8  # amplitude of each octave relative to the next coarser
+_ROUGHNESS: Final = 0.92  # amplitude of each octave relative to the next coarser
 ROAD_HALF_M: Final = 5.2
 _LANE_HALF_M = 3.05
 
@@ -36,7 +36,7 @@ class Grain(NamedTuple):
 
 GRAIN: Final = {
     Material.PLAIN: Grain(0.6, 0.5),
-    Material.ASPHALT: Grain(0.6, 0.42),
+    Material.ASPHALT: Grain(0.6, 0.5),
     Material.PAVING: Grain(0.8, 0.4),
     Material.KERB: Grain(0.5, 0.45),
     Material.PLASTER: Grain(2.2, 0.30),
@@ -47,7 +47,7 @@ GRAIN: Final = {
     Material.CAR_PAINT: Grain(0.5, 0.09),
     Material.CAR_GLASS: Grain(0.7, 0.09),
     Material.BARK: Grain(0.25, 1.0),
-    Material.LEAVES: Grain(0.55, 1.6),
+    Material.LEAVES: Grain(0.6, 2.0),
     Material.METAL: Grain(0.3, 0.35),
     Material.GRASS: Grain(0.7, 0.9),
     Material.POSTER: Grain(0.35, 0.6),
@@ -135,8 +135,8 @@ def _asphalt(p: Patch) -> Float64:
     """Wheel tracks, patches, joints and worn markings; u runs along the road, v to the left."""
     v, spread_v = p.v, p.spread[:, 1]
     tracks = sum(np.exp(-(((v - c) / 0.35) ** 2)) for c in (-2.3, -0.8, 0.8, 2.3))
-    repairs = tile_tone(p.uv, (7.3, 2.6), p.spread, np.zeros(len(v), dtype=int))
-    rgb = p.rgb * (1.0 - 0.12 * np.asarray(tracks) + 0.16 * np.round(repairs * 1.2))[:, None]
+    repairs = tile_tone(p.uv, (5.3, 2.1), p.spread, np.zeros(len(v), dtype=int))
+    rgb = p.rgb * (1.0 - 0.12 * np.asarray(tracks) + 0.16 * np.round(repairs * 0.8))[:, None]
     seam = v - 0.12 * np.sin(0.9 * p.u) - 0.05 * np.sin(3.1 * p.u)
     tar = both(stripe(seam, 0.35, 0.40, spread_v), stripe(seam, -3.5, -3.46, spread_v))
     across = p.u + 0.1 * np.sin(2.0 * v) + 0.04 * np.sin(7.0 * v)

@@ -87,10 +87,13 @@ class StreetCamera:
         Raises:
             SettingsError: There is no such frame.
         """
-        self._views(index)
+        # Prepared before the threads start, lest both do it.
+        views, stage = self.views(index), self.stage
+        smooth, threads = self.world.settings.smooth_edges, self.world.settings.threads
         # The two views are independent, so the number of threads changes no pixel.
-        with ThreadPoolExecutor(max_workers=1 if self.world.settings.threads == 1 else 2) as pool:
-            left, right = pool.map(lambda side: self._picture(index, side), (0, 1))
+        with ThreadPoolExecutor(max_workers=1 if threads == 1 else 2) as pool:
+            pictures = list(pool.map(lambda view: take_picture(stage, view, smooth), views))
+        left, right = (self._record(picture, index, side) for side, picture in enumerate(pictures))
         return StereoPair(
             left=left,
             right=right,
@@ -108,7 +111,7 @@ class StreetCamera:
         Raises:
             SettingsError: There is no such frame.
         """
-        view = self._views(index)[0]
+        view = self.views(index)[0]
         depth = self.stage.depth(view.origin, view.directions(view.pixels()))
         return depth.reshape(view.height_px, view.width_px).astype(np.float32)
 
@@ -120,10 +123,22 @@ class StreetCamera:
         """
         return self._truth(index, self.depth(index))
 
+    def views(self, index: int) -> tuple[View, View]:
+        """Left and right camera of a frame, in street axes.
+
+        Raises:
+            SettingsError: There is no such frame.
+        """
+        if not 0 <= index < len(self):
+            raise SettingsError(
+                "no such frame", got=index, expected=f"0 to {len(self) - 1}", hint="raise `frames`"
+            )
+        return stereo_views(self.world.camera, self.world.T_street_camera[index])
+
     def _truth(self, index: int, depth_m: Float32) -> DisparityTruth:
         """Disparity, and a look back from the right camera at each point."""
         camera = self.world.camera
-        left, right = self._views(index)
+        left, right = self.views(index)
         known = np.flatnonzero(np.isfinite(depth_m))
         rays = left.directions(left.pixels()[known])
         xyz = left.origin + depth_m.ravel()[known, None].astype(np.float64) * rays
@@ -132,9 +147,9 @@ class StreetCamera:
         nonocc[known] = seen
         return DisparityTruth(disparity_from_depth(depth_m, camera), nonocc.reshape(depth_m.shape))
 
-    def _picture(self, index: int, side: int) -> UInt8:
+    def _record(self, picture: Float64, index: int, side: int) -> UInt8:
+        """What the sensor of one side makes of a picture."""
         settings = self.world.settings
-        picture = take_picture(self.stage, self._views(index)[side], settings.smooth_edges)
         return record(
             picture,
             gain=settings.right_gain if side else 1.0,
@@ -142,10 +157,3 @@ class StreetCamera:
             noise_dn=settings.noise_dn,
             key=[settings.seed, 1000, index, side],
         )
-
-    def _views(self, index: int) -> tuple[View, View]:
-        if not 0 <= index < len(self):
-            raise SettingsError(
-                "no such frame", got=index, expected=f"0 to {len(self) - 1}", hint="raise `frames`"
-            )
-        return stereo_views(self.world.camera, self.world.T_street_camera[index])

@@ -118,7 +118,7 @@ def test_points_of_one_frame_are_found_by_the_next(street):
     moved = se3.apply(se3.invert(poses[there]) @ poses[here], xyz[np.isfinite(xyz[:, 2])])
     u, v, _ = project(moved, camera)
     inside = (u > 0) & (u < camera.width_px - 1) & (v > 0) & (v < camera.height_px - 1)
-    view = street._views(there)[0]
+    view = street.views(there)[0]
     pixels = np.stack([u[inside], v[inside]], axis=1)
     found = street.stage.depth(view.origin, view.directions(pixels))
     # A ray to a point ends there or before it; poses and depths are good to float32.

@@ -22,7 +22,7 @@ def test_surface_points_lie_on_what_the_camera_sees(street, surface):
     # World is the first camera, so points in its view are hit by rays through their projections.
     u, v, _ = project(surface.xyz.astype(np.float64), street.world.camera)
     inside = (u > 0) & (u < 319) & (v > 0) & (v < 119)
-    view = street._views(0)[0]
+    view = street.views(0)[0]
     found = street.stage.depth(view.origin, view.directions(np.stack([u, v], axis=1)[inside]))
     z = surface.xyz[inside, 2]
     # float32 coordinates of 25 m are good to 1e-6 m; grazing rays magnify that.
