@@ -18,7 +18,12 @@ _MIN_POINTS_OF_A_PLANE = 3
 
 
 class FilterSettings(Settings):
-    """Which filters a cloud passes, in this order; null turns one off."""
+    """Which filters a cloud passes, in this order; null turns one off.
+
+    The defaults suit one frame of a drive: the searches for outliers cost four times as much as
+    all else there and gain two per cent of precision, where the map that the frame goes into
+    drops whatever few frames saw.
+    """
 
     voxel_m: float | None = Field(
         default=0.1, gt=0, description="edge of the voxels that points are averaged in"
@@ -30,7 +35,7 @@ class FilterSettings(Settings):
         default=2.0, gt=0, description="its limit, in standard deviations of the mean distance"
     )
     radius_m: float | None = Field(
-        default=0.3, gt=0, description="radius in which a point needs neighbours"
+        default=None, gt=0, description="radius in which a point needs neighbours"
     )
     radius_neighbours: int = Field(default=4, ge=1, description="how many it needs")
     normals_neighbours: int | None = Field(
@@ -39,7 +44,7 @@ class FilterSettings(Settings):
 
 
 #: For the cloud of one pair, whose scale is not known beforehand: no filter that counts metres.
-ANY_SCALE = FilterSettings(voxel_m=None, radius_m=None, statistical_neighbours=20)
+ANY_SCALE = FilterSettings(voxel_m=None, statistical_neighbours=20)
 
 
 def filter_cloud(

@@ -77,7 +77,7 @@ def test_voxels_leave_at_most_one_point_per_cell_and_lose_no_region() -> None:
 
 def test_the_same_cloud_gives_the_same_result() -> None:
     cloud, _ = wall_with_outliers()
-    settings = FilterSettings(normals_neighbours=12)
+    settings = FilterSettings(radius_m=0.3, normals_neighbours=12)
     first, second = filter_cloud(cloud, settings), filter_cloud(cloud, settings)
     np.testing.assert_array_equal(first.xyz, second.xyz)
     np.testing.assert_array_equal(first.normals, second.normals)
@@ -106,7 +106,7 @@ def test_estimated_normals_agree_with_those_the_cloud_had() -> None:
 @pytest.mark.parametrize("points", [0, 1, 2])
 def test_clouds_of_almost_nothing_pass(points: int) -> None:
     cloud = PointCloud(np.zeros((points, 3), dtype=np.float32))
-    settings = FilterSettings(statistical_neighbours=20, normals_neighbours=10)
+    settings = FilterSettings(statistical_neighbours=20, radius_m=0.3, normals_neighbours=10)
     assert len(filter_cloud(cloud, settings)) <= points
 
 
