@@ -22,24 +22,38 @@ _POLICY: Final = (
 )
 # plotly.js travels compressed: a third of its size, and no address in it is ever text here.
 _DRAW_SCENES: Final = """
-(async () => {
-  const scenes = document.querySelectorAll(".scene");
-  try {
-    const packed = document.getElementById("plotly").textContent;
-    const bytes = Uint8Array.from(atob(packed), (letter) => letter.charCodeAt(0));
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-    const code = document.createElement("script");
-    code.textContent = await new Response(stream).text();
-    document.head.append(code);
-    for (const element of scenes) {
-      const scene = JSON.parse(document.getElementById(element.dataset.source).textContent);
-      element.textContent = "";
-      await Plotly.newPlot(element, scene.data, scene.layout, scene.config);
-    }
-  } catch (error) {
-    for (const element of scenes) element.textContent = "No view in 3-D here: " + error;
-  }
-})();
+const views = document.querySelectorAll(".view");
+
+async function loadPlotly() {
+  const packed = document.getElementById("plotly").textContent;
+  const bytes = Uint8Array.from(atob(packed), (letter) => letter.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const code = document.createElement("script");
+  code.textContent = await new Response(stream).text();
+  document.head.append(code);
+}
+
+async function drawView(view) {
+  const element = view.querySelector(".scene");
+  const scene = JSON.parse(view.querySelector("script").textContent);
+  const buttons = view.querySelectorAll("button");
+  element.textContent = "";
+  await Plotly.newPlot(element, scene.data, scene.layout, scene.config);
+  buttons.forEach((button, chosen) => button.addEventListener("click", () => {
+    const [cloud, ...others] = scene.data;
+    const marker = { ...cloud.marker, ...scene.colourings[chosen].marker };
+    // What a click in the legend has hidden or shown stays so.
+    const data = [{ ...cloud, marker }, ...others].map(
+      (trace, n) => ({ ...trace, visible: element.data[n].visible })
+    );
+    Plotly.react(element, data, element.layout, scene.config);
+    buttons.forEach((other) => other.setAttribute("aria-pressed", other === button));
+  }));
+}
+
+loadPlotly().then(() => Promise.all([...views].map(drawView))).catch((error) => {
+  for (const view of views) view.textContent = "No view in 3-D here: " + error;
+});
 """
 
 
@@ -86,7 +100,7 @@ class SceneBlock:
 
     Attributes:
         title: What one sees.
-        scene: ``data``, ``layout`` and ``config`` for plotly.js, see `plot_scene`.
+        scene: ``data``, ``layout``, ``config`` and ``colourings``, see `plot_scene`.
         caption: How to read it.
     """
 
@@ -252,10 +266,21 @@ def _scene(block: SceneBlock, name: str) -> str:
     # "<" is written as an escape, so that no text in it can end the script element.
     data = json.dumps(block.scene, separators=(",", ":")).replace("<", "\\u003c")
     return (
-        f'<div class="scene" data-source="{name}">'
-        "The view in 3-D needs JavaScript.</div>"
-        f'<script type="application/json" id="{name}">{data}</script>'
+        f'<div class="view">{_colouring_buttons(block.scene)}'
+        '<div class="scene">The view in 3-D needs JavaScript.</div>'
+        f'<script type="application/json" id="{name}">{data}</script></div>'
     )
+
+
+def _colouring_buttons(scene: Mapping[str, Any]) -> str:
+    labels = [colouring["label"] for colouring in scene.get("colourings", ())]
+    if len(labels) < 2:
+        return ""
+    buttons = "".join(
+        f'<button type="button" aria-pressed="{str(n == 0).lower()}">{escape(label)}</button>'
+        for n, label in enumerate(labels)
+    )
+    return f'<div class="choices">Colour: {buttons}</div>'
 
 
 def _details(content: ReportContent) -> str:

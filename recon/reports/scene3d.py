@@ -30,7 +30,8 @@ T_UPRIGHT_CAMERA: Final[Float64] = np.array(
 _BACKGROUND = "#14181d"
 _PATH_COLOURS = ("#ff5252", "#ffb74d", "#81c784")
 _OUTLIER_SHARE = 0.002
-_BEHIND_AND_ABOVE = (-0.85, -1.0, 0.62)
+_BEHIND_AND_ABOVE = (-0.95, -1.15, 0.75)
+_LOOK_AT = (-0.1, -0.1, -0.1)  # nearer than the middle: what is near takes more of the view
 Json = dict[str, Any]
 
 
@@ -54,7 +55,10 @@ class Scene:
 
 
 def plot_scene(scene: Scene, max_points: int = MAX_POINTS, max_faces: int = MAX_FACES) -> Json:
-    """The ``data``, ``layout`` and ``config`` that plotly.js draws; plain JSON values.
+    """The ``data``, ``layout`` and ``config`` that plotly.js draws, and ``colourings``.
+
+    All are plain JSON values. Each colouring has a ``label`` and the ``marker`` fields that the
+    first trace, the cloud, gets when it is chosen.
 
     Args:
         scene: What to draw. The mesh is hidden at first where there is a cloud as well.
@@ -64,9 +68,9 @@ def plot_scene(scene: Scene, max_points: int = MAX_POINTS, max_faces: int = MAX_
     T = scene.T_view_frame
     cloud = None if scene.cloud is None else _without_outliers(scene.cloud)
     traces: list[Json] = []
-    buttons: list[Json] = []
+    colourings: list[Json] = []
     if cloud is not None and len(cloud):
-        trace, buttons = _cloud_trace(cloud, T, max_points)
+        trace, colourings = _cloud_trace(cloud, T, max_points)
         traces.append(trace)
     if scene.mesh is not None and len(scene.mesh.faces):
         traces.append(_mesh_trace(thin_mesh(scene.mesh, max_faces), T, hidden=bool(traces)))
@@ -74,7 +78,8 @@ def plot_scene(scene: Scene, max_points: int = MAX_POINTS, max_faces: int = MAX_
         traces.append(_path_trace(name, path, T, _PATH_COLOURS[number % len(_PATH_COLOURS)]))
     config = {"displaylogo": False, "responsive": True, "scrollZoom": True}
     box = _bounding_box(cloud, scene, T)
-    return {"data": traces, "layout": _layout(buttons, _eye(scene, box), box), "config": config}
+    layout = _layout(_eye(scene, box), box)
+    return {"data": traces, "layout": layout, "config": config, "colourings": colourings}
 
 
 def pack(array: NDArray[Any]) -> Json:
@@ -87,7 +92,7 @@ def pack(array: NDArray[Any]) -> Json:
 
 
 def _cloud_trace(cloud: PointCloud, T: Float64, max_points: int) -> tuple[Json, list[Json]]:
-    """The points, and a button for each way to colour them."""
+    """The points, and each way to colour them."""
     thinned = thin_cloud(cloud, max_points)
     xyz = apply(T, thinned.xyz)
     colourings = [("height", _height_colouring(xyz))]
@@ -101,7 +106,7 @@ def _cloud_trace(cloud: PointCloud, T: Float64, max_points: int) -> tuple[Json, 
         **_xyz(xyz),
         "marker": {"size": 1.6, "showscale": False, **colourings[0][1]},
     }
-    return trace, [_button(name, colouring) for name, colouring in colourings]
+    return trace, [{"label": name, "marker": marker} for name, marker in colourings]
 
 
 def _mesh_trace(mesh: TriangleMesh, T: Float64, *, hidden: bool) -> Json:
@@ -159,11 +164,6 @@ def _height_colouring(xyz: Float32) -> Json:
     return _colouring(scale_colours(HEIGHT_SCALE), index)
 
 
-def _button(name: str, colouring: Json) -> Json:
-    changes = {f"marker.{key}": [value] for key, value in colouring.items()}
-    return {"method": "restyle", "label": f"colour: {name}", "args": [changes, [0]]}
-
-
 def _without_outliers(cloud: PointCloud) -> PointCloud:
     """Drop the few points far from all others, which would make the rest small."""
     if not len(cloud):
@@ -201,7 +201,7 @@ def _eye(scene: Scene, box: Float64) -> Float64:
     return np.asarray((np.asarray(scene.eye_m) - box.mean(axis=0)) * _scale(box))
 
 
-def _layout(buttons: list[Json], eye: Float64, box: Float64) -> Json:
+def _layout(eye: Float64, box: Float64) -> Json:
     aspect = dict(zip("xyz", (_scale(box) * np.ptp(box, axis=0)).tolist(), strict=True))
     titles = {"x": "x forward (m)", "y": "y left (m)", "z": "z up (m)"}
     axes = {
@@ -215,27 +215,21 @@ def _layout(buttons: list[Json], eye: Float64, box: Float64) -> Json:
         }
         for n, axis in enumerate("xyz")
     }
-    camera = {"eye": dict(zip("xyz", eye.tolist(), strict=True))}
+    camera = {
+        "eye": dict(zip("xyz", eye.tolist(), strict=True)),
+        "center": dict(zip("xyz", _LOOK_AT, strict=True)),
+    }
     return {
         "paper_bgcolor": _BACKGROUND,
         "font": {"color": "#dfe5ea"},
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
-        "legend": {"x": 0.0, "y": 0.0, "yanchor": "bottom", "itemsizing": "constant"},
-        "updatemenus": [_menu(buttons)] if len(buttons) > 1 else [],
+        "legend": {
+            "x": 0.0,
+            "y": 0.0,
+            "yanchor": "bottom",
+            "itemsizing": "constant",
+            "bgcolor": "rgba(0,0,0,0)",
+        },
+        "uirevision": "kept",  # another colouring does not turn the view back
         "scene": {"aspectmode": "manual", "aspectratio": aspect, "camera": camera, **axes},
-    }
-
-
-def _menu(buttons: list[Json]) -> Json:
-    return {
-        "type": "buttons",
-        "direction": "right",
-        "x": 0.0,
-        "xanchor": "left",
-        "y": 1.0,
-        "yanchor": "top",
-        "buttons": buttons,
-        "bgcolor": "#e6ebf0",
-        "font": {"size": 12, "color": "#14181d"},
-        "pad": {"l": 8, "t": 8},
     }

@@ -141,6 +141,15 @@ def test_plotly_travels_once_compressed_and_only_with_a_scene() -> None:
     assert len(without) < 20_000
 
 
+def test_colourings_of_a_scene_get_a_button_each_where_there_is_a_choice() -> None:
+    coloured = PointCloud(np.eye(3, dtype=np.float32), rgb=np.eye(3, dtype=np.uint8))
+    block = SceneBlock("In 3-D", plot_scene(Scene(np.eye(4), coloured)))
+    page = render_html(ReportContent("t", sections=(Section("a", (block,)),)))
+    assert re.findall(r"<button[^>]*>(\w+)</button>", page) == ["picture", "height"]
+    plain = render_html(ReportContent("t", sections=(Section("a", (scene(),)),)))
+    assert "</button>" not in plain
+
+
 def test_sections_without_content_are_left_out() -> None:
     page = render_html(ReportContent("t", sections=(Section("Nothing here", ()),)))
     assert "Nothing here" not in page

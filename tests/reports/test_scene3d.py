@@ -42,13 +42,12 @@ def test_colours_of_points_come_back_from_their_scale() -> None:
 
 
 def test_coloured_cloud_can_also_be_shown_by_height(cloud: PointCloud) -> None:
-    menu = plot_scene(Scene(np.eye(4), cloud))["layout"]["updatemenus"]
-    assert [button["label"] for button in menu[0]["buttons"]] == [
-        "colour: picture",
-        "colour: height",
-    ]
+    plot = plot_scene(Scene(np.eye(4), cloud))
+    assert [colouring["label"] for colouring in plot["colourings"]] == ["picture", "height"]
+    lengths = {len(unpack(colouring["marker"]["color"])) for colouring in plot["colourings"]}
+    assert lengths == {len(unpack(plot["data"][0]["x"]))}
     plain = PointCloud(cloud.xyz, frame="map")
-    assert plot_scene(Scene(np.eye(4), plain))["layout"]["updatemenus"] == []
+    assert len(plot_scene(Scene(np.eye(4), plain))["colourings"]) == 1
 
 
 def test_mesh_is_hidden_at_first_beside_a_cloud_and_shown_alone(
