@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 HEAVY = {
@@ -36,13 +36,19 @@ def test_import_of_the_package_loads_no_heavy_library() -> None:
     assert HEAVY & set(done.stdout.split()) == set()
 
 
-def test_help_answers_within_half_a_second() -> None:
-    """The fastest of some tries counts: the others tell how busy the machine is."""
+def test_help_takes_less_than_half_a_second_of_processor_time() -> None:
+    """The best of some tries: on a busy machine even processor time is stretched."""
     program = str(Path(sys.executable).with_name("recon"))
-    for _ in range(10):
-        start_s = time.perf_counter()
+    spent_s = []
+    while len(spent_s) < 10 and min(spent_s, default=1.0) >= 0.5:
+        before = os.times()
         subprocess.run([program, "--help"], capture_output=True, check=True)
-        duration_s = time.perf_counter() - start_s
-        if duration_s < 0.5:
-            return
-    raise AssertionError(f"the last try took {duration_s:.2f} s")
+        after = os.times()
+        spent_s.append(
+            after.children_user
+            - before.children_user
+            + after.children_system
+            - before.children_system
+        )
+
+    assert min(spent_s) < 0.5
