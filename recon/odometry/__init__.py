@@ -1,1 +1,17 @@
 """From frames to poses: a visual prior and a kiss-icp correction that must earn its place."""
+
+from recon.odometry.known import KnownPoses
+from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
+from recon.odometry.registry import ODOMETRIES, make_odometry
+from recon.odometry.settings import OdometrySettings
+
+__all__ = [
+    "ODOMETRIES",
+    "KnownPoses",
+    "Odometry",
+    "OdometryFrame",
+    "OdometryHealth",
+    "OdometryResult",
+    "OdometrySettings",
+    "make_odometry",
+]
