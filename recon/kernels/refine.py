@@ -138,9 +138,11 @@ def _claim(right_winner: NDArray[np.uint16], rules: Rules, claimed: NDArray[np.b
     width = claimed.size
     claimed[:] = False
     for x_right in range(width):
+        if right_winner[x_right] == rules.ndisp:
+            continue
         x = x_right + rules.minimum + np.int64(right_winner[x_right])
-        if right_winner[x_right] < rules.ndisp:
-            claimed[max(x - 1, 0) : min(x + 2, width)] = True
+        for near in range(max(x - 1, 0), min(x + 2, width)):
+            claimed[near] = True
 
 
 @njit(cache=True, nogil=True)

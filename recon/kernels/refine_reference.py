@@ -72,7 +72,7 @@ def _claimed(right_winner: NDArray[np.uint16], rules: Rules) -> NDArray[np.bool_
     x = np.arange(width) + rules.minimum + right_winner.astype(np.int64)
     claimed = np.zeros((height, width), np.bool_)
     for aside in (-1, 0, 1):
-        seen = (right_winner < rules.ndisp) & (x + aside >= 0) & (x + aside < width)
+        seen = (right_winner != rules.ndisp) & (x + aside >= 0) & (x + aside < width)
         claimed[np.nonzero(seen)[0], (x + aside)[seen]] = True
     return claimed
 

@@ -80,7 +80,7 @@ class SadSettings(Settings):
         description="By how much the second best cost must exceed the best; 0 = no check.",
     )
     min_texture: float = Field(
-        default=0.5,
+        default=0.1,
         ge=0.0,
         le=255.0,
         description="Least mean horizontal gradient in the window, grey levels per pixel.",
