@@ -69,6 +69,7 @@ class FusedOdometry:
         self._T_world_camera = np.eye(4)
         self._offset = np.zeros(6)
         self._measured = 0
+        self._lost = 0
         self._mapped = False
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
@@ -89,9 +90,11 @@ class FusedOdometry:
 
     def _prior(self, visual: VisualEstimate) -> _Prior:
         gate = self._settings.gate
+        self._lost = 0 if visual.information is not None else self._lost + 1
         T = self._T_world_camera @ invert(self._T_visual) @ visual.result.T_world_camera
         if visual.information is None:
-            covariance = step_covariance(gate.lost_sigma_m, gate.lost_sigma_deg)
+            sigmas = self._lost * np.array([gate.lost_sigma_m, gate.lost_sigma_deg])
+            covariance = step_covariance(*sigmas.tolist())
         else:
             covariance = np.linalg.inv(gate.visual_independence * visual.information)
         return _Prior(orthonormalise(T), covariance, visual)

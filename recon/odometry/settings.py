@@ -169,9 +169,12 @@ class GateSettings(Settings):
     )
     icp_floor_deg: float = Field(0.05, gt=0.0, description="The same for its rotation")
     lost_sigma_m: float = Field(
-        0.3, gt=0.0, description="Standard deviation of a motion extrapolated over one frame"
+        0.05,
+        gt=0.0,
+        description="Standard deviation of a motion extrapolated over one frame; over the n-th "
+        "frame without a visual motion it is n times that",
     )
-    lost_sigma_deg: float = Field(1.0, gt=0.0, description="The same for its rotation")
+    lost_sigma_deg: float = Field(0.3, gt=0.0, description="The same for its rotation")
     offset_frames: int = Field(
         30,
         ge=1,

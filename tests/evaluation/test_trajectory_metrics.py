@@ -1,0 +1,166 @@
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recon.errors import EvaluationError
+from recon.evaluation.trajectory import (
+    KITTI_LENGTHS_M,
+    choose_segments,
+    evaluate_trajectory,
+    segments_of,
+)
+from recon.geometry.se3 import exp_so3, make_transform
+from recon.structures import Trajectory
+
+
+def trajectory(poses: np.ndarray) -> Trajectory:
+    return Trajectory(poses, 0.1 * np.arange(len(poses), dtype=np.float64))
+
+
+def straight(frames: int, step_m: float = 1.0) -> np.ndarray:
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 2, 3] = step_m * np.arange(frames)
+    return poses
+
+
+def bend(frames: int, yaw_rad: float, step_m: float = 1.0) -> np.ndarray:
+    step = make_transform(exp_so3(np.array([0.0, yaw_rad, 0.0])), np.array([0.0, 0.0, step_m]))
+    return np.stack([np.linalg.matrix_power(step, n) for n in range(frames)])
+
+
+def test_a_perfect_estimate_has_no_error() -> None:
+    truth = trajectory(bend(300, 0.005))
+    metrics = evaluate_trajectory(truth, truth)
+    # 1e-6: the sums of 300 products of float64 matrices.
+    assert metrics.t_rel_percent < 1e-6
+    assert metrics.r_rel_deg_per_100m < 1e-6
+    assert metrics.ate_m < 1e-6
+    assert metrics.rpe_m < 1e-9
+    assert metrics.frames == 300
+
+
+@given(scale=st.floats(0.5, 1.5))
+def test_a_constant_scale_error_is_the_relative_error(scale: float) -> None:
+    truth = straight(201)
+    estimate = truth.copy()
+    estimate[:, :3, 3] *= scale
+    metrics = evaluate_trajectory(trajectory(estimate), trajectory(truth))
+    # A segment ends at the first frame beyond its length, here one frame: 51/50 and 101/100.
+    count_50, count_100 = 150, 100
+    ends = (count_50 * 51 / 50 + count_100 * 101 / 100) / (count_50 + count_100)
+    assert metrics.t_rel_percent == pytest.approx(100 * abs(scale - 1) * ends, abs=1e-9)
+    assert metrics.r_rel_deg_per_100m == pytest.approx(0.0, abs=1e-9)
+    assert metrics.rpe_m == pytest.approx(abs(scale - 1), abs=1e-9)
+
+
+def test_a_yaw_drift_is_the_relative_rotation_error() -> None:
+    drift_rad = math.radians(0.01)
+    truth = trajectory(straight(201))
+    metrics = evaluate_trajectory(trajectory(bend(201, drift_rad)), truth)
+    # 0.01° a metre is 1° in 100 m; segments are up to one frame longer than they are called.
+    assert 1.0 < metrics.r_rel_deg_per_100m < 1.021
+    assert metrics.rpe_deg == pytest.approx(0.01, rel=1e-6)
+
+
+def test_the_absolute_error_does_not_see_where_the_world_begins() -> None:
+    poses = bend(120, 0.01)
+    moved = make_transform(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([5.0, -3.0, 2.0])) @ poses
+    metrics = evaluate_trajectory(trajectory(moved), trajectory(poses))
+    assert metrics.ate_m < 1e-9
+    assert metrics.t_rel_percent < 1e-9
+
+
+def test_the_absolute_error_does_see_the_scale() -> None:
+    poses = straight(101)
+    estimate = poses.copy()
+    estimate[:, :3, 3] *= 1.1
+    metrics = evaluate_trajectory(trajectory(estimate), trajectory(poses))
+    # Centred, position s is off by 0.1·s, s evenly in ±50 m: rms = 0.1·sqrt(50·51/3).
+    assert metrics.ate_m == pytest.approx(0.1 * math.sqrt(50 * 51 / 3), rel=1e-9)
+
+
+def test_a_mirrored_path_is_not_aligned_by_a_reflection() -> None:
+    rng = np.random.default_rng(1)
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    poses[:, :3, 3] = np.cumsum(rng.normal(size=(60, 3)), axis=0)
+    mirrored = poses.copy()
+    mirrored[:, 0, 3] *= -1
+    assert evaluate_trajectory(trajectory(mirrored), trajectory(poses)).ate_m > 0.5
+
+
+def test_a_long_drive_has_the_benchmarks_segments_at_every_tenth_frame() -> None:
+    segments = choose_segments(np.arange(1000, dtype=np.float64))
+    assert set(segments.length_m) == set(KITTI_LENGTHS_M)
+    assert set(np.unique(segments.first) % 10) == {0}
+
+
+def test_a_short_drive_has_segments_of_50_and_100_m_at_every_frame() -> None:
+    metrics = evaluate_trajectory(trajectory(straight(171)), trajectory(straight(171)))
+    assert metrics.segment_lengths_m == (50.0, 100.0)
+    assert metrics.segments == 120 + 70
+
+
+def test_a_drive_under_50_m_has_segments_of_half_its_path() -> None:
+    metrics = evaluate_trajectory(trajectory(straight(31)), trajectory(straight(31)))
+    assert metrics.segment_lengths_m == (15.0,)
+    assert metrics.segments == 15
+
+
+@given(
+    steps=st.lists(st.floats(0.0, 3.0), min_size=2, max_size=60).filter(lambda s: sum(s) >= 1.0)
+)
+def test_every_path_of_a_metre_or_more_has_a_finite_error(steps: list[float]) -> None:
+    poses = np.tile(np.eye(4), (len(steps) + 1, 1, 1))
+    poses[1:, 2, 3] = np.cumsum(steps)
+    estimate = poses.copy()
+    estimate[:, 0, 3] = 0.1
+    metrics = evaluate_trajectory(trajectory(estimate), trajectory(poses))
+    assert metrics.segments > 0
+    assert math.isfinite(metrics.t_rel_percent)
+
+
+def test_a_segment_ends_at_the_first_frame_beyond_its_length() -> None:
+    # As lastFrameFromSegmentLength of the development kit: strictly farther.
+    segments = segments_of(np.array([0.0, 40.0, 50.0, 60.0]), (50.0,), 1)
+    assert segments.first.tolist() == [0]
+    assert segments.last.tolist() == [3]
+
+
+@pytest.mark.parametrize(
+    ("estimate", "truth", "told"),
+    [
+        (straight(5), straight(6), "differ in length (got 5 poses, expected 6 poses)"),
+        (straight(1), straight(1), "too few poses"),
+        (straight(9), straight(9, 0.0), "too short"),
+    ],
+)
+def test_what_cannot_be_compared_is_told(
+    estimate: np.ndarray, truth: np.ndarray, told: str
+) -> None:
+    with pytest.raises(EvaluationError) as error:
+        evaluate_trajectory(trajectory(estimate), trajectory(truth))
+    assert told in str(error.value)
+
+
+@pytest.mark.real
+def test_the_two_truths_of_a_real_drive_differ_by_about_one_per_cent(recon_data: Path) -> None:
+    folder = recon_data / "driven" / "kitti_raw_0013"
+    if not (folder / "poses_oxts.txt").exists():
+        pytest.skip("real data: no second truth of kitti_raw_0013")
+    lidar, gps = (_read(folder / name) for name in ("poses.txt", "poses_oxts.txt"))
+    metrics = evaluate_trajectory(gps, lidar)
+    # The data's README states "about 1 %".
+    assert 0.3 < metrics.t_rel_percent < 2.0
+    assert metrics.segment_lengths_m == (50.0, 100.0)
+
+
+def _read(path: Path) -> Trajectory:
+    poses = np.tile(np.eye(4), (len(path.read_text().splitlines()), 1, 1))
+    poses[:, :3] = np.loadtxt(path).reshape(-1, 3, 4)
+    return trajectory(poses)
