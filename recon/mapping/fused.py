@@ -33,7 +33,10 @@ class FusionSettings(Settings):
         description="Points more precise than this count as this precise: bounds the weight.",
     )
     max_sigma_m: float = Field(
-        1.0, gt=0.0, le=100.0, description="Points less precise than this are left out."
+        0.3,
+        gt=0.0,
+        le=100.0,
+        description="Points less precise than this are left out: they would smear over voxels.",
     )
 
 
