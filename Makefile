@@ -7,7 +7,7 @@ READY := .venv/.ready
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: help setup demo test test-all check lint format bench clean
+.PHONY: help setup demo test test-all check lint format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -38,9 +38,6 @@ lint: $(READY) ## style, formatting, types and import contracts
 format: $(READY) ## put the code into the project's style
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
-
-bench: $(READY) ## measure speed and accuracy side by side with other tools
-	$(BIN)/python -m benchmarks
 
 clean: ## remove .venv, caches and builds; outputs/ stays
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
