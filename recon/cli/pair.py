@@ -22,6 +22,9 @@ def pair(
     left: Left,
     right: Right,
     calib: Annotated[Path, typer.Option(help=_CALIB_HELP)],
+    unit_m: Annotated[
+        float, typer.Option(min=1e-6, help="Metres per unit of an OpenCV file: 0.001 for mm.")
+    ] = 1.0,
     truth: Annotated[
         Path | None, typer.Option(help="True disparity (PFM or 16-bit PNG) to compare with.")
     ] = None,
@@ -44,7 +47,7 @@ def pair(
         from recon.reports import present_pair
 
         settings = load_config(config, [*(set_ or ()), *_range(ndisp)], PAIR_DEFAULTS)
-        given = read_pair_input(left, right, calib, truth)
+        given = read_pair_input(left, right, calib, truth, metres_per_unit=unit_m)
         options = PairOptions("pair", out, threads, present_pair)
         run = run_pair(given, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

@@ -1,16 +1,15 @@
-"""Disparity as a PNG: 16 bits, ``256·d``, 0 = unknown (KITTI), or in colours to look at."""
+"""Disparity as a PNG: 16 bits, ``256·d``, 0 = unknown (KITTI)."""
 
 from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 
 from recon.errors import FormatError, OutputError
 from recon.formats.files import StrPath
 from recon.formats.image import read_grey_levels, write_image
-from recon.structures.arrays import Float32, UInt8, frozen_array
+from recon.structures.arrays import Float32, frozen_array
 
 
 def read_disparity_png(path: StrPath, *, scale: float = 256.0) -> Float32:
@@ -68,22 +67,3 @@ def fitting_scale(values: Float32) -> float:
     """The largest power of two, at most KITTI's 256, with which ``values`` fit 16 bits."""
     highest = max(1.0, float(np.nanmax(values, initial=1.0)))
     return min(256.0, 2.0 ** math.floor(math.log2(65535 / highest)))
-
-
-def colour_disparity(values: Float32, low_px: float, high_px: float) -> UInt8:
-    """Paint a disparity: blue is far, red is near, black is unknown.
-
-    Args:
-        values: float32 (H, W), pixels; NaN = unknown.
-        low_px: Painted blue, as all below it.
-        high_px: Painted red, as all above it.
-
-    Returns:
-        uint8 (H, W, 3) RGB.
-    """
-    frozen_array("values", values, np.float32, (None, None))
-    span = max(high_px - low_px, 1e-6)
-    share = np.clip((np.where(np.isfinite(values), values, low_px) - low_px) / span, 0, 1)
-    painted = cv2.applyColorMap(np.rint(share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
-    painted[~np.isfinite(values)] = 0
-    return np.ascontiguousarray(painted[:, :, ::-1])

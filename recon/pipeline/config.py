@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import yaml
+from pydantic import Field
+
 from recon.cloud import ANY_SCALE, CloudSettings, EdgeSettings, FilterSettings
 from recon.errors import SettingsError
 from recon.mapping import (
@@ -23,6 +25,8 @@ from recon.rectification import RectificationSettings
 from recon.settings import Settings
 from recon.synthetic import StreetSettings
 
+NO_FILTER: Final = FilterSettings(voxel_m=None)
+
 
 class ReconConfig(Settings):
     """All that decides a result. Written beside every result as ``config.yaml``."""
@@ -31,7 +35,12 @@ class ReconConfig(Settings):
     matching: MatchingSettings = MatchingSettings()
     edges: EdgeSettings = EdgeSettings()
     cloud: CloudSettings = CloudSettings()
-    filters: FilterSettings = FilterSettings()
+    filters: FilterSettings = Field(
+        default=NO_FILTER, description="Of the cloud of one frame; fusing thins and cleans anyway."
+    )
+    map_filters: FilterSettings = Field(
+        default=NO_FILTER, description="Of the fused cloud, when it is exported."
+    )
     odometry: OdometrySettings = OdometrySettings()
     axes: AxesSettings = AxesSettings()
     fusion: FusionSettings = FusionSettings()

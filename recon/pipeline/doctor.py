@@ -44,7 +44,13 @@ PACKAGES: Final[Mapping[str, str]] = MappingProxyType(
 )
 # Shared library -> Debian or Ubuntu package that has it.
 SYSTEM_LIBRARIES: Final[Mapping[str, str]] = MappingProxyType(
-    {"libGL.so.1": "libgl1", "libgomp.so.1": "libgomp1", "libusb-1.0.so.0": "libusb-1.0-0"}
+    {
+        "libGL.so.1": "libgl1",
+        "libEGL.so.1": "libegl1",
+        "libX11.so.6": "libx11-6",
+        "libusb-1.0.so.0": "libusb-1.0-0",
+        "libOpenGL.so.0": "libopengl0",
+    }
 )
 
 

@@ -12,8 +12,8 @@ from recon.errors import FormatError
 from recon.evaluation import evaluate_map, evaluate_trajectory
 from recon.formats.ply import read_ply
 from recon.formats.trajectory import read_trajectory
-from recon.geometry.transform import transform_cloud
 from recon.geometry.se3 import invert
+from recon.geometry.transform import transform_cloud
 from recon.pipeline.run_directory import RECORD
 from recon.pipeline.summary import plain
 from recon.structures import PointCloud

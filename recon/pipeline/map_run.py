@@ -17,8 +17,8 @@ from recon.formats.nav2 import write_nav2
 from recon.formats.octomap import write_octomap
 from recon.formats.ply import write_ply
 from recon.formats.trajectory import write_kitti_poses, write_tum
-from recon.geometry.transform import transform_cloud
 from recon.geometry.se3 import apply
+from recon.geometry.transform import transform_cloud
 from recon.mapping import estimate_ground_surface, flatten
 from recon.meshing import reconstruct_mesh
 from recon.pipeline.config import ReconConfig, dump_config
@@ -120,6 +120,7 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
         run = _finish(source, config, mapped, options, watch)
         with watch.stage("write"):
             _write(run, directory)
+        run.summary.update(cost(watch, time.perf_counter() - start))
         if options.present is not None:
             _tell(options.observers, "report")
             with watch.stage("report"):
@@ -244,9 +245,8 @@ def _write(run: MapRun, directory: RunDirectory) -> None:
     write_kitti_poses(path("trajectory_kitti.txt"), run.mapped.trajectory)
     write_tum(path("trajectory_tum.txt"), run.mapped.trajectory)
     write_ply(path("map/cloud.ply"), run.cloud)
-    write_nav2(path("map/grid.yaml"), run.grid)
-    write_octomap(path("map/octomap.bt"), run.mapped.voxels)
-    write_octomap(path("map/octomap.ot"), run.mapped.voxels)
+    write_nav2(path("map/grid"), run.grid)
+    write_octomap(path("map/octomap"), run.mapped.voxels)
     if run.mesh is not None:
         write_mesh(path("mesh/mesh.ply"), run.mesh)
         layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("map/cloud.ply")}

@@ -7,17 +7,20 @@ from pathlib import Path
 import numpy as np
 
 from recon.errors import FormatError
-from recon.formats.calibration import read_calibration
 from recon.formats.disparity_png import read_disparity_png
-from recon.formats.image import read_image
-from recon.formats.middlebury import stand_in_camera
 from recon.formats.pfm import read_pfm
 from recon.pipeline.pair_run import PairInput
-from recon.structures import DisparityTruth, StereoPair
+from recon.sources.files import FilesSource
+from recon.structures import DisparityTruth
 
 
 def read_pair_input(
-    left: Path, right: Path, calibration: Path | None, truth: Path | None = None
+    left: Path,
+    right: Path,
+    calibration: Path | None,
+    truth: Path | None = None,
+    *,
+    metres_per_unit: float = 1.0,
 ) -> PairInput:
     """Read two pictures and what belongs to them.
 
@@ -27,25 +30,23 @@ def read_pair_input(
         calibration: Any file that `read_calibration` understands; None = the pair is rectified
             and depth is not wanted.
         truth: True disparity of the rectified left picture, PFM or 16-bit PNG.
+        metres_per_unit: Unit of the translation in an OpenCV file; the others define theirs.
 
     Raises:
         FormatError: A file is missing, damaged or of another size.
-        ShapeError: The pictures differ in size.
+        SourceError: The pictures differ in size.
     """
-    pair = StereoPair(read_image(left), read_image(right), name=str(left))
-    height_px, width_px = pair.left.shape[:2]
-    files = tuple(path for path in (left, right, calibration, truth) if path is not None)
+    source = FilesSource(left, right, calibration, metres_per_unit=metres_per_unit)
+    (pair,) = source
     return PairInput(
         pair=pair,
-        calibration=stand_in_camera(width_px, height_px)
-        if calibration is None
-        else read_calibration(calibration, width_px, height_px),
-        files=files,
-        truth=None if truth is None else _read_truth(truth, (height_px, width_px)),
+        calibration=source.calibration,
+        files=source.files if truth is None else (*source.files, truth),
+        truth=None if truth is None else _read_truth(truth, pair.left.shape[:2]),
     )
 
 
-def _read_truth(path: Path, shape: tuple[int, int]) -> DisparityTruth:
+def _read_truth(path: Path, shape: tuple[int, ...]) -> DisparityTruth:
     """A true disparity without an occlusion mask: every known pixel counts."""
     values = read_pfm(path) if path.suffix.lower() == ".pfm" else read_disparity_png(path)
     if values.shape != shape:

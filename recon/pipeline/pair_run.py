@@ -127,6 +127,7 @@ def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> Pai
             run = _reconstruct(given, config, reconstructor, watch)
         with watch.stage("write"):
             _write(run, directory)
+        run.summary.update(cost(watch, time.perf_counter() - start))
         if options.present is not None:
             with watch.stage("report"):
                 options.present(run, directory)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from recon.cloud import filter_cloud
 from recon.errors import RegistrationError
 from recon.geometry.transform import transform_cloud
 from recon.mapping import MapBuilder, OccupancyBuilder, estimate_ground, map_axes
@@ -134,7 +135,7 @@ class _Mapper:
             raise RegistrationError("the source has no frame")
         trajectory = Trajectory(np.stack(self._poses), np.array(self._times_s))
         with self._stopwatch.stage("export"):
-            cloud = self._fused.cloud()
+            cloud = filter_cloud(self._fused.cloud(), self._config.map_filters)
             voxels = self._occupancy.voxels()
         return MappedSequence(
             trajectory=trajectory,

@@ -9,6 +9,7 @@ from recon.errors import SourceError
 from recon.formats.calibration import read_calibration
 from recon.formats.files import StrPath
 from recon.formats.image import read_image
+from recon.formats.middlebury import stand_in_camera
 from recon.structures import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
 
 
@@ -18,7 +19,8 @@ class FilesSource:
     Args:
         left: Left picture.
         right: Right picture.
-        calibration: Calibration file of any kind that `read_calibration` understands.
+        calibration: Calibration file of any kind that `read_calibration` understands; None = the
+            pictures are rectified, and a camera stands in that is fit for matching alone.
         metres_per_unit: Unit of the translation in an OpenCV file.
 
     Raises:
@@ -31,15 +33,18 @@ class FilesSource:
         self,
         left: StrPath,
         right: StrPath,
-        calibration: StrPath,
+        calibration: StrPath | None,
         *,
         metres_per_unit: float = 1.0,
     ) -> None:
-        self._files = (Path(left), Path(right), Path(calibration))
+        given = (left, right, calibration)
+        self._files = tuple(Path(path) for path in given if path is not None)
         self._pair = read_pair(left, right)
         height_px, width_px = self._pair.left.shape[:2]
-        self._calibration = read_calibration(
-            calibration, width_px, height_px, metres_per_unit=metres_per_unit
+        self._calibration = (
+            stand_in_camera(width_px, height_px)
+            if calibration is None
+            else read_calibration(calibration, width_px, height_px, metres_per_unit=metres_per_unit)
         )
 
     @property

@@ -11,7 +11,6 @@ from hypothesis.extra.numpy import arrays
 
 from recon.errors import FormatError, OutputError
 from recon.formats.disparity_png import (
-    colour_disparity,
     fitting_scale,
     read_disparity_png,
     write_disparity_png,
@@ -76,11 +75,3 @@ def test_fitting_scale_is_the_largest_that_fits(tmp_path: Path, top: float, scal
 
 def test_fitting_scale_of_nothing_is_kittis() -> None:
     assert fitting_scale(np.full((2, 2), NAN, dtype=np.float32)) == 256
-
-
-def test_near_is_red_far_is_blue_and_unknown_is_black() -> None:
-    painted = colour_disparity(np.array([[1.0, 9.0, NAN]], dtype=np.float32), 1.0, 9.0)
-    far, near, unknown = painted[0].astype(int)
-    assert far[2] > far[0]
-    assert near[0] > near[2]
-    assert unknown.tolist() == [0, 0, 0]
