@@ -139,6 +139,7 @@ class _RangedKissIcp(KissICP):  # type: ignore[misc]
 
     def __init__(self, config: KISSConfig, source_range_m: float) -> None:
         super().__init__(config)
+        self.last_pose: Float64 = np.eye(4)
         self._source_range_m = source_range_m
 
     def voxelize(self, iframe: Float64) -> tuple[Float64, Float64]:

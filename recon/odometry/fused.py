@@ -13,6 +13,7 @@ from recon.odometry.gate import (
     Verdict,
     as_step,
     as_transform,
+    covariance_of,
     judge,
     step_covariance,
 )
@@ -94,9 +95,8 @@ class FusedOdometry:
         T = self._T_world_camera @ invert(self._T_visual) @ visual.result.T_world_camera
         if visual.information is None:
             sigmas = self._lost * np.array([gate.lost_sigma_m, gate.lost_sigma_deg])
-            covariance = step_covariance(*sigmas.tolist())
-        else:
-            covariance = np.linalg.inv(gate.visual_independence * visual.information)
+            return _Prior(orthonormalise(T), step_covariance(*sigmas.tolist()), visual)
+        covariance = covariance_of(gate.visual_independence * visual.information)
         return _Prior(orthonormalise(T), covariance, visual)
 
     def _corrected(self, prior: _Prior, points: PointCloud) -> OdometryResult:

@@ -76,10 +76,13 @@ def judge(
 
 def icp_covariance(fit: Fit, settings: GateSettings) -> Float64:
     """Covariance (6, 6) of ICP: from the surfaces it rests on, with a floor for their bias."""
-    # The smallest information stands for 100 m or rad, so that free directions can be inverted.
-    information = settings.icp_independence * fit.information + 1e-4 * np.eye(6)
     floor = step_covariance(settings.icp_floor_m, settings.icp_floor_deg)
-    return np.asarray(np.linalg.inv(information) + floor)
+    return covariance_of(settings.icp_independence * fit.information) + floor
+
+
+def covariance_of(information: Float64) -> Float64:
+    """Covariance (6, 6) of an information matrix; free directions get 100 m or rad."""
+    return np.asarray(np.linalg.inv(information + 1e-4 * np.eye(6)))
 
 
 def step_covariance(sigma_m: float, sigma_deg: float) -> Float64:

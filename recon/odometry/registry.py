@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final, cast
+from collections.abc import Callable
+from typing import Final
 
 from recon.errors import SettingsError
 from recon.odometry.fused import FusedOdometry
@@ -11,7 +12,7 @@ from recon.odometry.protocol import Odometry
 from recon.odometry.settings import OdometrySettings
 from recon.odometry.visual import VisualOdometry
 
-ODOMETRIES: Final = {
+ODOMETRIES: Final[dict[str, Callable[[OdometrySettings], Odometry]]] = {
     "visual": lambda settings: VisualOdometry(settings.visual),
     "kiss": lambda settings: KissOdometry(settings.kiss),
     "fused": lambda settings: FusedOdometry(settings.fused, settings.visual),
@@ -31,4 +32,4 @@ def make_odometry(name: str, settings: OdometrySettings | None = None) -> Odomet
     if name not in ODOMETRIES:
         choices = ", ".join(sorted(ODOMETRIES))
         raise SettingsError("unknown odometry", got=repr(name), expected=f"one of: {choices}")
-    return cast("Odometry", ODOMETRIES[name](settings or OdometrySettings()))
+    return ODOMETRIES[name](settings or OdometrySettings())

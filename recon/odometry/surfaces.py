@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from recon.structures.arrays import Bool, Float64
 
-MIN_POINTS = 6
+MIN_POINTS = 10
 """Fewer points of a cell do not tell a surface."""
 
-THIN_SHARE = 0.15
+THIN_SHARE = 0.1
 """A cell is thin along an axis where its points spread by less than this share of its edge.
 
 Points that fill a cell evenly spread by 0.29 of its edge (1/√12)."""

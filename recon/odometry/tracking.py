@@ -64,7 +64,8 @@ def sample_disparity(disparity: Disparity, uv: Float32, settings: TrackSettings)
     around = np.where(np.isfinite(around), around, centre[:, None])
     middle = np.median(around, axis=1)
     agrees = np.abs(middle - centre) <= settings.max_disparity_step_px
-    return np.where(agrees, middle, np.float32(np.nan)).astype(np.float32)
+    sampled: Float32 = np.where(agrees, middle, np.nan).astype(np.float32)
+    return sampled
 
 
 def _lucas_kanade(

@@ -83,9 +83,7 @@ def misfits(window: TrackWindow, camera: RectifiedCamera, settings: WindowSettin
     return np.asarray(square > settings.max_sigmas**2)
 
 
-def adjust(
-    window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings
-) -> TrackWindow:
+def adjust(window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings) -> TrackWindow:
     """Poses and points that explain all observations best; the oldest pose stays.
 
     Levenberg-Marquardt on whitened residuals with Cauchy weights; the points are eliminated
@@ -184,9 +182,9 @@ def _solve(normal: _NormalEquations, damping: float) -> tuple[Float64, Float64]:
     """Steps of the poses (W, 6) and of the points (N, 3); the first pose's is zero."""
     free = 6 * (len(normal.H_pose) - 1)
     inverse = np.linalg.inv(_damped(normal.H_point, damping))
-    cross = normal.H_cross[1:].reshape(free, -1, 3)
-    folded = np.einsum("anj,njk->ank", cross, inverse).reshape(free, -1)
-    cross = cross.reshape(free, -1)
+    blocks = normal.H_cross[1:].reshape(free, -1, 3)
+    folded = np.einsum("anj,njk->ank", blocks, inverse).reshape(free, -1)
+    cross = blocks.reshape(free, -1)
     S = _block_diagonal(_damped(normal.H_pose[1:], damping)) - folded @ cross.T
     g = normal.g_pose[1:].reshape(-1) - folded @ normal.g_point.reshape(-1)
     step_pose = np.linalg.solve(S, g)
@@ -198,7 +196,7 @@ def _solve(normal: _NormalEquations, damping: float) -> tuple[Float64, Float64]:
 def _damped(H: Float64, damping: float = 0.0) -> Float64:
     """Blocks (N, K, K) with their diagonals raised, so that each can be inverted."""
     diagonal = np.einsum("nii->ni", H)
-    raised = H.copy()
+    raised: Float64 = H.copy()
     np.einsum("nii->ni", raised)[:] += damping * diagonal + 1e-9
     return raised
 

@@ -91,9 +91,7 @@ def test_two_runs_are_equal_to_the_bit() -> None:
 
 
 @pytest.mark.parametrize("value", ['{"max_range": 1.0}', "not json"])
-def test_environment_variables_change_nothing(
-    value: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_environment_variables_change_nothing(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = aligned_to_room(np.eye(4))
     monkeypatch.setenv("kiss_icp_data", value)
     np.testing.assert_array_equal(aligned_to_room(np.eye(4)), expected)

@@ -112,9 +112,7 @@ def test_a_drive_under_50_m_has_segments_of_half_its_path() -> None:
     assert metrics.segments == 15
 
 
-@given(
-    steps=st.lists(st.floats(0.0, 3.0), min_size=2, max_size=60).filter(lambda s: sum(s) >= 1.0)
-)
+@given(steps=st.lists(st.floats(0.0, 3.0), min_size=2, max_size=60).filter(lambda s: sum(s) >= 1.0))
 def test_every_path_of_a_metre_or_more_has_a_finite_error(steps: list[float]) -> None:
     poses = np.tile(np.eye(4), (len(steps) + 1, 1, 1))
     poses[1:, 2, 3] = np.cumsum(steps)

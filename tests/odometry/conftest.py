@@ -1,0 +1,132 @@
+"""A street of textured planes: pictures and disparity from any pose, exact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.geometry.se3 import exp_so3, make_transform
+from recon.odometry.protocol import OdometryFrame
+from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
+
+CAMERA = RectifiedCamera(
+    focal_px=260.0,
+    cx_px=199.5,
+    cy_px=79.5,
+    cx_right_px=199.5,
+    baseline_m=0.5,
+    width_px=400,
+    height_px=160,
+)
+
+# Normal, offset (n·x = c) and the two axes of the texture: ground, side walls, ceiling, end wall.
+PLANES = (
+    ((0, 1, 0), 1.6, (0, 2)),
+    ((1, 0, 0), -4.0, (1, 2)),
+    ((1, 0, 0), 5.0, (1, 2)),
+    ((0, 1, 0), -4.0, (0, 2)),
+    ((0, 0, 1), 40.0, (0, 1)),
+)
+
+
+def _texture() -> np.ndarray:
+    rng = np.random.default_rng(7)
+    total = np.zeros((1024, 1024))
+    for size in (3.0, 8.0, 20.0):
+        noise = cv2.GaussianBlur(rng.normal(size=total.shape), (0, 0), size)
+        total += noise / noise.std()
+    return np.clip(128 + 35 * total, 0, 255).astype(np.float32)
+
+
+TEXTURE = _texture()
+TEXELS_PER_M = 24.0
+
+
+def _render(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Grey picture, averaged over 3 by 3 rays in a pixel, and depth, seen from a pose."""
+    thirds = [(du, dv) for du in (-1 / 3, 0.0, 1 / 3) for dv in (-1 / 3, 0.0, 1 / 3)]
+    grey = np.mean([_cast(T_world_camera, shift)[0] for shift in thirds], axis=0)
+    return np.rint(grey).astype(np.uint8), _cast(T_world_camera, (0.0, 0.0))[1]
+
+
+def _cast(T_world_camera: np.ndarray, shift: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Grey values and depth along one ray in each pixel."""
+    v, u = np.mgrid[0 : CAMERA.height_px, 0 : CAMERA.width_px].astype(np.float64)
+    x = (u + shift[0] - CAMERA.cx_px) / CAMERA.focal_px
+    y = (v + shift[1] - CAMERA.cy_px) / CAMERA.focal_px
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ T_world_camera[:3, :3].T
+    start = T_world_camera[:3, 3]
+    depth = np.full(x.shape, np.inf)
+    grey = np.zeros(x.shape, np.float32)
+    for number, (normal, offset, axes) in enumerate(PLANES):
+        n = np.asarray(normal, dtype=np.float64)
+        with np.errstate(divide="ignore"):
+            t = (offset - start @ n) / (rays @ n)
+        nearer = (t > 0.1) & (t < depth)
+        hit = start + rays[nearer] * t[nearer][:, None]
+        texel = (hit[:, axes] * TEXELS_PER_M + 311.0 * number).astype(np.float32) % 1023
+        colour = cv2.remap(TEXTURE, texel[None, :, 0], texel[None, :, 1], cv2.INTER_LINEAR)
+        grey[nearer], depth[nearer] = colour[0], t[nearer]
+    return grey, depth
+
+
+def make_disparity(values: np.ndarray, sigma_px: float = 0.1) -> Disparity:
+    """A disparity map of plain values."""
+    values = values.astype(np.float32)
+    valid = np.isfinite(values)
+    return Disparity(
+        values=values,
+        confidence=valid.astype(np.float32),
+        sigma_px=np.where(valid, np.float32(sigma_px), np.float32(np.nan)),
+        reason=np.where(valid, np.uint8(Reason.VALID), np.uint8(Reason.LOW_TEXTURE)),
+    )
+
+
+def make_frame(grey: np.ndarray, values: np.ndarray, index: int = 0) -> OdometryFrame:
+    """A frame; odometry never looks at the right picture."""
+    pair = RectifiedPair(grey, grey, CAMERA, timestamp_s=0.1 * index, index=index)
+    return OdometryFrame(pair, make_disparity(values))
+
+
+@pytest.fixture(scope="session")
+def camera() -> RectifiedCamera:
+    return CAMERA
+
+
+@pytest.fixture(scope="session")
+def see() -> Callable[..., OdometryFrame]:
+    """See the street from a pose: a frame with exact disparity."""
+
+    def see_from(T_world_camera: np.ndarray, index: int = 0) -> OdometryFrame:
+        grey, depth = _render(T_world_camera)
+        return make_frame(grey, CAMERA.focal_px * CAMERA.baseline_m / depth, index)
+
+    return see_from
+
+
+@pytest.fixture(scope="session")
+def blind() -> Callable[..., OdometryFrame]:
+    """A frame that shows nothing: one grey level, no disparity."""
+
+    def blind_frame(level: int = 0, index: int = 0) -> OdometryFrame:
+        shape = (CAMERA.height_px, CAMERA.width_px)
+        return make_frame(np.full(shape, level, np.uint8), np.full(shape, np.nan), index)
+
+    return blind_frame
+
+
+@pytest.fixture(scope="session")
+def street_poses() -> np.ndarray:
+    """float64 (12, 4, 4): 0.5 m a frame along a gentle bend; the first is the identity."""
+    step = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.array([0.0, 0.0, 0.5]))
+    return np.stack([np.linalg.matrix_power(step, n) for n in range(12)])
+
+
+@pytest.fixture(scope="session")
+def street(
+    see: Callable[..., OdometryFrame], street_poses: np.ndarray
+) -> tuple[OdometryFrame, ...]:
+    return tuple(see(T, index) for index, T in enumerate(street_poses))

@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+import pytest
+
+from recon.geometry.se3 import invert
+from recon.odometry.fused import FusedOdometry
+from recon.odometry.protocol import OdometryFrame, OdometryResult
+from recon.odometry.settings import FusedSettings, VisualSettings
+
+See = Callable[..., OdometryFrame]
+
+
+def follow(frames: Iterable[OdometryFrame]) -> list[OdometryResult]:
+    odometry = FusedOdometry(FusedSettings(), VisualSettings())
+    return [odometry.register(frame) for frame in frames]
+
+
+def error_m(result: OdometryResult, truth: np.ndarray) -> float:
+    return float(np.linalg.norm((invert(truth) @ result.T_world_camera)[:3, 3]))
+
+
+@pytest.fixture(scope="module")
+def results(street: tuple[OdometryFrame, ...]) -> list[OdometryResult]:
+    return follow(street)
+
+
+def test_the_street_is_followed(results: list[OdometryResult], street_poses: np.ndarray) -> None:
+    # 1 % of 5.5 m.
+    assert error_m(results[-1], street_poses[-1]) < 0.055
+    assert all(result.health.ok for result in results)
+
+
+def test_health_measures_every_frame_but_the_first(results: list[OdometryResult]) -> None:
+    for result in results[1:]:
+        health = result.health
+        assert 0.6 < health.overlap <= 1.0
+        # Exact disparity on planes: far less than the 0.3 m voxel.
+        assert 0.0 < health.residual_m < 0.02
+        assert 0.0 <= health.correction_m < 0.2
+        assert health.icp_points > 300
+        assert health.inliers <= health.tracks
+    assert np.isnan(results[0].health.overlap)
+
+
+def test_what_is_refused_says_why(results: list[OdometryResult]) -> None:
+    for result in results[1:]:
+        assert result.health.accepted or result.health.notes
+
+
+def test_two_runs_are_equal_to_the_bit(
+    results: list[OdometryResult], street: tuple[OdometryFrame, ...]
+) -> None:
+    for once, again in zip(results, follow(street), strict=True):
+        np.testing.assert_array_equal(once.T_world_camera, again.T_world_camera)
+
+
+def test_poses_stay_rigid(results: list[OdometryResult]) -> None:
+    for result in results:
+        R = result.T_world_camera[:3, :3]
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+def test_blind_frames_extrapolate_leave_the_map_alone_and_are_recovered_from(
+    blind: See, street: tuple[OdometryFrame, ...], street_poses: np.ndarray
+) -> None:
+    results = follow((*street[:5], blind(index=5), blind(255, index=6), *street[7:]))
+    assert [r.health.ok for r in results[4:7]] == [True, False, False]
+    assert any("too few points" in note for note in results[5].health.notes)
+    # The motion is constant, so it is extrapolated well; after that ICP and vision go on.
+    for result, truth in zip(results, street_poses, strict=True):
+        assert error_m(result, truth) < 0.2
+    assert results[-1].health.ok
+
+
+def test_a_drive_that_begins_blind_begins_where_it_sees(
+    blind: See, street: tuple[OdometryFrame, ...]
+) -> None:
+    results = follow((blind(), blind(), *street[:4]))
+    np.testing.assert_allclose(results[2].T_world_camera, np.eye(4), atol=1e-12)
+    assert results[0].health.ok
+    assert not results[1].health.ok
+    assert results[-1].health.ok
+
+
+def test_icp_takes_over_where_vision_is_lost(
+    street: tuple[OdometryFrame, ...],
+    street_poses: np.ndarray,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without tracks, but with a disparity map, the map still tells where the camera is."""
+    odometry = FusedOdometry(FusedSettings(), VisualSettings())
+    results = [odometry.register(frame) for frame in street[:6]]
+    monkeypatch.setattr("recon.odometry.visual.locate_camera", lambda *_: None)
+    results += [odometry.register(frame) for frame in street[6:9]]
+    lost = results[6:]
+    assert any(result.health.accepted and result.health.ok for result in lost)
+    assert all("lost" in result.health.notes[0] for result in lost)
+    # Along the street the walls hardly tell; extrapolation stands in.
+    assert error_m(lost[-1], street_poses[8]) < 0.15

@@ -1,0 +1,73 @@
+"""Real drives: figures that the project promises, with its own matcher."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.evaluation.trajectory import evaluate_trajectory
+from recon.matching.registry import make_matcher
+from recon.odometry.protocol import OdometryFrame
+from recon.odometry.registry import make_odometry
+from recon.structures import RectifiedCamera, RectifiedPair, Trajectory, TrajectoryMetrics
+
+pytestmark = [pytest.mark.real, pytest.mark.slow]
+
+
+def frames(folder: Path) -> Iterator[OdometryFrame]:
+    matcher = make_matcher("sad")
+    left = sorted((folder / "image_0").glob("*.png"))
+    for index, path in enumerate(left):
+        pair = [
+            cv2.imread(str(side), cv2.IMREAD_GRAYSCALE)
+            for side in (path, folder / "image_1" / path.name)
+        ]
+        camera = read_camera(folder / "calib.txt", *pair[0].shape)
+        rectified = RectifiedPair(pair[0], pair[1], camera, index=index)
+        yield OdometryFrame(rectified, matcher.match(rectified))
+
+
+def read_camera(path: Path, height_px: int, width_px: int) -> RectifiedCamera:
+    rows = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
+    P0, P1 = (np.array(rows[key].split(), dtype=np.float64).reshape(3, 4) for key in ("P0", "P1"))
+    return RectifiedCamera(
+        focal_px=P0[0, 0],
+        cx_px=P0[0, 2],
+        cy_px=P0[1, 2],
+        cx_right_px=P1[0, 2],
+        baseline_m=-P1[0, 3] / P1[0, 0],
+        width_px=width_px,
+        height_px=height_px,
+    )
+
+
+def drive(folder: Path) -> dict[str, TrajectoryMetrics]:
+    """Visual and fused odometry over the same frames."""
+    if not folder.is_dir():
+        pytest.skip(f"real data: no folder {folder.name}")
+    odometries = {name: make_odometry(name) for name in ("visual", "fused")}
+    poses: dict[str, list[np.ndarray]] = {name: [] for name in odometries}
+    for frame in frames(folder):
+        for name, odometry in odometries.items():
+            poses[name].append(odometry.register(frame).T_world_camera)
+    truth = np.tile(np.eye(4), (len(poses["visual"]), 1, 1))
+    truth[:, :3] = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
+    times = np.arange(len(truth), dtype=np.float64)
+    return {
+        name: evaluate_trajectory(Trajectory(np.stack(T), times), Trajectory(truth, times))
+        for name, T in poses.items()
+    }
+
+
+@pytest.mark.parametrize(("name", "bound"), [("kitti_raw_0013", 0.6), ("kitti_06_51", 0.9)])
+def test_real_drives_drift_by_less_than_one_per_cent(
+    name: str, bound: float, recon_data: Path
+) -> None:
+    metrics = drive(recon_data / "driven" / name)
+    assert 0.0 < metrics["visual"].t_rel_percent < bound
+    # A correction that did not earn its place would make it worse.
+    assert metrics["fused"].t_rel_percent <= metrics["visual"].t_rel_percent + 0.05

@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.geometry.se3 import apply
+from recon.odometry.gate import as_transform
+from recon.odometry.surfaces import NOISE_M, describe_surfaces, fit_surfaces
+
+
+def wall(points: int = 3000, noise_m: float = 0.0) -> np.ndarray:
+    """Points on the plane z = 5.5."""
+    rng = np.random.default_rng(2)
+    xy = rng.uniform(-4, 4, (points, 2))
+    return np.c_[xy, 5.5 + noise_m * rng.normal(size=points)]
+
+
+def test_points_on_a_wall_fit_it_exactly() -> None:
+    fit = fit_surfaces(wall(), describe_surfaces(wall(), 1.0))
+    assert fit.overlap == 1.0
+    assert fit.residual_m < 1e-9
+
+
+@pytest.mark.parametrize("shift_m", [0.05, 0.2, -0.3])
+def test_the_residual_is_the_distance_to_the_wall(shift_m: float) -> None:
+    moved = wall() + np.array([0.0, 0.0, shift_m])
+    fit = fit_surfaces(moved, describe_surfaces(wall(), 1.0))
+    assert fit.residual_m == pytest.approx(abs(shift_m), rel=1e-6)
+
+
+def test_a_wall_fixes_one_translation_and_two_rotations() -> None:
+    information = fit_surfaces(wall(), describe_surfaces(wall(), 1.0)).information
+    values = np.linalg.eigvalsh(information)
+    # Three directions are free (slide twice, spin), three are not.
+    assert values[2] < 1e-6 * values[-1]
+    assert values[3] > 1e-3 * values[-1]
+
+
+def test_a_bush_fixes_nothing() -> None:
+    bush = np.random.default_rng(4).uniform(-4, 4, (20_000, 3))
+    assert len(describe_surfaces(bush, 1.0).keys) == 0
+    fit = fit_surfaces(bush, describe_surfaces(bush, 1.0))
+    assert fit.overlap == 0.0
+    assert np.isnan(fit.residual_m)
+
+
+def test_few_points_are_no_surface() -> None:
+    assert len(describe_surfaces(wall(5), 100.0).keys) == 0
+
+
+def test_nothing_fits_nothing() -> None:
+    empty = np.zeros((0, 3))
+    fit = fit_surfaces(wall(), describe_surfaces(empty, 1.0))
+    assert fit.overlap == 0.0
+
+
+def test_information_is_the_curvature_of_the_squared_distance() -> None:
+    """Second difference of the cost along each step against the diagonal."""
+    xyz = wall(noise_m=0.03)
+    surfaces = describe_surfaces(xyz, 1.0)
+    fit = fit_surfaces(xyz, surfaces)
+    h = 1e-4
+
+    def cost(step: np.ndarray) -> float:
+        moved = apply(as_transform(step), xyz)
+        # Cells stay as they are for so small a step but for points on their rims.
+        return sum(
+            float((p - m) @ W @ (p - m)) for p, m, W in zip(moved, means, information, strict=True)
+        )
+
+    cell = np.searchsorted(surfaces.keys, _keys_of(xyz))
+    means, information = surfaces.means[cell], surfaces.information[cell]
+    for axis in range(6):
+        step = np.zeros(6)
+        step[axis] = h
+        curvature = (cost(step) - 2 * cost(np.zeros(6)) + cost(-step)) / (2 * h * h)
+        # The rest of the curvature is the residuals' own, some 1/1000 here.
+        assert curvature == pytest.approx(fit.information[axis, axis], rel=0.02, abs=1 / NOISE_M**2)
+
+
+def _keys_of(xyz: np.ndarray) -> np.ndarray:
+    index = np.floor(xyz).astype(np.int64) + (1 << 20)
+    return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]

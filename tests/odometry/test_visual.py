@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.geometry.se3 import angle_rad, exp_so3, invert, make_transform
+from recon.odometry.protocol import OdometryFrame
+from recon.odometry.settings import VisualSettings
+from recon.odometry.visual import VisualOdometry
+from recon.structures import RectifiedPair
+
+See = Callable[..., OdometryFrame]
+
+
+def follow(frames: list[OdometryFrame] | tuple[OdometryFrame, ...]) -> np.ndarray:
+    odometry = VisualOdometry(VisualSettings())
+    return np.stack([odometry.register(frame).T_world_camera for frame in frames])
+
+
+def yaw(angle_rad: float) -> np.ndarray:
+    return make_transform(exp_so3(np.array([0.0, angle_rad, 0.0])), np.zeros(3))
+
+
+def forward(distance_m: float) -> np.ndarray:
+    return make_transform(np.eye(3), np.array([0.0, 0.0, distance_m]))
+
+
+def test_a_camera_that_stands_still_stays(see: See) -> None:
+    poses = follow([see(np.eye(4))] * 4)
+    # Equal pictures: what is left is the optimiser's rounding.
+    np.testing.assert_allclose(poses, np.tile(np.eye(4), (4, 1, 1)), atol=1e-4)
+
+
+@pytest.mark.parametrize("step", [forward(0.5), yaw(0.02), forward(-0.3), forward(0.4) @ yaw(0.01)])
+def test_a_motion_is_found(step: np.ndarray, see: See) -> None:
+    truth = [np.linalg.matrix_power(step, n) for n in range(5)]
+    off = invert(follow([see(T) for T in truth])[-1]) @ truth[-1]
+    # 1 % of a 2 m path; a quarter of a pixel (1/260 rad) in four frames, as patches that grow
+    # or turn while they are followed cost some hundredths of a pixel each time.
+    assert np.linalg.norm(off[:3, 3]) < 0.02
+    assert angle_rad(off) < 0.25 / 260
+
+
+def test_the_first_frame_is_the_identity(see: See, street_poses: np.ndarray) -> None:
+    np.testing.assert_array_equal(follow([see(street_poses[3])])[0], np.eye(4))
+
+
+def test_motion_does_not_depend_on_where_the_drive_begins(
+    street: tuple[OdometryFrame, ...], street_poses: np.ndarray
+) -> None:
+    late = follow(street[4:8])
+    whole = follow(street)[:8]
+    relative = invert(whole[4]) @ whole[7]
+    # Other frames were in the window; both are good to about 1 % of 1.5 m.
+    assert np.linalg.norm(relative[:3, 3] - late[3][:3, 3]) < 0.03
+
+
+def test_two_runs_are_equal_to_the_bit(street: tuple[OdometryFrame, ...]) -> None:
+    np.testing.assert_array_equal(follow(street), follow(street))
+
+
+def test_a_black_frame_extrapolates_says_so_and_is_recovered_from(
+    see: See, blind: See, street: tuple[OdometryFrame, ...], street_poses: np.ndarray
+) -> None:
+    odometry = VisualOdometry(VisualSettings())
+    results = [odometry.register(f) for f in (*street[:6], blind(index=6), *street[7:])]
+    assert [result.health.ok for result in results] == [True] * 6 + [False] * 2 + [True] * 4
+    assert "lost" in results[6].health.notes[0]
+    last = results[-1].T_world_camera
+    # The motion is constant, so the extrapolated step costs hardly more than a seen one.
+    assert np.linalg.norm((invert(street_poses[-1]) @ last)[:3, 3]) < 0.1
+
+
+def test_a_missing_disparity_map_does_not_lose_the_camera(
+    blind: See, street: tuple[OdometryFrame, ...], street_poses: np.ndarray
+) -> None:
+    empty = OdometryFrame(street[6].pair, blind().disparity)
+    odometry = VisualOdometry(VisualSettings())
+    results = [odometry.register(f) for f in (*street[:6], empty, *street[7:])]
+    assert all(result.health.ok for result in results)
+    off = invert(street_poses[-1]) @ results[-1].T_world_camera
+    assert np.linalg.norm(off[:3, 3]) < 0.06
+
+
+def test_a_blank_wall_gives_no_motion_and_no_exception(blind: See) -> None:
+    odometry = VisualOdometry(VisualSettings())
+    results = [odometry.register(blind(128, n)) for n in range(3)]
+    assert results[0].health.ok
+    assert not results[1].health.ok
+    np.testing.assert_allclose(results[2].T_world_camera, np.eye(4), atol=1e-12)
+
+
+def test_an_object_that_moves_does_not_move_the_camera(see: See) -> None:
+    """A third of the picture shows the street from elsewhere, as on the side of a passing bus."""
+    truth = [forward(0.4 * n) for n in range(5)]
+    frames = []
+    for n, T in enumerate(truth):
+        street, bus = see(T, n), see(forward(-0.3 * n), n)
+        frames.append(_pasted(street, bus))
+    off = invert(follow(frames)[-1]) @ truth[-1]
+    assert np.linalg.norm(off[:3, 3]) < 0.05
+
+
+def _pasted(below: OdometryFrame, above: OdometryFrame) -> OdometryFrame:
+    """The left third of one frame on another."""
+    third = slice(0, below.pair.camera.width_px // 3)
+    grey = below.pair.left.copy()
+    grey[:, third] = above.pair.left[:, third]
+    values = below.disparity.values.copy()
+    values[:, third] = above.disparity.values[:, third]
+    pair = RectifiedPair(grey, grey, below.pair.camera, index=below.pair.index)
+    return OdometryFrame(pair, replace(below.disparity, values=values))
