@@ -54,6 +54,7 @@ class ReconConfig(Settings):
 PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
     "cloud": {"max_range_m": None, "max_relative_sigma": None},
     "filters": ANY_SCALE.model_dump(),
+    "mesh": {"max_depth": 9},
 }
 """What one pair sets differently from a drive: nobody knows the scale of its scene beforehand."""
 

@@ -167,7 +167,9 @@ def _finish(
             mesh = _mesh(cloud, config, warnings)
     truth = source.truth
     with watch.stage("compare"):
-        metrics = _compare_paths(mapped.trajectory, truth, warnings)
+        # Poses that were given are no estimate; a drift of 0 % would be a lie.
+        given = options.known_poses is not None
+        metrics = None if given else _compare_paths(mapped.trajectory, truth, warnings)
         map_metrics = _compare_surfaces(mapped.cloud, truth, warnings)
     run = MapRun(
         name=source.name,
@@ -182,7 +184,8 @@ def _finish(
         summary={},
         warnings=tuple(warnings),
     )
-    run.summary.update(_summary(run))
+    odometry = "known poses" if given else config.odometry.method
+    run.summary.update(odometry=odometry, **_summary(run))
     return run
 
 

@@ -75,7 +75,7 @@ def map_sequence(
     watch = stopwatch or Stopwatch()
     audience = tuple(observers)
     reconstructor = FrameReconstructor(source.calibration, config, threads=threads, stopwatch=watch)
-    odometry = _odometry(config, known_poses)
+    odometry = _odometry(config, known_poses, frames=len(source))
     mapper = _Mapper(config, odometry, watch, sample_at=len(source) // 2)
     for observer in audience:
         observer.on_start(source.name, len(source))
@@ -135,7 +135,9 @@ class _Mapper:
             raise RegistrationError("the source has no frame")
         trajectory = Trajectory(np.stack(self._poses), np.array(self._times_s))
         with self._stopwatch.stage("export"):
-            cloud = filter_cloud(self._fused.cloud(), self._config.map_filters)
+            # A drive of fewer frames than the least count must still give a map.
+            least = min(self._config.fusion.min_count, len(self._poses))
+            cloud = filter_cloud(self._fused.cloud(least), self._config.map_filters)
             voxels = self._occupancy.voxels()
         return MappedSequence(
             trajectory=trajectory,
@@ -157,7 +159,14 @@ class _Mapper:
         return self._occupancy
 
 
-def _odometry(config: ReconConfig, known_poses: Trajectory | None) -> Odometry:
-    if known_poses is not None:
-        return KnownPoses(known_poses)
-    return make_odometry(config.odometry.method, config.odometry)
+def _odometry(config: ReconConfig, known_poses: Trajectory | None, *, frames: int) -> Odometry:
+    if known_poses is None:
+        return make_odometry(config.odometry.method, config.odometry)
+    if len(known_poses) < frames:
+        raise RegistrationError(
+            "fewer known poses than frames",
+            got=f"{len(known_poses)} poses",
+            expected=f"{frames}",
+            hint="the pose file must list every frame of the source",
+        )
+    return KnownPoses(known_poses)
