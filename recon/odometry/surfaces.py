@@ -44,8 +44,8 @@ class Fit:
     """How points fit surfaces.
 
     Attributes:
-        overlap: Share of points that lie in a cell with a surface.
-        residual_m: Median distance from those points to their surfaces; NaN = none.
+        overlap: Share of points that lie in a cell of the map.
+        residual_m: Median distance of points to the surface of their cell; NaN = no surface.
         information: float64 (6, 6), what the points tell about a step (translation in metres,
             rotation vector in radians) of their frame.
     """
@@ -70,23 +70,24 @@ def describe_surfaces(xyz: Float64, edge_m: float) -> Surfaces:
     off = xyz - means[cell]
     products = np.einsum("ni,nj->nij", off, off).reshape(-1, 9)
     covariance = _sums(cell, products, len(keys)).reshape(-1, 3, 3) / count[:, None, None]
-    known = count >= MIN_POINTS
-    information = _thin_information(covariance[known], edge_m)
-    some = information.any(axis=(1, 2))
-    return Surfaces(edge_m, keys[known][some], means[known][some], information[some])
+    information = _thin_information(covariance, edge_m)
+    information[count < MIN_POINTS] = 0.0
+    return Surfaces(edge_m, keys, means, information)
 
 
 def fit_surfaces(xyz: Float64, surfaces: Surfaces) -> Fit:
     """How points (N, 3), in the axes of the surfaces, fit them."""
     cell, hit = _look_up(xyz, surfaces)
-    if not hit.any():
-        return Fit(0.0, float("nan"), np.zeros((6, 6)))
-    near, information = xyz[hit], surfaces.information[cell[hit]]
-    off = near - surfaces.means[cell[hit]]
+    overlap = float(hit.mean()) if len(hit) else 0.0
+    flat = np.flatnonzero(hit)[surfaces.information[cell[hit]].any(axis=(1, 2))]
+    if not len(flat):
+        return Fit(overlap, float("nan"), np.zeros((6, 6)))
+    near, information = xyz[flat], surfaces.information[cell[flat]]
+    off = near - surfaces.means[cell[flat]]
     residual_m = float(np.median(_distance_m(off, information)))
     J = _step_jacobian(near)
     total = np.einsum("nki,nkl,nlj->ij", J, information, J, optimize=True)
-    return Fit(float(hit.mean()), residual_m, total)
+    return Fit(overlap, residual_m, total)
 
 
 def _thin_information(covariance: Float64, edge_m: float) -> Float64:

@@ -36,7 +36,7 @@ def test_the_street_is_followed(results: list[OdometryResult], street_poses: np.
 def test_health_measures_every_frame_but_the_first(results: list[OdometryResult]) -> None:
     for result in results[1:]:
         health = result.health
-        assert 0.6 < health.overlap <= 1.0
+        assert 0.8 < health.overlap <= 1.0
         # Exact disparity on planes: far less than the 0.3 m voxel.
         assert 0.0 < health.residual_m < 0.02
         assert 0.0 <= health.correction_m < 0.2
