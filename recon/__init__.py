@@ -80,7 +80,7 @@ _HOMES = {
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
-__all__ = [  # noqa: PLE0604, F822 - each name is loaded by __getattr__
+__all__ = [
     "CameraIntrinsics",
     "Disparity",
     "MapOptions",
