@@ -10,7 +10,8 @@ The twin in plain numpy, `recon.kernels.sad_reference.sad_minima_reference`, say
 results are.
 
 Ref: K. Mühlmann et al., "Calculating dense disparity maps from color stereo images, an efficient
-implementation", IJCV 47, 2002.
+implementation", IJCV 47, 2002; N. Einecke, J. Eggert, "A multi-block-matching approach for
+stereo", IEEE Intelligent Vehicles, 2015 (several windows).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.kernels.minima import Minima, left_minima, right_minima
+from recon.kernels.minima import NO_COST, Minima, left_minima, right_minima
 
 
 class Search(NamedTuple):
@@ -33,6 +34,7 @@ class Search(NamedTuple):
         radius: Half width of the window, pixels: it is ``2·radius + 1`` wide.
         rows_radius: Half height of the window, pixels.
         cost_cap: Largest cost of one pixel; times the pixels of the window it is < 65535.
+        slant: Disparity per row of a second, slanted window, pixels; 0 = there is none.
     """
 
     ndisp: int
@@ -40,6 +42,7 @@ class Search(NamedTuple):
     radius: int
     rows_radius: int
     cost_cap: int
+    slant: float
 
 
 def mirror_right(right: NDArray[np.uint8], search: Search) -> NDArray[np.uint8]:
@@ -50,13 +53,28 @@ def mirror_right(right: NDArray[np.uint8], search: Search) -> NDArray[np.uint8]:
         search: What will be searched.
 
     Returns:
-        uint8 (H, W + 2·radius + ndisp - 1); column ``j`` is right column
-        ``W - 1 + radius - minimum - j``, clamped to the picture.
+        uint8 (H, W + 2·margin + ndisp - 1), where ``margin`` is the radius and what the slant
+        reaches over; column ``j`` is right column ``W - 1 + margin - minimum - j``, clamped to
+        the picture.
     """
-    width = right.shape[1]
-    places = np.arange(width + 2 * search.radius + search.ndisp - 1)
-    columns = np.clip(width - 1 + search.radius - search.minimum - places, 0, width - 1)
+    width, margin = right.shape[1], search.radius + slant_reach(search)
+    places = np.arange(width + 2 * margin + search.ndisp - 1)
+    columns = np.clip(width - 1 + margin - search.minimum - places, 0, width - 1)
     return np.ascontiguousarray(right[:, columns])
+
+
+@njit(cache=True, nogil=True)
+def slant_offset(search: Search, dy: int) -> int:
+    """By how many candidates the slanted window leans ``dy`` rows below its middle."""
+    return int(np.floor(dy * search.slant + 0.5))
+
+
+@njit(cache=True, nogil=True)
+def slant_reach(search: Search) -> int:
+    """Largest absolute `slant_offset` of the window."""
+    rows = search.rows_radius
+    reach: int = max(abs(slant_offset(search, rows)), abs(slant_offset(search, -rows)))
+    return reach
 
 
 @njit(cache=True, nogil=True)
@@ -71,9 +89,11 @@ def sad_minima(
     """Find the best candidate of each pixel of some rows, in the left and the right view.
 
     Candidate ``k`` of a pixel is the disparity ``minimum + k``. Its cost is the sum over the
-    window of ``min(|left - right|, cost_cap)``, both pictures continued by their border pixels.
-    Candidates whose right pixel lies outside the picture do not exist. Of equal costs the
-    smaller disparity wins.
+    window of ``min(|left - right|, cost_cap)``, both pictures continued by their border pixels;
+    with a slant it is the smaller of that and of the same sum where the disparity grows by
+    ``slant`` per row (rounded), as on the ground under a camera. Candidates whose right pixel
+    lies outside the picture do not exist. Of equal costs the smaller disparity wins. The costs
+    before and after the best are those of the window that won, the upright one if both did.
 
     Args:
         left: uint8 (H, W), the left picture.
@@ -85,13 +105,22 @@ def sad_minima(
     """
     width, ndisp = left.shape[1], search.ndisp
     columns = np.zeros((width + 2 * search.radius, ndisp), np.uint16)
-    sums = np.empty((width, ndisp), np.uint16)
+    slanted_columns = np.empty(columns.shape if search.slant else (0, 0), np.uint16)
+    upright = np.empty((width, ndisp), np.uint16)
+    slanted, lowest = np.empty_like(upright), np.empty_like(upright)
     right_best = np.empty((2, width + ndisp), np.uint16)
     for y in range(first, end):
         _move_down(left, mirrored, search, first, y, columns)
-        _sum_windows(columns, search.radius, sums)
-        left_minima(sums, y, search.minimum, minima)
-        right_minima(sums, y, search.minimum, right_best, minima.right_winner)
+        _sum_windows(columns, search.radius, upright)
+        if search.slant:
+            _sum_slanted_columns(left, mirrored, search, y, slanted_columns)
+            _sum_windows(slanted_columns, search.radius, slanted)
+            _lower(upright.reshape(-1), slanted.reshape(-1), lowest.reshape(-1))
+        costs = lowest if search.slant else upright
+        left_minima(costs, y, search.minimum, minima)
+        right_minima(costs, y, search.minimum, right_best, minima.right_winner)
+        if search.slant:
+            _neighbours_of_the_same_window(upright, slanted, y, minima)
 
 
 @njit(cache=True, nogil=True)
@@ -110,7 +139,7 @@ def _move_down(
         _exchange_row(left, mirrored, search, come, gone, columns)
         return
     for dy in range(-reach, reach + 1):
-        _add_row(left, mirrored, search, min(max(y + dy, 0), last), columns)
+        _add_row(left, mirrored, search, min(max(y + dy, 0), last), 0, columns)
 
 
 @njit(cache=True, nogil=True)
@@ -119,15 +148,16 @@ def _add_row(
     mirrored: NDArray[np.uint8],
     search: Search,
     y: int,
+    offset: int,
     columns: NDArray[np.uint16],
 ) -> None:
-    """Add the costs of the pixels of row ``y`` to the column sums."""
+    """Add the costs of the pixels of row ``y``, ``offset`` candidates aside, to the column sums."""
     cap = np.uint8(search.cost_cap)
-    last = left.shape[1] - 1
+    last, reach = left.shape[1] - 1, slant_reach(search)
     for c in range(columns.shape[0]):
         a = left[y, min(max(c - search.radius, 0), last)]
+        start = last + 2 * search.radius + reach + offset - c
         sums = columns[c]
-        start = last + 2 * search.radius - c
         right = mirrored[y, start : start + sums.size]
         for k in range(sums.size):
             sums[k] = np.uint16(sums[k] + np.uint16(_difference(a, right[k], cap)))
@@ -144,18 +174,33 @@ def _exchange_row(
 ) -> None:
     """Take the costs of row ``gone`` out of the column sums and add those of row ``come``."""
     cap = np.uint8(search.cost_cap)
-    last = left.shape[1] - 1
+    last, reach = left.shape[1] - 1, slant_reach(search)
     for c in range(columns.shape[0]):
         x = min(max(c - search.radius, 0), last)
         a, a_gone = left[come, x], left[gone, x]
         sums = columns[c]
-        start = last + 2 * search.radius - c
+        start = last + 2 * search.radius + reach - c
         right = mirrored[come, start : start + sums.size]
         right_gone = mirrored[gone, start : start + sums.size]
         for k in range(sums.size):
             plus = np.uint16(_difference(a, right[k], cap))
             minus = np.uint16(_difference(a_gone, right_gone[k], cap))
             sums[k] = np.uint16(np.uint16(sums[k] - minus) + plus)
+
+
+@njit(cache=True, nogil=True)
+def _sum_slanted_columns(
+    left: NDArray[np.uint8],
+    mirrored: NDArray[np.uint8],
+    search: Search,
+    y: int,
+    columns: NDArray[np.uint16],
+) -> None:
+    """Write the column sums of the slanted windows around row ``y``; they cannot be moved down."""
+    columns[:] = np.uint16(0)
+    for dy in range(-search.rows_radius, search.rows_radius + 1):
+        row = min(max(y + dy, 0), left.shape[0] - 1)
+        _add_row(left, mirrored, search, row, slant_offset(search, dy), columns)
 
 
 @njit(cache=True, nogil=True)
@@ -176,3 +221,28 @@ def _sum_windows(columns: NDArray[np.uint16], radius: int, sums: NDArray[np.uint
         for k in range(sums.shape[1]):
             rest = np.uint16(sums[x - 1, k] - columns[gone, k])
             sums[x, k] = np.uint16(rest + columns[come, k])
+
+
+@njit(cache=True, nogil=True)
+def _lower(
+    costs: NDArray[np.uint16], others: NDArray[np.uint16], lowest: NDArray[np.uint16]
+) -> None:
+    """Write the lower of two costs, for all candidates."""
+    for k in range(lowest.size):
+        lowest[k] = min(costs[k], others[k])
+
+
+@njit(cache=True, nogil=True)
+def _neighbours_of_the_same_window(
+    upright: NDArray[np.uint16], slanted: NDArray[np.uint16], y: int, minima: Minima
+) -> None:
+    """Take the costs before and after the best from the window that won: a fit mixes no two."""
+    for x in range(upright.shape[0]):
+        k = np.int64(minima.winner[y, x])
+        if k == upright.shape[1]:
+            continue
+        own = upright[x] if upright[x, k] <= slanted[x, k] else slanted[x]
+        if minima.costs[1, y, x] != NO_COST:
+            minima.costs[1, y, x] = own[k - 1]
+        if minima.costs[2, y, x] != NO_COST:
+            minima.costs[2, y, x] = own[k + 1]

@@ -13,7 +13,18 @@ def sad_minima_reference(
     left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search
 ) -> Minima:
     """All rows of `recon.kernels.sad.sad_minima`, from pictures (H, W) that are not mirrored."""
-    return minima_reference(window_costs_reference(left, right, search), search.minimum)
+    upright = window_costs_reference(left, right, search._replace(slant=0.0))
+    slanted = window_costs_reference(left, right, search)
+    lowest = np.minimum(upright, slanted)
+    minima = minima_reference(lowest, search.minimum)
+    k = np.minimum(minima.winner, search.ndisp - 1).astype(np.int64)[:, :, None]
+    slanted_wins = np.take_along_axis(slanted < upright, k, axis=2)
+    own = np.where(slanted_wins, slanted, upright)
+    for n, step in ((1, -1), (2, 1)):
+        there = np.clip(k + step, 0, search.ndisp - 1)
+        cost = np.take_along_axis(own, there, axis=2)[:, :, 0]
+        minima.costs[n] = np.where(minima.costs[n] == NO_COST, NO_COST, cost)
+    return minima
 
 
 def window_costs_reference(
@@ -22,10 +33,11 @@ def window_costs_reference(
     """int64 (H, W, ndisp), the cost of each candidate, as if both pictures went on for ever."""
     height, width = left.shape
     costs = np.zeros((height, width, search.ndisp), np.int64)
-    disparities = search.minimum + np.arange(search.ndisp)
+    candidates = search.minimum + np.arange(search.ndisp)
     y, x = np.arange(height), np.arange(width)
     for dy in range(-search.rows_radius, search.rows_radius + 1):
         rows = np.clip(y + dy, 0, height - 1)[:, None]
+        disparities = candidates + int(np.floor(dy * search.slant + 0.5))
         for dx in range(-search.radius, search.radius + 1):
             columns = np.clip(x + dx, 0, width - 1)
             others = np.clip(x[:, None] + dx - disparities, 0, width - 1)

@@ -37,13 +37,14 @@ _GAIN_OF_SOBEL: Final = 8.0
 class SadSettings(Settings):
     """Settings of the SAD matcher."""
 
-    window_px: int = Field(default=15, ge=1, le=61, description="Width of the window; odd.")
-    window_height_px: int = Field(
-        default=7,
-        ge=1,
-        le=61,
-        description="Height of the window; odd. Low windows suit the ground, whose disparity "
-        "changes from row to row.",
+    window_px: int = Field(default=11, ge=1, le=61, description="Width of the window; odd.")
+    window_height_px: int = Field(default=11, ge=1, le=61, description="Height of the window; odd.")
+    window_slant: float = Field(
+        default=1 / 3,
+        ge=-1.0,
+        le=1.0,
+        description="Disparity per row of a second window, which competes with the upright one "
+        "at each pixel; 0 = none. On level ground it is baseline / camera height.",
     )
     min_disparity_px: int = Field(
         default=0, ge=-4096, le=4096, description="First disparity searched; may be negative."
@@ -167,7 +168,7 @@ class SadMatcher:
                 hint="check min_disparity_px and ndisp",
             )
         radius, rows_radius = s.window_px // 2, s.window_height_px // 2
-        search = Search(ndisp, s.min_disparity_px, radius, rows_radius, s.cost_cap)
+        search = Search(ndisp, s.min_disparity_px, radius, rows_radius, s.cost_cap, s.window_slant)
         rules = Rules(
             ndisp=ndisp,
             minimum=s.min_disparity_px,

@@ -90,14 +90,31 @@ def test_fraction_of_a_pixel_is_recovered(shift: float, fit: str) -> None:
     assert np.isfinite(values).mean() > 0.95
 
 
-def test_slanted_plane_is_followed() -> None:
+def ground(slant: float) -> tuple[RectifiedPair, Float64]:
+    """A plane whose disparity grows by ``slant`` per row, and its disparity."""
     row = np.arange(HEIGHT, dtype=np.float64)[:, None]
-    truth = np.broadcast_to(4 + 0.2 * row, (HEIGHT, WIDTH))
-    found = SadMatcher(PLAIN).match(warped_pair(truth))
+    truth = np.broadcast_to(4 + slant * row, (HEIGHT, WIDTH)).copy()
+    return warped_pair(truth), truth
+
+
+def test_slanted_plane_is_followed() -> None:
+    pair, truth = ground(0.2)
+    found = SadMatcher(PLAIN).match(pair)
     # The disparity is constant along a row, so it is the same on the grid of both views.
     error = inner(np.abs(found.values - truth))
     assert np.nanmedian(error) < 0.15
     assert np.isfinite(error).mean() > 0.9
+
+
+def test_slanted_window_sees_the_ground_more_completely_and_better() -> None:
+    pair, truth = ground(1 / 3)
+    errors = [
+        inner(np.abs(SadMatcher(SadSettings(ndisp=32, window_slant=s)).match(pair).values - truth))
+        for s in (0, 1 / 3)
+    ]
+    density = [np.isfinite(error).mean() for error in errors]
+    assert density[1] >= density[0]
+    assert np.nanmedian(errors[1]) < 0.5 * np.nanmedian(errors[0])
 
 
 def square_before_wall() -> tuple[RectifiedPair, np.ndarray]:
