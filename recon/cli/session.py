@@ -51,10 +51,12 @@ def print_figures(title: str, figures: Mapping[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left", show_header=False)
+    table = Table(show_header=False)
     for name, value in figures.items():
         if isinstance(value, str | int | float) and value is not None:
             table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
+    if title:
+        typer.echo(title)
     Console().print(table)
 
 
