@@ -27,9 +27,9 @@ def demo(
     """
     with session():
         from recon.pipeline.config import load_config
+        from recon.pipeline.demo_source import demo_source
         from recon.pipeline.map_run import MapOptions, run_map
         from recon.reports import present_map
-        from recon.sources.synthetic import SyntheticSource
         from recon.viewers import choose_viewer
 
         given = {"frames": frames, "seed": seed}
@@ -42,5 +42,5 @@ def demo(
             observers=(choose_viewer(quiet=quiet),),
             present=present_map,
         )
-        run = run_map(SyntheticSource(settings.street), settings, options)
+        run = run_map(demo_source(settings), settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

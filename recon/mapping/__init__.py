@@ -1,7 +1,7 @@
 """From posed clouds to a fused cloud, 3-D occupancy and a flat grid."""
 
 from recon.mapping.axes import AxesSettings, GroundPlane, estimate_ground, map_axes
-from recon.mapping.fused import FusionSettings, MapBuilder
+from recon.mapping.fused import FusionSettings, MapBuilder, fusion_range_m
 from recon.mapping.grid import GridSettings, flatten
 from recon.mapping.ground import GroundSettings, GroundSurface, estimate_ground_surface
 from recon.mapping.occupancy import OccupancyBuilder, OccupancySettings
@@ -19,5 +19,6 @@ __all__ = [
     "estimate_ground",
     "estimate_ground_surface",
     "flatten",
+    "fusion_range_m",
     "map_axes",
 ]

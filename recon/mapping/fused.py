@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -10,7 +11,7 @@ from pydantic import Field
 from recon.errors import MappingError
 from recon.kernels import voxels
 from recon.settings import Settings
-from recon.structures import PointCloud
+from recon.structures import PointCloud, RectifiedCamera
 from recon.structures.arrays import Bool, Float32
 
 _RGB: Final = slice(0, 3)
@@ -32,12 +33,42 @@ class FusionSettings(Settings):
         le=10.0,
         description="Points more precise than this count as this precise: bounds the weight.",
     )
+    max_depth_error_m: float | None = Field(
+        0.25,
+        gt=0.0,
+        le=100.0,
+        description="Points are fused up to the depth at which `nominal_error_px` makes this "
+        "error; null = all.",
+    )
+    nominal_error_px: float = Field(
+        0.3, gt=0.0, le=10.0, description="Error of a good match, for that limit."
+    )
     max_sigma_m: float = Field(
-        0.3,
+        0.6,
         gt=0.0,
         le=100.0,
         description="Points less precise than this are left out: they would smear over voxels.",
     )
+
+
+def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
+    """The depth at which a matching error of ``nominal_error_px`` costs ``max_depth_error_m``.
+
+    The error of a depth grows with its square, ``Z²·error_px / (f·b)``, so this is where a rig
+    stops to measure as finely as the map is meant to be; the same setting fits a short baseline
+    and a long one.
+
+    Args:
+        camera: The rectified camera.
+        settings: How to fuse.
+
+    Returns:
+        Metres; infinity where the settings have no limit.
+    """
+    if settings.max_depth_error_m is None:
+        return math.inf
+    fb = camera.focal_px * camera.baseline_m
+    return math.sqrt(settings.max_depth_error_m * fb / settings.nominal_error_px)
 
 
 class MapBuilder:

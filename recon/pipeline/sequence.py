@@ -11,7 +11,13 @@ import numpy as np
 from recon.cloud import filter_cloud
 from recon.errors import RegistrationError
 from recon.geometry.transform import transform_cloud
-from recon.mapping import MapBuilder, OccupancyBuilder, estimate_ground, map_axes
+from recon.mapping import (
+    MapBuilder,
+    OccupancyBuilder,
+    estimate_ground,
+    fusion_range_m,
+    map_axes,
+)
 from recon.odometry import KnownPoses, Odometry, OdometryFrame, OdometryHealth, make_odometry
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
@@ -76,7 +82,7 @@ def map_sequence(
     audience = tuple(observers)
     reconstructor = FrameReconstructor(source.calibration, config, threads=threads, stopwatch=watch)
     odometry = _odometry(config, known_poses, frames=len(source))
-    mapper = _Mapper(config, odometry, watch, sample_at=len(source) // 2)
+    mapper = _Mapper(config, reconstructor.camera, odometry, watch, sample_at=len(source) // 2)
     for observer in audience:
         observer.on_start(source.name, len(source))
     start = last = time.perf_counter()
@@ -90,20 +96,28 @@ def map_sequence(
     finally:
         for observer in audience:
             observer.on_finish()
-    return mapper.finish(reconstructor.camera, seconds=last - start)
+    return mapper.finish(seconds=last - start)
 
 
 class _Mapper:
     """The part of the flow that holds state: odometry and the two maps."""
 
     def __init__(
-        self, config: ReconConfig, odometry: Odometry, stopwatch: Stopwatch, *, sample_at: int
+        self,
+        config: ReconConfig,
+        camera: RectifiedCamera,
+        odometry: Odometry,
+        stopwatch: Stopwatch,
+        *,
+        sample_at: int,
     ) -> None:
         self._config = config
         self._odometry = odometry
         self._stopwatch = stopwatch
         self._sample_at = sample_at
+        self._camera = camera
         self._fused = MapBuilder(config.fusion)
+        self._fusion_range_m = fusion_range_m(camera, config.fusion)
         self._occupancy: OccupancyBuilder | None = None
         self._T_map_world = np.eye(4)
         self._poses: list[Float64] = []
@@ -117,7 +131,8 @@ class _Mapper:
             registered = self._odometry.register(OdometryFrame(frame.pair, frame.disparity))
         T_world_camera = registered.T_world_camera
         with stage("fuse"):
-            self._fused.integrate(transform_cloud(frame.cloud, T_world_camera, frame="world"))
+            near = frame.cloud.select(frame.cloud.xyz[:, 2] <= self._fusion_range_m)
+            self._fused.integrate(transform_cloud(near, T_world_camera, frame="world"))
         with stage("occupancy"):
             self._occupancy_of(frame).integrate(frame.cloud, T_world_camera)
         self._poses.append(T_world_camera)
@@ -130,7 +145,7 @@ class _Mapper:
             index, total, 0.0, valid_share, len(frame.cloud), T_world_camera, registered.health
         )
 
-    def finish(self, camera: RectifiedCamera, *, seconds: float) -> MappedSequence:
+    def finish(self, *, seconds: float) -> MappedSequence:
         if self._sample is None or self._occupancy is None:
             raise RegistrationError("the source has no frame")
         trajectory = Trajectory(np.stack(self._poses), np.array(self._times_s))
@@ -145,7 +160,7 @@ class _Mapper:
             cloud=cloud,
             voxels=voxels,
             T_map_world=self._T_map_world,
-            camera=camera,
+            camera=self._camera,
             sample=self._sample,
             seconds=seconds,
         )

@@ -35,10 +35,14 @@ class SyntheticSource:
 
     Args:
         settings: Street, rig and path.
+        surface_range_m: Depth up to which a surface that was in view counts as true surface.
     """
 
-    def __init__(self, settings: StreetSettings | None = None) -> None:
+    def __init__(
+        self, settings: StreetSettings | None = None, *, surface_range_m: float = 30.0
+    ) -> None:
         self.settings = StreetSettings() if settings is None else settings
+        self._surface_range_m = surface_range_m
 
     @property
     def name(self) -> str:
@@ -67,8 +71,9 @@ class SyntheticSource:
 
     @cached_property
     def truth(self) -> SequenceTruth:
-        """True poses, and the surfaces that were in view up to 30 m, every 5 cm."""
-        return SequenceTruth(self.trajectory, true_surface(self.camera))
+        """True poses, and the surfaces that were in view within the range, every 5 cm."""
+        surface = true_surface(self.camera, range_m=self._surface_range_m)
+        return SequenceTruth(self.trajectory, surface)
 
     @property
     def files(self) -> Sequence[Path]:
@@ -101,9 +106,7 @@ class SyntheticSource:
         self, *, resolution_m: float = 0.2, band_m: tuple[float, float] = (0.3, 2.0)
     ) -> OccupancyTruth:
         """Where obstacles stand, in exact map axes; see `true_occupancy`."""
-        surface = self.truth.surface
-        if surface is None:  # pragma: no cover - `truth` always has one
-            surface = true_surface(self.camera)
+        surface = true_surface(self.camera, range_m=self._surface_range_m)
         return true_occupancy(self.world, surface, resolution_m=resolution_m, band_m=band_m)
 
 

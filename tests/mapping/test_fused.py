@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from recon.errors import MappingError
-from recon.mapping.fused import FusionSettings, MapBuilder
-from recon.structures import PointCloud
+from recon.geometry.triangulation import depth_sigma
+from recon.mapping.fused import FusionSettings, MapBuilder, fusion_range_m
+from recon.structures import PointCloud, RectifiedCamera
 
 
 def _cloud(xyz: np.ndarray, **fields: np.ndarray) -> PointCloud:
@@ -160,3 +161,15 @@ def test_a_million_voxels_are_held() -> None:
 def test_clouds_that_would_spoil_the_map_are_refused(cloud: PointCloud, words: str) -> None:
     with pytest.raises(MappingError, match=words):
         _build(cloud)
+
+
+def test_fusion_range_is_where_the_nominal_error_reaches_its_limit() -> None:
+    camera = RectifiedCamera(700.0, 320.0, 120.0, 320.0, 0.5, 640, 240)
+    settings = FusionSettings(max_depth_error_m=0.2, nominal_error_px=0.3)
+    range_m = fusion_range_m(camera, settings)
+    assert depth_sigma(np.array([range_m]), 0.3, camera)[0] == pytest.approx(0.2, rel=1e-6)
+
+
+def test_without_a_limit_fusion_has_no_range() -> None:
+    camera = RectifiedCamera(700.0, 320.0, 120.0, 320.0, 0.5, 640, 240)
+    assert fusion_range_m(camera, FusionSettings(max_depth_error_m=None)) == np.inf

@@ -1,0 +1,21 @@
+"""The rendered street that `recon demo` maps."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from recon.mapping import fusion_range_m
+from recon.pipeline.config import ReconConfig
+from recon.sources.synthetic import SyntheticSource
+from recon.synthetic.street import rig
+
+FARTHEST_M: Final = 30.0
+
+
+def demo_source(config: ReconConfig) -> SyntheticSource:
+    """A street whose true surface reaches as far as the map does.
+
+    Farther surfaces are not fused by design, so they are no part of the truth to find.
+    """
+    range_m = fusion_range_m(rig(config.street), config.fusion)
+    return SyntheticSource(config.street, surface_range_m=min(range_m, FARTHEST_M))
