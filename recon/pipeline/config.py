@@ -26,6 +26,7 @@ from recon.settings import Settings
 from recon.synthetic import StreetSettings
 
 NO_FILTER: Final = FilterSettings(voxel_m=None)
+NO_ISLANDS: Final = FilterSettings(voxel_m=None, radius_m=0.3, radius_neighbours=2)
 
 
 class ReconConfig(Settings):
@@ -39,7 +40,7 @@ class ReconConfig(Settings):
         default=NO_FILTER, description="Of the cloud of one frame; fusing thins and cleans anyway."
     )
     map_filters: FilterSettings = Field(
-        default=NO_FILTER, description="Of the fused cloud, when it is exported."
+        default=NO_ISLANDS, description="Of the fused cloud, when it is exported."
     )
     odometry: OdometrySettings = OdometrySettings()
     axes: AxesSettings = AxesSettings()
