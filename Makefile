@@ -22,6 +22,7 @@ demo: $(READY) ## map a synthetic street drive into outputs/demo/
 	$(BIN)/recon demo
 
 test: $(READY) ## fast tests, with style, types and import contracts; real data where RECON_DATA is set
+	NUMBA_DISABLE_JIT=1 $(PYTEST) -q tests/kernels
 	$(PYTEST) -m "not slow"
 
 test-all: $(READY) ## every test
