@@ -12,7 +12,7 @@ from recon.cli.session import print_json, print_run, session
 
 def demo(
     out: Out = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Frames to render. [40]")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Frames to render (40).")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Another seed, another street.")] = None,
     config: Config = None,
     set_: Set = None,

@@ -25,7 +25,7 @@ def map_(
     out: Out = None,
     odometry: Annotated[
         OdometryName | None,
-        typer.Option(help="Visual prior with gated kiss-icp, or one of them alone. [fused]"),
+        typer.Option(help="Visual prior with gated kiss-icp (fused, the default), or one alone."),
     ] = None,
     poses: Annotated[
         Path | None, typer.Option(help="Known poses (KITTI or TUM) to use instead of odometry.")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Out, Set, Threads, Verbose
+from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
 
 
@@ -15,11 +15,13 @@ def mesh(
     cloud: Annotated[Path, typer.Argument(help="PLY with points; normals and colours are used.")],
     out: Out = None,
     formats: Annotated[
-        list[str] | None, typer.Option("--format", "-f", help="ply, obj, stl or glb. [ply]")
+        list[str] | None,
+        typer.Option("--format", "-f", help="ply (the default), obj, stl or glb; may be repeated."),
     ] = None,
     config: Config = None,
     set_: Set = None,
     json: Json = False,
+    quiet: Quiet = False,
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
@@ -27,6 +29,7 @@ def mesh(
 
     Example: recon mesh map/cloud.ply --format obj --format glb
     """
+    del quiet  # there is no progress to hide; every command takes the option
     with session():
         from recon.pipeline.config import load_config
         from recon.pipeline.mesh_run import MeshOptions, run_mesh

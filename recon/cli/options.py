@@ -9,7 +9,7 @@ import typer
 
 Out = Annotated[
     Path | None,
-    typer.Option("--out", "-o", help="Result folder. [default: outputs/<command>/<UTC stamp>]"),
+    typer.Option("--out", "-o", help="Result folder (outputs/<command>/<UTC stamp>)."),
 ]
 Config = Annotated[
     Path | None,
@@ -24,5 +24,5 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print seconds per stage.")]
 Threads = Annotated[
     int | None,
-    typer.Option("--threads", min=1, help="Threads to use. [default: all cores]"),
+    typer.Option("--threads", min=1, help="Threads to use (all cores)."),
 ]

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Out, Set, Threads, Verbose
+from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
 
 Left = Annotated[Path, typer.Argument(help="Left picture.")]
 Right = Annotated[Path, typer.Argument(help="Right picture.")]
 Ndisp = Annotated[
-    int | None, typer.Option(min=1, help="Disparities to search. [from the calibration]")
+    int | None, typer.Option(min=1, help="Disparities to search (from the calibration).")
 ]
 _CALIB_HELP = "Calibration: KITTI or Middlebury calib.txt, or OpenCV stereo YAML."
 
@@ -33,6 +33,7 @@ def pair(
     config: Config = None,
     set_: Set = None,
     json: Json = False,
+    quiet: Quiet = False,
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
@@ -40,6 +41,7 @@ def pair(
 
     Example: recon pair im0.png im1.png --calib calib.txt --out outputs/motorcycle
     """
+    del quiet  # there is no progress to hide; every command takes the option
     with session():
         from recon.pipeline.config import PAIR_DEFAULTS, load_config
         from recon.pipeline.pair_input import read_pair_input
@@ -64,6 +66,7 @@ def disparity(
     config: Config = None,
     set_: Set = None,
     json: Json = False,
+    quiet: Quiet = False,
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
@@ -71,6 +74,7 @@ def disparity(
 
     Example: recon disparity left.png right.png --ndisp 128
     """
+    del quiet  # there is no progress to hide; every command takes the option
     with session():
         from recon.pipeline.config import PAIR_DEFAULTS, load_config
         from recon.pipeline.pair_input import read_pair_input
