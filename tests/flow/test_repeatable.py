@@ -1,0 +1,31 @@
+"""The same input gives the same files, whatever the number of threads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from recon.pipeline.config import load_config
+from recon.pipeline.map_run import MapOptions, run_map
+from recon.sources.synthetic import SyntheticSource
+from recon.synthetic import StreetSettings
+
+STREET = StreetSettings(frames=6, width_px=320, height_px=120, focal_px=180.0)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    base = tmp_path_factory.mktemp("runs")
+    for threads in (1, 2):
+        options = MapOptions(out=base / str(threads), threads=threads, mesh=False)
+        run_map(SyntheticSource(STREET), load_config(), options)
+    return [base / "1", base / "2"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["trajectory_kitti.txt", "map/cloud.ply", "map/grid.pgm", "map/octomap.ot", "config.yaml"],
+)
+def test_one_thread_and_two_write_the_same_bytes(runs: list[Path], name: str) -> None:
+    assert (runs[0] / name).read_bytes() == (runs[1] / name).read_bytes()
