@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli.options import Config, Json, Mesh, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
 
 
@@ -14,6 +14,7 @@ def demo(
     out: Out = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Frames to render (40).")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Another seed, another street.")] = None,
+    mesh: Mesh = True,
     config: Config = None,
     set_: Set = None,
     json: Json = False,
@@ -39,6 +40,7 @@ def demo(
             command="demo",
             out=out,
             threads=threads,
+            mesh=mesh,
             observers=(choose_viewer(quiet=quiet),),
             present=present_map,
         )

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli.options import Config, Json, Mesh, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
 
 
@@ -30,7 +30,7 @@ def map_(
     poses: Annotated[
         Path | None, typer.Option(help="Known poses (KITTI or TUM) to use instead of odometry.")
     ] = None,
-    mesh: Annotated[bool, typer.Option(help="Reconstruct a surface.")] = True,
+    mesh: Mesh = True,
     config: Config = None,
     set_: Set = None,
     json: Json = False,

@@ -22,6 +22,7 @@ Set = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print seconds per stage.")]
+Mesh = Annotated[bool, typer.Option(help="Reconstruct a surface.")]
 Threads = Annotated[
     int | None,
     typer.Option("--threads", min=1, help="Threads to use (all cores)."),
