@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from recon.geometry.se3 import invert, make_transform
+from recon.geometry.projection import project
+from recon.geometry.se3 import apply, invert, make_transform
 from recon.odometry.settings import PoseSettings
 from recon.structures import RectifiedCamera
 from recon.structures.arrays import Bool, Float64
@@ -27,16 +28,24 @@ class LocatedCamera:
 
 
 def locate_camera(
-    xyz_world: Float64, uv: Float64, camera: RectifiedCamera, settings: PoseSettings
+    xyz_world: Float64,
+    uv: Float64,
+    camera: RectifiedCamera,
+    T_world_guess: Float64,
+    settings: PoseSettings,
 ) -> LocatedCamera | None:
     """Where a camera stands that sees known points, by the largest set that agrees.
 
-    OpenCV's RANSAC seeds its own generator, so equal input gives equal output.
+    OpenCV's RANSAC finds that set well, but its pose is a closed-form fit (EPnP) that one point
+    near the horizon throws by metres or kilometres. So only the set is taken: the pose is fitted
+    to it anew, from the guess and from RANSAC's pose, and the one that more points agree with wins.
+    RANSAC seeds its own generator, so equal input gives equal output.
 
     Args:
         xyz_world: float64 (N, 3), the points.
         uv: float64 (N, 2), where the camera sees them.
         camera: The rectified camera.
+        T_world_guess: float64 (4, 4), where the camera is expected.
         settings: Tolerance, samples, and how many must agree.
 
     Returns:
@@ -47,6 +56,27 @@ def locate_camera(
     """
     if len(xyz_world) < settings.min_inliers:
         return None
+    consensus = _ransac(xyz_world, uv, camera, settings)
+    if consensus is None:
+        return None
+    among = consensus.agree
+    fits = [
+        _agreement(_fit(xyz_world[among], uv[among], camera, T), xyz_world, uv, camera, settings)
+        for T in (T_world_guess, consensus.T_world_camera)
+    ]
+    best = max(fits, key=lambda fit: int(fit.agree.sum()))
+    return best if enough_agree(int(best.agree.sum()), len(xyz_world), settings) else None
+
+
+def enough_agree(agreeing: int, tracks: int, settings: PoseSettings) -> bool:
+    """Whether so many agreeing points of so many tracks make a pose."""
+    return agreeing >= max(settings.min_inliers, settings.min_inlier_share * tracks)
+
+
+def _ransac(
+    xyz_world: Float64, uv: Float64, camera: RectifiedCamera, settings: PoseSettings
+) -> LocatedCamera | None:
+    """The largest set that agrees, and a rough pose."""
     found, rotation, translation, inliers = cv2.solvePnPRansac(
         xyz_world,
         uv,
@@ -57,12 +87,42 @@ def locate_camera(
         confidence=0.999,
         flags=cv2.SOLVEPNP_AP3P,
     )
-    if not found or inliers is None:
+    # Four points give a closed-form pose anyhow; the fit that follows needs more.
+    if not found or inliers is None or len(inliers) < settings.min_inliers:
         return None
     agree = np.zeros(len(xyz_world), np.bool_)
     agree[inliers.reshape(-1)] = True
-    enough = max(settings.min_inliers, settings.min_inlier_share * len(xyz_world))
-    if agree.sum() < enough or not np.isfinite(translation).all():
-        return None
+    return LocatedCamera(_pose(rotation, translation), agree)
+
+
+def _fit(
+    xyz_world: Float64, uv: Float64, camera: RectifiedCamera, T_world_start: Float64
+) -> Float64:
+    """The pose (4, 4) of least squared reprojection error near a start."""
+    T_camera_world = invert(T_world_start)
+    rotation, _ = cv2.Rodrigues(T_camera_world[:3, :3])
+    translation = T_camera_world[:3, 3].reshape(3, 1).copy()
+    rotation, translation = cv2.solvePnPRefineLM(
+        xyz_world, uv, camera.matrix, None, rotation, translation
+    )
+    return _pose(rotation, translation)
+
+
+def _agreement(
+    T_world_camera: Float64,
+    xyz_world: Float64,
+    uv: Float64,
+    camera: RectifiedCamera,
+    settings: PoseSettings,
+) -> LocatedCamera:
+    """Which points agree with a pose; none, where it is not finite."""
+    u, v, _ = project(apply(invert(T_world_camera), xyz_world), camera)
+    error_px = np.hypot(u - uv[:, 0], v - uv[:, 1])
+    # A point behind the camera has a NaN error, which compares as False.
+    return LocatedCamera(T_world_camera, np.asarray(error_px <= settings.reprojection_px))
+
+
+def _pose(rotation: Float64, translation: Float64) -> Float64:
+    """T_world_camera from OpenCV's rotation vector and translation."""
     R, _ = cv2.Rodrigues(rotation)
-    return LocatedCamera(invert(make_transform(R, translation)), agree)
+    return invert(make_transform(R, translation))

@@ -10,7 +10,7 @@ from recon.geometry.projection import project, unproject
 from recon.geometry.se3 import apply, invert
 from recon.geometry.triangulation import depth_from_disparity
 from recon.odometry.corners import find_corners
-from recon.odometry.pose import locate_camera
+from recon.odometry.pose import enough_agree, locate_camera
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
 from recon.odometry.settings import VisualSettings
 from recon.odometry.tracking import follow, sample_disparity
@@ -85,14 +85,15 @@ class VisualOdometry:
         uvd = self._observe(state, frame, predicted)
         tracks = np.flatnonzero(np.isfinite(uvd[:, 0]))
         found = locate_camera(
-            state.window.xyz_world[tracks], uvd[tracks, :2], camera, settings.pose
+            state.window.xyz_world[tracks], uvd[tracks, :2], camera, predicted, settings.pose
         )
         if found is None:
-            note = f"lost: {len(tracks)} tracks, too few agree on a motion; the last one goes on"
-            return _empty(predicted), OdometryHealth(False, len(tracks), notes=(note,)), None
+            return _lost(predicted, len(tracks))
         uvd[tracks[~found.agree]] = np.nan
         window = adjust(state.window.with_frame(found.T_world_camera, uvd), camera, settings.window)
         window = window.without_newest(misfits(window, camera, settings.window))
+        if not enough_agree(int(window.seen[-1].sum()), len(tracks), settings.pose):
+            return _lost(predicted, len(tracks))
         health = _health(window, len(tracks), camera)
         return window, health, pose_information(window, camera, settings.window)
 
@@ -125,6 +126,12 @@ class VisualOdometry:
         depth = depth_from_disparity(uvd[:, 2], frame.pair.camera).astype(np.float64)
         xyz_camera = unproject(uvd[:, 0], uvd[:, 1], depth, frame.pair.camera)
         return window.with_points(uvd, apply(window.T_world_camera[-1], xyz_camera))
+
+
+def _lost(predicted: Float64, tracks: int) -> tuple[TrackWindow, OdometryHealth, None]:
+    """A new window where the last motion would have led."""
+    note = f"lost: {tracks} tracks, too few agree on a motion; the last one goes on"
+    return _empty(predicted), OdometryHealth(False, tracks, notes=(note,)), None
 
 
 def _empty(T_world_camera: Float64) -> TrackWindow:
