@@ -1,11 +1,15 @@
 """From estimates and truth to figures."""
 
-from recon.evaluation.disparity import evaluate_disparity
+from recon.evaluation.disparity import evaluate_depth, evaluate_disparity
 from recon.evaluation.map import evaluate_map
+from recon.evaluation.middlebury import MiddleburyRules, evaluate_middlebury
 from recon.evaluation.trajectory import evaluate_trajectory
 
 __all__ = [
+    "MiddleburyRules",
+    "evaluate_depth",
     "evaluate_disparity",
     "evaluate_map",
+    "evaluate_middlebury",
     "evaluate_trajectory",
 ]

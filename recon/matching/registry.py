@@ -2,23 +2,48 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final
 
 from pydantic import Field
 
 from recon.errors import SettingsError
+from recon.matching.onnx import OnnxMatcher, OnnxSettings
+from recon.matching.opencv import (
+    OpencvBmMatcher,
+    OpencvBmSettings,
+    OpencvSgbmMatcher,
+    OpencvSgbmSettings,
+)
 from recon.matching.protocol import Matcher
 from recon.matching.sad import SadMatcher, SadSettings
+from recon.matching.sgm import SgmMatcher, SgmSettings
 from recon.settings import Settings
 
-MATCHERS: Final = {"sad": SadMatcher}
+MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
+    "sad": SadMatcher,
+    "sgm": SgmMatcher,
+    "opencv-bm": OpencvBmMatcher,
+    "opencv-sgbm": OpencvSgbmMatcher,
+    "onnx": OnnxMatcher,
+}
 
 
 class MatchingSettings(Settings):
     """Which matcher, and the settings of each."""
 
-    matcher: str = Field(default="sad", description="Name of the matcher: sad.")
+    matcher: str = Field(
+        default="sad", description="Name of the matcher: sad, sgm, opencv-bm, opencv-sgbm or onnx."
+    )
     sad: SadSettings = Field(default_factory=SadSettings, description="Of the matcher `sad`.")
+    sgm: SgmSettings = Field(default_factory=SgmSettings, description="Of the matcher `sgm`.")
+    opencv_bm: OpencvBmSettings = Field(
+        default_factory=OpencvBmSettings, description="Of the matcher `opencv-bm`."
+    )
+    opencv_sgbm: OpencvSgbmSettings = Field(
+        default_factory=OpencvSgbmSettings, description="Of the matcher `opencv-sgbm`."
+    )
+    onnx: OnnxSettings = Field(default_factory=OnnxSettings, description="Of the matcher `onnx`.")
 
 
 def make_matcher(
@@ -37,4 +62,10 @@ def make_matcher(
     if name not in MATCHERS:
         choices = ", ".join(sorted(MATCHERS))
         raise SettingsError("unknown matcher", got=repr(name), expected=f"one of: {choices}")
-    return MATCHERS[name](getattr(settings or MatchingSettings(), name), threads)
+    own = getattr(settings or MatchingSettings(), field_of(name))
+    return MATCHERS[name](own, threads)
+
+
+def field_of(name: str) -> str:
+    """The field of `MatchingSettings` that a matcher's settings have."""
+    return name.replace("-", "_")
