@@ -19,5 +19,5 @@ def test_default_matcher_exists() -> None:
 
 
 def test_unknown_name_lists_the_choices() -> None:
-    with pytest.raises(SettingsError, match="one of: onnx, opencv-bm, opencv-sgbm, sad"):
+    with pytest.raises(SettingsError, match="one of: onnx, opencv-bm, opencv-sgbm, sad, sgm"):
         make_matcher("census")

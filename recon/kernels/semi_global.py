@@ -1,0 +1,319 @@
+"""Semi-global matching: each pixel's candidates agree with those along paths to it.
+
+Two sweeps over a strip of rows, one down and one up, follow half of the paths each. Of a path
+only the row before is kept, in uint8; its least cost is taken off at every step, so that no path
+cost exceeds the cost of a pixel plus the larger penalty. The four paths of a sweep advance in
+one loop: it is the loop that vectorises best. A strip starts some rows early, so that its paths
+have forgotten where they began; what it needs of memory does not grow with the picture's height.
+
+The twin in plain numpy is `recon.kernels.semi_global_reference.semi_global_minima_reference`.
+
+Ref: H. Hirschmüller, "Stereo processing by semiglobal matching and mutual information", PAMI 30,
+2008, equations 13 and 14.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from recon.kernels.minima import Minima, left_minima, right_minima
+from recon.kernels.path_costs import (
+    Views,
+    Window,
+    empty_cost_rows,
+    enter_row,
+    write_costs,
+)
+
+
+class Paths(NamedTuple):
+    """What is searched, and what changes along a path cost.
+
+    Attributes:
+        ndisp: Number of candidates.
+        minimum: Disparity of candidate 0, pixels.
+        small: Penalty of a step of one candidate.
+        large: Penalty of any other step; `Window.top` + small + large is at most 255.
+        large_at_edge: The same where the grey level changes by more than ``edge``.
+        edge: Grey levels.
+        diagonal: Eight paths; else the four along rows and columns.
+        overlap: Rows that a strip starts early.
+    """
+
+    ndisp: int
+    minimum: int
+    small: int
+    large: int
+    large_at_edge: int
+    edge: int
+    diagonal: bool
+    overlap: int
+
+
+class PathRow(NamedTuple):
+    """Path costs of one row, with a border of one pixel and one candidate on each side.
+
+    Attributes:
+        straight: uint8 (W + 2, P + 2), path that comes from the row before, same column.
+        from_left: the same, path that comes from the column to the left.
+        from_right: the same, path that comes from the column to the right.
+        least: uint8 (3, W + 2), the least of each.
+    """
+
+    straight: NDArray[np.uint8]
+    from_left: NDArray[np.uint8]
+    from_right: NDArray[np.uint8]
+    least: NDArray[np.uint8]
+
+
+def semi_global_minima(
+    views: Views, window: Window, paths: Paths, first: int, end: int, minima: Minima
+) -> None:
+    """Find the best candidate of each pixel of a strip, in the left and the right view.
+
+    Candidate ``k`` of a pixel is the disparity ``minimum + k``. Its cost is the sum of the costs
+    of the paths that end there, which begin at the border of the picture or ``overlap`` rows
+    outside the strip.
+
+    Args:
+        views: What is compared.
+        window: What the cost of a pixel is.
+        paths: What is searched.
+        first: First row of the strip.
+        end: The row after its last.
+        minima: Written: the rows ``first`` to ``end - 1``.
+    """
+    (height, width), candidates = views.grey.shape, views.right.shape[1] - views.grey.shape[1] + 1
+    top, bottom = max(first - paths.overlap, 0), min(end + paths.overlap, height)
+    costs = np.empty((bottom - top, width, candidates), np.uint8)
+    sums = np.empty((end - first, width, paths.ndisp), np.uint16)
+    _sweep_down(views, window, paths, top, first, costs, sums)
+    _sweep_up(views.grey, paths, top, first, costs, sums, minima)
+
+
+def _sweep_down(
+    views: Views,
+    window: Window,
+    paths: Paths,
+    top: int,
+    first: int,
+    costs: NDArray[np.uint8],
+    sums: NDArray[np.uint16],
+) -> None:
+    """Compute the costs from row ``top`` on, and follow the paths that come from above."""
+    width, candidates = costs.shape[1:]
+    rows = empty_cost_rows(width, candidates, window)
+    now, before, side, limits = _start(paths, width, candidates)
+    for y in range(top - window.rows_radius, top + window.rows_radius):
+        enter_row(views, window, y, rows)
+    for y in range(top, top + costs.shape[0]):
+        enter_row(views, window, y + window.rows_radius, rows)
+        write_costs(rows, window, paths.ndisp, y - top, costs)
+        if y >= first + sums.shape[0]:
+            continue
+        _set_limits(views.grey, y, max(y - 1, 0), -1, paths, limits)
+        _advance(costs, y - top, 1, paths, limits, before, now, side)
+        if y >= first:
+            _store(now, side, paths.diagonal, y - first, sums)
+        now, before = before, now
+
+
+def _sweep_up(
+    grey: NDArray[np.uint8],
+    paths: Paths,
+    top: int,
+    first: int,
+    costs: NDArray[np.uint8],
+    sums: NDArray[np.uint16],
+    minima: Minima,
+) -> None:
+    """Follow the paths that come from below, and choose."""
+    height, width = grey.shape
+    now, before, side, limits = _start(paths, width, costs.shape[2])
+    right_best = np.empty((2, width + paths.ndisp), np.uint16)
+    for y in range(top + costs.shape[0] - 1, first - 1, -1):
+        _set_limits(grey, y, min(y + 1, height - 1), 1, paths, limits)
+        _advance(costs, y - top, -1, paths, limits, before, now, side)
+        if y < first + sums.shape[0]:
+            _add(now, side, paths.diagonal, y - first, sums)
+            left_minima(sums[y - first], y, paths.minimum, minima)
+            right_minima(sums[y - first], y, paths.minimum, right_best, minima.right_winner)
+        now, before = before, now
+
+
+def _start(
+    paths: Paths, width: int, candidates: int
+) -> tuple[PathRow, PathRow, NDArray[np.uint8], NDArray[np.uint8]]:
+    """Two rows of paths that begin, room for those along the row, and for `_set_limits`."""
+    now, before = _begin(paths, width, candidates), _begin(paths, width, candidates)
+    side = _closed(paths, width, candidates)
+    return now, before, side, np.empty((4, width), np.uint8)
+
+
+def _begin(paths: Paths, width: int, candidates: int) -> PathRow:
+    """A row of paths that begin: all their costs are 0."""
+    diagonals = width if paths.diagonal else 0
+    return PathRow(
+        _closed(paths, width, candidates),
+        _closed(paths, diagonals, candidates),
+        _closed(paths, diagonals, candidates),
+        np.zeros((3, width + 2), np.uint8),
+    )
+
+
+def _closed(paths: Paths, width: int, candidates: int) -> NDArray[np.uint8]:
+    """Path costs 0, with candidates on both sides that no path comes from."""
+    costs = np.zeros((width + 2, candidates + 2), np.uint8)
+    costs[:, 0] = costs[:, -1] = np.uint8(255 - paths.small)
+    return costs
+
+
+@njit(cache=True, nogil=True)
+def _set_limits(
+    grey: NDArray[np.uint8],
+    y: int,
+    other: int,
+    back: int,
+    paths: Paths,
+    limits: NDArray[np.uint8],
+) -> None:
+    """Write the larger penalties of a row: straight, from left, from right, along the row."""
+    last = grey.shape[1] - 1
+    for x in range(last + 1):
+        here, left, right = np.int64(grey[y, x]), max(x - 1, 0), min(x + 1, last)
+        along = min(max(x + back, 0), last)
+        limits[0, x] = _large(here, np.int64(grey[other, x]), paths)
+        limits[1, x] = _large(here, np.int64(grey[other, left]), paths)
+        limits[2, x] = _large(here, np.int64(grey[other, right]), paths)
+        limits[3, x] = _large(here, np.int64(grey[y, along]), paths)
+
+
+@njit(cache=True, nogil=True)
+def _large(here: int, there: int, paths: Paths) -> np.uint8:
+    """The larger penalty between two grey levels."""
+    edge = abs(here - there) > paths.edge
+    large: np.uint8 = np.uint8(paths.large_at_edge if edge else paths.large)
+    return large
+
+
+def _advance(
+    costs: NDArray[np.uint8],
+    y: int,
+    step: int,
+    paths: Paths,
+    limits: NDArray[np.uint8],
+    before: PathRow,
+    now: PathRow,
+    side: NDArray[np.uint8],
+) -> None:
+    """Advance the paths of a sweep by one row."""
+    if paths.diagonal:
+        _advance_four(costs, y, step, paths.small, limits, before, now, side)
+    else:
+        _advance_two(costs, y, step, paths.small, limits, before, now, side)
+
+
+@njit(cache=True, nogil=True)
+def _advance_four(
+    costs: NDArray[np.uint8],
+    y: int,
+    step: int,
+    small: int,
+    limits: NDArray[np.uint8],
+    before: PathRow,
+    now: PathRow,
+    side: NDArray[np.uint8],
+) -> None:
+    """Advance the straight, both diagonal, and the path along the row."""
+    p0, p1, p2 = before.straight, before.from_left, before.from_right
+    n0, n1, n2 = now.straight, now.from_left, now.from_right
+    width, candidates = costs.shape[1:]
+    penalty, m3 = np.uint8(small), np.uint8(0)
+    for n in range(width):
+        x = n if step > 0 else width - 1 - n
+        back = x + 1 - step
+        if n == 0:
+            side[back, 1:-1] = np.uint8(0)
+        m0, m1, m2 = before.least[0, x + 1], before.least[1, x], before.least[2, x + 2]
+        l0, l1 = np.uint8(m0 + limits[0, x]), np.uint8(m1 + limits[1, x])
+        l2, l3 = np.uint8(m2 + limits[2, x]), np.uint8(m3 + limits[3, x])
+        r0 = r1 = r2 = r3 = np.uint8(255)
+        for k in range(candidates):
+            cost = costs[y, x, k]
+            beside = np.uint8(min(p0[x + 1, k], p0[x + 1, k + 2]) + penalty)
+            v0 = np.uint8(np.uint8(min(p0[x + 1, k + 1], beside, l0) - m0) + cost)
+            beside = np.uint8(min(p1[x, k], p1[x, k + 2]) + penalty)
+            v1 = np.uint8(np.uint8(min(p1[x, k + 1], beside, l1) - m1) + cost)
+            beside = np.uint8(min(p2[x + 2, k], p2[x + 2, k + 2]) + penalty)
+            v2 = np.uint8(np.uint8(min(p2[x + 2, k + 1], beside, l2) - m2) + cost)
+            beside = np.uint8(min(side[back, k], side[back, k + 2]) + penalty)
+            v3 = np.uint8(np.uint8(min(side[back, k + 1], beside, l3) - m3) + cost)
+            n0[x + 1, k + 1], n1[x + 1, k + 1] = v0, v1
+            n2[x + 1, k + 1], side[x + 1, k + 1] = v2, v3
+            r0, r1, r2, r3 = min(r0, v0), min(r1, v1), min(r2, v2), min(r3, v3)
+        now.least[0, x + 1], now.least[1, x + 1], now.least[2, x + 1] = r0, r1, r2
+        m3 = r3
+
+
+@njit(cache=True, nogil=True)
+def _advance_two(
+    costs: NDArray[np.uint8],
+    y: int,
+    step: int,
+    small: int,
+    limits: NDArray[np.uint8],
+    before: PathRow,
+    now: PathRow,
+    side: NDArray[np.uint8],
+) -> None:
+    """Advance the straight path and the one along the row."""
+    p0, n0 = before.straight, now.straight
+    width, candidates = costs.shape[1:]
+    penalty, m3 = np.uint8(small), np.uint8(0)
+    for n in range(width):
+        x = n if step > 0 else width - 1 - n
+        back = x + 1 - step
+        if n == 0:
+            side[back, 1:-1] = np.uint8(0)
+        m0 = before.least[0, x + 1]
+        l0, l3 = np.uint8(m0 + limits[0, x]), np.uint8(m3 + limits[3, x])
+        r0 = r3 = np.uint8(255)
+        for k in range(candidates):
+            cost = costs[y, x, k]
+            beside = np.uint8(min(p0[x + 1, k], p0[x + 1, k + 2]) + penalty)
+            v0 = np.uint8(np.uint8(min(p0[x + 1, k + 1], beside, l0) - m0) + cost)
+            beside = np.uint8(min(side[back, k], side[back, k + 2]) + penalty)
+            v3 = np.uint8(np.uint8(min(side[back, k + 1], beside, l3) - m3) + cost)
+            n0[x + 1, k + 1], side[x + 1, k + 1] = v0, v3
+            r0, r3 = min(r0, v0), min(r3, v3)
+        now.least[0, x + 1], m3 = r0, r3
+
+
+@njit(cache=True, nogil=True)
+def _store(
+    now: PathRow, side: NDArray[np.uint8], diagonal: bool, y: int, sums: NDArray[np.uint16]
+) -> None:
+    """Write row ``y`` of the sums over paths."""
+    sums[y] = np.uint16(0)
+    _add(now, side, diagonal, y, sums)
+
+
+@njit(cache=True, nogil=True)
+def _add(
+    now: PathRow, side: NDArray[np.uint8], diagonal: bool, y: int, sums: NDArray[np.uint16]
+) -> None:
+    """Add the paths of a sweep to row ``y`` of the sums."""
+    n0, n1, n2 = now.straight, now.from_left, now.from_right
+    for x in range(sums.shape[1]):
+        for k in range(sums.shape[2]):
+            pair = np.uint16(np.uint16(n0[x + 1, k + 1]) + np.uint16(side[x + 1, k + 1]))
+            sums[y, x, k] = np.uint16(sums[y, x, k] + pair)
+        if not diagonal:
+            continue
+        for k in range(sums.shape[2]):
+            pair = np.uint16(np.uint16(n1[x + 1, k + 1]) + np.uint16(n2[x + 1, k + 1]))
+            sums[y, x, k] = np.uint16(sums[y, x, k] + pair)
