@@ -23,7 +23,7 @@ Matcher = Annotated[
     str | None,
     typer.Option(
         "--matcher",
-        help="How to match: sad, sgm, opencv-bm, opencv-sgbm, onnx. [default: of the configuration]",
+        help="How to match: sad, sgm, opencv-bm, opencv-sgbm, onnx. [default: as configured]",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]

@@ -17,10 +17,12 @@ from recon.matching.opencv import (
 )
 from recon.matching.protocol import Matcher
 from recon.matching.sad import SadMatcher, SadSettings
+from recon.matching.sgm import SgmMatcher, SgmSettings
 from recon.settings import Settings
 
 MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
     "sad": SadMatcher,
+    "sgm": SgmMatcher,
     "opencv-bm": OpencvBmMatcher,
     "opencv-sgbm": OpencvSgbmMatcher,
     "onnx": OnnxMatcher,
@@ -31,9 +33,10 @@ class MatchingSettings(Settings):
     """Which matcher, and the settings of each."""
 
     matcher: str = Field(
-        default="sad", description="Name of the matcher: sad, opencv-bm, opencv-sgbm or onnx."
+        default="sad", description="Name of the matcher: sad, sgm, opencv-bm, opencv-sgbm or onnx."
     )
     sad: SadSettings = Field(default_factory=SadSettings, description="Of the matcher `sad`.")
+    sgm: SgmSettings = Field(default_factory=SgmSettings, description="Of the matcher `sgm`.")
     opencv_bm: OpencvBmSettings = Field(
         default_factory=OpencvBmSettings, description="Of the matcher `opencv-bm`."
     )
