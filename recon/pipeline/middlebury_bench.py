@@ -17,7 +17,7 @@ from recon.pipeline.config import ReconConfig
 from recon.pipeline.middlebury_scenes import ScoredScene
 from recon.pipeline.middlebury_score import Figures, dense_map, score_result
 from recon.rectification import Rectifier
-from recon.structures import RectifiedPair
+from recon.structures import Disparity, RectifiedPair
 from recon.structures.arrays import Float32
 
 _WARM_UP_ROWS: Final = 64
@@ -30,21 +30,21 @@ class SceneResult:
     Attributes:
         scene: The scene.
         matcher: Name of the matcher.
-        values: float32 (h, w), what it found, pixels of the pictures; NaN = no match.
+        disparity: What it found, at the size of the pictures.
         figures: As `score_result` gives them.
         seconds: Of matching alone.
     """
 
     scene: ScoredScene
     matcher: str
-    values: Float32
+    disparity: Disparity
     figures: Figures
     seconds: float
 
     def error_px(self) -> Float32:
         """float32 (H, W), dense absolute error in full-size pixels; NaN = truth unknown."""
         truth, rules = self.scene.truth.values, self.scene.rules
-        error = by_the_rules(dense_map(self.values), truth.shape, rules) - truth
+        error = by_the_rules(dense_map(self.disparity.values), truth.shape, rules) - truth
         return np.asarray(np.abs(error) * np.float32(rules.full_size_factor), dtype=np.float32)
 
 
@@ -77,9 +77,10 @@ class Bench:
         with naming(scene.name):
             for name, matcher in self._matchers(pair).items():
                 start = time.perf_counter()
-                values = matcher.match(pair).values
+                disparity = matcher.match(pair)
                 seconds = time.perf_counter() - start
-                yield SceneResult(scene, name, values, score_result(scene, values), seconds)
+                figures = score_result(scene, disparity.values)
+                yield SceneResult(scene, name, disparity, figures, seconds)
 
     def _matchers(self, pair: RectifiedPair) -> dict[str, Matcher]:
         made: dict[str, Matcher] | None = getattr(self._own, "matchers", None)

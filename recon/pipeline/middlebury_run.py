@@ -19,7 +19,7 @@ from recon.pipeline.machine import peak_memory_mb, use_threads
 from recon.pipeline.middlebury_bench import Bench, SceneResult
 from recon.pipeline.middlebury_scenes import find_scenes, read_scored_scene
 from recon.pipeline.middlebury_score import Figures, weighted_figures
-from recon.pipeline.record import write_record
+from recon.pipeline.record import fingerprint, write_record
 from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.summary import plain
 
@@ -110,6 +110,7 @@ def run_middlebury(folder: Path, config: ReconConfig, options: MiddleburyOptions
         summary["out"] = str(directory.folder)
         summary = dict(plain(summary))
         _write(summary, config, options, directory)
+        _record(summary, paths, directory)
     return summary
 
 
@@ -156,7 +157,8 @@ def _scenes(
 def _kept(result: SceneResult, options: MiddleburyOptions, directory: RunDirectory) -> Figures:
     """Write the maps of a result, and keep its figures alone."""
     scene = result.scene
-    write_pfm(directory.path(f"disparity/{result.matcher}/{scene.name}.pfm"), result.values)
+    path = directory.path(f"disparity/{result.matcher}/{scene.name}.pfm")
+    write_pfm(path, result.disparity.values)
     if options.draw is not None:
         options.draw(result, directory)
     return {
@@ -188,5 +190,11 @@ def _write(
     if options.present is not None:
         options.present(summary, directory)
     directory.write_json("summary.json", summary)
+
+
+def _record(summary: Figures, paths: Mapping[str, Path], directory: RunDirectory) -> None:
+    """Write ``run.json``, with a hash of all files of all scenes."""
+    files = [file for path in paths.values() for file in sorted(path.iterdir()) if file.is_file()]
     shared = ("folder", "threads", "parallel", "seconds", "peak_memory_mb", "warnings")
-    write_record(directory, COMMAND, {key: summary[key] for key in shared})
+    record = {key: summary[key] for key in shared}
+    write_record(directory, COMMAND, {**record, "inputs": fingerprint(files)})

@@ -42,13 +42,7 @@ def score_result(scene: ScoredScene, values: Float32) -> Figures:
         EvaluationError: The result does not fit the truth.
     """
     maps = {"dense": dense_map(values), "sparse": values}
-    return {
-        mask: {
-            **{name: _of_map(scene, one, occluded=occluded) for name, one in maps.items()},
-            "invalid": _invalid(scene, values, occluded=occluded),
-        }
-        for mask, occluded in MASKS.items()
-    }
+    return {mask: _of_mask(scene, maps, occluded=occluded) for mask, occluded in MASKS.items()}
 
 
 def weighted_figures(scenes: Mapping[str, Figures]) -> Figures:
@@ -63,31 +57,36 @@ def weighted_figures(scenes: Mapping[str, Figures]) -> Figures:
     return {key: _weighted({name: one[key] for name, one in scenes.items()}) for key in shared}
 
 
-def _weighted(values: Mapping[str, Any]) -> Any:
-    if isinstance(next(iter(values.values())), dict):
-        return weighted_figures(values)
-    return weighted_mean(values)
-
-
-def _of_map(scene: ScoredScene, values: Float32, *, occluded: bool) -> Figures:
-    metrics = evaluate_middlebury(values, scene.truth, scene.rules, occluded=occluded)
-    figures = named_figures(metrics)
-    if scene.truth_camera is not None:
-        compared = by_the_rules(values, scene.truth.values.shape, scene.rules)
-        depth = evaluate_depth(compared, scene.truth, scene.truth_camera, occluded=occluded)
-        figures["depth"] = asdict(depth)
-    return figures
-
-
-def _invalid(scene: ScoredScene, values: Float32, *, occluded: bool) -> float:
-    return evaluate_middlebury(values, scene.truth, scene.rules, occluded=occluded).invalid
-
-
 def named_figures(metrics: DisparityMetrics) -> Figures:
-    """Names as the table has them; numbers are full-size pixels and per cent."""
+    """Names as the table has them; pixels and per cent."""
     return {
         "bad": {f"{limit:g}": share for limit, share in metrics.bad.items()},
         "avgerr": metrics.avgerr_px,
         "rms": metrics.rms_px,
         **{f"a{percent}": error for percent, error in metrics.quantiles_px.items()},
     }
+
+
+def _weighted(values: Mapping[str, Any]) -> Any:
+    if isinstance(next(iter(values.values())), dict):
+        return weighted_figures(values)
+    return weighted_mean(values)
+
+
+def _of_mask(scene: ScoredScene, maps: Mapping[str, Float32], *, occluded: bool) -> Figures:
+    figures: Figures = {}
+    for name, values in maps.items():
+        metrics = evaluate_middlebury(values, scene.truth, scene.rules, occluded=occluded)
+        figures[name] = named_figures(metrics) | _depth(scene, values, occluded=occluded)
+        # The sparse map comes last: what it lacks is what the matcher did not find.
+        figures["invalid"] = metrics.invalid
+    return figures
+
+
+def _depth(scene: ScoredScene, values: Float32, *, occluded: bool) -> Figures:
+    """Errors in metres, where the scene has a calibration."""
+    if scene.truth_camera is None:
+        return {}
+    compared = by_the_rules(values, scene.truth.values.shape, scene.rules)
+    metrics = evaluate_depth(compared, scene.truth, scene.truth_camera, occluded=occluded)
+    return {"depth": asdict(metrics)}

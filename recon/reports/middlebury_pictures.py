@@ -39,7 +39,7 @@ def draw_result(result: SceneResult, directory: RunDirectory) -> None:
     scale = round(4 * result.scene.camera.width_px / result.scene.truth.values.shape[1]) / 4
     low, high = value_range(result.scene.truth.values)
     pictures = {
-        "disparity": colour_disparity(result.values, low * scale, high * scale),
+        "disparity": colour_disparity(result.disparity.values, low * scale, high * scale),
         "error": colour_error(result.error_px(), ERROR_LIMIT_PX),
     }
     for name, picture in pictures.items():
