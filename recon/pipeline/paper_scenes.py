@@ -121,14 +121,16 @@ def camera_of_table_1(camera: RectifiedCamera) -> RectifiedCamera:
 
 
 def _read_experiment(number: int, folder: Path) -> Experiment:
-    source = MiddleburySource(folder)
+    source, row = MiddleburySource(folder), _table_1_row(number, folder)
+    camera = source.calibration
     return Experiment(
         number=number,
         scene=source.name,
         pair=source.scene.pair,
-        camera=source.calibration,
+        # The file rounds doffs and the principal points each for itself; depth is defined by doffs.
+        camera=replace(camera, cx_right_px=camera.cx_px + row.doffs_px),
         truth=source.scene.truth,
-        table_1=_table_1_row(number, folder),
+        table_1=row,
         files=tuple(source.files),
     )
 

@@ -85,10 +85,11 @@ def depth_curve_figure(
         depth_from_disparity(d, camera),
         color=ESTIMATE,
         linewidth=2.2,
-        label=f"Z = f·b / (d + doffs), f = {camera.focal_px:g} px, doffs = {camera.doffs_px:g} px",
+        label=f"Z = f·b / (d + doffs), f = {camera.focal_px:.7g} px, "
+        f"doffs = {camera.doffs_px:.7g} px",
     )
     if believed is not None:
-        label = f"as printed: Z = f·b / d, f = {believed.focal_px:g} px"
+        label = f"as printed: Z = f·b / d, f = {believed.focal_px:.7g} px"
         axes.plot(d, depth_from_disparity(d, believed), color=BAD, linewidth=2.2, label=label)
     known = disparities_px[np.isfinite(disparities_px)]
     if known.size:

@@ -83,7 +83,7 @@ def _figures(run: PaperRun) -> list[tuple[str, str]]:
     for result in run.experiments:
         for one in dict.fromkeys((result.methods[0], result.methods[-1])):
             if one.depth is not None:
-                label = f"{result.experiment.scene}: depth error, {TITLES[one.method]}"
+                label = f"{result.experiment.scene}: median depth error, {TITLES[one.method]}"
                 figures.append((label, f"{one.depth.median_error_percent:.2f} %"))
     return figures
 
@@ -128,15 +128,16 @@ def _experiment_section(result: ExperimentResult, bad_px: float) -> Section:
             "The effect of the patch size",
             patches_figure(result.patches, bad_px),
             "Against the truth, at pixels seen by both cameras; the last panel counts all pixels. "
-            "Shares are of all compared pixels, with or without a value.",
+            "Shares are of all compared pixels, with or without a value. As it should be: the matcher "
+            "sad with a window of that size and its checks, which leave out what is doubtful.",
         )
     )
     blocks.append(_curve_block(result))
     blocks += [_patches_table(name, figures, bad_px) for name, figures in result.patches.items()]
     blocks += [_scene_block(one) for one in _worth_turning(result)]
     intro = (
-        f"{camera.width_px} × {camera.height_px} px, focal length {camera.focal_px:g} px, "
-        f"baseline {1000 * camera.baseline_m:g} mm, doffs {camera.doffs_px:g} px"
+        f"{camera.width_px} × {camera.height_px} px, focal length {camera.focal_px:.7g} px, "
+        f"baseline {1000 * camera.baseline_m:.7g} mm, doffs {camera.doffs_px:.7g} px"
     )
     return Section(result.experiment.title, blocks, intro)
 
@@ -152,7 +153,10 @@ def _methods_table(result: ExperimentResult) -> TableBlock:
         "median depth error",
     )
     rows = [_method_row(one) for one in result.methods]
-    caption = "Against the truth at pixels seen by both cameras; limits in pixels of this size."
+    caption = (
+        "Against the truth at pixels seen by both cameras; errors are those of the pixels where "
+        "a method has a value. Limits in pixels of this size."
+    )
     return TableBlock("The methods side by side", header, rows, caption, wide=True)
 
 
