@@ -128,8 +128,8 @@ def _experiment_section(result: ExperimentResult, bad_px: float) -> Section:
             "The effect of the patch size",
             patches_figure(result.patches, bad_px),
             "Against the truth, at pixels seen by both cameras; the last panel counts all pixels. "
-            "Shares are of all compared pixels, with or without a value. As it should be: the matcher "
-            "sad with a window of that size and its checks, which leave out what is doubtful.",
+            "Shares are of all compared pixels, with or without a value. As it should be: "
+            "the matcher sad with a window of that size, and its checks, which leave out doubts.",
         )
     )
     blocks.append(_curve_block(result))
