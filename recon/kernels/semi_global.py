@@ -26,6 +26,7 @@ from recon.kernels.path_costs import (
     Window,
     empty_cost_rows,
     enter_row,
+    padded_candidates,
     write_costs,
 )
 
@@ -61,97 +62,102 @@ class PathRow(NamedTuple):
         straight: uint8 (W + 2, P + 2), path that comes from the row before, same column.
         from_left: the same, path that comes from the column to the left.
         from_right: the same, path that comes from the column to the right.
-        least: uint8 (3, W + 2), the least of each.
+        along: the same, path that comes along the row.
+        least: uint8 (3, W + 2), the least of each of the first three.
+        limits: uint8 (4, W), larger penalty on each path's way to a pixel.
     """
 
     straight: NDArray[np.uint8]
     from_left: NDArray[np.uint8]
     from_right: NDArray[np.uint8]
+    along: NDArray[np.uint8]
     least: NDArray[np.uint8]
+    limits: NDArray[np.uint8]
+
+
+class Room(NamedTuple):
+    """What a strip is worked on in; the next strip can have it.
+
+    Attributes:
+        costs: uint8 (rows + 2·overlap, W, P), cost of each candidate at each pixel.
+        sums: uint16 (rows, W, ndisp), sums of the path costs.
+    """
+
+    costs: NDArray[np.uint8]
+    sums: NDArray[np.uint16]
+
+
+def empty_room(rows: int, width: int, paths: Paths) -> Room:
+    """Room for strips of so many rows or fewer."""
+    high = rows + 2 * paths.overlap
+    return Room(
+        costs=np.empty((high, width, padded_candidates(paths.ndisp)), np.uint8),
+        sums=np.empty((rows, width, paths.ndisp), np.uint16),
+    )
 
 
 def semi_global_minima(
-    views: Views, window: Window, paths: Paths, first: int, end: int, minima: Minima
+    views: Views, window: Window, paths: Paths, strip: range, room: Room, minima: Minima
 ) -> None:
     """Find the best candidate of each pixel of a strip, in the left and the right view.
 
     Candidate ``k`` of a pixel is the disparity ``minimum + k``. Its cost is the sum of the costs
     of the paths that end there, which begin at the border of the picture or ``overlap`` rows
-    outside the strip.
+    outside the strip. The rows are driven from here, since the loops below lose their vector
+    instructions when they are compiled into one function with the arrays they work on.
 
     Args:
         views: What is compared.
         window: What the cost of a pixel is.
         paths: What is searched.
-        first: First row of the strip.
-        end: The row after its last.
-        minima: Written: the rows ``first`` to ``end - 1``.
+        strip: The rows.
+        room: Enough for the strip; what it holds does not matter.
+        minima: Written: the rows of the strip.
     """
-    (height, width), candidates = views.grey.shape, views.right.shape[1] - views.grey.shape[1] + 1
-    top, bottom = max(first - paths.overlap, 0), min(end + paths.overlap, height)
-    costs = np.empty((bottom - top, width, candidates), np.uint8)
-    sums = np.empty((end - first, width, paths.ndisp), np.uint16)
-    _sweep_down(views, window, paths, top, first, costs, sums)
-    _sweep_up(views.grey, paths, top, first, costs, sums, minima)
+    height = len(views.grey)
+    top, bottom = max(strip.start - paths.overlap, 0), min(strip.stop + paths.overlap, height)
+    reach = range(top, bottom)
+    _sweep_down(views, window, paths, strip, reach, room)
+    _sweep_up(views.grey, paths, strip, reach, room, minima)
 
 
 def _sweep_down(
-    views: Views,
-    window: Window,
-    paths: Paths,
-    top: int,
-    first: int,
-    costs: NDArray[np.uint8],
-    sums: NDArray[np.uint16],
+    views: Views, window: Window, paths: Paths, strip: range, reach: range, room: Room
 ) -> None:
-    """Compute the costs from row ``top`` on, and follow the paths that come from above."""
-    width, candidates = costs.shape[1:]
+    """Compute the costs of the rows within reach, and follow the paths that come from above."""
+    top, width, candidates = reach.start, *room.costs.shape[1:]
     rows = empty_cost_rows(width, candidates, window)
-    now, before, side, limits = _start(paths, width, candidates)
+    before, now = _begin(paths, width, candidates), _begin(paths, width, candidates)
     for y in range(top - window.rows_radius, top + window.rows_radius):
         enter_row(views, window, y, rows)
-    for y in range(top, top + costs.shape[0]):
+    for y in reach:
         enter_row(views, window, y + window.rows_radius, rows)
-        write_costs(rows, window, paths.ndisp, y - top, costs)
-        if y >= first + sums.shape[0]:
-            continue
-        _set_limits(views.grey, y, max(y - 1, 0), -1, paths, limits)
-        _advance(costs, y - top, 1, paths, limits, before, now, side)
-        if y >= first:
-            _store(now, side, paths.diagonal, y - first, sums)
-        now, before = before, now
+        write_costs(rows, window, paths.ndisp, y - top, room.costs)
+        if y < strip.stop:
+            costs = room.costs[y - top]
+            _advance(costs, views.grey[y], views.grey[max(y - 1, 0)], 1, paths, before, now)
+            if y in strip:
+                _store_sums(now, paths.diagonal, room.sums[y - strip.start])
+            before, now = now, before
 
 
 def _sweep_up(
-    grey: NDArray[np.uint8],
-    paths: Paths,
-    top: int,
-    first: int,
-    costs: NDArray[np.uint8],
-    sums: NDArray[np.uint16],
-    minima: Minima,
+    grey: NDArray[np.uint8], paths: Paths, strip: range, reach: range, room: Room, minima: Minima
 ) -> None:
     """Follow the paths that come from below, and choose."""
     height, width = grey.shape
-    now, before, side, limits = _start(paths, width, costs.shape[2])
+    candidates = room.costs.shape[2]
+    before, now = _begin(paths, width, candidates), _begin(paths, width, candidates)
     right_best = np.empty((2, width + paths.ndisp), np.uint16)
-    for y in range(top + costs.shape[0] - 1, first - 1, -1):
-        _set_limits(grey, y, min(y + 1, height - 1), 1, paths, limits)
-        _advance(costs, y - top, -1, paths, limits, before, now, side)
-        if y < first + sums.shape[0]:
-            _add(now, side, paths.diagonal, y - first, sums)
-            left_minima(sums[y - first], y, paths.minimum, minima)
-            right_minima(sums[y - first], y, paths.minimum, right_best, minima.right_winner)
-        now, before = before, now
-
-
-def _start(
-    paths: Paths, width: int, candidates: int
-) -> tuple[PathRow, PathRow, NDArray[np.uint8], NDArray[np.uint8]]:
-    """Two rows of paths that begin, room for those along the row, and for `_set_limits`."""
-    now, before = _begin(paths, width, candidates), _begin(paths, width, candidates)
-    side = _closed(paths, width, candidates)
-    return now, before, side, np.empty((4, width), np.uint8)
+    for y in reversed(reach):
+        costs = room.costs[y - reach.start]
+        _advance(costs, grey[y], grey[min(y + 1, height - 1)], -1, paths, before, now)
+        if y in strip:
+            sums = room.sums[y - strip.start]
+            _add_sums(now, paths.diagonal, sums)
+            left_minima(sums, y, paths.minimum, minima)
+            right_minima(sums, y, paths.minimum, right_best, minima.right_winner)
+        before, now = now, before
 
 
 def _begin(paths: Paths, width: int, candidates: int) -> PathRow:
@@ -161,7 +167,9 @@ def _begin(paths: Paths, width: int, candidates: int) -> PathRow:
         _closed(paths, width, candidates),
         _closed(paths, diagonals, candidates),
         _closed(paths, diagonals, candidates),
+        _closed(paths, width, candidates),
         np.zeros((3, width + 2), np.uint8),
+        np.empty((4, width), np.uint8),
     )
 
 
@@ -173,23 +181,40 @@ def _closed(paths: Paths, width: int, candidates: int) -> NDArray[np.uint8]:
 
 
 @njit(cache=True, nogil=True)
+def _advance(
+    costs: NDArray[np.uint8],
+    grey: NDArray[np.uint8],
+    grey_before: NDArray[np.uint8],
+    step: int,
+    paths: Paths,
+    before: PathRow,
+    now: PathRow,
+) -> None:
+    """Advance the paths of a sweep by one row; ``step`` is the way along the row, 1 or -1."""
+    _set_limits(grey, grey_before, step, paths, now.limits)
+    if paths.diagonal:
+        _advance_four(costs, step, paths.small, before, now)
+    else:
+        _advance_two(costs, step, paths.small, before, now)
+
+
+@njit(cache=True, nogil=True)
 def _set_limits(
     grey: NDArray[np.uint8],
-    y: int,
-    other: int,
-    back: int,
+    grey_before: NDArray[np.uint8],
+    step: int,
     paths: Paths,
     limits: NDArray[np.uint8],
 ) -> None:
     """Write the larger penalties of a row: straight, from left, from right, along the row."""
-    last = grey.shape[1] - 1
+    last = grey.size - 1
     for x in range(last + 1):
-        here, left, right = np.int64(grey[y, x]), max(x - 1, 0), min(x + 1, last)
-        along = min(max(x + back, 0), last)
-        limits[0, x] = _large(here, np.int64(grey[other, x]), paths)
-        limits[1, x] = _large(here, np.int64(grey[other, left]), paths)
-        limits[2, x] = _large(here, np.int64(grey[other, right]), paths)
-        limits[3, x] = _large(here, np.int64(grey[y, along]), paths)
+        here, left, right = np.int64(grey[x]), max(x - 1, 0), min(x + 1, last)
+        along = min(max(x - step, 0), last)
+        limits[0, x] = _large(here, np.int64(grey_before[x]), paths)
+        limits[1, x] = _large(here, np.int64(grey_before[left]), paths)
+        limits[2, x] = _large(here, np.int64(grey_before[right]), paths)
+        limits[3, x] = _large(here, np.int64(grey[along]), paths)
 
 
 @njit(cache=True, nogil=True)
@@ -200,50 +225,25 @@ def _large(here: int, there: int, paths: Paths) -> np.uint8:
     return large
 
 
-def _advance(
-    costs: NDArray[np.uint8],
-    y: int,
-    step: int,
-    paths: Paths,
-    limits: NDArray[np.uint8],
-    before: PathRow,
-    now: PathRow,
-    side: NDArray[np.uint8],
-) -> None:
-    """Advance the paths of a sweep by one row."""
-    if paths.diagonal:
-        _advance_four(costs, y, step, paths.small, limits, before, now, side)
-    else:
-        _advance_two(costs, y, step, paths.small, limits, before, now, side)
-
-
 @njit(cache=True, nogil=True)
 def _advance_four(
-    costs: NDArray[np.uint8],
-    y: int,
-    step: int,
-    small: int,
-    limits: NDArray[np.uint8],
-    before: PathRow,
-    now: PathRow,
-    side: NDArray[np.uint8],
+    costs: NDArray[np.uint8], step: int, small: int, before: PathRow, now: PathRow
 ) -> None:
-    """Advance the straight, both diagonal, and the path along the row."""
-    p0, p1, p2 = before.straight, before.from_left, before.from_right
-    n0, n1, n2 = now.straight, now.from_left, now.from_right
-    width, candidates = costs.shape[1:]
+    """Advance the straight path, both diagonals, and the path along the row."""
+    p0, p1, p2, side = before.straight, before.from_left, before.from_right, now.along
+    n0, n1, n2, limits = now.straight, now.from_left, now.from_right, now.limits
+    width, candidates = costs.shape
     penalty, m3 = np.uint8(small), np.uint8(0)
+    side[0 if step > 0 else width + 1, 1:-1] = np.uint8(0)
     for n in range(width):
         x = n if step > 0 else width - 1 - n
         back = x + 1 - step
-        if n == 0:
-            side[back, 1:-1] = np.uint8(0)
         m0, m1, m2 = before.least[0, x + 1], before.least[1, x], before.least[2, x + 2]
         l0, l1 = np.uint8(m0 + limits[0, x]), np.uint8(m1 + limits[1, x])
         l2, l3 = np.uint8(m2 + limits[2, x]), np.uint8(m3 + limits[3, x])
         r0 = r1 = r2 = r3 = np.uint8(255)
         for k in range(candidates):
-            cost = costs[y, x, k]
+            cost = costs[x, k]
             beside = np.uint8(min(p0[x + 1, k], p0[x + 1, k + 2]) + penalty)
             v0 = np.uint8(np.uint8(min(p0[x + 1, k + 1], beside, l0) - m0) + cost)
             beside = np.uint8(min(p1[x, k], p1[x, k + 2]) + penalty)
@@ -261,29 +261,21 @@ def _advance_four(
 
 @njit(cache=True, nogil=True)
 def _advance_two(
-    costs: NDArray[np.uint8],
-    y: int,
-    step: int,
-    small: int,
-    limits: NDArray[np.uint8],
-    before: PathRow,
-    now: PathRow,
-    side: NDArray[np.uint8],
+    costs: NDArray[np.uint8], step: int, small: int, before: PathRow, now: PathRow
 ) -> None:
     """Advance the straight path and the one along the row."""
-    p0, n0 = before.straight, now.straight
-    width, candidates = costs.shape[1:]
+    p0, n0, side, limits = before.straight, now.straight, now.along, now.limits
+    width, candidates = costs.shape
     penalty, m3 = np.uint8(small), np.uint8(0)
+    side[0 if step > 0 else width + 1, 1:-1] = np.uint8(0)
     for n in range(width):
         x = n if step > 0 else width - 1 - n
         back = x + 1 - step
-        if n == 0:
-            side[back, 1:-1] = np.uint8(0)
         m0 = before.least[0, x + 1]
         l0, l3 = np.uint8(m0 + limits[0, x]), np.uint8(m3 + limits[3, x])
         r0 = r3 = np.uint8(255)
         for k in range(candidates):
-            cost = costs[y, x, k]
+            cost = costs[x, k]
             beside = np.uint8(min(p0[x + 1, k], p0[x + 1, k + 2]) + penalty)
             v0 = np.uint8(np.uint8(min(p0[x + 1, k + 1], beside, l0) - m0) + cost)
             beside = np.uint8(min(side[back, k], side[back, k + 2]) + penalty)
@@ -294,26 +286,31 @@ def _advance_two(
 
 
 @njit(cache=True, nogil=True)
-def _store(
-    now: PathRow, side: NDArray[np.uint8], diagonal: bool, y: int, sums: NDArray[np.uint16]
-) -> None:
-    """Write row ``y`` of the sums over paths."""
-    sums[y] = np.uint16(0)
-    _add(now, side, diagonal, y, sums)
+def _store_sums(now: PathRow, diagonal: bool, sums: NDArray[np.uint16]) -> None:
+    """Write the sums over the paths of the sweep down."""
+    n0, n1, n2, n3 = now.straight, now.from_left, now.from_right, now.along
+    for x in range(sums.shape[0]):
+        if diagonal:
+            for k in range(sums.shape[1]):
+                pair = np.uint16(np.uint16(n0[x + 1, k + 1]) + np.uint16(n3[x + 1, k + 1]))
+                other = np.uint16(np.uint16(n1[x + 1, k + 1]) + np.uint16(n2[x + 1, k + 1]))
+                sums[x, k] = np.uint16(pair + other)
+        else:
+            for k in range(sums.shape[1]):
+                sums[x, k] = np.uint16(np.uint16(n0[x + 1, k + 1]) + np.uint16(n3[x + 1, k + 1]))
 
 
 @njit(cache=True, nogil=True)
-def _add(
-    now: PathRow, side: NDArray[np.uint8], diagonal: bool, y: int, sums: NDArray[np.uint16]
-) -> None:
-    """Add the paths of a sweep to row ``y`` of the sums."""
-    n0, n1, n2 = now.straight, now.from_left, now.from_right
-    for x in range(sums.shape[1]):
-        for k in range(sums.shape[2]):
-            pair = np.uint16(np.uint16(n0[x + 1, k + 1]) + np.uint16(side[x + 1, k + 1]))
-            sums[y, x, k] = np.uint16(sums[y, x, k] + pair)
-        if not diagonal:
-            continue
-        for k in range(sums.shape[2]):
-            pair = np.uint16(np.uint16(n1[x + 1, k + 1]) + np.uint16(n2[x + 1, k + 1]))
-            sums[y, x, k] = np.uint16(sums[y, x, k] + pair)
+def _add_sums(now: PathRow, diagonal: bool, sums: NDArray[np.uint16]) -> None:
+    """Add the paths of the sweep up."""
+    n0, n1, n2, n3 = now.straight, now.from_left, now.from_right, now.along
+    for x in range(sums.shape[0]):
+        if diagonal:
+            for k in range(sums.shape[1]):
+                pair = np.uint16(np.uint16(n0[x + 1, k + 1]) + np.uint16(n3[x + 1, k + 1]))
+                other = np.uint16(np.uint16(n1[x + 1, k + 1]) + np.uint16(n2[x + 1, k + 1]))
+                sums[x, k] = np.uint16(sums[x, k] + np.uint16(pair + other))
+        else:
+            for k in range(sums.shape[1]):
+                pair = np.uint16(np.uint16(n0[x + 1, k + 1]) + np.uint16(n3[x + 1, k + 1]))
+                sums[x, k] = np.uint16(sums[x, k] + pair)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final, Literal
 
@@ -23,7 +24,7 @@ from recon.kernels.refine import (
     empty_refined,
     refine_minima,
 )
-from recon.kernels.semi_global import Paths, semi_global_minima
+from recon.kernels.semi_global import Paths, Room, empty_room, semi_global_minima
 from recon.kernels.speckle import find_speckles
 from recon.matching.sad import usual_ndisp
 from recon.settings import Settings
@@ -65,7 +66,7 @@ class SgmSettings(Settings):
         description="Horizontal gradients (Sobel units) are clipped to plus or minus this.",
     )
     cost_cap: int = Field(
-        default=16,
+        default=14,
         ge=0,
         le=127,
         description="Largest difference of gradients that counts at one pixel; 0 = census alone.",
@@ -82,13 +83,13 @@ class SgmSettings(Settings):
         default=8, description="Along rows and columns, or along the diagonals too."
     )
     small_penalty: float = Field(
-        default=12.0,
+        default=16.0,
         gt=0.0,
         le=255.0,
         description="For a step of one disparity along a path, as a mean cost of one pixel.",
     )
     large_penalty: float = Field(
-        default=60.0,
+        default=50.0,
         gt=0.0,
         le=1000.0,
         description="For a larger step along a path, as a mean cost of one pixel.",
@@ -186,6 +187,7 @@ class SgmMatcher:
     def __init__(self, settings: SgmSettings, threads: int | None = None) -> None:
         self._settings = settings
         self._threads = max(1, threads or os.cpu_count() or 1)
+        self._rooms: deque[Room] = deque(maxlen=self._threads)
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair.
@@ -201,25 +203,39 @@ class SgmMatcher:
         texture = _texture(pair, s)
         minima, refined = empty_minima(*texture.shape), empty_refined(*texture.shape)
 
-        def strip(first: int, end: int) -> None:
-            semi_global_minima(views, window, paths, first, end, minima)
-            refine_minima(minima, texture, rules, first, end, refined)
+        def work(strip: range) -> None:
+            room = self._take_room(strip_rows, pair.camera.width_px, paths)
+            semi_global_minima(views, window, paths, strip, room, minima)
+            self._rooms.append(room)
+            refine_minima(minima, texture, rules, strip.start, strip.stop, refined)
 
-        edges, at_once = self._strips(pair.camera, ndisp)
+        strip_rows, at_once = self._strips(pair.camera, ndisp)
+        height = pair.camera.height_px
+        strips = [range(y, min(y + strip_rows, height)) for y in range(0, height, strip_rows)]
         with ThreadPoolExecutor(at_once) as pool:
-            list(pool.map(strip, edges[:-1], edges[1:]))
+            list(pool.map(work, strips))
         return self._without_speckles(Disparity(*refined))
 
-    def _strips(self, camera: RectifiedCamera, ndisp: int) -> tuple[list[int], int]:
-        """Where strips begin and end, and how many may be worked on at once."""
+    def _strips(self, camera: RectifiedCamera, ndisp: int) -> tuple[int, int]:
+        """Rows of a strip, and how many strips may be worked on at once."""
         height, width = camera.height_px, camera.width_px
         costs_row, sums_row = width * padded_candidates(ndisp), 2 * width * ndisp
         fitting = _STRIP_BYTES // (costs_row + sums_row)
-        rows = min(max(fitting, _LEAST_STRIP_ROWS), _STRIP_ROWS)
-        edges = np.linspace(0, height, -(-height // rows) + 1).astype(int).tolist()
+        most = min(max(fitting, _LEAST_STRIP_ROWS), _STRIP_ROWS)
+        rows = -(-height // -(-height // most))
         strip_bytes = rows * (costs_row + sums_row) + 2 * self._settings.overlap_rows * costs_row
         at_once = min(self._threads, (self._settings.memory_mb << 20) // strip_bytes)
-        return edges, max(1, at_once)
+        return rows, max(1, at_once)
+
+    def _take_room(self, rows: int, width: int, paths: Paths) -> Room:
+        """Room for a strip: that of an earlier one where it fits."""
+        fresh = empty_room(rows, width, paths)
+        try:
+            room = self._rooms.pop()
+        except IndexError:
+            return fresh
+        fits = room.costs.shape == fresh.costs.shape and room.sums.shape == fresh.sums.shape
+        return room if fits else fresh
 
     def _without_speckles(self, disparity: Disparity) -> Disparity:
         s = self._settings

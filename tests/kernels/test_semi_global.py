@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from recon.kernels.census import census_planes
 from recon.kernels.minima import Minima, empty_minima
 from recon.kernels.path_costs import Views, Window, mirror_view
-from recon.kernels.semi_global import Paths, semi_global_minima
+from recon.kernels.semi_global import Paths, empty_room, semi_global_minima
 from recon.kernels.semi_global_reference import semi_global_minima_reference
 
 Image = NDArray[np.uint8]
@@ -34,7 +34,8 @@ def search(views: Views, window: Window, paths: Paths, strips: int = 1) -> Minim
     minima = empty_minima(*views.grey.shape)
     edges = np.linspace(0, len(views.grey), strips + 1).astype(int).tolist()
     for first, end in itertools.pairwise(edges):
-        semi_global_minima(views, window, paths, first, end, minima)
+        room = empty_room(end - first, views.grey.shape[1], paths)
+        semi_global_minima(views, window, paths, range(first, end), room, minima)
     return minima
 
 
