@@ -17,7 +17,7 @@ from recon.matching import MATCHERS
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.machine import peak_memory_mb, use_threads
 from recon.pipeline.middlebury_bench import Bench, SceneResult
-from recon.pipeline.middlebury_scenes import find_scenes, read_scored_scene
+from recon.pipeline.middlebury_scenes import check_folder, find_scenes, read_scored_scene
 from recon.pipeline.middlebury_score import Figures, weighted_figures
 from recon.pipeline.record import fingerprint, write_record
 from recon.pipeline.run_directory import RunDirectory
@@ -79,12 +79,14 @@ def run_middlebury(folder: Path, config: ReconConfig, options: MiddleburyOptions
 
     Raises:
         SettingsError: A matcher is unknown or named twice.
-        SourceError: There is no scene, or none with a truth.
+        SourceError: There is no scene, or none with a truth; or a folder is missing.
         ReconError: A scene cannot be read or matched, or the folder not be written; then nothing
             is left behind.
     """
     start = time.perf_counter()
     names = _checked(options.matchers or (config.matching.matcher,))
+    if options.truth is not None:
+        check_folder(options.truth)
     paths, threads = find_scenes(folder), use_threads(options.threads)
     with RunDirectory.for_command(COMMAND, options.out) as directory:
         bench = Bench(names, config, max(1, threads // options.parallel))

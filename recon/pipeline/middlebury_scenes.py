@@ -45,9 +45,7 @@ def find_scenes(folder: Path) -> dict[str, Path]:
     Raises:
         SourceError: The folder is missing, or there is no scene in it.
     """
-    if not folder.is_dir():
-        what = "not a folder" if folder.exists() else "folder does not exist"
-        raise SourceError(what, where=folder)
+    check_folder(folder)
     paths = sorted(_scenes_below(folder))
     if not paths:
         raise SourceError(
@@ -56,6 +54,17 @@ def find_scenes(folder: Path) -> dict[str, Path]:
             expected="folders with im0 and im1 and calib.txt, view1 and view5, or im2 and im6",
         )
     return dict(zip(_names(folder, paths), paths, strict=True))
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse what is no folder.
+
+    Raises:
+        SourceError: It is none.
+    """
+    if not folder.is_dir():
+        what = "not a folder" if folder.exists() else "folder does not exist"
+        raise SourceError(what, where=folder)
 
 
 def read_scored_scene(name: str, path: Path, truth: Path | None) -> ScoredScene | None:
@@ -79,7 +88,8 @@ def read_scored_scene(name: str, path: Path, truth: Path | None) -> ScoredScene 
     if judge is None or judge.truth is None:
         return None
     width_px, truth_width_px = scene.pair.left.shape[1], judge.truth.values.shape[1]
-    factor = round(4 * truth_width_px / width_px) / 4
+    # Sizes differ by a row or column; those that do not fit at all are refused when compared.
+    factor = max(round(4 * truth_width_px / width_px), 1) / 4
     camera = _matching_camera(scene, judge.truth, factor)
     rules = MiddleburyRules(
         full_size_factor=judge.full_size_factor,
