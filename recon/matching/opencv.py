@@ -24,6 +24,9 @@ from recon.structures.arrays import UInt8
 _STEPS: Final = 16
 """OpenCV counts in 16ths of a pixel, and searches multiples of 16 disparities."""
 
+_LIMIT_PX: Final = 2**15 // _STEPS - 1
+"""16ths of a pixel are counted in 16 bits."""
+
 _MODES: Final = {
     "sgbm": cv2.STEREO_SGBM_MODE_SGBM,
     "hh": cv2.STEREO_SGBM_MODE_HH,
@@ -61,11 +64,15 @@ class OpencvSettings(UnratedSettings):
         description="Largest difference between the left and the right view; None = no check.",
     )
     speckle_size_px: int = Field(
-        default=50, ge=0, description="Regions of at most so many pixels are removed; 0 = keep all."
+        default=50,
+        ge=0,
+        le=1_000_000,
+        description="Regions of at most so many pixels are removed; 0 = keep all.",
     )
     speckle_range_px: float = Field(
         default=1.0,
         gt=0.0,
+        le=1000.0,
         description="Largest step of disparity between neighbours of one region.",
     )
     pad: bool = Field(
@@ -239,8 +246,18 @@ def _match(pair: RectifiedPair, engine: Any, s: OpencvSettings, margins: _Margin
 
 
 def _range(settings: OpencvSettings, camera: RectifiedCamera) -> int:
+    """Number of disparities, a multiple of 16."""
     ndisp = settings.ndisp or camera.ndisp or usual_ndisp(camera.width_px)
-    return _STEPS * -(-ndisp // _STEPS)
+    ndisp = _STEPS * -(-ndisp // _STEPS)
+    first, last = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1
+    if first <= -_LIMIT_PX or last >= _LIMIT_PX:
+        raise MatchingError(
+            "OpenCV cannot count so far",
+            got=f"disparities from {first} to {last} px",
+            expected=f"between {-_LIMIT_PX} and {_LIMIT_PX} px",
+            hint="check min_disparity_px and ndisp, or match smaller pictures",
+        )
+    return ndisp
 
 
 def _left_right(settings: OpencvSettings) -> int:

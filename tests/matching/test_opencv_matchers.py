@@ -100,6 +100,12 @@ def test_a_refusal_of_opencv_is_an_error_of_ours() -> None:
         match("opencv-bm", pair, pad=False, block_px=21)
 
 
+@pytest.mark.parametrize("range_px", [{"min_disparity_px": -4096}, {"ndisp": 4096}])
+def test_a_range_beyond_16_bits_is_refused(range_px: dict[str, int]) -> None:
+    with pytest.raises(MatchingError, match="cannot count so far"):
+        match("opencv-sgbm", shifted_pair(0), **range_px)
+
+
 def test_the_modes_of_the_semi_global_matcher_differ() -> None:
     left = cv2.GaussianBlur(shifted_pair(0).left, (9, 9), 0)
     right = np.roll(left, -5, axis=1) // 2 + 60
