@@ -1,5 +1,11 @@
 """From estimates and truth to figures."""
 
+from recon.evaluation.confidence import (
+    Reliability,
+    Sparsification,
+    measure_reliability,
+    measure_sparsification,
+)
 from recon.evaluation.disparity import evaluate_depth, evaluate_disparity
 from recon.evaluation.map import evaluate_map
 from recon.evaluation.middlebury import MiddleburyRules, evaluate_middlebury
@@ -7,9 +13,13 @@ from recon.evaluation.trajectory import evaluate_trajectory
 
 __all__ = [
     "MiddleburyRules",
+    "Reliability",
+    "Sparsification",
     "evaluate_depth",
     "evaluate_disparity",
     "evaluate_map",
     "evaluate_middlebury",
     "evaluate_trajectory",
+    "measure_reliability",
+    "measure_sparsification",
 ]
