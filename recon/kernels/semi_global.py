@@ -5,6 +5,8 @@ only the row before is kept, in uint8; its least cost is taken off at every step
 cost exceeds the cost of a pixel plus the larger penalty. The four paths of a sweep advance in
 one loop: it is the loop that vectorises best. A strip starts some rows early, so that its paths
 have forgotten where they began; what it needs of memory does not grow with the picture's height.
+Between the sweeps the sums over paths wait as rounded means, in uint8: the traffic to memory
+costs more than their last two bits are worth.
 
 The twin in plain numpy is `recon.kernels.semi_global_reference.semi_global_minima_reference`.
 
@@ -80,11 +82,11 @@ class Room(NamedTuple):
 
     Attributes:
         costs: uint8 (rows + 2·overlap, W, P), cost of each candidate at each pixel.
-        sums: uint16 (rows, W, ndisp), sums of the path costs.
+        means: uint8 (rows, W, ndisp), means of the path costs of the sweep down.
     """
 
     costs: NDArray[np.uint8]
-    sums: NDArray[np.uint16]
+    means: NDArray[np.uint8]
 
 
 def empty_room(rows: int, width: int, paths: Paths) -> Room:
@@ -92,7 +94,7 @@ def empty_room(rows: int, width: int, paths: Paths) -> Room:
     high = rows + 2 * paths.overlap
     return Room(
         costs=np.empty((high, width, padded_candidates(paths.ndisp)), np.uint8),
-        sums=np.empty((rows, width, paths.ndisp), np.uint16),
+        means=np.empty((rows, width, paths.ndisp), np.uint8),
     )
 
 
@@ -103,8 +105,9 @@ def semi_global_minima(
 
     Candidate ``k`` of a pixel is the disparity ``minimum + k``. Its cost is the sum of the costs
     of the paths that end there, which begin at the border of the picture or ``overlap`` rows
-    outside the strip. The rows are driven from here, since the loops below lose their vector
-    instructions when they are compiled into one function with the arrays they work on.
+    outside the strip; those of the sweep down enter as their rounded mean. The rows are driven
+    from here, since the loops below lose their vector instructions when they are compiled into
+    one function with the arrays they work on.
 
     Args:
         views: What is compared.
@@ -137,7 +140,7 @@ def _sweep_down(
             costs = room.costs[y - top]
             _advance(costs, views.grey[y], views.grey[max(y - 1, 0)], 1, paths, before, now)
             if y in strip:
-                _store_sums(now, paths.diagonal, room.sums[y - strip.start])
+                _store_means(now, paths.diagonal, room.means[y - strip.start])
             before, now = now, before
 
 
@@ -149,12 +152,12 @@ def _sweep_up(
     candidates = room.costs.shape[2]
     before, now = _begin(paths, width, candidates), _begin(paths, width, candidates)
     right_best = np.empty((2, width + paths.ndisp), np.uint16)
+    sums = np.empty((width, paths.ndisp), np.uint16)
     for y in reversed(reach):
         costs = room.costs[y - reach.start]
         _advance(costs, grey[y], grey[min(y + 1, height - 1)], -1, paths, before, now)
         if y in strip:
-            sums = room.sums[y - strip.start]
-            _add_sums(now, paths.diagonal, sums)
+            _sum_paths(now, paths.diagonal, room.means[y - strip.start], sums)
             left_minima(sums, y, paths.minimum, minima)
             right_minima(sums, y, paths.minimum, right_best, minima.right_winner)
         before, now = now, before
@@ -286,31 +289,37 @@ def _advance_two(
 
 
 @njit(cache=True, nogil=True)
-def _store_sums(now: PathRow, diagonal: bool, sums: NDArray[np.uint16]) -> None:
-    """Write the sums over the paths of the sweep down."""
+def _store_means(now: PathRow, diagonal: bool, means: NDArray[np.uint8]) -> None:
+    """Write the means over the paths of the sweep down, rounded."""
     n0, n1, n2, n3 = now.straight, now.from_left, now.from_right, now.along
-    for x in range(sums.shape[0]):
+    one, two = np.uint16(1), np.uint16(2)
+    for x in range(means.shape[0]):
         if diagonal:
-            for k in range(sums.shape[1]):
+            for k in range(means.shape[1]):
                 pair = np.uint16(np.uint16(n0[x + 1, k + 1]) + np.uint16(n3[x + 1, k + 1]))
                 other = np.uint16(np.uint16(n1[x + 1, k + 1]) + np.uint16(n2[x + 1, k + 1]))
-                sums[x, k] = np.uint16(pair + other)
+                means[x, k] = np.uint8(np.uint16(np.uint16(pair + other) + two) >> two)
         else:
-            for k in range(sums.shape[1]):
-                sums[x, k] = np.uint16(np.uint16(n0[x + 1, k + 1]) + np.uint16(n3[x + 1, k + 1]))
+            for k in range(means.shape[1]):
+                pair = np.uint16(np.uint16(n0[x + 1, k + 1]) + np.uint16(n3[x + 1, k + 1]))
+                means[x, k] = np.uint8(np.uint16(pair + one) >> one)
 
 
 @njit(cache=True, nogil=True)
-def _add_sums(now: PathRow, diagonal: bool, sums: NDArray[np.uint16]) -> None:
-    """Add the paths of the sweep up."""
+def _sum_paths(
+    now: PathRow, diagonal: bool, means: NDArray[np.uint8], sums: NDArray[np.uint16]
+) -> None:
+    """Add the paths of the sweep up to those of the sweep down, means times their number."""
     n0, n1, n2, n3 = now.straight, now.from_left, now.from_right, now.along
+    one, two = np.uint16(1), np.uint16(2)
     for x in range(sums.shape[0]):
         if diagonal:
             for k in range(sums.shape[1]):
                 pair = np.uint16(np.uint16(n0[x + 1, k + 1]) + np.uint16(n3[x + 1, k + 1]))
                 other = np.uint16(np.uint16(n1[x + 1, k + 1]) + np.uint16(n2[x + 1, k + 1]))
-                sums[x, k] = np.uint16(sums[x, k] + np.uint16(pair + other))
+                down = np.uint16(np.uint16(means[x, k]) << two)
+                sums[x, k] = np.uint16(np.uint16(pair + other) + down)
         else:
             for k in range(sums.shape[1]):
                 pair = np.uint16(np.uint16(n0[x + 1, k + 1]) + np.uint16(n3[x + 1, k + 1]))
-                sums[x, k] = np.uint16(sums[x, k] + pair)
+                sums[x, k] = np.uint16(pair + np.uint16(np.uint16(means[x, k]) << one))

@@ -219,11 +219,11 @@ class SgmMatcher:
     def _strips(self, camera: RectifiedCamera, ndisp: int) -> tuple[int, int]:
         """Rows of a strip, and how many strips may be worked on at once."""
         height, width = camera.height_px, camera.width_px
-        costs_row, sums_row = width * padded_candidates(ndisp), 2 * width * ndisp
-        fitting = _STRIP_BYTES // (costs_row + sums_row)
+        costs_row, means_row = width * padded_candidates(ndisp), width * ndisp
+        fitting = _STRIP_BYTES // (costs_row + means_row)
         most = min(max(fitting, _LEAST_STRIP_ROWS), _STRIP_ROWS)
         rows = -(-height // -(-height // most))
-        strip_bytes = rows * (costs_row + sums_row) + 2 * self._settings.overlap_rows * costs_row
+        strip_bytes = rows * (costs_row + means_row) + 2 * self._settings.overlap_rows * costs_row
         at_once = min(self._threads, (self._settings.memory_mb << 20) // strip_bytes)
         return rows, max(1, at_once)
 
@@ -234,7 +234,7 @@ class SgmMatcher:
             room = self._rooms.pop()
         except IndexError:
             return fresh
-        fits = room.costs.shape == fresh.costs.shape and room.sums.shape == fresh.sums.shape
+        fits = room.costs.shape == fresh.costs.shape and room.means.shape == fresh.means.shape
         return room if fits else fresh
 
     def _without_speckles(self, disparity: Disparity) -> Disparity:
