@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from pydantic import Field
 
@@ -16,6 +16,7 @@ from recon.matching.opencv import (
     OpencvSgbmSettings,
 )
 from recon.matching.protocol import Matcher
+from recon.matching.range import AutoRangeMatcher
 from recon.matching.sad import SadMatcher, SadSettings
 from recon.matching.sgm import SgmMatcher, SgmSettings
 from recon.settings import Settings
@@ -34,6 +35,12 @@ class MatchingSettings(Settings):
 
     matcher: str = Field(
         default="sad", description="Name of the matcher: sad, sgm, opencv-bm, opencv-sgbm or onnx."
+    )
+    range: Literal["auto", "usual"] = Field(
+        default="auto",
+        description="How far to search where neither the matcher's `ndisp` nor the calibration "
+        "says it: as far as each pair needs, but at least the usual tenth of the image width; or "
+        "just that tenth.",
     )
     sad: SadSettings = Field(default_factory=SadSettings, description="Of the matcher `sad`.")
     sgm: SgmSettings = Field(default_factory=SgmSettings, description="Of the matcher `sgm`.")
@@ -62,8 +69,13 @@ def make_matcher(
     if name not in MATCHERS:
         choices = ", ".join(sorted(MATCHERS))
         raise SettingsError("unknown matcher", got=repr(name), expected=f"one of: {choices}")
-    own = getattr(settings or MatchingSettings(), field_of(name))
-    return MATCHERS[name](own, threads)
+    settings = settings or MatchingSettings()
+    own = getattr(settings, field_of(name))
+    matcher = MATCHERS[name](own, threads)
+    # A matcher without the setting searches no range; one that is set needs no guess.
+    if settings.range == "usual" or getattr(own, "ndisp", 0) is not None:
+        return matcher
+    return AutoRangeMatcher(matcher, own.min_disparity_px)
 
 
 def field_of(name: str) -> str:
