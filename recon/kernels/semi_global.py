@@ -129,6 +129,7 @@ def _sweep_down(
 ) -> None:
     """Compute the costs of the rows within reach, and follow the paths that come from above."""
     top, width, candidates = reach.start, *room.costs.shape[1:]
+    grey = _widened(views.grey)
     rows = empty_cost_rows(width, candidates, window)
     before, now = _begin(paths, width, candidates), _begin(paths, width, candidates)
     for y in range(top - window.rows_radius, top + window.rows_radius):
@@ -138,7 +139,7 @@ def _sweep_down(
         write_costs(rows, window, paths.ndisp, y - top, room.costs)
         if y < strip.stop:
             costs = room.costs[y - top]
-            _advance(costs, views.grey[y], views.grey[max(y - 1, 0)], 1, paths, before, now)
+            _advance(costs, grey[y], grey[max(y - 1, 0)], 1, paths, before, now)
             if y in strip:
                 _store_means(now, paths.diagonal, room.means[y - strip.start])
             before, now = now, before
@@ -149,7 +150,7 @@ def _sweep_up(
 ) -> None:
     """Follow the paths that come from below, and choose."""
     height, width = grey.shape
-    candidates = room.costs.shape[2]
+    grey, candidates = _widened(grey), room.costs.shape[2]
     before, now = _begin(paths, width, candidates), _begin(paths, width, candidates)
     right_best = np.empty((2, width + paths.ndisp), np.uint16)
     sums = np.empty((width, paths.ndisp), np.uint16)
@@ -161,6 +162,11 @@ def _sweep_up(
             left_minima(sums, y, paths.minimum, minima)
             right_minima(sums, y, paths.minimum, right_best, minima.right_winner)
         before, now = now, before
+
+
+def _widened(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The picture with one more column at each side."""
+    return np.pad(grey, ((0, 0), (1, 1)), mode="edge")
 
 
 def _begin(paths: Paths, width: int, candidates: int) -> PathRow:
@@ -209,23 +215,28 @@ def _set_limits(
     paths: Paths,
     limits: NDArray[np.uint8],
 ) -> None:
-    """Write the larger penalties of a row: straight, from left, from right, along the row."""
-    last = grey.size - 1
-    for x in range(last + 1):
-        here, left, right = np.int64(grey[x]), max(x - 1, 0), min(x + 1, last)
-        along = min(max(x - step, 0), last)
-        limits[0, x] = _large(here, np.int64(grey_before[x]), paths)
-        limits[1, x] = _large(here, np.int64(grey_before[left]), paths)
-        limits[2, x] = _large(here, np.int64(grey_before[right]), paths)
-        limits[3, x] = _large(here, np.int64(grey[along]), paths)
+    """Write the larger penalties of a row: straight, from left, from right, along the row.
+
+    The rows of grey levels have one more at each end, so that the loops need not look for it.
+    """
+    end = grey.size - 1
+    here = grey[1:end]
+    _set_penalties(here, grey_before[1:end], paths, limits[0])
+    _set_penalties(here, grey_before[: end - 1], paths, limits[1])
+    _set_penalties(here, grey_before[2:], paths, limits[2])
+    _set_penalties(here, grey[: end - 1] if step > 0 else grey[2:], paths, limits[3])
 
 
 @njit(cache=True, nogil=True)
-def _large(here: int, there: int, paths: Paths) -> np.uint8:
-    """The larger penalty between two grey levels."""
-    edge = abs(here - there) > paths.edge
-    large: np.uint8 = np.uint8(paths.large_at_edge if edge else paths.large)
-    return large
+def _set_penalties(
+    grey: NDArray[np.uint8], others: NDArray[np.uint8], paths: Paths, limits: NDArray[np.uint8]
+) -> None:
+    """Write the larger penalties between grey levels."""
+    edge, large = np.uint8(paths.edge), np.uint8(paths.large)
+    large_at_edge = np.uint8(paths.large_at_edge)
+    for x in range(limits.size):
+        step = np.uint8(max(grey[x], others[x]) - min(grey[x], others[x]))
+        limits[x] = large_at_edge if step > edge else large
 
 
 @njit(cache=True, nogil=True)
