@@ -16,6 +16,7 @@ from recon.cli.doctor import doctor
 from recon.cli.map import map_
 from recon.cli.mesh import mesh
 from recon.cli.pair import disparity, pair
+from recon.cli.paper import paper
 
 app = typer.Typer(
     name="recon",
@@ -28,6 +29,7 @@ app.command()(pair)
 app.command("map")(map_)
 app.command()(mesh)
 app.command()(disparity)
+app.command()(paper)
 app.command()(doctor)
 app.add_typer(evaluate.app, name="evaluate")
 

@@ -8,10 +8,14 @@ from typing import Annotated
 
 import typer
 
+from recon.cli.evaluate_disparity import disparity
+from recon.cli.evaluate_middlebury import middlebury
 from recon.cli.options import Json
 from recon.cli.session import print_figures, print_json, session
 
 app = typer.Typer(no_args_is_help=True, help="Compare results with truth.")
+app.command()(middlebury)
+app.command()(disparity)
 
 
 class ReferenceFrame(str, Enum):

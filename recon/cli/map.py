@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Mesh, Out, Quiet, Set, Threads, Verbose
+from recon.cli.options import Config, Json, Matcher, Mesh, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
 
 
@@ -30,6 +30,7 @@ def map_(
     poses: Annotated[
         Path | None, typer.Option(help="Known poses (KITTI or TUM) to use instead of odometry.")
     ] = None,
+    matcher: Matcher = None,
     mesh: Mesh = True,
     config: Config = None,
     set_: Set = None,
@@ -44,13 +45,14 @@ def map_(
     """
     with session():
         from recon.formats.trajectory import read_trajectory
-        from recon.pipeline.config import load_config
+        from recon.pipeline.config import load_config, matching_overrides
         from recon.pipeline.map_run import MapOptions, run_map
         from recon.reports import present_map
         from recon.sources import open_source
         from recon.viewers import choose_viewer
 
-        overrides = [*(set_ or ()), *([f"odometry.method={odometry.value}"] if odometry else ())]
+        method = [] if odometry is None else [f"odometry.method={odometry.value}"]
+        overrides = [*(set_ or ()), *method, *matching_overrides(matcher)]
         options = MapOptions(
             out=out,
             threads=threads,

@@ -19,6 +19,13 @@ Set = Annotated[
     list[str] | None,
     typer.Option("--set", "-s", help="One setting, as key=value: matching.sad.window_px=9."),
 ]
+Matcher = Annotated[
+    str | None,
+    typer.Option(
+        "--matcher",
+        help="How to match: sad, sgm, opencv-bm, opencv-sgbm, onnx. [default: as configured]",
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print seconds per stage.")]

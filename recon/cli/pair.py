@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli.options import Config, Json, Matcher, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
 
 Left = Annotated[Path, typer.Argument(help="Left picture.")]
@@ -29,6 +29,7 @@ def pair(
         Path | None, typer.Option(help="True disparity (PFM or 16-bit PNG) to compare with.")
     ] = None,
     out: Out = None,
+    matcher: Matcher = None,
     ndisp: Ndisp = None,
     config: Config = None,
     set_: Set = None,
@@ -43,12 +44,13 @@ def pair(
     """
     del quiet  # there is no progress to hide; every command takes the option
     with session():
-        from recon.pipeline.config import PAIR_DEFAULTS, load_config
+        from recon.pipeline.config import PAIR_DEFAULTS, load_config, matching_overrides
         from recon.pipeline.pair_input import read_pair_input
         from recon.pipeline.pair_run import PairOptions, run_pair
         from recon.reports import present_pair
 
-        settings = load_config(config, [*(set_ or ()), *_range(ndisp)], PAIR_DEFAULTS)
+        overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
+        settings = load_config(config, overrides, PAIR_DEFAULTS)
         given = read_pair_input(left, right, calib, truth, metres_per_unit=unit_m)
         options = PairOptions("pair", out, threads, present_pair)
         run = run_pair(given, settings, options)
@@ -62,6 +64,7 @@ def disparity(
         Path | None, typer.Option(help=_CALIB_HELP + " Without it the pair must be rectified.")
     ] = None,
     out: Out = None,
+    matcher: Matcher = None,
     ndisp: Ndisp = None,
     config: Config = None,
     set_: Set = None,
@@ -76,17 +79,14 @@ def disparity(
     """
     del quiet  # there is no progress to hide; every command takes the option
     with session():
-        from recon.pipeline.config import PAIR_DEFAULTS, load_config
+        from recon.pipeline.config import PAIR_DEFAULTS, load_config, matching_overrides
         from recon.pipeline.pair_input import read_pair_input
         from recon.pipeline.pair_run import PairOptions, run_pair
         from recon.reports import present_disparity
 
-        settings = load_config(config, [*(set_ or ()), *_range(ndisp)], PAIR_DEFAULTS)
+        overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
+        settings = load_config(config, overrides, PAIR_DEFAULTS)
         given = read_pair_input(left, right, calib)
         options = PairOptions("disparity", out, threads, present_disparity)
         run = run_pair(given, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)
-
-
-def _range(ndisp: int | None) -> list[str]:
-    return [] if ndisp is None else [f"matching.sad.ndisp={ndisp}"]

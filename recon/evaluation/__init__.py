@@ -1,11 +1,25 @@
 """From estimates and truth to figures."""
 
-from recon.evaluation.disparity import evaluate_disparity
+from recon.evaluation.confidence import (
+    Reliability,
+    Sparsification,
+    measure_reliability,
+    measure_sparsification,
+)
+from recon.evaluation.disparity import evaluate_depth, evaluate_disparity
 from recon.evaluation.map import evaluate_map
+from recon.evaluation.middlebury import MiddleburyRules, evaluate_middlebury
 from recon.evaluation.trajectory import evaluate_trajectory
 
 __all__ = [
+    "MiddleburyRules",
+    "Reliability",
+    "Sparsification",
+    "evaluate_depth",
     "evaluate_disparity",
     "evaluate_map",
+    "evaluate_middlebury",
     "evaluate_trajectory",
+    "measure_reliability",
+    "measure_sparsification",
 ]

@@ -1,24 +1,37 @@
-"""How far a disparity map is from the truth, counted as Middlebury counts."""
+"""How far a disparity map is from the truth, counted as Middlebury and KITTI count."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
 from recon.errors import EvaluationError
-from recon.structures import Disparity, DisparityMetrics, DisparityTruth
-from recon.structures.arrays import Bool, Float32
+from recon.geometry.triangulation import depth_from_disparity
+from recon.structures import (
+    DepthMetrics,
+    Disparity,
+    DisparityMetrics,
+    DisparityTruth,
+    RectifiedCamera,
+)
+from recon.structures.arrays import Bool, Float32, Float64
 
-_THRESHOLDS_PX = (0.5, 1.0, 2.0, 4.0)
+THRESHOLDS_PX: Final = (0.5, 1.0, 2.0, 4.0)
+_QUANTILES: Final = (50, 90, 95, 99)
+_D1_PX: Final = 3.0
+_D1_SHARE: Final = 0.05
+_DEPTH_SHARE: Final = 0.05
 
 
 def evaluate_disparity(
     estimate: Disparity | Float32,
     truth: DisparityTruth,
-    thresholds_px: Sequence[float] = _THRESHOLDS_PX,
+    thresholds_px: Sequence[float] = THRESHOLDS_PX,
     *,
     occluded: bool = False,
+    scale: float = 1.0,
 ) -> DisparityMetrics:
     """Compare a disparity map with the truth, over the pixels whose truth is known.
 
@@ -28,27 +41,73 @@ def evaluate_disparity(
     Args:
         estimate: A disparity, or its values: float32 (H, W), pixels, NaN = none.
         truth: The truth at the same size.
-        thresholds_px: The limits of ``bad``, in pixels of this size.
+        thresholds_px: The limits of ``bad``, in pixels of the size that figures are given in.
         occluded: Count the pixels too that only the left camera sees.
+        scale: Pixels of the size that figures are given in per pixel here: 4 to give a
+            quarter-size map the figures of the full size.
 
     Raises:
         EvaluationError: The sizes differ, or no pixel has a known truth.
 
-    Ref: Scharstein et al., Middlebury Stereo Evaluation SDK 1.6, ``evaldisp``.
+    Ref: Scharstein et al., Middlebury Stereo Evaluation SDK 1.6, ``evaldisp``; A. Geiger et al.,
+    KITTI stereo development kit (2015), ``d1``.
     """
+    values, true = _compared(estimate, truth, occluded=occluded)
+    pixels, known = len(values), np.isfinite(values)
+    error, true = scale * np.abs(values - true)[known], scale * true[known]
+    outlier = (error > _D1_PX) & (error > _D1_SHARE * np.abs(true))
+    return DisparityMetrics(
+        bad={float(t): 100 * float(np.sum(error > t)) / pixels for t in thresholds_px},
+        invalid=100 * (1 - len(error) / pixels),
+        avgerr_px=_mean(error),
+        rms_px=_mean(error**2) ** 0.5,
+        pixels=pixels,
+        quantiles_px={q: _quantile(error, q) for q in _QUANTILES},
+        d1=100 * float(np.sum(outlier)) / pixels,
+    )
+
+
+def evaluate_depth(
+    estimate: Disparity | Float32,
+    truth: DisparityTruth,
+    camera: RectifiedCamera,
+    *,
+    occluded: bool = False,
+) -> DepthMetrics:
+    """Compare the depths that a disparity map and the truth give.
+
+    Args:
+        estimate: A disparity, or its values: float32 (H, W), pixels, NaN = none.
+        truth: The truth at the same size.
+        camera: The camera at that size.
+        occluded: Count the pixels too that only the left camera sees.
+
+    Raises:
+        EvaluationError: The sizes differ, or no pixel has a known truth.
+    """
+    values, true = _compared(estimate, truth, occluded=occluded)
+    true_m = depth_from_disparity(true, camera).astype(np.float64)
+    both = np.isfinite(values) & np.isfinite(true_m)
+    depth_m, true_m = depth_from_disparity(values[both], camera), true_m[both]
+    error_m = np.abs(np.where(np.isnan(depth_m), np.inf, depth_m) - true_m)
+    finite = error_m[np.isfinite(error_m)]
+    return DepthMetrics(
+        mean_m=_mean(finite),
+        median_m=_quantile(error_m, 50),
+        rms_m=_mean(finite**2) ** 0.5,
+        median_percent=100 * _quantile(error_m / true_m, 50),
+        over_5_percent=100 * _mean((error_m > _DEPTH_SHARE * true_m).astype(np.float64)),
+        infinite=100 * _mean(np.isinf(error_m).astype(np.float64)),
+    )
+
+
+def _compared(
+    estimate: Disparity | Float32, truth: DisparityTruth, *, occluded: bool
+) -> tuple[Float64, Float64]:
+    """float64 (N,), values and truth of the pixels that are compared."""
     values = estimate.values if isinstance(estimate, Disparity) else estimate
     counted = _counted(values, truth, occluded=occluded)
-    with np.errstate(invalid="ignore"):
-        error_px = np.abs(values[counted].astype(np.float64) - truth.values[counted])
-    known = np.isfinite(error_px)
-    error_px, pixels = error_px[known], len(error_px)
-    return DisparityMetrics(
-        bad={float(t): 100 * float(np.sum(error_px > t)) / pixels for t in thresholds_px},
-        invalid=100 * (1 - len(error_px) / pixels),
-        avgerr_px=float(np.mean(error_px)) if len(error_px) else float("nan"),
-        rms_px=float(np.sqrt(np.mean(error_px**2))) if len(error_px) else float("nan"),
-        pixels=pixels,
-    )
+    return values[counted].astype(np.float64), truth.values[counted].astype(np.float64)
 
 
 def _counted(values: Float32, truth: DisparityTruth, *, occluded: bool) -> Bool:
@@ -63,3 +122,15 @@ def _counted(values: Float32, truth: DisparityTruth, *, occluded: bool) -> Bool:
     if not counted.any():
         raise EvaluationError("no pixel has a known truth to compare with")
     return np.asarray(counted)
+
+
+def _mean(numbers: Float64) -> float:
+    return float(np.mean(numbers)) if len(numbers) else float("nan")
+
+
+def _quantile(numbers: Float64, percent: int) -> float:
+    """The smallest of the numbers that at least so many per cent do not exceed; NaN = none."""
+    if not len(numbers):
+        return float("nan")
+    rank = max(1, -(-len(numbers) * percent // 100))
+    return float(np.partition(numbers, rank - 1)[rank - 1])

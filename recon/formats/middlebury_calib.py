@@ -30,12 +30,15 @@ class MiddleburyCalib:
             are compared.
         vmin_px: Smallest true disparity, or None.
         vmax_px: Largest true disparity, or None.
+        doffs_px: ``doffs`` as the file has it; the camera's is the difference of its principal
+            points, which are rounded too. None = the file does not say.
     """
 
     camera: RectifiedCamera
     isint: bool = False
     vmin_px: float | None = None
     vmax_px: float | None = None
+    doffs_px: float | None = None
 
 
 def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
@@ -48,7 +51,8 @@ def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
     """
     entries = dict(_LINE.findall(read_text(path)))
     cam0, cam1 = (_matrix(entries, key, path) for key in ("cam0", "cam1"))
-    _check_views(cam0, cam1, _number(entries, "doffs", path), path)
+    doffs_px = _number(entries, "doffs", path)
+    _check_views(cam0, cam1, doffs_px, path)
     with naming(path):
         camera = RectifiedCamera(
             focal_px=float(cam0[0, 0]),
@@ -60,9 +64,9 @@ def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
             height_px=int(_number(entries, "height", path)),
             ndisp=int(_number(entries, "ndisp", path)) if "ndisp" in entries else None,
         )
-    bounds = [_number(entries, key, path) if key in entries else None for key in ("vmin", "vmax")]
+    vmin, vmax = (_number(entries, k, path) if k in entries else None for k in ("vmin", "vmax"))
     isint = "isint" in entries and _number(entries, "isint", path) != 0
-    return MiddleburyCalib(camera, isint, *bounds)
+    return MiddleburyCalib(camera, isint, vmin, vmax, doffs_px)
 
 
 def nominal_camera_2005(

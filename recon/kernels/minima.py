@@ -69,9 +69,7 @@ def left_minima(sums: NDArray[np.uint16], y: int, minimum: int, minima: Minima) 
         costs[0, y, x] = lowest
         costs[1, y, x] = here[k - 1] if k > low else np.uint16(NO_COST)
         costs[2, y, x] = here[k + 1] if k + 1 < end else np.uint16(NO_COST)
-        before = _lowest(here[low : max(k - 1, low)])
-        after = _lowest(here[min(k + 2, end) : end])
-        costs[3, y, x] = before if before < after else after
+        costs[3, y, x] = _lowest_aside(here[low:end], np.uint16(k - low))
 
 
 @njit(cache=True, nogil=True)
@@ -80,6 +78,18 @@ def _lowest(costs: NDArray[np.uint16]) -> np.uint16:
     lowest: np.uint16 = np.uint16(NO_COST)
     for k in range(costs.size):
         lowest = min(lowest, costs[k])
+    return lowest
+
+
+@njit(cache=True, nogil=True)
+def _lowest_aside(costs: NDArray[np.uint16], place: np.uint16) -> np.uint16:
+    """Lowest of the costs that are two or more aside from ``place``; no slice, so one loop."""
+    lowest: np.uint16 = np.uint16(NO_COST)
+    for k in range(costs.size):
+        # Below ``place - 1`` the difference wraps round to a large number.
+        aside = np.uint16(np.uint16(np.uint16(k) - place) + np.uint16(1))
+        here = costs[k] if aside > np.uint16(2) else np.uint16(NO_COST)
+        lowest = min(lowest, here)
     return lowest
 
 

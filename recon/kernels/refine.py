@@ -23,8 +23,8 @@ NO_FIT, EQUIANGULAR, PARABOLA = range(3)
 SIGMA_LARGEST_PX: Final = 2.0
 """A flat minimum tells no more than this."""
 
-HALF_SURE: Final = 0.06
-"""Margin at which the confidence is one half (see `refine_minima`)."""
+ODDS: Final = 2.2
+"""Odds of being right at margin 1 and a standard deviation of 1 px (see `refine_minima`)."""
 
 
 class Rules(NamedTuple):
@@ -39,6 +39,7 @@ class Rules(NamedTuple):
         left_right: Largest difference between the two views, candidates; negative = unchecked.
         window_pixels: Number of pixels that a cost sums up.
         sigma_floor_px: Smallest standard deviation.
+        odds: Odds that a pixel of margin 1 and a standard deviation of 1 px is right.
     """
 
     ndisp: int
@@ -49,6 +50,7 @@ class Rules(NamedTuple):
     left_right: int
     window_pixels: int
     sigma_floor_px: float
+    odds: float = ODDS
 
 
 class Refined(NamedTuple):
@@ -98,9 +100,13 @@ def refine_minima(
     absolute differences) or of a parabola. The standard deviation is that of a displacement
     estimated from N pixels with gradient g and noise n, here in its least-absolute form,
     ``pi/2 · mean|n| / (mean|g| · sqrt(N))``; the cost at the vertex of the lines is N·mean|n|,
-    their slope is N·mean|g|. A floor is added (squared) for what the model leaves out. The
-    confidence is ``m / (m + HALF_SURE)`` of the margin ``m = (second - best) / (N + best)``: the
-    distance of the two costs in units of the noise, one grey level added.
+    their slope is N·mean|g|. A floor is added (squared) for what the model leaves out.
+
+    The confidence is the probability that the disparity is off by no more than 1 px. Its odds grow
+    with the margin ``m = (second - best) / (N + best)``, the distance of the two costs in units of
+    the noise (one grey level added), and fall with the standard deviation: they are
+    ``odds · sqrt(m / sigma³)``. The powers are rounded from a logistic regression on Middlebury
+    scenes and the factor is fitted to them (`docs/evaluation.md` has the scenes held out).
 
     Args:
         minima: What the search found.
@@ -181,7 +187,8 @@ def _measure(minima: Minima, rules: Rules, y: int, x: int, refined: Refined) -> 
     refined.sigma_px[y, x] = np.float32(sigma)
     if second < NO_COST:
         margin = (second - best) / (rules.window_pixels + best)
-        refined.confidence[y, x] = np.float32(margin / (margin + HALF_SURE))
+        odds = rules.odds * np.sqrt(margin / (sigma * sigma * sigma))
+        refined.confidence[y, x] = np.float32(odds / (odds + 1.0))
 
 
 @njit(cache=True, nogil=True)

@@ -12,7 +12,6 @@ from recon.kernels.refine import (
     AMBIGUOUS,
     BORDER,
     EQUIANGULAR,
-    HALF_SURE,
     LEFT_RIGHT,
     LOW_TEXTURE,
     NO_FIT,
@@ -35,7 +34,8 @@ def refine_minima_reference(minima: Minima, texture: NDArray[np.float32], rules:
         values += _offsets(best, before, after, rules.fit)
         sigma = _sigmas(best, before, after, rules)
         margin = (second - best) / (rules.window_pixels + best)
-        confidence = np.where(second < NO_COST, margin / (margin + HALF_SURE), 0.0)
+        odds = rules.odds * np.sqrt(margin / (sigma * sigma * sigma))
+        confidence = np.where(second < NO_COST, odds / (odds + 1.0), 0.0)
     return Refined(
         values=np.where(keep, values, np.nan).astype(np.float32),
         confidence=np.where(keep, confidence, 0.0).astype(np.float32),

@@ -27,17 +27,18 @@ def find_speckles(
     Ref: union-find with path halving, R. Sedgewick, K. Wayne, "Algorithms", 4th ed., 1.5.
     """
     height, width = values.shape
-    parents = np.arange(height * width)
+    parents = np.arange(height * width, dtype=np.int32)
     for y in range(height):
         for x in range(width):
             here = y * width + x
             if x > 0 and abs(values[y, x] - values[y, x - 1]) <= largest_step:
-                _join(parents, here, here - 1)
+                parents[here] = parents[here - 1]
             if y > 0 and abs(values[y, x] - values[y - 1, x]) <= largest_step:
                 _join(parents, here, here - width)
-    sizes = np.zeros(height * width, np.int64)
+    sizes = np.zeros(height * width, np.int32)
     for here in range(height * width):
-        parents[here] = _root(parents, here)
+        # A parent has the smaller index: it points to its root already.
+        parents[here] = parents[parents[here]]
         sizes[parents[here]] += 1
     small = np.zeros((height, width), np.bool_)
     for y in range(height):
@@ -48,7 +49,7 @@ def find_speckles(
 
 
 @njit(cache=True, nogil=True)
-def _join(parents: NDArray[np.int64], one: int, other: int) -> None:
+def _join(parents: NDArray[np.int32], one: int, other: int) -> None:
     """Give two regions one root: the smaller index."""
     a, b = _root(parents, one), _root(parents, other)
     if a < b:
@@ -58,7 +59,7 @@ def _join(parents: NDArray[np.int64], one: int, other: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _root(parents: NDArray[np.int64], node: int) -> int:
+def _root(parents: NDArray[np.int32], node: int) -> int:
     """The root of a node's region; every step halves the path for the next call."""
     while parents[node] != node:
         parents[node] = parents[parents[node]]

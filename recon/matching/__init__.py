@@ -1,8 +1,10 @@
 """From a rectified pair to a disparity for each pixel."""
 
+from recon.matching.fill import fill_holes
 from recon.matching.protocol import Matcher
-from recon.matching.registry import MATCHERS, MatchingSettings, make_matcher
+from recon.matching.registry import MATCHERS, MatchingSettings, field_of, make_matcher
 from recon.matching.sad import SadMatcher, SadSettings
+from recon.matching.sgm import SgmMatcher, SgmSettings
 
 __all__ = [
     "MATCHERS",
@@ -10,5 +12,9 @@ __all__ = [
     "MatchingSettings",
     "SadMatcher",
     "SadSettings",
+    "SgmMatcher",
+    "SgmSettings",
+    "field_of",
+    "fill_holes",
     "make_matcher",
 ]

@@ -2,23 +2,55 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Callable
+from typing import Any, Final, Literal
 
 from pydantic import Field
 
 from recon.errors import SettingsError
+from recon.matching.onnx import OnnxMatcher, OnnxSettings
+from recon.matching.opencv import (
+    OpencvBmMatcher,
+    OpencvBmSettings,
+    OpencvSgbmMatcher,
+    OpencvSgbmSettings,
+)
 from recon.matching.protocol import Matcher
+from recon.matching.range import AutoRangeMatcher
 from recon.matching.sad import SadMatcher, SadSettings
+from recon.matching.sgm import SgmMatcher, SgmSettings
 from recon.settings import Settings
 
-MATCHERS: Final = {"sad": SadMatcher}
+MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
+    "sad": SadMatcher,
+    "sgm": SgmMatcher,
+    "opencv-bm": OpencvBmMatcher,
+    "opencv-sgbm": OpencvSgbmMatcher,
+    "onnx": OnnxMatcher,
+}
 
 
 class MatchingSettings(Settings):
     """Which matcher, and the settings of each."""
 
-    matcher: str = Field(default="sad", description="Name of the matcher: sad.")
+    matcher: str = Field(
+        default="sad", description="Name of the matcher: sad, sgm, opencv-bm, opencv-sgbm or onnx."
+    )
+    range: Literal["auto", "usual"] = Field(
+        default="auto",
+        description="How far to search where neither the matcher's `ndisp` nor the calibration "
+        "says it: as far as each pair needs, but at least the usual tenth of the image width; or "
+        "just that tenth.",
+    )
     sad: SadSettings = Field(default_factory=SadSettings, description="Of the matcher `sad`.")
+    sgm: SgmSettings = Field(default_factory=SgmSettings, description="Of the matcher `sgm`.")
+    opencv_bm: OpencvBmSettings = Field(
+        default_factory=OpencvBmSettings, description="Of the matcher `opencv-bm`."
+    )
+    opencv_sgbm: OpencvSgbmSettings = Field(
+        default_factory=OpencvSgbmSettings, description="Of the matcher `opencv-sgbm`."
+    )
+    onnx: OnnxSettings = Field(default_factory=OnnxSettings, description="Of the matcher `onnx`.")
 
 
 def make_matcher(
@@ -37,4 +69,15 @@ def make_matcher(
     if name not in MATCHERS:
         choices = ", ".join(sorted(MATCHERS))
         raise SettingsError("unknown matcher", got=repr(name), expected=f"one of: {choices}")
-    return MATCHERS[name](getattr(settings or MatchingSettings(), name), threads)
+    settings = settings or MatchingSettings()
+    own = getattr(settings, field_of(name))
+    matcher = MATCHERS[name](own, threads)
+    # A matcher without the setting searches no range; one that is set needs no guess.
+    if settings.range == "usual" or getattr(own, "ndisp", 0) is not None:
+        return matcher
+    return AutoRangeMatcher(matcher, own.min_disparity_px)
+
+
+def field_of(name: str) -> str:
+    """The field of `MatchingSettings` that a matcher's settings have."""
+    return name.replace("-", "_")

@@ -205,11 +205,16 @@ def _prefiltered(image: UInt8, settings: SadSettings) -> UInt8:
 
 def _texture(pair: RectifiedPair, settings: SadSettings) -> Float32:
     """Mean horizontal gradient in the window, grey levels per pixel; NaN = no picture."""
-    gradient = cv2.Sobel(
-        pair.left, cv2.CV_32F, 1, 0, scale=1 / _GAIN_OF_SOBEL, borderType=cv2.BORDER_REPLICATE
+    gradient = cv2.Sobel(pair.left, cv2.CV_16S, 1, 0, borderType=cv2.BORDER_REPLICATE)
+    size = (settings.window_px, settings.window_height_px)
+    total = cv2.boxFilter(
+        np.abs(gradient).view(np.uint16),
+        cv2.CV_32F,
+        size,
+        normalize=False,
+        borderType=cv2.BORDER_REPLICATE,
     )
-    window = (settings.window_px, settings.window_height_px)
-    mean = cv2.blur(np.abs(gradient), window, borderType=cv2.BORDER_REPLICATE)
+    mean = total * np.float32(1 / (_GAIN_OF_SOBEL * size[0] * size[1]))
     if pair.valid is not None:
         mean[~pair.valid] = np.nan
     return np.asarray(mean, dtype=np.float32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from recon.formats.middlebury import stand_in_camera
+from recon.matching import MATCHERS, field_of
 from recon.pipeline.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
 from recon.structures import Disparity, RectifiedCamera, StereoCalibration, StereoPair
@@ -14,7 +15,12 @@ Calibration = RectifiedCamera | StereoCalibration
 
 
 def match(
-    left: UInt8, right: UInt8, calibration: Calibration | None = None, **sad: Any
+    left: UInt8,
+    right: UInt8,
+    calibration: Calibration | None = None,
+    *,
+    matcher: str = "sad",
+    **settings: Any,
 ) -> Disparity:
     """Disparity of two pictures.
 
@@ -22,14 +28,16 @@ def match(
         left: uint8 (H, W) grey or (H, W, 3) RGB.
         right: The same shape as ``left``.
         calibration: Needed where the pictures are not rectified; it also tells the range.
-        **sad: Settings of the matcher, such as ``ndisp=64`` or ``window_px=9``.
+        matcher: Name of the matcher: a key of `recon.matching.MATCHERS`.
+        **settings: Settings of that matcher, such as ``ndisp=64`` or ``window_px=9``.
 
     Raises:
         ShapeError: The pictures differ in size.
-        SettingsError: A setting is unknown or out of its range.
+        SettingsError: There is no such matcher, or a setting is unknown or out of its range.
     """
     height_px, width_px = left.shape[:2]
-    config = ReconConfig.parse({"matching": {"sad": sad}})
+    own = {field_of(matcher): settings} if matcher in MATCHERS else {}
+    config = ReconConfig.parse({"matching": {"matcher": matcher, **own}})
     camera = calibration or stand_in_camera(width_px, height_px)
     return FrameReconstructor(camera, config).match(StereoPair(left, right))[1]
 

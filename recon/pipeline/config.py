@@ -21,6 +21,7 @@ from recon.mapping import (
 from recon.matching import MatchingSettings
 from recon.meshing import MeshSettings
 from recon.odometry import OdometrySettings
+from recon.pipeline.paper_settings import PaperSettings
 from recon.rectification import RectificationSettings
 from recon.settings import Settings
 from recon.synthetic import StreetSettings
@@ -50,6 +51,7 @@ class ReconConfig(Settings):
     grid: GridSettings = GridSettings()
     mesh: MeshSettings = MeshSettings()
     street: StreetSettings = StreetSettings()
+    paper: PaperSettings = PaperSettings()
 
 
 PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
@@ -82,6 +84,18 @@ def load_config(
     for text in overrides:
         _merge(values, _parse_override(text))
     return ReconConfig.parse(values, where=str(path) if path else None)
+
+
+def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> list[str]:
+    """Overrides that choose a matcher, and the range of whichever is chosen; None = as it is."""
+    chosen = [] if matcher is None else [f"matching.matcher={matcher}"]
+    fields = MatchingSettings.model_fields
+    ranged = [
+        name
+        for name, field in fields.items()
+        if "ndisp" in getattr(field.annotation, "model_fields", ())
+    ]
+    return chosen + ([] if ndisp is None else [f"matching.{name}.ndisp={ndisp}" for name in ranged])
 
 
 def dump_config(config: ReconConfig) -> str:

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
-from recon.errors import FormatError
-from recon.evaluation import evaluate_map, evaluate_trajectory
+from recon.errors import EvaluationError, FormatError
+from recon.evaluation import evaluate_disparity, evaluate_map, evaluate_trajectory
+from recon.formats.image import read_grey_levels
 from recon.formats.ply import read_ply
 from recon.formats.trajectory import read_trajectory
 from recon.geometry.se3 import invert
 from recon.geometry.transform import transform_cloud
+from recon.pipeline.middlebury_score import dense_map, named_figures
+from recon.pipeline.pair_input import read_disparity
 from recon.pipeline.run_directory import RECORD
 from recon.pipeline.summary import plain
-from recon.structures import PointCloud
+from recon.structures import DisparityTruth, PointCloud
 from recon.structures.arrays import Float64
 
 ReferenceFrame = Literal["camera", "map"]
+_COUNTED: Final = 255
 
 
 def compare_trajectories(estimate: Path, truth: Path) -> dict[str, Any]:
@@ -31,6 +35,38 @@ def compare_trajectories(estimate: Path, truth: Path) -> dict[str, Any]:
     """
     metrics = evaluate_trajectory(read_trajectory(estimate), read_trajectory(truth))
     return dict(plain(metrics))
+
+
+def compare_disparities(
+    estimate: Path, truth: Path, mask: Path | None = None, *, scale: float = 1.0
+) -> dict[str, Any]:
+    """Figures of one disparity map file (PFM or 16-bit PNG) against another.
+
+    Args:
+        estimate: The map; holes are filled for the dense figures, KITTI's ``d1`` among them.
+        truth: The true one, of the same size.
+        mask: A picture that is 255 where pixels are compared; None = all with a truth.
+        scale: Pixels of the size that figures are given in per pixel here.
+
+    Raises:
+        FormatError: A file cannot be read.
+        EvaluationError: The two cannot be compared.
+    """
+    values, true = read_disparity(estimate), read_disparity(truth)
+    counted = np.isfinite(true) if mask is None else read_grey_levels(mask) == _COUNTED
+    if counted.shape != true.shape:
+        raise EvaluationError(
+            "mask and truth differ in size", where=mask, got=counted.shape, expected=true.shape
+        )
+    known = DisparityTruth(true, counted)
+    found = evaluate_disparity(values, known, scale=scale)
+    figures: dict[str, Any] = {"pixels": found.pixels, "invalid": found.invalid}
+    for name, metrics in (
+        ("sparse", found),
+        ("dense", evaluate_disparity(dense_map(values), known, scale=scale)),
+    ):
+        figures[name] = {**named_figures(metrics), "d1": metrics.d1}
+    return dict(plain(figures))
 
 
 def compare_maps(

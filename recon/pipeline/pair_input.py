@@ -12,6 +12,7 @@ from recon.formats.pfm import read_pfm
 from recon.pipeline.pair_run import PairInput
 from recon.sources.files import FilesSource
 from recon.structures import DisparityTruth
+from recon.structures.arrays import Float32
 
 
 def read_pair_input(
@@ -46,9 +47,18 @@ def read_pair_input(
     )
 
 
+def read_disparity(path: Path) -> Float32:
+    """A disparity map, PFM or 16-bit PNG by its suffix: float32 (H, W), NaN = unknown.
+
+    Raises:
+        FormatError: The file is missing or damaged.
+    """
+    return read_pfm(path) if path.suffix.lower() == ".pfm" else read_disparity_png(path)
+
+
 def _read_truth(path: Path, shape: tuple[int, ...]) -> DisparityTruth:
     """A true disparity without an occlusion mask: every known pixel counts."""
-    values = read_pfm(path) if path.suffix.lower() == ".pfm" else read_disparity_png(path)
+    values = read_disparity(path)
     if values.shape != shape:
         raise FormatError(
             "truth is not of the size of the pictures",

@@ -3,7 +3,8 @@
 from recon.reports.html import ReportContent, render_html
 from recon.reports.map_report import MapReportInputs, map_report
 from recon.reports.pair_report import PairReportInputs, pair_report
-from recon.reports.present import present_disparity, present_map, present_pair
+from recon.reports.paper_report import paper_report
+from recon.reports.present import present_disparity, present_map, present_pair, present_paper
 
 __all__ = [
     "MapReportInputs",
@@ -11,8 +12,10 @@ __all__ = [
     "ReportContent",
     "map_report",
     "pair_report",
+    "paper_report",
     "present_disparity",
     "present_map",
     "present_pair",
+    "present_paper",
     "render_html",
 ]

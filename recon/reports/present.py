@@ -12,11 +12,13 @@ from recon.pipeline.config import dump_config
 from recon.pipeline.machine import versions
 from recon.pipeline.map_run import MapRun
 from recon.pipeline.pair_run import PairRun
+from recon.pipeline.paper_run import PaperRun
 from recon.pipeline.run_directory import RunDirectory
 from recon.reports.colour import colour_confidence, colour_disparity, colour_reasons
 from recon.reports.html import render_html
 from recon.reports.map_report import MapReportInputs, map_report
 from recon.reports.pair_report import PairReportInputs, pair_report
+from recon.reports.paper_report import paper_report
 
 
 def present_map(run: MapRun, directory: RunDirectory) -> None:
@@ -87,6 +89,19 @@ def present_disparity(run: PairRun, directory: RunDirectory) -> None:
     }
     for name, picture in pictures.items():
         write_image(directory.path(f"disparity/{name}"), picture)
+
+
+def present_paper(run: PaperRun, directory: RunDirectory) -> None:
+    """Write ``report.html`` of the seed paper's experiments, and each disparity in colour.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    for result in run.experiments:
+        for one in result.methods:
+            path = directory.path(f"{result.experiment.folder}/{one.method}/disparity_colour.png")
+            write_image(path, colour_disparity(one.disparity.values))
+    write_text(directory.path("report.html"), render_html(paper_report(run, command_line())))
 
 
 def command_line() -> str:

@@ -6,7 +6,12 @@ from recon.structures.disparity import Disparity, Reason
 from recon.structures.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
 from recon.structures.image import RectifiedPair, StereoPair
 from recon.structures.mesh import TriangleMesh
-from recon.structures.metrics import DisparityMetrics, MapMetrics, TrajectoryMetrics
+from recon.structures.metrics import (
+    DepthMetrics,
+    DisparityMetrics,
+    MapMetrics,
+    TrajectoryMetrics,
+)
 from recon.structures.trajectory import Trajectory
 from recon.structures.truth import DisparityTruth, SequenceTruth
 
@@ -15,6 +20,7 @@ __all__ = [
     "OCCUPIED",
     "UNKNOWN",
     "CameraIntrinsics",
+    "DepthMetrics",
     "Disparity",
     "DisparityMetrics",
     "DisparityTruth",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -67,6 +67,10 @@ class DisparityMetrics:
         avgerr_px: Mean absolute error of the pixels with a value.
         rms_px: Root mean square error of the same.
         pixels: Number of pixels compared.
+        quantiles_px: Absolute error that so many per cent (the key) of the pixels with a value do
+            not exceed: Middlebury's A50, A90, A95 and A99.
+        d1: Share of all pixels (per cent) that have a value off by more than 3 pixels and more
+            than 5 % of the truth: KITTI's outliers.
     """
 
     bad: dict[float, float]
@@ -74,3 +78,27 @@ class DisparityMetrics:
     avgerr_px: float
     rms_px: float
     pixels: int
+    quantiles_px: dict[int, float] = field(default_factory=dict)
+    d1: float = float("nan")
+
+
+@dataclass(frozen=True)
+class DepthMetrics:
+    """What the errors of a disparity map mean in depth, over pixels with a value and a truth.
+
+    Attributes:
+        mean_m: Mean absolute error of the depth.
+        median_m: Median of the same.
+        rms_m: Root mean square of the same.
+        median_percent: Median absolute error, per cent of the true depth.
+        over_5_percent: Share of those pixels (per cent) off by more than 5 % of the true depth.
+        infinite: Share of those pixels (per cent) whose disparity gives no finite depth; they
+            count in the median and in ``over_5_percent``, not in ``mean_m`` and ``rms_m``.
+    """
+
+    mean_m: float
+    median_m: float
+    rms_m: float
+    median_percent: float
+    over_5_percent: float
+    infinite: float

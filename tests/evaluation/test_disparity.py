@@ -74,3 +74,20 @@ def test_sizes_that_differ_and_truth_that_is_unknown_are_refused() -> None:
         evaluate_disparity(estimate([1, 2]), truth([1]))
     with pytest.raises(EvaluationError, match="no pixel has a known truth"):
         evaluate_disparity(estimate([1]), truth([NAN]))
+
+
+def test_an_outlier_of_kitti_is_off_by_three_pixels_and_by_a_twentieth() -> None:
+    result = evaluate_disparity(estimate([13.5, 13, 103.5, 106, NAN]), truth([10, 10, 100, 100, 9]))
+    assert result.d1 == pytest.approx(40.0)
+
+
+def test_quantiles_are_errors_that_occur() -> None:
+    errors = np.arange(100, 0, -1, dtype=np.float32)[None]
+    known = DisparityTruth(np.zeros_like(errors), np.ones(errors.shape, dtype=bool))
+    assert evaluate_disparity(errors, known).quantiles_px == {50: 50, 90: 90, 95: 95, 99: 99}
+
+
+def test_figures_of_the_full_size_are_those_of_maps_enlarged() -> None:
+    small = evaluate_disparity(estimate([10.25, 12, 9]), truth([10, 10, 10]), scale=4)
+    large = evaluate_disparity(estimate([41, 48, 36]), truth([40, 40, 40]))
+    assert small == large

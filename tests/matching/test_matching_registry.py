@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from recon.errors import SettingsError
-from recon.matching import MATCHERS, Matcher, MatchingSettings, make_matcher
+from recon.matching import MATCHERS, Matcher, MatchingSettings, field_of, make_matcher
 
 
 @pytest.mark.parametrize("name", MATCHERS)
 def test_every_name_gives_a_matcher_that_has_settings(name: str) -> None:
-    assert name in MatchingSettings.model_fields
+    assert field_of(name) in MatchingSettings.model_fields
     assert isinstance(make_matcher(name, MatchingSettings(), threads=1), Matcher)
 
 
@@ -19,5 +19,5 @@ def test_default_matcher_exists() -> None:
 
 
 def test_unknown_name_lists_the_choices() -> None:
-    with pytest.raises(SettingsError, match="one of: sad"):
+    with pytest.raises(SettingsError, match="one of: onnx, opencv-bm, opencv-sgbm, sad, sgm"):
         make_matcher("census")

@@ -1,0 +1,87 @@
+"""Networks in ONNX files through onnxruntime (extra ``onnx``): arrays in, arrays out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon.errors import FormatError, MatchingError
+from recon.optional import require
+from recon.structures.arrays import Float32
+
+
+class OnnxNetwork:
+    """A network that is loaded and ready to run on the processor.
+
+    Args:
+        path: An ``.onnx`` file.
+        threads: Threads within one operator; None = onnxruntime decides.
+
+    Raises:
+        MissingDependencyError: onnxruntime is not installed.
+        FormatError: The file is missing, or no network that onnxruntime can load.
+    """
+
+    def __init__(self, path: Path, threads: int | None = None) -> None:
+        runtime = require("onnxruntime", extra="onnx")
+        if not path.is_file():
+            raise FormatError("file does not exist", where=path, expected="an ONNX network")
+        self._path = path
+        self._errors = _errors_of(runtime)
+        options = runtime.SessionOptions()
+        options.intra_op_num_threads = threads or 0
+        options.log_severity_level = 4  # fatal: what is less arrives as an exception, if at all
+        try:
+            self._session = runtime.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"]
+            )
+        except self._errors as error:
+            raise FormatError(
+                "onnxruntime cannot load the network", where=path, got=_first_line(error)
+            ) from error
+
+    def run(self, inputs: Sequence[Float32]) -> list[Float32]:
+        """Run the network once.
+
+        Args:
+            inputs: float32 arrays, in the order in which the network lists its inputs.
+
+        Returns:
+            Its outputs, in its order.
+
+        Raises:
+            MatchingError: The network has other inputs than these.
+        """
+        wanted = self._session.get_inputs()
+        if len(wanted) != len(inputs):
+            raise MatchingError(
+                "the network has another number of inputs",
+                where=self._path,
+                got=f"{len(wanted)}: {', '.join(one.name for one in wanted)}",
+                expected=str(len(inputs)),
+            )
+        feed = {one.name: np.ascontiguousarray(x) for one, x in zip(wanted, inputs, strict=True)}
+        try:
+            outputs = self._session.run(None, feed)
+        except self._errors as error:
+            raise MatchingError(
+                "the network cannot be run on these pictures",
+                where=self._path,
+                got=_first_line(error),
+                hint="check the size and the channels that it was made for",
+            ) from error
+        return [np.asarray(output, dtype=np.float32) for output in outputs]
+
+
+def _errors_of(runtime: Any) -> tuple[type[Exception], ...]:
+    """What onnxruntime raises: its own errors have no common root."""
+    state = vars(runtime.capi.onnxruntime_pybind11_state).values()
+    own = [kind for kind in state if isinstance(kind, type) and issubclass(kind, Exception)]
+    return (*own, RuntimeError, ValueError, TypeError)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -1,0 +1,65 @@
+"""`recon evaluate middlebury`: matchers on benchmark scenes, side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import Config, Json, Matcher, Out, Quiet, Set, Threads
+from recon.cli.session import print_json, session
+
+
+def middlebury(
+    folder: Annotated[
+        Path,
+        typer.Argument(help="Folder of scenes of any year, at any depth, or one scene."),
+    ],
+    matcher: Matcher = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="Scenes of another size whose truth is taken for those without."),
+    ] = None,
+    parallel: Annotated[
+        int, typer.Option(min=1, help="Scenes worked on at once. Above 1, seconds are no measure.")
+    ] = 1,
+    out: Out = None,
+    config: Config = None,
+    set_: Set = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    threads: Threads = None,
+) -> None:
+    """Score matchers on Middlebury scenes as the benchmark's own tools do.
+
+    Several matchers, separated by commas, are compared in one run.
+
+    Example: recon evaluate middlebury MiddEval3/trainingH --truth MiddEval3/trainingQ
+    """
+    with session():
+        from recon.pipeline.config import load_config
+        from recon.pipeline.middlebury_run import MiddleburyOptions, run_middlebury
+        from recon.reports.middlebury_pictures import draw_result, present_middlebury
+        from recon.reports.middlebury_tables import text_tables
+        from recon.viewers.scenes import choose_scene_viewer
+
+        options = MiddleburyOptions(
+            matchers=[] if matcher is None else [name.strip() for name in matcher.split(",")],
+            truth=truth,
+            out=out,
+            threads=threads,
+            parallel=parallel,
+            observer=choose_scene_viewer(quiet=quiet),
+            draw=draw_result,
+            present=present_middlebury,
+        )
+        summary = run_middlebury(folder, load_config(config, set_ or ()), options)
+        tables = text_tables(summary)
+    for warning in summary["warnings"]:
+        typer.echo(f"warning: {warning}", err=True)
+    if json:
+        print_json(summary)
+        return
+    typer.echo(tables)
+    typer.echo(f"results: {summary['out']}")

@@ -1,0 +1,50 @@
+"""`recon paper`: the seed paper's experiments, repeated and corrected."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import Config, Json, Out, Set, Threads, Verbose
+from recon.cli.session import print_json, print_run, session
+
+
+def paper(
+    scenes: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Folder with ArtL, Jadeplant and Pipes at quarter size. "
+            "[$RECON_DATA/middlebury/MiddEval3/trainingQ]"
+        ),
+    ] = None,
+    as_printed: Annotated[
+        bool,
+        typer.Option("--as-printed", help="Try the method as printed too, and compare the two."),
+    ] = False,
+    out: Out = None,
+    config: Config = None,
+    set_: Set = None,
+    json: Json = False,
+    verbose: Verbose = False,
+    threads: Threads = None,
+) -> None:
+    """Repeat experiments 2 to 4 of the seed paper: maps, surfaces, clouds, curves, Table 1, report.
+
+    Example: recon paper MiddEval3/trainingQ --as-printed --out outputs/paper-as-printed
+    """
+    with session():
+        from recon.pipeline.config import PAIR_DEFAULTS, load_config
+        from recon.pipeline.paper_run import PaperOptions, headline, run_paper
+        from recon.pipeline.paper_scenes import default_scenes_folder
+        from recon.reports import present_paper
+
+        overrides = [*(set_ or ()), *(["paper.as_printed=true"] if as_printed else ())]
+        settings = load_config(config, overrides, PAIR_DEFAULTS)
+        folder = scenes or default_scenes_folder()
+        run = run_paper(folder, settings, PaperOptions(out, threads, present_paper))
+    if json:
+        print_json(run.summary)
+    else:
+        print_run({**headline(run.summary), **run.summary}, stages=verbose)

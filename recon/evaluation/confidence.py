@@ -1,0 +1,145 @@
+"""Whether a confidence means what it says: reliability, and what is gained by believing it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon.errors import EvaluationError
+from recon.structures import Disparity, DisparityTruth
+from recon.structures.arrays import Float32, Float64, freeze
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """How often pixels of each level of confidence are right.
+
+    Attributes:
+        edges: float64 (B + 1,), limits of the bins, from 0 to 1.
+        confidence: float64 (B,), mean confidence in the bin; NaN = no pixel there.
+        right: float64 (B,), share of right pixels in the bin; NaN = no pixel there.
+        pixels: float64 (B,), number of pixels in the bin.
+    """
+
+    edges: Float64
+    confidence: Float64
+    right: Float64
+    pixels: Float64
+
+    def __post_init__(self) -> None:
+        freeze(self, "edges", np.float64, (None,))
+        for name in ("confidence", "right", "pixels"):
+            freeze(self, name, np.float64, (len(self.edges) - 1,))
+
+    @property
+    def calibration_error(self) -> float:
+        """Expected calibration error, in [0, 1]: ``|confidence - right|`` of a pixel's bin."""
+        gaps = np.nan_to_num(np.abs(self.confidence - self.right))
+        return float(np.average(gaps, weights=self.pixels))
+
+
+@dataclass(frozen=True, eq=False)
+class Sparsification:
+    """The share of wrong pixels among those left, as the least certain ones are removed.
+
+    Attributes:
+        removed: float64 (N,), share of the pixels that are removed, from 0 to below 1.
+        wrong: float64 (N,), share of wrong ones among the rest, removed by confidence.
+        best: float64 (N,), the same if the wrong ones were removed first: the least possible.
+    """
+
+    removed: Float64
+    wrong: Float64
+    best: Float64
+
+    def __post_init__(self) -> None:
+        freeze(self, "removed", np.float64, (None,))
+        for name in ("wrong", "best"):
+            freeze(self, name, np.float64, self.removed.shape)
+
+    @property
+    def ause(self) -> float:
+        """Area between the two curves, in [0, 1]; 0 = the confidence sorts perfectly."""
+        return float(np.mean(self.wrong - self.best))
+
+
+def measure_reliability(
+    estimate: Disparity, truth: DisparityTruth, limit_px: float = 1.0, bins: int = 10
+) -> Reliability:
+    """Compare the confidence of pixels with how often they are right.
+
+    Args:
+        estimate: The disparity, with its confidence.
+        truth: The truth at the same size; pixels that only the left camera sees count too.
+        limit_px: Pixels are right when they are off by no more than this.
+        bins: Number of equal bins between 0 and 1.
+
+    Raises:
+        EvaluationError: The sizes differ, or no pixel has both a value and a known truth.
+
+    Ref: C. Guo et al., "On calibration of modern neural networks", ICML 2017, section 2.
+    """
+    confidence, error_px = _pixels(estimate, truth)
+    right = error_px <= limit_px
+    place = np.minimum((confidence.astype(np.float64) * bins).astype(np.int64), bins - 1)
+    pixels = np.bincount(place, minlength=bins).astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        return Reliability(
+            edges=np.linspace(0, 1, bins + 1),
+            confidence=np.bincount(place, weights=confidence, minlength=bins) / pixels,
+            right=np.bincount(place, weights=right, minlength=bins) / pixels,
+            pixels=pixels,
+        )
+
+
+def measure_sparsification(
+    estimate: Disparity, truth: DisparityTruth, limit_px: float = 1.0, steps: int = 100
+) -> Sparsification:
+    """Remove the least certain pixels step by step and count the wrong ones that stay.
+
+    Pixels of equal confidence are removed in an order that does not favour either kind.
+
+    Args:
+        estimate: The disparity, with its confidence.
+        truth: The truth at the same size.
+        limit_px: Pixels are wrong when they are off by more than this.
+        steps: Number of points of the curves.
+
+    Raises:
+        EvaluationError: The sizes differ, or no pixel has both a value and a known truth.
+
+    Ref: E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow",
+    ECCV 2018, section 4 (sparsification, AUSE).
+    """
+    confidence, error_px = _pixels(estimate, truth)
+    wrong = (error_px > limit_px).astype(np.float64)
+    removed = np.arange(steps) / steps
+    kept = np.maximum(np.ceil((1 - removed) * wrong.size).astype(np.int64), 1)
+    return Sparsification(
+        removed=removed,
+        wrong=np.cumsum(_shared_by_equals(confidence, wrong))[kept - 1] / kept,
+        best=np.cumsum(np.sort(wrong))[kept - 1] / kept,
+    )
+
+
+def _shared_by_equals(confidence: Float32, wrong: Float64) -> Float64:
+    """Wrong pixels from the most certain to the least, spread evenly over equal confidences."""
+    _, group, size = np.unique(-confidence, return_inverse=True, return_counts=True)
+    share = np.bincount(group, weights=wrong) / size
+    return np.asarray(np.repeat(share, size), dtype=np.float64)
+
+
+def _pixels(estimate: Disparity, truth: DisparityTruth) -> tuple[Float32, Float64]:
+    """Confidence and absolute error of the pixels that have a value and a known truth."""
+    if estimate.values.shape != truth.values.shape:
+        raise EvaluationError(
+            "disparity and truth differ in size",
+            got=f"disparity {estimate.values.shape}",
+            expected=f"{truth.values.shape}",
+        )
+    both = estimate.valid & np.isfinite(truth.values)
+    if not both.any():
+        raise EvaluationError("no pixel has both a disparity and a known truth")
+    error_px = np.abs(estimate.values[both].astype(np.float64) - truth.values[both])
+    return estimate.confidence[both], error_px

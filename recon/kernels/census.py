@@ -1,0 +1,79 @@
+"""Census: which neighbours of a pixel are darker, one bit each.
+
+It stays what it is under any change of brightness that keeps the order of grey levels.
+
+Ref: R. Zabih, J. Woodfill, "Non-parametric local transforms for computing visual
+correspondence", ECCV 1994.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+PLANES: Final = 3
+"""Planes come in threes, because three are counted at the price of two."""
+
+
+def census_planes(grey: NDArray[np.uint8], rows_radius: int, radius: int) -> NDArray[np.uint8]:
+    """Compare each pixel with the neighbours around it.
+
+    Args:
+        grey: uint8 (H, W); continued by its border pixels.
+        rows_radius: Rows above and below that are compared.
+        radius: Columns to each side that are compared.
+
+    Returns:
+        uint8 (B, H, W). Bit ``n % 8`` of plane ``n // 8`` is set where neighbour ``n`` (row by
+        row, the middle left out) is darker than the pixel; unused bits are 0.
+    """
+    height, width = grey.shape
+    neighbours = (2 * rows_radius + 1) * (2 * radius + 1) - 1
+    planes = np.zeros((number_of_planes(neighbours), height, width), np.uint8)
+    around = np.pad(grey, ((rows_radius,) * 2, (radius,) * 2), mode="edge")
+    n = 0
+    for dy in range(2 * rows_radius + 1):
+        for dx in range(2 * radius + 1):
+            if (dy, dx) != (rows_radius, radius):
+                neighbour = around[dy : dy + height, dx : dx + width]
+                _set_bits(grey, neighbour, np.uint8(1 << (n % 8)), planes[n // 8])
+                n += 1
+    return planes
+
+
+def number_of_planes(neighbours: int) -> int:
+    """Planes for so many bits."""
+    return (neighbours + 8 * PLANES - 1) // (8 * PLANES) * PLANES
+
+
+@njit(cache=True, nogil=True)
+def _set_bits(
+    grey: NDArray[np.uint8], neighbour: NDArray[np.uint8], bit: np.uint8, plane: NDArray[np.uint8]
+) -> None:
+    """Set one bit wherever the neighbour is darker."""
+    for y in range(grey.shape[0]):
+        for x in range(grey.shape[1]):
+            darker = bit if neighbour[y, x] < grey[y, x] else np.uint8(0)
+            plane[y, x] = np.uint8(plane[y, x] | darker)
+
+
+def census_planes_reference(
+    grey: NDArray[np.uint8], rows_radius: int, radius: int
+) -> NDArray[np.uint8]:
+    """The plain-numpy twin of `census_planes`."""
+    height, width = grey.shape
+    around = np.pad(grey, ((rows_radius,) * 2, (radius,) * 2), mode="edge")
+    planes = np.zeros((0, height, width), np.uint8)
+    bits = [
+        around[dy : dy + height, dx : dx + width] < grey
+        for dy in range(2 * rows_radius + 1)
+        for dx in range(2 * radius + 1)
+        if (dy, dx) != (rows_radius, radius)
+    ]
+    if bits:
+        planes = np.packbits(np.stack(bits), axis=0, bitorder="little")
+    unused = number_of_planes(len(bits)) - len(planes)
+    return np.pad(planes, ((0, unused), (0, 0), (0, 0)))

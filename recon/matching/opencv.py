@@ -1,0 +1,270 @@
+"""OpenCV's block matcher and its semi-global matcher, to compare with.
+
+What changes at this border: OpenCV gives 16ths of a pixel, and ``(minimum - 1) · 16`` where it
+found nothing; it skips the columns that the whole range does not fit, and here it does not (see
+`OpencvSettings.pad`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from recon.errors import MatchingError
+from recon.matching.sad import usual_ndisp
+from recon.matching.unrated import UnratedSettings, unrated_disparity
+from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
+from recon.structures.arrays import UInt8
+
+_STEPS: Final = 16
+"""OpenCV counts in 16ths of a pixel, and searches multiples of 16 disparities."""
+
+_LIMIT_PX: Final = 2**15 // _STEPS - 1
+"""16ths of a pixel are counted in 16 bits."""
+
+_MODES: Final = {
+    "sgbm": cv2.STEREO_SGBM_MODE_SGBM,
+    "hh": cv2.STEREO_SGBM_MODE_HH,
+    "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+}
+_PREFILTERS: Final = {
+    "sobel": cv2.STEREO_BM_PREFILTER_XSOBEL,
+    "normalised": cv2.STEREO_BM_PREFILTER_NORMALIZED_RESPONSE,
+}
+
+
+class OpencvSettings(UnratedSettings):
+    """What both of OpenCV's matchers have."""
+
+    min_disparity_px: int = Field(
+        default=0, ge=-4096, le=4096, description="First disparity searched; may be negative."
+    )
+    ndisp: int | None = Field(
+        default=None,
+        ge=1,
+        le=4096,
+        description="Number of disparities searched, rounded up to a multiple of 16. None: what "
+        "the calibration says, or else a tenth of the image width.",
+    )
+    uniqueness_percent: int = Field(
+        default=5,
+        ge=0,
+        le=100,
+        description="By how much the second best cost must exceed the best; 0 = no check.",
+    )
+    left_right_px: int | None = Field(
+        default=1,
+        ge=0,
+        le=255,
+        description="Largest difference between the left and the right view; None = no check.",
+    )
+    speckle_size_px: int = Field(
+        default=50,
+        ge=0,
+        le=1_000_000,
+        description="Regions of at most so many pixels are removed; 0 = keep all.",
+    )
+    speckle_range_px: float = Field(
+        default=1.0,
+        gt=0.0,
+        le=1000.0,
+        description="Largest step of disparity between neighbours of one region.",
+    )
+    pad: bool = Field(
+        default=True,
+        description="Widen the pictures by repeating their edges, so that every pixel is searched "
+        "as far as the right picture reaches. False: OpenCV as it comes, without a strip at the "
+        "left as wide as the range.",
+    )
+
+
+class OpencvBmSettings(OpencvSettings):
+    """Settings of ``cv2.StereoBM``."""
+
+    block_px: int = Field(default=9, ge=5, le=255, description="Width of the window; odd.")
+    prefilter: Literal["sobel", "normalised"] = Field(
+        default="sobel", description="What is compared."
+    )
+    prefilter_cap: int = Field(
+        default=31, ge=1, le=63, description="Prefiltered values are clipped to plus or minus this."
+    )
+    texture_threshold: int = Field(
+        default=10, ge=0, description="Least sum of prefiltered values in the window."
+    )
+
+    @field_validator("block_px")
+    @classmethod
+    def _is_odd(cls, value: int) -> int:
+        return _odd(value)
+
+
+class OpencvSgbmSettings(OpencvSettings):
+    """Settings of ``cv2.StereoSGBM``."""
+
+    block_px: int = Field(default=3, ge=1, le=51, description="Width of the window; odd.")
+    mode: Literal["hh", "3way", "sgbm"] = Field(
+        default="hh", description="8 paths over the whole picture, 3 paths in strips, or 5 paths."
+    )
+    prefilter_cap: int = Field(
+        default=63, ge=1, le=127, description="Gradients are clipped to plus or minus this."
+    )
+    small_step_cost: int | None = Field(
+        default=None, ge=1, description="OpenCV's P1. None: 8 times the block's pixels."
+    )
+    large_step_cost: int | None = Field(
+        default=None, ge=2, description="OpenCV's P2. None: 32 times the block's pixels."
+    )
+
+    @field_validator("block_px")
+    @classmethod
+    def _is_odd(cls, value: int) -> int:
+        return _odd(value)
+
+
+class OpencvBmMatcher:
+    """``cv2.StereoBM`` as a `Matcher`.
+
+    Args:
+        settings: What to search and what to believe.
+        threads: Not used: OpenCV has one number of threads for the whole process, which the
+            commands set (``--threads``).
+    """
+
+    def __init__(self, settings: OpencvBmSettings, threads: int | None = None) -> None:
+        del threads
+        self._settings = settings
+
+    def match(self, pair: RectifiedPair) -> Disparity:
+        """Match one rectified pair.
+
+        Raises:
+            MatchingError: OpenCV refuses the pair or the settings.
+        """
+        s = self._settings
+        ndisp = _range(s, pair.camera)
+        engine = cv2.StereoBM.create(ndisp, s.block_px)
+        engine.setMinDisparity(s.min_disparity_px)
+        engine.setPreFilterType(_PREFILTERS[s.prefilter])
+        engine.setPreFilterCap(s.prefilter_cap)
+        engine.setTextureThreshold(s.texture_threshold)
+        engine.setUniquenessRatio(s.uniqueness_percent)
+        engine.setDisp12MaxDiff(_left_right(s))
+        return _match(pair, engine, s, _Margins.around(s, ndisp))
+
+
+class OpencvSgbmMatcher:
+    """``cv2.StereoSGBM`` as a `Matcher`.
+
+    Args:
+        settings: What to search and what to believe.
+        threads: Not used, as in `OpencvBmMatcher`.
+    """
+
+    def __init__(self, settings: OpencvSgbmSettings, threads: int | None = None) -> None:
+        del threads
+        self._settings = settings
+
+    def match(self, pair: RectifiedPair) -> Disparity:
+        """Match one rectified pair.
+
+        Raises:
+            MatchingError: OpenCV refuses the pair or the settings.
+        """
+        s = self._settings
+        ndisp, pixels = _range(s, pair.camera), s.block_px**2
+        engine = cv2.StereoSGBM.create(
+            minDisparity=s.min_disparity_px,
+            numDisparities=ndisp,
+            blockSize=s.block_px,
+            P1=s.small_step_cost or 8 * pixels,
+            P2=s.large_step_cost or 32 * pixels,
+            disp12MaxDiff=_left_right(s),
+            preFilterCap=s.prefilter_cap,
+            uniquenessRatio=s.uniqueness_percent,
+            mode=_MODES[s.mode],
+        )
+        return _match(pair, engine, s, _Margins.around(s, ndisp))
+
+
+@dataclass(frozen=True)
+class _Margins:
+    """Pixels added to each side of both pictures."""
+
+    rows: int
+    left: int
+    right: int
+
+    @classmethod
+    def around(cls, settings: OpencvBmSettings | OpencvSgbmSettings, ndisp: int) -> _Margins:
+        """As many as OpenCV leaves out, half a window and the range, or none."""
+        if not settings.pad:
+            return cls(0, 0, 0)
+        margin = settings.block_px // 2 + 1
+        low, high = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1
+        return cls(margin, margin + max(0, high), margin + max(0, -low))
+
+    def widen(self, image: UInt8) -> UInt8:
+        """The picture with its edges repeated."""
+        sides = (self.rows, self.rows, self.left, self.right)
+        return np.asarray(cv2.copyMakeBorder(image, *sides, cv2.BORDER_REPLICATE))
+
+    def crop(self, image: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
+        """What `widen` made of a picture of that shape, without the edges."""
+        height, width = shape
+        rows, columns = slice(self.rows, self.rows + height), slice(self.left, self.left + width)
+        return image[rows, columns]
+
+
+def _match(pair: RectifiedPair, engine: Any, s: OpencvSettings, margins: _Margins) -> Disparity:
+    """Let OpenCV match, and say of each pixel without a value why, as far as that is known.
+
+    OpenCV does not tell which of its own checks (texture, uniqueness, left against right) a pixel
+    failed: such pixels are AMBIGUOUS.
+    """
+    try:
+        raw = engine.compute(margins.widen(pair.left), margins.widen(pair.right))
+    except cv2.error as error:
+        raise MatchingError(
+            "OpenCV cannot match this pair with these settings",
+            got=f"{pair.camera.width_px}x{pair.camera.height_px}: {error.err[:200]}",
+        ) from error
+    fixed = np.ascontiguousarray(margins.crop(raw, pair.left.shape))
+    unknown = (s.min_disparity_px - 1) * _STEPS
+    values = fixed / np.float32(_STEPS)
+    reason = np.where(fixed > unknown, Reason.VALID, Reason.AMBIGUOUS).astype(np.uint8)
+    found = unrated_disparity(values, reason, pair, s)
+    if not s.speckle_size_px:
+        return found
+    kept = np.where(found.valid, fixed, np.int16(unknown))
+    cv2.filterSpeckles(kept, unknown, s.speckle_size_px, round(s.speckle_range_px * _STEPS))
+    return found.reject(kept == unknown, Reason.SPECKLE)
+
+
+def _range(settings: OpencvSettings, camera: RectifiedCamera) -> int:
+    """Number of disparities, a multiple of 16."""
+    ndisp = settings.ndisp or camera.ndisp or usual_ndisp(camera.width_px)
+    ndisp = _STEPS * -(-ndisp // _STEPS)
+    first, last = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1
+    if first <= -_LIMIT_PX or last >= _LIMIT_PX:
+        raise MatchingError(
+            "OpenCV cannot count so far",
+            got=f"disparities from {first} to {last} px",
+            expected=f"between {-_LIMIT_PX} and {_LIMIT_PX} px",
+            hint="check min_disparity_px and ndisp, or match smaller pictures",
+        )
+    return ndisp
+
+
+def _left_right(settings: OpencvSettings) -> int:
+    return -1 if settings.left_right_px is None else settings.left_right_px
+
+
+def _odd(value: int) -> int:
+    if value % 2 == 0:
+        raise ValueError("a window needs a pixel in its middle: an odd number")
+    return value

@@ -1,0 +1,342 @@
+"""The semi-global matcher: gradients and census in small windows, agreed along paths."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from typing import Final, Literal
+
+import cv2
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+from typing_extensions import Self
+
+from recon.errors import MatchingError
+from recon.kernels.census import census_planes
+from recon.kernels.minima import empty_minima
+from recon.kernels.path_costs import Views, Window, mirror_view, padded_candidates
+from recon.kernels.refine import (
+    EQUIANGULAR,
+    NO_FIT,
+    PARABOLA,
+    Rules,
+    empty_refined,
+    refine_minima,
+)
+from recon.kernels.semi_global import Paths, Room, empty_room, semi_global_minima
+from recon.kernels.speckle import find_speckles
+from recon.matching.sad import usual_ndisp
+from recon.settings import Settings
+from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
+from recon.structures.arrays import Float32, UInt8
+
+_FITS: Final = {"none": NO_FIT, "equiangular": EQUIANGULAR, "parabola": PARABOLA}
+
+_GAIN_OF_SOBEL: Final = 8.0
+"""A 3×3 Sobel filter answers a slope of one grey level per pixel with 8."""
+
+_LEVELS: Final = 253
+"""Of the 255 that a path cost has; rounding needs the others."""
+
+_ODDS: Final = 4.0
+"""`Rules.odds` of sums over paths, fitted on MiddEval3; 2005 and 2006 were held out."""
+
+_STRIP_BYTES: Final = 512 << 20
+_STRIP_ROWS: Final = 192
+_LEAST_STRIP_ROWS: Final = 32
+
+
+class SgmSettings(Settings):
+    """Settings of the semi-global matcher."""
+
+    window_px: int = Field(default=5, ge=1, le=31, description="Width of the window; odd.")
+    window_height_px: int = Field(default=5, ge=1, le=31, description="Height of the window; odd.")
+    min_disparity_px: int = Field(
+        default=0, ge=-4096, le=4096, description="First disparity searched; may be negative."
+    )
+    ndisp: int | None = Field(
+        default=None,
+        ge=3,
+        le=4096,
+        description="Number of disparities searched. None: what the calibration says, or else a "
+        "tenth of the image width, rounded up to a multiple of 16.",
+    )
+    prefilter_cap: int = Field(
+        default=127,
+        ge=1,
+        le=127,
+        description="Horizontal gradients (Sobel units) are clipped to plus or minus this.",
+    )
+    cost_cap: int = Field(
+        default=14,
+        ge=0,
+        le=127,
+        description="Largest difference of gradients that counts at one pixel; 0 = census alone.",
+    )
+    census_px: int = Field(
+        default=5,
+        ge=1,
+        le=9,
+        description="Width of the census, whose bits are added to the gradients; odd. 1 by 1 = "
+        "gradients alone.",
+    )
+    census_height_px: int = Field(default=5, ge=1, le=9, description="Height of the census; odd.")
+    paths: Literal[4, 8] = Field(
+        default=8, description="Along rows and columns, or along the diagonals too."
+    )
+    small_penalty: float = Field(
+        default=16.0,
+        gt=0.0,
+        le=255.0,
+        description="For a step of one disparity along a path, as a mean cost of one pixel.",
+    )
+    large_penalty: float = Field(
+        default=50.0,
+        gt=0.0,
+        le=1000.0,
+        description="For a larger step along a path, as a mean cost of one pixel.",
+    )
+    edge_grey_levels: int = Field(
+        default=12,
+        ge=0,
+        le=255,
+        description="Where the picture changes by more along a path, large steps are cheaper.",
+    )
+    edge_penalty_share: float = Field(
+        default=0.25, ge=0.0, le=1.0, description="Share of large_penalty that is left there."
+    )
+    subpixel: Literal["equiangular", "parabola", "none"] = Field(
+        default="equiangular", description="How the minimum is placed between whole disparities."
+    )
+    uniqueness_percent: int = Field(
+        default=0,
+        ge=0,
+        le=100,
+        description="By how much the second best cost must exceed the best; 0 = no check.",
+    )
+    min_texture: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=255.0,
+        description="Least mean horizontal gradient in the window, grey levels per pixel.",
+    )
+    left_right_px: int | None = Field(
+        default=1,
+        ge=0,
+        le=255,
+        description="Largest difference between the left and the right view; None = no check.",
+    )
+    speckle_size_px: int = Field(
+        default=50, ge=0, description="Regions of fewer pixels are removed; 0 = keep all."
+    )
+    speckle_range_px: float = Field(
+        default=1.0,
+        gt=0.0,
+        description="Largest step of disparity between neighbours of one region.",
+    )
+    sigma_floor_px: float = Field(
+        default=0.1,
+        gt=0.0,
+        le=2.0,
+        description="Smallest standard deviation that a disparity is given.",
+    )
+    overlap_rows: int = Field(
+        default=16,
+        ge=0,
+        le=1024,
+        description="Rows that each strip of a picture shares with its neighbours.",
+    )
+    memory_mb: int = Field(
+        default=1536,
+        ge=1,
+        description="Strips are worked on at once as long as they need less than this together.",
+    )
+
+    @field_validator("window_px", "window_height_px", "census_px", "census_height_px")
+    @classmethod
+    def _is_odd(cls, value: int) -> int:
+        if value % 2 == 0:
+            raise ValueError("a window needs a pixel in its middle: an odd number")
+        return value
+
+    @model_validator(mode="after")
+    def _costs_fit(self) -> Self:
+        if self.largest_cost == 0:
+            raise ValueError("cost_cap 0 needs a census of more than one pixel")
+        if self.small_penalty > self.large_penalty:
+            raise ValueError("small_penalty must not exceed large_penalty")
+        if self.window_px * self.window_height_px * self.largest_cost > 65535:
+            raise ValueError("window_px x window_height_px x (cost_cap + census) exceeds 65535")
+        return self
+
+    @property
+    def largest_cost(self) -> int:
+        """Largest cost of one pixel: of its gradient and of all bits of the census."""
+        return self.cost_cap + self.census_px * self.census_height_px - 1
+
+
+class SgmMatcher:
+    """Lets neighbours agree on disparities, and checks what they agree on; a `Matcher`.
+
+    Every pixel is searched, those at the left border as far as the right picture reaches.
+
+    Args:
+        settings: What to search and what to believe.
+        threads: Strips of rows worked on at once, all cores by default. The result does not
+            depend on it.
+    """
+
+    def __init__(self, settings: SgmSettings, threads: int | None = None) -> None:
+        self._settings = settings
+        self._threads = max(1, threads or os.cpu_count() or 1)
+        self._rooms: deque[Room] = deque(maxlen=self._threads)
+
+    def match(self, pair: RectifiedPair) -> Disparity:
+        """Match one rectified pair.
+
+        Raises:
+            MatchingError: No disparity of the range lies within the picture.
+        """
+        s = self._settings
+        ndisp = _ndisp_within(pair.camera, s)
+        levels = _LEVELS / (s.largest_cost + s.small_penalty + s.large_penalty)
+        views, window = _views(pair, ndisp, s), _window(s, levels)
+        paths, rules = _paths(s, ndisp, levels), _rules(s, ndisp, levels)
+        texture = _texture(pair, s)
+        minima, refined = empty_minima(*texture.shape), empty_refined(*texture.shape)
+
+        def work(strip: range) -> None:
+            room = self._take_room(strip_rows, pair.camera.width_px, paths)
+            semi_global_minima(views, window, paths, strip, room, minima)
+            self._rooms.append(room)
+            refine_minima(minima, texture, rules, strip.start, strip.stop, refined)
+
+        strip_rows, at_once = self._strips(pair.camera, ndisp)
+        height = pair.camera.height_px
+        strips = [range(y, min(y + strip_rows, height)) for y in range(0, height, strip_rows)]
+        with ThreadPoolExecutor(at_once) as pool:
+            list(pool.map(work, strips))
+        return self._without_speckles(Disparity(*refined))
+
+    def _strips(self, camera: RectifiedCamera, ndisp: int) -> tuple[int, int]:
+        """Rows of a strip, and how many strips may be worked on at once."""
+        height, width = camera.height_px, camera.width_px
+        costs_row, means_row = width * padded_candidates(ndisp), width * ndisp
+        fitting = _STRIP_BYTES // (costs_row + means_row)
+        most = min(max(fitting, _LEAST_STRIP_ROWS), _STRIP_ROWS)
+        # An even number of strips, so that two cores end together.
+        rows = -(-height // (2 * -(-height // (2 * most))))
+        strip_bytes = rows * (costs_row + means_row) + 2 * self._settings.overlap_rows * costs_row
+        at_once = min(self._threads, (self._settings.memory_mb << 20) // strip_bytes)
+        return rows, max(1, at_once)
+
+    def _take_room(self, rows: int, width: int, paths: Paths) -> Room:
+        """Room for a strip: that of an earlier one where it fits."""
+        fresh = empty_room(rows, width, paths)
+        try:
+            room = self._rooms.pop()
+        except IndexError:
+            return fresh
+        fits = room.costs.shape == fresh.costs.shape and room.means.shape == fresh.means.shape
+        return room if fits else fresh
+
+    def _without_speckles(self, disparity: Disparity) -> Disparity:
+        s = self._settings
+        if s.speckle_size_px < 2:
+            return disparity
+        small = find_speckles(disparity.values, s.speckle_range_px, s.speckle_size_px)
+        return disparity.reject(small, Reason.SPECKLE)
+
+
+def _ndisp_within(camera: RectifiedCamera, settings: SgmSettings) -> int:
+    """Number of disparities to search, some of which lie within the picture."""
+    ndisp = settings.ndisp or camera.ndisp or usual_ndisp(camera.width_px)
+    last = settings.min_disparity_px + ndisp - 1
+    if settings.min_disparity_px >= camera.width_px or last <= -camera.width_px:
+        raise MatchingError(
+            "no disparity of the range lies within the picture",
+            got=f"{settings.min_disparity_px} to {last} px",
+            expected=f"some within {1 - camera.width_px} to {camera.width_px - 1} px",
+            hint="check min_disparity_px and ndisp",
+        )
+    return ndisp
+
+
+def _window(settings: SgmSettings, levels: float) -> Window:
+    s = settings
+    return Window(
+        radius=s.window_px // 2,
+        rows_radius=s.window_height_px // 2,
+        gradient_cap=s.cost_cap,
+        factor=int(65536 * levels / (s.window_px * s.window_height_px)),
+        top=int(s.largest_cost * levels),
+    )
+
+
+def _paths(settings: SgmSettings, ndisp: int, levels: float) -> Paths:
+    s = settings
+    large = round(s.large_penalty * levels)
+    small = max(1, round(s.small_penalty * levels))
+    return Paths(
+        ndisp=ndisp,
+        minimum=s.min_disparity_px,
+        small=small,
+        large=large,
+        large_at_edge=max(small, round(large * s.edge_penalty_share)),
+        edge=s.edge_grey_levels,
+        diagonal=s.paths == 8,
+        overlap=s.overlap_rows,
+    )
+
+
+def _rules(settings: SgmSettings, ndisp: int, levels: float) -> Rules:
+    s = settings
+    return Rules(
+        ndisp=ndisp,
+        minimum=s.min_disparity_px,
+        fit=_FITS[s.subpixel],
+        texture=s.min_texture,
+        uniqueness=s.uniqueness_percent,
+        left_right=-1 if s.left_right_px is None else s.left_right_px,
+        window_pixels=max(1, round(s.paths * levels)),
+        sigma_floor_px=s.sigma_floor_px,
+        odds=_ODDS,
+    )
+
+
+def _views(pair: RectifiedPair, ndisp: int, settings: SgmSettings) -> Views:
+    rows_radius, radius = settings.census_height_px // 2, settings.census_px // 2
+    first = settings.min_disparity_px
+    right_census = census_planes(pair.right, rows_radius, radius)
+    return Views(
+        grey=pair.left,
+        left=_gradients(pair.left, settings.prefilter_cap),
+        right=mirror_view(_gradients(pair.right, settings.prefilter_cap), ndisp, first),
+        left_census=census_planes(pair.left, rows_radius, radius),
+        right_census=mirror_view(right_census, ndisp, first),
+    )
+
+
+def _gradients(image: UInt8, cap: int) -> UInt8:
+    """Horizontal gradients, uint8 (H, W), ``cap`` where there is none."""
+    gradient = cv2.Sobel(image, cv2.CV_16S, 1, 0, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(np.clip(gradient, -cap, cap) + cap, dtype=np.uint8)
+
+
+def _texture(pair: RectifiedPair, settings: SgmSettings) -> Float32:
+    """Mean horizontal gradient in the window, grey levels per pixel; NaN = no picture.
+
+    Where nothing is asked of it, it is not computed: 0.
+    """
+    mean = np.zeros(pair.left.shape, np.float32)
+    if settings.min_texture > 0:
+        gradient = cv2.Sobel(
+            pair.left, cv2.CV_32F, 1, 0, scale=1 / _GAIN_OF_SOBEL, borderType=cv2.BORDER_REPLICATE
+        )
+        window = (settings.window_px, settings.window_height_px)
+        blurred = cv2.blur(np.abs(gradient), window, borderType=cv2.BORDER_REPLICATE)
+        mean = np.asarray(blurred, dtype=np.float32)
+    if pair.valid is not None:
+        mean[~pair.valid] = np.nan
+    return mean

@@ -1,0 +1,102 @@
+"""Matching and scoring one scene with several matchers."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from recon.evaluation.middlebury import by_the_rules
+from recon.formats.files import naming
+from recon.matching import Matcher, make_matcher
+from recon.pipeline.config import ReconConfig
+from recon.pipeline.middlebury_scenes import ScoredScene
+from recon.pipeline.middlebury_score import Figures, dense_map, score_result
+from recon.rectification import Rectifier
+from recon.structures import Disparity, RectifiedPair
+from recon.structures.arrays import Float32
+
+_WARM_UP_ROWS: Final = 64
+
+
+@dataclass(frozen=True, eq=False)
+class SceneResult:
+    """What one matcher made of one scene.
+
+    Attributes:
+        scene: The scene.
+        matcher: Name of the matcher.
+        disparity: What it found, at the size of the pictures.
+        figures: As `score_result` gives them.
+        seconds: Of matching alone.
+    """
+
+    scene: ScoredScene
+    matcher: str
+    disparity: Disparity
+    figures: Figures
+    seconds: float
+
+    def error_px(self) -> Float32:
+        """float32 (H, W), dense absolute error in full-size pixels; NaN = truth unknown."""
+        truth, rules = self.scene.truth.values, self.scene.rules
+        error = by_the_rules(dense_map(self.disparity.values), truth.shape, rules) - truth
+        return np.asarray(np.abs(error) * np.float32(rules.full_size_factor), dtype=np.float32)
+
+
+class Bench:
+    """Matches and scores; each thread has matchers of its own, warmed up once.
+
+    Compiled loops are compiled, and networks loaded, at the first use of a matcher: that is not
+    counted.
+
+    Args:
+        names: The matchers.
+        config: Their settings, and how pictures become grey.
+        threads: Threads of each matcher.
+    """
+
+    def __init__(self, names: Sequence[str], config: ReconConfig, threads: int) -> None:
+        self._names = names
+        self._config = config
+        self._threads = threads
+        self._own = threading.local()
+
+    def results(self, scene: ScoredScene) -> Iterator[SceneResult]:
+        """One result for each matcher, in their order.
+
+        Raises:
+            ReconError: A matcher cannot match the scene; the message names it.
+        """
+        rectifier = Rectifier(scene.camera, self._config.rectification)
+        pair = rectifier.rectify(scene.pair)
+        with naming(scene.name):
+            for name, matcher in self._matchers(pair).items():
+                start = time.perf_counter()
+                disparity = matcher.match(pair)
+                seconds = time.perf_counter() - start
+                figures = score_result(scene, disparity.values)
+                yield SceneResult(scene, name, disparity, figures, seconds)
+
+    def _matchers(self, pair: RectifiedPair) -> dict[str, Matcher]:
+        made: dict[str, Matcher] | None = getattr(self._own, "matchers", None)
+        if made is None:
+            made = {n: make_matcher(n, self._config.matching, self._threads) for n in self._names}
+            for matcher in made.values():
+                matcher.match(_upper_rows(pair))
+            self._own.matchers = made
+        return made
+
+
+def _upper_rows(pair: RectifiedPair) -> RectifiedPair:
+    """The top of a pair: of the same kind, but quickly matched."""
+    rows = min(_WARM_UP_ROWS, pair.camera.height_px)
+    return RectifiedPair(
+        left=np.ascontiguousarray(pair.left[:rows]),
+        right=np.ascontiguousarray(pair.right[:rows]),
+        camera=replace(pair.camera, height_px=rows),
+    )

@@ -1,0 +1,223 @@
+"""The methods that `recon paper` tries on each experiment, and what the patch does to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+
+from recon.cloud import CloudSettings, back_project
+from recon.evaluation import evaluate_disparity
+from recon.geometry.triangulation import depth_from_disparity
+from recon.matching import Matcher, SadMatcher, SadSettings
+from recon.matching.printed import PrintedMatcher, PrintedSettings
+from recon.pipeline.config import ReconConfig
+from recon.pipeline.frame import FrameReconstructor
+from recon.pipeline.paper_scenes import Experiment, camera_of_table_1
+from recon.rectification import RectificationSettings, Rectifier
+from recon.structures import (
+    Disparity,
+    DisparityMetrics,
+    DisparityTruth,
+    PointCloud,
+    RectifiedCamera,
+    RectifiedPair,
+)
+from recon.structures.arrays import Float32
+
+CORRECTED: Final = "corrected"
+ABSOLUTE: Final = "absolute"
+AS_PRINTED: Final = "as_printed"
+TITLES: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        CORRECTED: "as it should be",
+        ABSOLUTE: "as printed, but absolute differences",
+        AS_PRINTED: "as printed",
+    }
+)
+# Every point that the printed method finds, however far and however doubtful.
+_EVERY_POINT: Final = CloudSettings(
+    min_range_m=0.0, max_range_m=None, max_relative_sigma=None, normals_radius_px=None
+)
+
+
+@dataclass(frozen=True)
+class DepthFigures:
+    """How deep a method finds the scene to be, over the pixels whose true depth is known.
+
+    Attributes:
+        median_m: Median of the depths found.
+        true_median_m: Median of the true depths of the same pixels.
+        median_error_percent: Median of the absolute error, in per cent of the true depth.
+        median_ratio: Median of found ÷ true depth: 1 = the right scale.
+        pixels: Number of pixels compared.
+    """
+
+    median_m: float
+    true_median_m: float
+    median_error_percent: float
+    median_ratio: float
+    pixels: int
+
+
+@dataclass(frozen=True, eq=False)
+class MethodResult:
+    """What one method makes of one experiment.
+
+    Attributes:
+        method: A key of `TITLES`.
+        pair: The grey pictures, with the camera that the method believes in.
+        disparity: What was found.
+        depth_m: float32 (H, W), metres; NaN = unknown.
+        cloud: Its points in camera axes.
+        metrics: Distance of the disparity to the truth, or None.
+        depth: How deep the scene comes out, or None.
+    """
+
+    method: str
+    pair: RectifiedPair
+    disparity: Disparity
+    depth_m: Float32
+    cloud: PointCloud
+    metrics: DisparityMetrics | None
+    depth: DepthFigures | None
+
+
+@dataclass(frozen=True)
+class PatchFigure:
+    """What one patch gives; the last three are None where there is no truth.
+
+    Attributes:
+        patch_px: Edge of the patch.
+        valid_percent: Share of all pixels that have a value.
+        bad_percent: Share of the pixels of known truth whose value is off by more than the limit.
+        right_percent: Share of the same pixels whose value is not.
+        avgerr_px: Mean absolute error of those that have a value.
+    """
+
+    patch_px: int
+    valid_percent: float
+    bad_percent: float | None
+    right_percent: float | None
+    avgerr_px: float | None
+
+
+def methods_of(config: ReconConfig) -> tuple[str, ...]:
+    """The methods that a configuration asks for."""
+    return tuple(TITLES) if config.paper.as_printed else (CORRECTED,)
+
+
+def apply_method(
+    method: str, experiment: Experiment, config: ReconConfig, threads: int | None = None
+) -> MethodResult:
+    """Reconstruct one experiment by one method.
+
+    Args:
+        method: ``corrected`` is our matcher with the scene's calibration; ``absolute`` and
+            ``as_printed`` are whole disparities of Eq. 6 grey pictures, without and with the
+            misprint of Eq. 9-10, and both take Table 1's focal length at its word.
+        experiment: The scene.
+        config: Settings of the stages, and of the experiments.
+        threads: Threads for our matcher; None = all cores.
+    """
+    if method == CORRECTED:
+        frame = FrameReconstructor(experiment.camera, config, threads=threads).reconstruct(
+            experiment.pair
+        )
+        return _result(method, experiment, frame.pair, frame.disparity, frame.cloud)
+    matcher = _matcher(method, config.paper.patch_px, config, threads)
+    pair = _printed_pair(experiment)
+    disparity = matcher.match(pair)
+    pair = replace(pair, camera=camera_of_table_1(pair.camera))
+    return _result(method, experiment, pair, disparity, back_project(disparity, pair, _EVERY_POINT))
+
+
+def try_patches(
+    method: str, experiment: Experiment, config: ReconConfig, threads: int | None = None
+) -> list[PatchFigure]:
+    """What a method finds with each patch of the settings; ``corrected`` is the matcher `sad`."""
+    pair = _grey_pair(method, experiment, config)
+    figures = []
+    for patch_px in config.paper.patches_px:
+        if patch_px <= min(pair.left.shape):
+            found = _matcher(method, patch_px, config, threads).match(pair)
+            figures.append(_patch_figure(patch_px, found, experiment.truth, config.paper.bad_px))
+    return figures
+
+
+def compare_depth(
+    depth_m: Float32, truth: DisparityTruth, camera: RectifiedCamera
+) -> DepthFigures | None:
+    """Depths against the truth, at pixels seen by both cameras; None = no pixel has both.
+
+    Args:
+        depth_m: float32 (H, W), metres; NaN = unknown.
+        truth: True disparity.
+        camera: The true geometry.
+    """
+    true_m = depth_from_disparity(truth.values, camera)
+    both = np.isfinite(depth_m) & np.isfinite(true_m) & truth.nonocc
+    if not both.any():
+        return None
+    found, true = depth_m[both].astype(np.float64), true_m[both].astype(np.float64)
+    return DepthFigures(
+        median_m=float(np.median(found)),
+        true_median_m=float(np.median(true)),
+        median_error_percent=100 * float(np.median(np.abs(found - true) / true)),
+        median_ratio=float(np.median(found / true)),
+        pixels=int(both.sum()),
+    )
+
+
+def _result(
+    method: str,
+    experiment: Experiment,
+    pair: RectifiedPair,
+    disparity: Disparity,
+    cloud: PointCloud,
+) -> MethodResult:
+    depth_m = depth_from_disparity(disparity.values, pair.camera)
+    truth = experiment.truth
+    return MethodResult(
+        method=method,
+        pair=pair,
+        disparity=disparity,
+        depth_m=depth_m,
+        cloud=cloud,
+        metrics=None if truth is None else evaluate_disparity(disparity, truth),
+        depth=None if truth is None else compare_depth(depth_m, truth, experiment.camera),
+    )
+
+
+def _matcher(method: str, patch_px: int, config: ReconConfig, threads: int | None) -> Matcher:
+    """The matcher of a method with a patch of that size."""
+    if method != CORRECTED:
+        return PrintedMatcher(PrintedSettings(patch_px=patch_px, signed=method == AS_PRINTED))
+    window = {"window_px": patch_px, "window_height_px": patch_px}
+    return SadMatcher(SadSettings.parse({**config.matching.sad.model_dump(), **window}), threads)
+
+
+def _grey_pair(method: str, experiment: Experiment, config: ReconConfig) -> RectifiedPair:
+    if method != CORRECTED:
+        return _printed_pair(experiment)
+    return Rectifier(experiment.camera, config.rectification).rectify(experiment.pair)
+
+
+def _printed_pair(experiment: Experiment) -> RectifiedPair:
+    """The pictures in the grey of Eq. 6."""
+    settings = RectificationSettings(grey="paper")
+    return Rectifier(experiment.camera, settings).rectify(experiment.pair)
+
+
+def _patch_figure(
+    patch_px: int, found: Disparity, truth: DisparityTruth | None, bad_px: float
+) -> PatchFigure:
+    valid_percent = 100 * float(found.valid.mean())
+    if truth is None:
+        return PatchFigure(patch_px, valid_percent, None, None, None)
+    metrics = evaluate_disparity(found, truth, (bad_px,))
+    bad = metrics.bad[bad_px]
+    return PatchFigure(patch_px, valid_percent, bad, 100 - bad - metrics.invalid, metrics.avgerr_px)

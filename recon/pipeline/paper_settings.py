@@ -1,0 +1,34 @@
+"""What `recon paper` tries."""
+
+from __future__ import annotations
+
+from pydantic import Field, field_validator
+
+from recon.settings import Settings
+
+
+class PaperSettings(Settings):
+    """How the seed paper's experiments are repeated."""
+
+    as_printed: bool = Field(
+        default=False, description="Try the method as printed too, beside the corrected one."
+    )
+    patch_px: int = Field(
+        default=11, ge=3, le=61, description="Patch of the printed method; odd. Our choice."
+    )
+    patches_px: tuple[int, ...] = Field(
+        default=tuple(range(3, 22, 2)),
+        min_length=1,
+        description="Patches, and windows of the matcher `sad`, that are compared; odd.",
+    )
+    bad_px: float = Field(
+        default=1.0, gt=0, description="Disparity error from which a pixel counts as wrong."
+    )
+
+    @field_validator("patch_px", "patches_px")
+    @classmethod
+    def _are_odd(cls, value: int | tuple[int, ...]) -> int | tuple[int, ...]:
+        patches = (value,) if isinstance(value, int) else value
+        if any(patch % 2 == 0 or not 1 <= patch <= 61 for patch in patches):
+            raise ValueError("a patch is an odd number from 1 to 61")
+        return value

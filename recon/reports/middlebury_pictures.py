@@ -1,0 +1,47 @@
+"""What an evaluation on Middlebury scenes leaves to look at: tables and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from recon.formats.atomic import write_text
+from recon.formats.image import write_image
+from recon.pipeline.middlebury_bench import SceneResult
+from recon.pipeline.run_directory import RunDirectory
+from recon.reports.colour import colour_disparity, colour_error, value_range
+from recon.reports.middlebury_tables import csv_table, markdown_tables, text_tables
+
+ERROR_LIMIT_PX: Final = 4.0
+"""Error that gets the last colour, full-size pixels: the largest limit of the table."""
+
+
+def present_middlebury(summary: Mapping[str, Any], directory: RunDirectory) -> None:
+    """Write the tables as text, Markdown and CSV.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    write_text(directory.path("tables.txt"), text_tables(summary))
+    write_text(directory.path("tables.md"), markdown_tables(summary))
+    write_text(directory.path("figures.csv"), csv_table(summary))
+
+
+def draw_result(result: SceneResult, directory: RunDirectory) -> None:
+    """Write the disparity and the error of a result as pictures in colour.
+
+    In the error, blue is right, red is off by `ERROR_LIMIT_PX` full-size pixels or more, and dark
+    is where the truth is unknown; holes are filled. Colours of disparities span the truth's range.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    scale = round(4 * result.scene.camera.width_px / result.scene.truth.values.shape[1]) / 4
+    low, high = value_range(result.scene.truth.values)
+    pictures = {
+        "disparity": colour_disparity(result.disparity.values, low * scale, high * scale),
+        "error": colour_error(result.error_px(), ERROR_LIMIT_PX),
+    }
+    for name, picture in pictures.items():
+        path = directory.path(f"pictures/{result.matcher}/{result.scene.name}_{name}.png")
+        write_image(path, picture)

@@ -1,0 +1,111 @@
+"""Tables of an evaluation on Middlebury scenes: plain text, Markdown, CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+Row = Sequence[str]
+Figures = Mapping[str, Any]
+
+WEIGHTED: Final = "weighted"
+_LIMITS: Final = ("0.5", "1", "2", "4")
+_LENGTHS: Final = ("avgerr", "rms", "a50", "a90", "a95", "a99")
+_DEPTHS: Final = ("mean_m", "median_m", "rms_m", "median_percent", "over_5_percent", "infinite")
+_HEAD: Final = ("matcher", *(f"bad{t}" for t in _LIMITS), "invalid", *_LENGTHS)
+_KINDS: Final = (("nonocc", "dense"), ("nonocc", "sparse"), ("all", "dense"), ("all", "sparse"))
+
+
+def text_tables(summary: Figures) -> str:
+    """The tables in columns, to read in a terminal."""
+    return "\n\n".join(f"{title}\n{_columns(rows)}" for title, rows in _tables(summary)) + "\n"
+
+
+def markdown_tables(summary: Figures) -> str:
+    """The tables in Markdown."""
+    return "\n\n".join(f"### {title}\n{_markdown(rows)}" for title, rows in _tables(summary)) + "\n"
+
+
+def csv_table(summary: Figures) -> str:
+    """All figures of all matchers: a row per scene, mask and filling."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    depths = [f"depth_{name}" for name in _DEPTHS]
+    writer.writerow([_HEAD[0], "scene", "mask", "holes", *_HEAD[1:], *depths, "seconds"])
+    for matcher, found in summary["matchers"].items():
+        mean = {**found["weighted"], "seconds": found["seconds"]}
+        for scene, figures in [*found["scenes"].items(), (WEIGHTED, mean)]:
+            for mask, holes in _KINDS:
+                cells = _all_cells(figures, mask, holes)
+                writer.writerow([matcher, scene, mask, holes, *cells, figures["seconds"]])
+    return out.getvalue()
+
+
+def _tables(summary: Figures) -> Iterator[tuple[str, list[Row]]]:
+    """Titles and rows, the first of which is the head."""
+    matchers = summary["matchers"]
+    for mask, holes in _KINDS:
+        yield f"Weighted mean, {mask}, {holes}", _weighted_rows(matchers, mask, holes)
+    for limit in _LIMITS[1:3]:
+        rows = _scene_rows(matchers, lambda one, t=limit: one["nonocc"]["dense"]["bad"][t])
+        yield f"bad {limit} of each scene, nonocc, dense", rows
+    rows = _scene_rows(matchers, lambda one: one["nonocc"]["dense"]["avgerr"])
+    yield "avgerr (px) of each scene, nonocc, dense", rows
+    rows = _scene_rows(matchers, lambda one: one["seconds"], digits=3)
+    yield "seconds of each scene, matching alone", rows
+
+
+def _weighted_rows(matchers: Figures, mask: str, holes: str) -> list[Row]:
+    rows: list[Row] = [(*_HEAD, "depth error", "seconds")]
+    for name, found in matchers.items():
+        figures = found["weighted"][mask][holes]
+        depth = figures.get("depth", {}).get("median_percent")
+        cells = [_number(cell) for cell in _cells(found["weighted"], mask, holes)]
+        shown = f"{_number(depth)} %" if depth is not None else "–"
+        rows.append((name, *cells, shown, _number(found["seconds"])))
+    return rows
+
+
+def _scene_rows(matchers: Figures, pick: Any, digits: int = 2) -> list[Row]:
+    """One row per scene, one column per matcher."""
+    scenes = next(iter(matchers.values()))["scenes"]
+    rows: list[Row] = [("scene", *matchers)]
+    for scene in scenes:
+        picked = (pick(found["scenes"][scene]) for found in matchers.values())
+        rows.append((scene, *(_number(value, digits) for value in picked)))
+    return rows
+
+
+def _cells(figures: Figures, mask: str, holes: str) -> list[Any]:
+    """In the order of the head; the share without a value is that of the unfilled map."""
+    one = figures[mask][holes]
+    bad = [one["bad"][limit] for limit in _LIMITS]
+    return [*bad, figures[mask]["invalid"], *(one[name] for name in _LENGTHS)]
+
+
+def _all_cells(figures: Figures, mask: str, holes: str) -> list[Any]:
+    depth = figures[mask][holes].get("depth", {})
+    cells = [*_cells(figures, mask, holes), *(depth.get(name) for name in _DEPTHS)]
+    return ["" if cell is None else f"{cell:.6g}" for cell in cells]
+
+
+def _number(value: float | None, digits: int = 2) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def _columns(rows: Sequence[Row]) -> str:
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    return "\n".join(_line(row, widths) for row in rows)
+
+
+def _line(row: Row, widths: Sequence[int]) -> str:
+    first, *others = zip(row, widths, strict=True)
+    cells = [first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in others)]
+    return "  ".join(cells).rstrip()
+
+
+def _markdown(rows: Sequence[Row]) -> str:
+    rule = ["---", *["---:"] * (len(rows[0]) - 1)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in (rows[0], rule, *rows[1:]))

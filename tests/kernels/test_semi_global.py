@@ -1,0 +1,114 @@
+"""The compiled semi-global search equals its twin, for any picture, window and range."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
+
+from recon.kernels.census import census_planes
+from recon.kernels.minima import Minima, empty_minima
+from recon.kernels.path_costs import Views, Window, mirror_view
+from recon.kernels.semi_global import Paths, empty_room, semi_global_minima
+from recon.kernels.semi_global_reference import semi_global_minima_reference
+
+Image = NDArray[np.uint8]
+
+
+def make_views(left: Image, right: Image, paths: Paths) -> Views:
+    return Views(
+        grey=left,
+        left=left,
+        right=mirror_view(right, paths.ndisp, paths.minimum),
+        left_census=census_planes(left, 1, 2),
+        right_census=mirror_view(census_planes(right, 1, 2), paths.ndisp, paths.minimum),
+    )
+
+
+def search(views: Views, window: Window, paths: Paths, strips: int = 1) -> Minima:
+    minima = empty_minima(*views.grey.shape)
+    edges = np.linspace(0, len(views.grey), strips + 1).astype(int).tolist()
+    for first, end in itertools.pairwise(edges):
+        room = empty_room(end - first, views.grey.shape[1], paths)
+        semi_global_minima(views, window, paths, range(first, end), room, minima)
+    return minima
+
+
+def assert_equal(found: Minima, expected: Minima) -> None:
+    for name in Minima._fields:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+
+
+@st.composite
+def pairs(draw: st.DrawFn) -> tuple[Image, Image]:
+    shape = draw(st.tuples(st.integers(1, 7), st.integers(1, 9)))
+    # Few grey levels make ties, many make overflows.
+    levels = draw(st.sampled_from([1, 3, 255]))
+    grey = hnp.arrays(np.uint8, shape, elements=st.integers(0, levels))
+    return draw(grey), draw(grey)
+
+
+@st.composite
+def windows(draw: st.DrawFn) -> tuple[Window, Paths]:
+    radius, rows_radius, cap = draw(
+        st.tuples(st.integers(0, 3), st.integers(0, 3), st.sampled_from([0, 16, 60]))
+    )
+    small, more = draw(st.tuples(st.integers(1, 40), st.integers(0, 80)))
+    # The largest that a path cost leaves: cost + small + large <= 255.
+    top = 255 - 2 * small - more
+    pixels = (2 * radius + 1) * (2 * rows_radius + 1)
+    window = Window(radius, rows_radius, cap, 65536 * top // (pixels * (cap + 14)), top)
+    paths = Paths(
+        ndisp=draw(st.integers(1, 70)),
+        minimum=draw(st.integers(-6, 6)),
+        small=small,
+        large=small + more,
+        large_at_edge=small,
+        edge=draw(st.sampled_from([0, 12, 255])),
+        diagonal=draw(st.booleans()),
+        overlap=100,
+    )
+    return window, paths
+
+
+@settings(deadline=None, max_examples=60)  # the first call compiles
+@given(pairs(), windows())
+def test_search_equals_its_twin(pair: tuple[Image, Image], rules: tuple[Window, Paths]) -> None:
+    window, paths = rules
+    views = make_views(*pair, paths)
+    expected = semi_global_minima_reference(views, window, paths)
+    assert_equal(search(views, window, paths), expected)
+
+
+@settings(deadline=None, max_examples=30)  # the first call compiles
+@given(pairs(), windows(), st.integers(2, 4))
+def test_strips_that_overlap_wholly_do_not_change_the_result(
+    pair: tuple[Image, Image], rules: tuple[Window, Paths], strips: int
+) -> None:
+    window, paths = rules
+    views = make_views(*pair, paths)
+    assert_equal(search(views, window, paths, strips), search(views, window, paths))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
+def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
+    grey = np.zeros(shape, np.uint8)
+    paths = Paths(4, 0, 10, 50, 20, 12, diagonal=True, overlap=4)
+    minima = search(make_views(grey, grey, paths), Window(2, 2, 16, 8000, 90), paths)
+    assert (minima.winner == 0).all()
+    assert (minima.right_winner == 0).all()
+
+
+def test_few_rows_of_overlap_change_little() -> None:
+    rng = np.random.default_rng(0)
+    left = rng.integers(0, 256, (80, 60), dtype=np.uint8)
+    right = np.roll(left, -5, axis=1)
+    paths = Paths(16, 0, 10, 50, 20, 12, diagonal=True, overlap=8)
+    views, window = make_views(left, right, paths), Window(1, 1, 16, 18000, 90)
+    whole, strips = search(views, window, paths), search(views, window, paths, strips=4)
+    assert (whole.winner == strips.winner).mean() > 0.99

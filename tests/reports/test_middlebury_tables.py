@@ -1,0 +1,61 @@
+"""Tables of an evaluation say what the figures say."""
+
+from __future__ import annotations
+
+import csv
+import io
+from typing import Any
+
+from recon.reports.middlebury_tables import csv_table, markdown_tables, text_tables
+
+
+def masked(error: float | None, *, depth: bool) -> dict[str, Any]:
+    one: dict[str, Any] = dict.fromkeys(("avgerr", "rms", "a50", "a90", "a95", "a99"), error)
+    one["bad"] = {"0.5": 40.0, "1": 30.0, "2": 20.0, "4": 10.0}
+    if depth:
+        names = ("mean_m", "median_m", "rms_m", "median_percent", "over_5_percent", "infinite")
+        one["depth"] = dict.fromkeys(names, 0.5)
+    return {"dense": one, "sparse": one, "invalid": 12.5}
+
+
+def summary(error: float | None = 3.25, *, depth: bool = True) -> dict[str, Any]:
+    figures = {mask: masked(error, depth=depth) for mask in ("nonocc", "all")}
+    scenes = {name: {**figures, "seconds": 0.5} for name in ("Piano", "Teddy")}
+    found = {"scenes": scenes, "weighted": figures, "seconds": 1.0}
+    return {"matchers": {"sad": found, "opencv-bm": found}}
+
+
+def test_a_table_has_a_row_per_matcher_and_a_column_per_figure() -> None:
+    text = text_tables(summary())
+    first = text.split("\n\n")[0].splitlines()
+    assert first[0] == "Weighted mean, nonocc, dense"
+    assert first[2].split()[:8] == [
+        "sad",
+        "40.00",
+        "30.00",
+        "20.00",
+        "10.00",
+        "12.50",
+        "3.25",
+        "3.25",
+    ]
+    assert len({line.rstrip()[-4:] for line in first[2:]}) == 1
+
+
+def test_markdown_has_as_many_cells_in_each_row() -> None:
+    for table in markdown_tables(summary()).split("\n\n"):
+        assert len({line.count("|") for line in table.splitlines()[1:]}) == 1
+
+
+def test_csv_has_every_scene_mask_and_filling() -> None:
+    rows = list(csv.DictReader(io.StringIO(csv_table(summary()))))
+    assert len(rows) == 2 * 3 * 4
+    assert rows[0]["scene"] == "Piano"
+    assert float(rows[0]["depth_median_m"]) == 0.5
+
+
+def test_a_figure_that_is_not_known_is_a_dash_or_an_empty_cell() -> None:
+    given = summary(None, depth=False)
+    assert "–" in text_tables(given)
+    row = next(csv.DictReader(io.StringIO(csv_table(given))))
+    assert row["avgerr"] == row["depth_mean_m"] == ""
