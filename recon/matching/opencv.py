@@ -1,8 +1,8 @@
 """OpenCV's block matcher and its semi-global matcher, to compare with.
 
 What changes at this border: OpenCV gives 16ths of a pixel, and ``(minimum - 1) · 16`` where it
-found nothing; it skips the columns that the whole range does not fit, and here it does not (see
-`OpencvSettings.pad`).
+found nothing; it skips the columns that the whole range does not fit, unless `OpencvSettings.pad`
+widens the pictures.
 """
 
 from __future__ import annotations
@@ -76,10 +76,10 @@ class OpencvSettings(UnratedSettings):
         description="Largest step of disparity between neighbours of one region.",
     )
     pad: bool = Field(
-        default=True,
+        default=False,
         description="Widen the pictures by repeating their edges, so that every pixel is searched "
         "as far as the right picture reaches. False: OpenCV as it comes, without a strip at the "
-        "left as wide as the range.",
+        "left as wide as the range; the baseline that everybody else measures.",
     )
 
 
