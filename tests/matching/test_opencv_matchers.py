@@ -8,7 +8,6 @@ import pytest
 
 from recon.errors import MatchingError, SettingsError
 from recon.formats.middlebury import stand_in_camera
-from recon.matching import make_matcher
 from recon.matching.opencv import (
     OpencvBmMatcher,
     OpencvBmSettings,
