@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Final, Literal
 
 import cv2
@@ -24,6 +25,7 @@ from recon.kernels.refine import (
 )
 from recon.kernels.sad import Search, mirror_right, sad_minima
 from recon.kernels.speckle import find_speckles
+from recon.matching.fill import fill_holes
 from recon.settings import Settings
 from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import Float32, UInt8
@@ -100,6 +102,11 @@ class SadSettings(Settings):
         gt=0.0,
         description="Largest step of disparity between neighbours of one region.",
     )
+    median_px: Literal[0, 3, 5] = Field(
+        default=5,
+        description="Each disparity becomes the median of a square of this width around it, holes "
+        "filled for that from the row; 0 = as measured.",
+    )
     sigma_floor_px: float = Field(
         default=0.1,
         gt=0.0,
@@ -154,7 +161,8 @@ class SadMatcher:
             refine_minima(minima, texture, rules, first, end, refined)
 
         _in_strips(strip, len(left), self._threads)
-        return self._without_speckles(Disparity(*refined))
+        found = self._without_speckles(Disparity(*refined))
+        return _smoothed(found, self._settings.median_px)
 
     def _plan(self, camera: RectifiedCamera) -> tuple[Search, Rules]:
         s = self._settings
@@ -187,6 +195,16 @@ class SadMatcher:
             return disparity
         small = find_speckles(disparity.values, s.speckle_range_px, s.speckle_size_px)
         return disparity.reject(small, Reason.SPECKLE)
+
+
+def _smoothed(disparity: Disparity, median_px: int) -> Disparity:
+    """The disparity with medians for values; what has none gets none."""
+    if median_px == 0 or not disparity.valid.any():
+        return disparity
+    filled = np.nan_to_num(fill_holes(disparity.values))
+    medians = cv2.medianBlur(filled, median_px)
+    values = np.where(disparity.valid, medians, np.float32(np.nan))
+    return replace(disparity, values=values)
 
 
 def usual_ndisp(width_px: int) -> int:

@@ -247,7 +247,7 @@ def test_usual_range_is_a_tenth_of_the_width(width: int, ndisp: int) -> None:
     ("values", "complaint"),
     [
         ({"window_px": 10}, "odd"),
-        ({"window_px": 61, "window_height_px": 61}, "65535"),
+        ({"window_px": 61, "window_height_px": 61, "cost_cap": 20}, "65535"),
         ({"window": 9}, "unknown setting"),
         ({"left_right_px": -1}, "left_right_px"),
     ],
@@ -255,6 +255,19 @@ def test_usual_range_is_a_tenth_of_the_width(width: int, ndisp: int) -> None:
 def test_settings_that_cannot_work_are_refused(values: dict[str, int], complaint: str) -> None:
     with pytest.raises(SettingsError, match=complaint):
         SadSettings.parse(values)
+
+
+@pytest.mark.parametrize("median_px", [3, 5])
+def test_median_keeps_holes_and_steps_and_takes_outliers(median_px: int) -> None:
+    scene, _ = square_before_wall()
+    plain, smooth = (
+        SadMatcher(SadSettings(ndisp=32, median_px=m)).match(scene) for m in (0, median_px)
+    )
+    np.testing.assert_array_equal(plain.reason, smooth.reason)
+    np.testing.assert_array_equal(plain.confidence, smooth.confidence)
+    assert np.nanmedian(smooth.values[25:55, 80:110]) == pytest.approx(20, abs=0.1)
+    spread = [np.nanstd(found.values[25:55, 80:110]) for found in (plain, smooth)]
+    assert spread[1] <= spread[0]
 
 
 def test_it_is_a_matcher() -> None:
