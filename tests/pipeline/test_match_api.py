@@ -25,7 +25,8 @@ def test_every_matcher_finds_the_shift(
     disparity = recon.match(*pictures, matcher=matcher, ndisp=16)
     # All fit parts of a pixel; a quarter is more than the bias of any of them.
     assert np.nanmedian(disparity.values) == pytest.approx(6, abs=0.25)
-    assert disparity.valid[:, 16:].mean() > 0.8
+    # OpenCV as it comes leaves out the range at the left and half a window at each other side.
+    assert disparity.valid[4:-4, 20:-4].mean() > 0.8
 
 
 def test_settings_are_those_of_the_matcher_that_is_named(
