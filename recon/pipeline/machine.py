@@ -6,10 +6,13 @@ import os
 import platform
 import resource
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from typing import Final
 
 import cv2
+from threadpoolctl import threadpool_limits
 
 _RECORDED: Final = (
     "recon",
@@ -28,6 +31,17 @@ def use_threads(threads: int | None) -> int:
     count = threads or available_cores()
     cv2.setNumThreads(count)
     return count
+
+
+@contextmanager
+def serial_algebra() -> Iterator[None]:
+    """Keep numpy's linear algebra on one thread for the body of a ``with`` statement.
+
+    Its matrices are small here: more threads make it slower while stages overlap, and sums that are
+    split among another number of threads round otherwise, so a path would depend on the machine.
+    """
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
 
 
 def available_cores() -> int:

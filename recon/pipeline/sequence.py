@@ -22,6 +22,7 @@ from recon.odometry import KnownPoses, Odometry, OdometryFrame, OdometryHealth, 
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
 from recon.pipeline.lookahead import look_ahead
+from recon.pipeline.machine import serial_algebra
 from recon.pipeline.observer import FrameResult, Observer
 from recon.pipeline.stopwatch import Stopwatch
 from recon.sources import StereoSource
@@ -87,16 +88,21 @@ def map_sequence(
         observer.on_start(source.name, len(source))
     start = last = time.perf_counter()
     try:
-        for frame in look_ahead(reconstructor.reconstruct, source):
-            result = mapper.add(frame, total=len(source))
-            now = time.perf_counter()
-            last, result = now, replace(result, seconds=now - last)
-            for observer in audience:
-                observer.on_frame(result)
+        with serial_algebra():
+            for frame in look_ahead(reconstructor.reconstruct, source):
+                result = mapper.add(frame, total=len(source))
+                now = time.perf_counter()
+                _tell(audience, replace(result, seconds=now - last))
+                last = now
     finally:
         for observer in audience:
             observer.on_finish()
     return mapper.finish(seconds=last - start)
+
+
+def _tell(audience: Iterable[Observer], result: FrameResult) -> None:
+    for observer in audience:
+        observer.on_frame(result)
 
 
 class _Mapper:
