@@ -79,7 +79,7 @@ class OpencvSettings(UnratedSettings):
         default=False,
         description="Widen the pictures by repeating their edges, so that every pixel is searched "
         "as far as the right picture reaches. False: OpenCV as it comes, without a strip at the "
-        "left as wide as the range; the baseline that everybody else measures.",
+        "left as wide as the range, which scoring then fills by a guess.",
     )
 
 
