@@ -13,10 +13,10 @@ from typing import Any, Final, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from recon.errors import MatchingError
-from recon.matching.sad import usual_ndisp
+from recon.matching.search import OddInt, SearchSettings, UniquenessPercent
 from recon.matching.unrated import UnratedSettings, unrated_disparity
 from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import UInt8
@@ -38,12 +38,9 @@ _PREFILTERS: Final = {
 }
 
 
-class OpencvSettings(UnratedSettings):
+class OpencvSettings(SearchSettings, UnratedSettings):
     """What both of OpenCV's matchers have."""
 
-    min_disparity_px: int = Field(
-        default=0, ge=-4096, le=4096, description="First disparity searched; may be negative."
-    )
     ndisp: int | None = Field(
         default=None,
         ge=1,
@@ -51,29 +48,12 @@ class OpencvSettings(UnratedSettings):
         description="Number of disparities searched, rounded up to a multiple of 16. None: what "
         "the calibration says, or else a tenth of the image width.",
     )
-    uniqueness_percent: int = Field(
-        default=5,
-        ge=0,
-        le=100,
-        description="By how much the second best cost must exceed the best; 0 = no check.",
-    )
-    left_right_px: int | None = Field(
-        default=1,
-        ge=0,
-        le=255,
-        description="Largest difference between the left and the right view; None = no check.",
-    )
+    uniqueness_percent: UniquenessPercent = 5
     speckle_size_px: int = Field(
         default=50,
         ge=0,
         le=1_000_000,
         description="Regions of at most so many pixels are removed; 0 = keep all.",
-    )
-    speckle_range_px: float = Field(
-        default=1.0,
-        gt=0.0,
-        le=1000.0,
-        description="Largest step of disparity between neighbours of one region.",
     )
     pad: bool = Field(
         default=False,
@@ -86,7 +66,7 @@ class OpencvSettings(UnratedSettings):
 class OpencvBmSettings(OpencvSettings):
     """Settings of ``cv2.StereoBM``."""
 
-    block_px: int = Field(default=9, ge=5, le=255, description="Width of the window; odd.")
+    block_px: OddInt = Field(default=9, ge=5, le=255, description="Width of the window; odd.")
     prefilter: Literal["sobel", "normalised"] = Field(
         default="sobel", description="What is compared."
     )
@@ -97,16 +77,11 @@ class OpencvBmSettings(OpencvSettings):
         default=10, ge=0, description="Least sum of prefiltered values in the window."
     )
 
-    @field_validator("block_px")
-    @classmethod
-    def _is_odd(cls, value: int) -> int:
-        return _odd(value)
-
 
 class OpencvSgbmSettings(OpencvSettings):
     """Settings of ``cv2.StereoSGBM``."""
 
-    block_px: int = Field(default=3, ge=1, le=51, description="Width of the window; odd.")
+    block_px: OddInt = Field(default=3, ge=1, le=51, description="Width of the window; odd.")
     mode: Literal["hh", "3way", "sgbm"] = Field(
         default="hh", description="8 paths over the whole picture, 3 paths in strips, or 5 paths."
     )
@@ -119,11 +94,6 @@ class OpencvSgbmSettings(OpencvSettings):
     large_step_cost: int | None = Field(
         default=None, ge=2, description="OpenCV's P2. None: 32 times the block's pixels."
     )
-
-    @field_validator("block_px")
-    @classmethod
-    def _is_odd(cls, value: int) -> int:
-        return _odd(value)
 
 
 class OpencvBmMatcher:
@@ -153,7 +123,7 @@ class OpencvBmMatcher:
         engine.setPreFilterCap(s.prefilter_cap)
         engine.setTextureThreshold(s.texture_threshold)
         engine.setUniquenessRatio(s.uniqueness_percent)
-        engine.setDisp12MaxDiff(_left_right(s))
+        engine.setDisp12MaxDiff(s.left_right_or_none)
         return _match(pair, engine, s, _Margins.around(s, ndisp))
 
 
@@ -183,7 +153,7 @@ class OpencvSgbmMatcher:
             blockSize=s.block_px,
             P1=s.small_step_cost or 8 * pixels,
             P2=s.large_step_cost or 32 * pixels,
-            disp12MaxDiff=_left_right(s),
+            disp12MaxDiff=s.left_right_or_none,
             preFilterCap=s.prefilter_cap,
             uniquenessRatio=s.uniqueness_percent,
             mode=_MODES[s.mode],
@@ -241,13 +211,15 @@ def _match(pair: RectifiedPair, engine: Any, s: OpencvSettings, margins: _Margin
     if not s.speckle_size_px:
         return found
     kept = np.where(found.valid, fixed, np.int16(unknown))
-    cv2.filterSpeckles(kept, unknown, s.speckle_size_px, round(s.speckle_range_px * _STEPS))
+    cv2.filterSpeckles(
+        kept, unknown, s.speckle_size_px, round(min(s.speckle_range_px, _LIMIT_PX) * _STEPS)
+    )
     return found.reject(kept == unknown, Reason.SPECKLE)
 
 
 def _range(settings: OpencvSettings, camera: RectifiedCamera) -> int:
     """Number of disparities, a multiple of 16."""
-    ndisp = settings.ndisp or camera.ndisp or usual_ndisp(camera.width_px)
+    ndisp = settings.ndisp_for(camera)
     ndisp = _STEPS * -(-ndisp // _STEPS)
     first, last = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1
     if first <= -_LIMIT_PX or last >= _LIMIT_PX:
@@ -258,13 +230,3 @@ def _range(settings: OpencvSettings, camera: RectifiedCamera) -> int:
             hint="check min_disparity_px and ndisp, or match smaller pictures",
         )
     return ndisp
-
-
-def _left_right(settings: OpencvSettings) -> int:
-    return -1 if settings.left_right_px is None else settings.left_right_px
-
-
-def _odd(value: int) -> int:
-    if value % 2 == 0:
-        raise ValueError("a window needs a pixel in its middle: an odd number")
-    return value

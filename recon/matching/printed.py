@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from recon.errors import MatchingError
-from recon.matching.sad import usual_ndisp
+from recon.matching.search import usual_ndisp
 from recon.settings import Settings
 from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import Float32, Int32

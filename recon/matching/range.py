@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from recon.matching.protocol import Matcher
-from recon.matching.sad import SadMatcher, SadSettings, usual_ndisp
+from recon.matching.sad import SadMatcher, SadSettings
+from recon.matching.search import usual_ndisp
 from recon.structures import Disparity, RectifiedPair
 from recon.structures.arrays import UInt8
 

@@ -9,29 +9,21 @@ from typing import Final, Literal
 
 import cv2
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from recon.errors import MatchingError
 from recon.kernels.census import census_planes
 from recon.kernels.minima import empty_minima
 from recon.kernels.path_costs import Views, Window, mirror_view, padded_candidates
 from recon.kernels.refine import (
-    EQUIANGULAR,
-    NO_FIT,
-    PARABOLA,
     Rules,
     empty_refined,
     refine_minima,
 )
 from recon.kernels.semi_global import Paths, Room, empty_room, semi_global_minima
-from recon.kernels.speckle import find_speckles
-from recon.matching.sad import usual_ndisp
-from recon.settings import Settings
-from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
+from recon.matching.search import FITS, MeasuredSettings, OddInt, without_speckles
+from recon.structures import Disparity, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import Float32, UInt8
-
-_FITS: Final = {"none": NO_FIT, "equiangular": EQUIANGULAR, "parabola": PARABOLA}
 
 _GAIN_OF_SOBEL: Final = 8.0
 """A 3×3 Sobel filter answers a slope of one grey level per pixel with 8."""
@@ -47,20 +39,12 @@ _STRIP_ROWS: Final = 192
 _LEAST_STRIP_ROWS: Final = 32
 
 
-class SgmSettings(Settings):
+class SgmSettings(MeasuredSettings):
     """Settings of the semi-global matcher."""
 
-    window_px: int = Field(default=5, ge=1, le=31, description="Width of the window; odd.")
-    window_height_px: int = Field(default=5, ge=1, le=31, description="Height of the window; odd.")
-    min_disparity_px: int = Field(
-        default=0, ge=-4096, le=4096, description="First disparity searched; may be negative."
-    )
-    ndisp: int | None = Field(
-        default=None,
-        ge=3,
-        le=4096,
-        description="Number of disparities searched. None: what the calibration says, or else a "
-        "tenth of the image width, rounded up to a multiple of 16.",
+    window_px: OddInt = Field(default=5, ge=1, le=31, description="Width of the window; odd.")
+    window_height_px: OddInt = Field(
+        default=5, ge=1, le=31, description="Height of the window; odd."
     )
     prefilter_cap: int = Field(
         default=127,
@@ -74,14 +58,16 @@ class SgmSettings(Settings):
         le=127,
         description="Largest difference of gradients that counts at one pixel; 0 = census alone.",
     )
-    census_px: int = Field(
+    census_px: OddInt = Field(
         default=5,
         ge=1,
         le=9,
         description="Width of the census, whose bits are added to the gradients; odd. 1 by 1 = "
         "gradients alone.",
     )
-    census_height_px: int = Field(default=5, ge=1, le=9, description="Height of the census; odd.")
+    census_height_px: OddInt = Field(
+        default=5, ge=1, le=9, description="Height of the census; odd."
+    )
     paths: Literal[4, 8] = Field(
         default=8, description="Along rows and columns, or along the diagonals too."
     )
@@ -106,41 +92,6 @@ class SgmSettings(Settings):
     edge_penalty_share: float = Field(
         default=0.25, ge=0.0, le=1.0, description="Share of large_penalty that is left there."
     )
-    subpixel: Literal["equiangular", "parabola", "none"] = Field(
-        default="equiangular", description="How the minimum is placed between whole disparities."
-    )
-    uniqueness_percent: int = Field(
-        default=0,
-        ge=0,
-        le=100,
-        description="By how much the second best cost must exceed the best; 0 = no check.",
-    )
-    min_texture: float = Field(
-        default=0.0,
-        ge=0.0,
-        le=255.0,
-        description="Least mean horizontal gradient in the window, grey levels per pixel.",
-    )
-    left_right_px: int | None = Field(
-        default=1,
-        ge=0,
-        le=255,
-        description="Largest difference between the left and the right view; None = no check.",
-    )
-    speckle_size_px: int = Field(
-        default=50, ge=0, description="Regions of fewer pixels are removed; 0 = keep all."
-    )
-    speckle_range_px: float = Field(
-        default=1.0,
-        gt=0.0,
-        description="Largest step of disparity between neighbours of one region.",
-    )
-    sigma_floor_px: float = Field(
-        default=0.1,
-        gt=0.0,
-        le=2.0,
-        description="Smallest standard deviation that a disparity is given.",
-    )
     overlap_rows: int = Field(
         default=16,
         ge=0,
@@ -152,13 +103,6 @@ class SgmSettings(Settings):
         ge=1,
         description="Strips are worked on at once as long as they need less than this together.",
     )
-
-    @field_validator("window_px", "window_height_px", "census_px", "census_height_px")
-    @classmethod
-    def _is_odd(cls, value: int) -> int:
-        if value % 2 == 0:
-            raise ValueError("a window needs a pixel in its middle: an odd number")
-        return value
 
     @model_validator(mode="after")
     def _costs_fit(self) -> Self:
@@ -199,7 +143,7 @@ class SgmMatcher:
             MatchingError: No disparity of the range lies within the picture.
         """
         s = self._settings
-        ndisp = _ndisp_within(pair.camera, s)
+        ndisp = s.ndisp_within(pair.camera)
         levels = _LEVELS / (s.largest_cost + s.small_penalty + s.large_penalty)
         views, window = _views(pair, ndisp, s), _window(s, levels)
         paths, rules = _paths(s, ndisp, levels), _rules(s, ndisp, levels)
@@ -217,7 +161,7 @@ class SgmMatcher:
         strips = [range(y, min(y + strip_rows, height)) for y in range(0, height, strip_rows)]
         with ThreadPoolExecutor(at_once) as pool:
             list(pool.map(work, strips))
-        return self._without_speckles(Disparity(*refined))
+        return without_speckles(Disparity(*refined), s)
 
     def _strips(self, camera: RectifiedCamera, ndisp: int) -> tuple[int, int]:
         """Rows of a strip, and how many strips may be worked on at once."""
@@ -240,27 +184,6 @@ class SgmMatcher:
             return fresh
         fits = room.costs.shape == fresh.costs.shape and room.means.shape == fresh.means.shape
         return room if fits else fresh
-
-    def _without_speckles(self, disparity: Disparity) -> Disparity:
-        s = self._settings
-        if s.speckle_size_px < 2:
-            return disparity
-        small = find_speckles(disparity.values, s.speckle_range_px, s.speckle_size_px)
-        return disparity.reject(small, Reason.SPECKLE)
-
-
-def _ndisp_within(camera: RectifiedCamera, settings: SgmSettings) -> int:
-    """Number of disparities to search, some of which lie within the picture."""
-    ndisp = settings.ndisp or camera.ndisp or usual_ndisp(camera.width_px)
-    last = settings.min_disparity_px + ndisp - 1
-    if settings.min_disparity_px >= camera.width_px or last <= -camera.width_px:
-        raise MatchingError(
-            "no disparity of the range lies within the picture",
-            got=f"{settings.min_disparity_px} to {last} px",
-            expected=f"some within {1 - camera.width_px} to {camera.width_px - 1} px",
-            hint="check min_disparity_px and ndisp",
-        )
-    return ndisp
 
 
 def _window(settings: SgmSettings, levels: float) -> Window:
@@ -295,10 +218,10 @@ def _rules(settings: SgmSettings, ndisp: int, levels: float) -> Rules:
     return Rules(
         ndisp=ndisp,
         minimum=s.min_disparity_px,
-        fit=_FITS[s.subpixel],
+        fit=FITS[s.subpixel],
         texture=s.min_texture,
         uniqueness=s.uniqueness_percent,
-        left_right=-1 if s.left_right_px is None else s.left_right_px,
+        left_right=s.left_right_or_none,
         window_pixels=max(1, round(s.paths * levels)),
         sigma_floor_px=s.sigma_floor_px,
         odds=_ODDS,

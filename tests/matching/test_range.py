@@ -12,7 +12,7 @@ import pytest
 from recon.formats.middlebury import read_middlebury_scene, stand_in_camera
 from recon.matching import MatchingSettings, SadSettings, make_matcher
 from recon.matching.range import AutoRangeMatcher, estimate_ndisp
-from recon.matching.sad import usual_ndisp
+from recon.matching.search import usual_ndisp
 from recon.rectification import to_grey
 from recon.structures import Disparity, RectifiedPair
 

@@ -8,7 +8,7 @@ import pytest
 
 from recon.errors import MatchingError, SettingsError
 from recon.matching import Matcher, SadMatcher, SadSettings
-from recon.matching.sad import usual_ndisp
+from recon.matching.search import usual_ndisp
 from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import Float32, Float64, UInt8
 

@@ -1,0 +1,127 @@
+"""What every matcher over a range of disparities has in common: the range, and the checks."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final, Literal
+
+from pydantic import AfterValidator, Field
+
+from recon.errors import MatchingError
+from recon.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA
+from recon.kernels.speckle import find_speckles
+from recon.settings import Settings
+from recon.structures import Disparity, Reason, RectifiedCamera
+
+FITS: Final = {"none": NO_FIT, "equiangular": EQUIANGULAR, "parabola": PARABOLA}
+"""The codes of `MeasuredSettings.subpixel`."""
+
+
+def _odd(value: int) -> int:
+    if value % 2 == 0:
+        raise ValueError("a window needs a pixel in its middle: an odd number")
+    return value
+
+
+OddInt = Annotated[int, AfterValidator(_odd)]
+"""The width of something that has a pixel in its middle."""
+
+UniquenessPercent = Annotated[
+    int,
+    Field(
+        ge=0,
+        le=100,
+        description="By how much the second best cost must exceed the best; 0 = no check.",
+    ),
+]
+MinTexture = Annotated[
+    float,
+    Field(
+        ge=0.0,
+        le=255.0,
+        description="Least mean horizontal gradient in the window, grey levels per pixel.",
+    ),
+]
+
+
+class SearchSettings(Settings):
+    """Which disparities are searched, and which of those found are kept."""
+
+    min_disparity_px: int = Field(
+        default=0, ge=-4096, le=4096, description="First disparity searched; may be negative."
+    )
+    ndisp: int | None = Field(
+        default=None,
+        ge=3,
+        le=4096,
+        description="Number of disparities searched. None: what the calibration says, or else a "
+        "tenth of the image width, rounded up to a multiple of 16.",
+    )
+    uniqueness_percent: UniquenessPercent = 0
+    left_right_px: int | None = Field(
+        default=1,
+        ge=0,
+        le=255,
+        description="Largest difference between the left and the right view; None = no check.",
+    )
+    speckle_size_px: int = Field(
+        default=50, ge=0, description="Regions of fewer pixels are removed; 0 = keep all."
+    )
+    speckle_range_px: float = Field(
+        default=1.0,
+        gt=0.0,
+        description="Largest step of disparity between neighbours of one region.",
+    )
+
+    @property
+    def left_right_or_none(self) -> int:
+        """``left_right_px``, negative for no check, as kernels and OpenCV take it."""
+        return -1 if self.left_right_px is None else self.left_right_px
+
+    def ndisp_for(self, camera: RectifiedCamera) -> int:
+        """Number of disparities to search in the pictures of a camera."""
+        return self.ndisp or camera.ndisp or usual_ndisp(camera.width_px)
+
+    def ndisp_within(self, camera: RectifiedCamera) -> int:
+        """Number of disparities to search, some of which lie within the picture.
+
+        Raises:
+            MatchingError: None does.
+        """
+        ndisp = self.ndisp_for(camera)
+        last = self.min_disparity_px + ndisp - 1
+        if self.min_disparity_px >= camera.width_px or last <= -camera.width_px:
+            raise MatchingError(
+                "no disparity of the range lies within the picture",
+                got=f"{self.min_disparity_px} to {last} px",
+                expected=f"some within {1 - camera.width_px} to {camera.width_px - 1} px",
+                hint="check min_disparity_px and ndisp",
+            )
+        return ndisp
+
+
+class MeasuredSettings(SearchSettings):
+    """Of the matchers that measure each match: between whole disparities, and how exactly."""
+
+    subpixel: Literal["equiangular", "parabola", "none"] = Field(
+        default="equiangular", description="How the minimum is placed between whole disparities."
+    )
+    min_texture: MinTexture = 0.0
+    sigma_floor_px: float = Field(
+        default=0.1,
+        gt=0.0,
+        le=2.0,
+        description="Smallest standard deviation that a disparity is given.",
+    )
+
+
+def without_speckles(disparity: Disparity, settings: SearchSettings) -> Disparity:
+    """The disparity without its small regions, whose reason becomes SPECKLE."""
+    if settings.speckle_size_px < 2:
+        return disparity
+    small = find_speckles(disparity.values, settings.speckle_range_px, settings.speckle_size_px)
+    return disparity.reject(small, Reason.SPECKLE)
+
+
+def usual_ndisp(width_px: int) -> int:
+    """A number of disparities that suits most rigs: a tenth of the width, in steps of 16."""
+    return 16 * max(1, -(-width_px // 160))
