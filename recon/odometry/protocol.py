@@ -40,6 +40,7 @@ class OdometryHealth:
         correction_deg: Rotation by which ICP would move the prior.
         accepted: True where (a part of) the ICP correction was taken.
         notes: Why something was refused or went wrong, for the log.
+        warnings: What a user must know about the frame, though it may have a pose.
     """
 
     ok: bool = True
@@ -53,6 +54,7 @@ class OdometryHealth:
     correction_deg: float = float("nan")
     accepted: bool = False
     notes: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...] = field(default=())
 
 
 @dataclass(frozen=True, eq=False)

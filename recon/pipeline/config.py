@@ -22,7 +22,7 @@ from recon.matching import MatchingSettings
 from recon.meshing import MeshSettings
 from recon.odometry import OdometrySettings
 from recon.pipeline.paper_settings import PaperSettings
-from recon.rectification import RectificationSettings
+from recon.rectification import InspectionSettings, RectificationSettings
 from recon.settings import Settings
 from recon.synthetic import StreetSettings
 
@@ -34,6 +34,7 @@ class ReconConfig(Settings):
     """All that decides a result. Written beside every result as ``config.yaml``."""
 
     rectification: RectificationSettings = RectificationSettings()
+    inspection: InspectionSettings = InspectionSettings()
     matching: MatchingSettings = MatchingSettings()
     edges: EdgeSettings = EdgeSettings()
     cloud: CloudSettings = CloudSettings()

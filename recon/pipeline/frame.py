@@ -8,7 +8,7 @@ from recon.cloud import back_project, filter_cloud, remove_flying_edges
 from recon.matching import make_matcher
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.stopwatch import Stopwatch
-from recon.rectification import Rectifier
+from recon.rectification import Rectifier, check_inspection, inspect_pair
 from recon.structures import (
     Disparity,
     PointCloud,
@@ -27,15 +27,17 @@ class ReconstructedFrame:
         pair: The rectified pictures.
         disparity: Its disparity, flying edges removed.
         cloud: Its points in camera axes, filtered.
+        warnings: What is wrong with the pictures though they gave something.
     """
 
     pair: RectifiedPair
     disparity: Disparity
     cloud: PointCloud
+    warnings: tuple[str, ...] = ()
 
 
 class FrameReconstructor:
-    """Walks one pair through rectify, match, edges, back-project, filter.
+    """Walks one pair through rectify, inspect, match, edges, back-project, filter.
 
     Args:
         calibration: Of the source of the pairs.
@@ -73,12 +75,30 @@ class FrameReconstructor:
             disparity = remove_flying_edges(disparity, config.edges)
         return rectified, disparity
 
+    def inspect(self, pair: RectifiedPair) -> tuple[str, ...]:
+        """Warnings about the geometry of a pair whose turn it is; of others none.
+
+        Raises:
+            CalibrationError: Left and right are swapped.
+        """
+        settings = self._config.inspection
+        if settings.every is None or pair.index % settings.every:
+            return ()
+        with self._stopwatch.stage("inspect"):
+            found = inspect_pair(pair, settings)
+        return check_inspection(found, settings, where=f"frame {pair.index}")
+
     def reconstruct(self, pair: StereoPair) -> ReconstructedFrame:
-        """Reconstruct one pair."""
+        """Reconstruct one pair.
+
+        Raises:
+            CalibrationError: Left and right are swapped.
+        """
         config, stage = self._config, self._stopwatch.stage
         rectified, disparity = self.match(pair)
+        warnings = self.inspect(rectified)
         with stage("back_project"):
             cloud = back_project(disparity, rectified, config.cloud)
         with stage("filter"):
             cloud = filter_cloud(cloud, config.filters)
-        return ReconstructedFrame(rectified, disparity, cloud)
+        return ReconstructedFrame(rectified, disparity, cloud, warnings)

@@ -122,7 +122,10 @@ def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> Pai
             given.calibration, config, threads=threads, stopwatch=watch
         )
         if options.command == "disparity":
-            run = _run(given, config, *reconstructor.match(given.pair))
+            pair, disparity = reconstructor.match(given.pair)
+            run = replace(
+                _run(given, config, pair, disparity), warnings=reconstructor.inspect(pair)
+            )
         else:
             run = _reconstruct(given, config, reconstructor, watch)
         with watch.stage("write"):
@@ -152,12 +155,12 @@ def _reconstruct(
     """The run of a pair with cloud and mesh; without a mesh it is still a run."""
     frame = reconstructor.reconstruct(given.pair)
     mesh: TriangleMesh | None = None
-    warnings: tuple[str, ...] = ()
+    warnings = frame.warnings
     try:
         with watch.stage("mesh"):
             mesh = reconstruct_mesh(frame.cloud, config.mesh)
     except MeshingError as error:
-        warnings = (f"no mesh: {error}",)
+        warnings = (*warnings, f"no mesh: {error}")
     run = _run(given, config, frame.pair, frame.disparity)
     figures = _metric_summary(frame, mesh)
     return replace(

@@ -136,6 +136,7 @@ class _Mapper:
         with stage("odometry"):
             registered = self._odometry.register(OdometryFrame(frame.pair, frame.disparity))
         T_world_camera = registered.T_world_camera
+        health = replace(registered.health, warnings=(*frame.warnings, *registered.health.warnings))
         with stage("fuse"):
             near = frame.cloud.select(frame.cloud.xyz[:, 2] <= self._fusion_range_m)
             self._fused.integrate(transform_cloud(near, T_world_camera, frame="world"))
@@ -143,13 +144,11 @@ class _Mapper:
             self._occupancy_of(frame).integrate(frame.cloud, T_world_camera)
         self._poses.append(T_world_camera)
         self._times_s.append(frame.pair.timestamp_s)
-        self._health.append(registered.health)
+        self._health.append(health)
         if index <= self._sample_at:
             self._sample = frame
         valid_share = float(np.mean(frame.disparity.valid))
-        return FrameResult(
-            index, total, 0.0, valid_share, len(frame.cloud), T_world_camera, registered.health
-        )
+        return FrameResult(index, total, 0.0, valid_share, len(frame.cloud), T_world_camera, health)
 
     def finish(self, *, seconds: float) -> MappedSequence:
         if self._sample is None or self._occupancy is None:

@@ -35,14 +35,25 @@ def cost(stopwatch: Stopwatch, total_seconds: float) -> dict[str, Any]:
 
 
 def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:
-    """One line for each stretch of frames whose pose rests on no measurement."""
+    """One line for each thing to warn of, and for each stretch of frames that were lost."""
+    told = dict.fromkeys(line for record in health for line in record.warnings)
+    lines = [f"{_named(health, line)}: {line}" for line in told]
     bad = [index for index, record in enumerate(health) if not record.ok]
-    lines = []
     for first, last in _stretches(bad):
-        frames = f"frame {first}" if first == last else f"frames {first}-{last}"
         why = "; ".join(dict.fromkeys(health[first].notes)) or "no reason recorded"
-        lines.append(f"{frames}: pose not measured, extrapolated from the frames before ({why})")
+        where = _frames(first, last)
+        lines.append(f"{where}: pose not measured, extrapolated from the frames before ({why})")
     return lines
+
+
+def _named(health: Sequence[OdometryHealth], line: str) -> str:
+    """The frames that a warning is about; their first and last, where they are many."""
+    about = [index for index, record in enumerate(health) if line in record.warnings]
+    return _frames(about[0], about[-1])
+
+
+def _frames(first: int, last: int) -> str:
+    return f"frame {first}" if first == last else f"frames {first}-{last}"
 
 
 def _stretches(indices: Sequence[int]) -> list[tuple[int, int]]:

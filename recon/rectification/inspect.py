@@ -1,0 +1,241 @@
+"""Whether two pictures are a rectified pair at all: swapped eyes, rows that do not correspond.
+
+A matcher looks along one row and to one side. Fed with swapped or misaligned pictures it fails
+without a word, or worse, finds something. Features that are matched over the whole picture tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from recon.errors import CalibrationError
+from recon.settings import Settings
+from recon.structures import RectifiedPair
+from recon.structures.arrays import Bool, Float32, UInt8, freeze
+
+_RATIO: Final = 0.8
+"""Lowe's ratio: the best match must be so much nearer than the second best."""
+
+_NEAR_PX: Final = 1.0
+"""Features that shift by less between the eyes are too far away to tell the eyes apart."""
+
+_OUTLIER_PX: Final = 3.0
+"""Rows of a feature that are off by more than this from the others' tell of a wrong match."""
+
+
+class InspectionSettings(Settings):
+    """When a pair is said not to be rectified."""
+
+    every: int | None = Field(
+        default=50, ge=1, description="Every n-th frame is inspected; null = none"
+    )
+    features: int = Field(default=1000, ge=50, le=20000, description="Features per picture at most")
+    min_features: int = Field(
+        default=40, ge=8, description="Fewer matched features tell nothing about a pair"
+    )
+    warn_row_px: float = Field(
+        default=1.0, gt=0.0, description="Median row error that is warned of"
+    )
+    swapped_share: float = Field(
+        default=0.8,
+        gt=0.5,
+        le=1.0,
+        description="Share of near features with negative disparity from which eyes count as "
+        "swapped",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PairFeatures:
+    """The same features in both pictures, matched without knowing the geometry.
+
+    Attributes:
+        left_uv: float32 (N, 2), columns and rows in the left picture, pixels.
+        right_uv: float32 (N, 2), the same features in the right picture.
+    """
+
+    left_uv: Float32
+    right_uv: Float32
+
+    def __post_init__(self) -> None:
+        freeze(self, "left_uv", np.float32, (None, 2))
+        freeze(self, "right_uv", np.float32, (len(self.left_uv), 2))
+
+    def __len__(self) -> int:
+        return len(self.left_uv)
+
+
+@dataclass(frozen=True)
+class PairInspection:
+    """How well a pair is rectified, by features matched over the whole picture. NaN = not known.
+
+    Attributes:
+        features: Matched features that agree on one row error.
+        row_error_px: Median of right minus left row; 0 where rows correspond.
+        row_spread_px: Standard deviation of that, robust (from the median absolute deviation).
+        near: Features near enough to tell the eyes apart.
+        negative_share: Share of those with a negative disparity: about 0, or 1 where the eyes
+            are swapped.
+    """
+
+    features: int
+    row_error_px: float
+    row_spread_px: float
+    near: int
+    negative_share: float
+
+
+def inspect_pair(pair: RectifiedPair, settings: InspectionSettings | None = None) -> PairInspection:
+    """How well a pair is rectified.
+
+    Args:
+        pair: A pair that is said to be rectified.
+        settings: Number of features.
+    """
+    settings = settings or InspectionSettings()
+    features = match_features(pair.left, pair.right, settings.features)
+    return inspect_features(features, pair.camera.doffs_px, settings.min_features)
+
+
+def match_features(left: UInt8, right: UInt8, count: int) -> PairFeatures:
+    """Features that both pictures show, wherever they are: mutual best matches that stand out.
+
+    Args:
+        left: uint8 (H, W).
+        right: uint8 (H, W).
+        count: Features per picture at most.
+
+    Ref:
+        Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011.
+    """
+    orb = cv2.ORB.create(nfeatures=count, fastThreshold=10)
+    (left_uv, left_bits), (right_uv, right_bits) = (_describe(orb, side) for side in (left, right))
+    if len(left_uv) < 2 or len(right_uv) < 2:
+        return PairFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+    there = _distinct(matcher.knnMatch(left_bits, right_bits, k=2))
+    back = _distinct(matcher.knnMatch(right_bits, left_bits, k=2))
+    mutual = [(i, j) for i, j in there.items() if back.get(j) == i]
+    at = np.array(mutual, dtype=np.int64).reshape(-1, 2)
+    return PairFeatures(*_refined(left, right, left_uv[at[:, 0]], right_uv[at[:, 1]]))
+
+
+def inspect_features(
+    features: PairFeatures, doffs_px: float = 0.0, min_features: int = 40
+) -> PairInspection:
+    """Sum matched features up.
+
+    Args:
+        features: Of one pair, or of several pairs of one rig.
+        doffs_px: ``cx_right - cx_left``, added to disparities so that 0 is infinitely far.
+        min_features: Fewer tell nothing: the figures are NaN.
+    """
+    shift = features.right_uv - features.left_uv
+    agree = _agreeing(shift[:, 1])
+    rows, disparity = shift[agree, 1], doffs_px - shift[agree, 0]
+    near = np.abs(disparity) > _NEAR_PX
+    known = len(rows) >= min_features
+    middle = float(np.median(rows)) if known else float("nan")
+    spread = 1.4826 * float(np.median(np.abs(rows - middle))) if known else float("nan")
+    tells = near.sum() >= min_features
+    negative = float(np.mean(disparity[near] < 0)) if tells else float("nan")
+    return PairInspection(len(rows), middle, spread, int(near.sum()), negative)
+
+
+def check_inspection(
+    inspection: PairInspection, settings: InspectionSettings, where: str | None = None
+) -> tuple[str, ...]:
+    """Warnings about a pair; none where it is good, or where nothing can be told.
+
+    Args:
+        inspection: What `inspect_pair` found.
+        settings: Limits.
+        where: Name of the frame or drive, for the message.
+
+    Raises:
+        CalibrationError: Left and right are swapped: no depth can come of it.
+    """
+    if inspection.negative_share >= settings.swapped_share:
+        raise CalibrationError(
+            "left and right pictures are swapped",
+            where=where,
+            got=f"{100 * inspection.negative_share:.0f} % of {inspection.near} features farther "
+            "right in the right picture",
+            expected="farther left",
+            hint="give the left camera's pictures first (or un-mirror the pictures)",
+        )
+    if abs(inspection.row_error_px) >= settings.warn_row_px:
+        line = (
+            "rows of left and right do not correspond: the right picture lies "
+            f"{abs(inspection.row_error_px):.0f} px too {_side(inspection.row_error_px)} (expected "
+            f"under {settings.warn_row_px:g} px); depth will be poor or wrong: rectify the "
+            "pictures, or calibrate the cameras anew"
+        )
+        return (line,)
+    return ()
+
+
+def _side(row_error_px: float) -> str:
+    return "low" if row_error_px > 0 else "high"
+
+
+def _describe(orb: cv2.ORB, image: UInt8) -> tuple[Float32, UInt8]:
+    """Places (N, 2) and descriptors (N, 32) of the features of a picture."""
+    keypoints, bits = orb.detectAndCompute(image, None)
+    uv = np.array([point.pt for point in keypoints], dtype=np.float32).reshape(-1, 2)
+    return uv, np.zeros((0, 32), np.uint8) if bits is None else bits
+
+
+def _distinct(candidates: Sequence[Sequence[cv2.DMatch]]) -> dict[int, int]:
+    """Best matches that are much better than the second best."""
+    return {
+        best.queryIdx: best.trainIdx
+        for best, second in candidates
+        if best.distance < _RATIO * second.distance
+    }
+
+
+def _refined(
+    left: UInt8, right: UInt8, left_uv: Float32, right_uv: Float32
+) -> tuple[Float32, Float32]:
+    """Matches whose place in the right picture is known to a fraction of a pixel."""
+    if not len(left_uv):
+        return left_uv, right_uv
+    there, status, _ = cv2.calcOpticalFlowPyrLK(
+        left,
+        _exposed_as(left, right),
+        left_uv[:, None],
+        right_uv[:, None].copy(),
+        winSize=(15, 15),
+        maxLevel=0,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    there = there.reshape(-1, 2)
+    # The features of coarse pyramid levels are a few pixels off; farther is another thing.
+    kept = (status.ravel() > 0) & (np.abs(there - right_uv).max(axis=1) <= _OUTLIER_PX)
+    return left_uv[kept], there[kept].astype(np.float32)
+
+
+def _exposed_as(model: UInt8, image: UInt8) -> UInt8:
+    """A picture at the brightness and contrast of another: tracking takes both for motion."""
+    gain = model.std() / max(float(image.std()), 1.0)
+    return np.asarray(
+        cv2.convertScaleAbs(image, alpha=gain, beta=model.mean() - gain * image.mean())
+    )
+
+
+def _agreeing(row_shift: Float32) -> Bool:
+    """bool (N,), features whose row error is near the most common one."""
+    if not len(row_shift):
+        return np.zeros(0, np.bool_)
+    ordered = np.sort(row_shift)
+    until = np.searchsorted(ordered, ordered + 2 * _OUTLIER_PX, side="right")
+    first = int(np.argmax(until - np.arange(len(ordered))))
+    middle = np.median(ordered[first : until[first]])
+    return np.asarray(np.abs(row_shift - middle) <= _OUTLIER_PX)
