@@ -7,17 +7,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry import se3
 from recon.structures.arrays import Float64
-from recon.synthetic.settings import StreetSettings
+from recon.synthetic.settings import CORNER_M, StreetSettings
 
 LANE_M = -1.55  # the car keeps to the right of the centre line
 _STEP_M = 0.25
 _BEFORE_M = 60.0
+_BARE_M: Final = 60.0  # at the end of an open road, behind the closing row of trees
+BEHIND_M: Final = 30.0  # objects stand from so far behind the start
 # Columns are the camera's axes (right, down, forward) in street axes.
 R_STREET_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -30,21 +34,26 @@ class CentreLine:
         along_m: float64 (N,), distances, increasing; 0 is where the drive begins.
         xy_m: float64 (N, 2), street axes.
         heading_rad: float64 (N,), direction, counter-clockwise from x.
+        span_m: Where objects stand along it; a repeated street is laid out over one period.
+        loop_m: Length of one lap where the line closes, else None.
     """
 
     along_m: Float64
     xy_m: Float64
     heading_rad: Float64
+    span_m: tuple[float, float]
+    loop_m: float | None = None
 
     def heading(self, along_m: float) -> float:
         """Direction of the road at a distance."""
-        return float(np.interp(along_m, self.along_m, self.heading_rad))
+        return float(np.interp(self._in_lap(along_m), self.along_m, self.heading_rad))
 
     def points(self, along_m: NDArray[np.float64], lateral_m: NDArray[np.float64]) -> Float64:
         """Points (N, 2) at distances and to the left (positive) of the centre line."""
-        x = np.interp(along_m, self.along_m, self.xy_m[:, 0])
-        y = np.interp(along_m, self.along_m, self.xy_m[:, 1])
-        heading = np.interp(along_m, self.along_m, self.heading_rad)
+        s = self._in_lap(along_m)
+        x = np.interp(s, self.along_m, self.xy_m[:, 0])
+        y = np.interp(s, self.along_m, self.xy_m[:, 1])
+        heading = np.interp(s, self.along_m, self.heading_rad)
         return np.stack([x - lateral_m * np.sin(heading), y + lateral_m * np.cos(heading)], axis=-1)
 
     def place(self, along_m: float, lateral_m: float, height_m: float = 0.0) -> Float64:
@@ -54,15 +63,34 @@ class CentreLine:
             se3.exp_so3(np.array([0.0, 0.0, self.heading(along_m)])), np.array([x, y, height_m])
         )
 
+    def bends(self, from_m: float, to_m: float) -> bool:
+        """Whether a stretch lies on a corner, if only in part."""
+        return abs(self.heading(to_m) - self.heading(from_m)) > 1e-6
+
+    def _in_lap(self, along_m: Any) -> Any:
+        """Distances along one lap; its very end is its end, not its start."""
+        if self.loop_m is None:
+            return along_m
+        return np.where(along_m == self.loop_m, along_m, np.mod(along_m, self.loop_m))
+
 
 def centre_line(settings: StreetSettings, length_m: float) -> CentreLine:
-    """The road from 60 m before the start to ``length_m`` beyond it."""
+    """The road from 60 m before the start to ``length_m`` beyond it, or once around a block."""
+    if settings.path == "block":
+        return _block(*settings.block_m)
     along = np.arange(-_BEFORE_M, length_m + _STEP_M, _STEP_M)
     heading = _heading(along, settings)
-    middle = 0.5 * (heading[:-1] + heading[1:])
-    steps = _STEP_M * np.stack([np.cos(middle), np.sin(middle)], axis=1)
-    xy = np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    return CentreLine(along, xy - xy[np.searchsorted(along, 0.0)], heading)
+    xy = _walk(along, heading)
+    last = float(along[-1]) - _BARE_M
+    span = (-BEHIND_M, last) if settings.repeat_m is None else (0.0, settings.repeat_m)
+    return CentreLine(along, xy - xy[np.searchsorted(along, 0.0)], heading, span)
+
+
+def _walk(along_m: Float64, heading_rad: Float64) -> Float64:
+    """Points (N, 2) of a line of given directions."""
+    middle = 0.5 * (heading_rad[:-1] + heading_rad[1:])
+    steps = np.diff(along_m)[:, None] * np.stack([np.cos(middle), np.sin(middle)], axis=1)
+    return np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
 def _heading(along_m: Float64, settings: StreetSettings) -> Float64:
@@ -72,6 +100,21 @@ def _heading(along_m: Float64, settings: StreetSettings) -> Float64:
     # A road is no perfect arc: it winds a little about it.
     winding = 0.35 * rate * 18.0 * np.sin(along_m / 18.0)
     return np.asarray(rate * along_m + winding)
+
+
+def _block(length_m: float, width_m: float) -> CentreLine:
+    """One lap around a block, counter-clockwise, from the start of a long side."""
+    arc_m = 0.5 * math.pi * CORNER_M
+    sides = [length_m - 2 * CORNER_M, width_m - 2 * CORNER_M] * 2
+    ends = np.cumsum([[side, arc_m] for side in sides])
+    knots = np.concatenate([[0.0], ends])
+    turns = 0.5 * math.pi * np.repeat(np.arange(5), 2)[:-1]
+    # The knots are among the samples, so each piece has its exact length and the lap closes.
+    pieces = [np.linspace(a, b, int((b - a) / _STEP_M) + 2)[:-1] for a, b in pairwise(knots)]
+    along = np.concatenate([*pieces, knots[-1:]])
+    heading = np.interp(along, knots, turns)
+    lap = float(knots[-1])
+    return CentreLine(along, _walk(along, heading), heading, (0.0, lap), lap)
 
 
 def camera_poses(settings: StreetSettings, road: CentreLine) -> Float64:

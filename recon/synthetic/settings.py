@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Final, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
+from typing_extensions import Self
 
 from recon.settings import Settings
+
+CORNER_M: Final = 16.0
+"""Radius of the corners of a block."""
+
+_LEAST_SIDE_M: Final = 2 * CORNER_M + 28.0  # two rows of houses, back to back
 
 
 class StreetSettings(Settings):
@@ -22,12 +28,23 @@ class StreetSettings(Settings):
         default=1.0, ge=0.0, le=5.0, description="Path between two frames."
     )
     frame_rate_hz: float = Field(default=10.0, gt=0.0, description="Sets the timestamps alone.")
-    path: Literal["curve", "straight"] = Field(default="curve", description="Shape of the street.")
+    path: Literal["curve", "straight", "block"] = Field(
+        default="curve", description="Shape of the street; block = around one, lap after lap."
+    )
     turn_deg_per_100m: float = Field(
         default=20.0,
         ge=-60.0,
         le=60.0,
         description="Mean turn of a curved street; positive = to the left.",
+    )
+    block_m: tuple[float, float] = Field(
+        default=(100.0, 70.0), description="Sides of the block that the street goes around."
+    )
+    repeat_m: float | None = Field(
+        default=None,
+        ge=20.0,
+        le=1000.0,
+        description="A straight street looks the same every so many metres; null = it never does.",
     )
     sway: float = Field(
         default=1.0,
@@ -80,3 +97,11 @@ class StreetSettings(Settings):
         le=256,
         description="Rendering threads, 0 = one per core; changes no result.",
     )
+
+    @model_validator(mode="after")
+    def _check_shape(self) -> Self:
+        if min(self.block_m) < _LEAST_SIDE_M or max(self.block_m) > 2000.0:
+            raise ValueError(f"block_m: each side must be {_LEAST_SIDE_M:g} to 2000 m")
+        if self.repeat_m is not None and self.path != "straight":
+            raise ValueError("repeat_m: only a straight street can repeat itself")
+        return self

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -14,13 +15,12 @@ from recon.structures.arrays import Float64, freeze
 from recon.synthetic import props
 from recon.synthetic.buildings import draw_plan, house
 from recon.synthetic.materials import ROAD_HALF_M
-from recon.synthetic.path import CentreLine, camera_poses, centre_line
+from recon.synthetic.path import BEHIND_M, CentreLine, camera_poses, centre_line
 from recon.synthetic.settings import StreetSettings
 from recon.synthetic.soup import Material, Paint, TriangleSoup, merge, move, painted
 
 KERB_M: Final = 0.12  # pavement above road
 _WALL_M: Final = 8.2  # facades from the centre line
-_BEHIND_M: Final = 30.0
 _AHEAD_M: Final = 110.0
 _CAR_LANE_M: Final = 4.15
 _SEEDLINGS: Final = 5
@@ -93,18 +93,26 @@ def build_street(settings: StreetSettings) -> StreetWorld:
         _trees,
         _furniture,
     ]
-    parts = [_ground(road, length)]
+    parts = [_ground(road)]
     for number, layer in enumerate(layers):
         for side in (1.0, -1.0):
             stream = np.random.default_rng([settings.seed, number, int(side > 0)])
             parts.extend(layer(road, side, stream))
+    soup = merge(parts)
     return StreetWorld(
         settings=settings,
-        soup=merge(parts),
+        soup=soup if settings.repeat_m is None else _repeated(soup, settings.repeat_m, length),
         camera=rig(settings),
         T_street_camera=camera_poses(settings, road),
         to_sun=_sun(settings.seed),
     )
+
+
+def _repeated(period: TriangleSoup, repeat_m: float, length_m: float) -> TriangleSoup:
+    """A period of a straight street, end to end from behind the start on."""
+    shifts = repeat_m * np.arange(-math.ceil(BEHIND_M / repeat_m), math.ceil(length_m / repeat_m))
+    along = [np.array([shift, 0.0, 0.0]) for shift in shifts]
+    return merge([move(period, se3.make_transform(np.eye(3), offset)) for offset in along])
 
 
 def rig(settings: StreetSettings) -> RectifiedCamera:
@@ -130,30 +138,30 @@ def _sun(seed: int) -> Float64:
     )
 
 
-def _ground(road: CentreLine, length_m: float) -> TriangleSoup:
+def _ground(road: CentreLine) -> TriangleSoup:
     """Road, kerbs and pavements in strips of a metre, and the land beside them."""
     a, top = ROAD_HALF_M, KERB_M
     grey = Paint(Material.ASPHALT, (0.40, 0.40, 0.41))
-    strips = [_strip(road, length_m, ((-a, 0.0), (a, 0.0)), grey)]
+    strips = [_strip(road, ((-a, 0.0), (a, 0.0)), grey)]
     for side in (1.0, -1.0):
         stone = Paint(Material.KERB, (0.58, 0.57, 0.55))
         slabs = Paint(Material.PAVING, (0.56, 0.54, 0.51))
         grass = Paint(Material.GRASS, (0.33, 0.38, 0.20))
         b, c, d = side * (a + 0.15), side * (_WALL_M + 3.0), side * 60.0
         strips += [
-            _strip(road, length_m, ((side * a, 0.0), (side * a, top)), stone),
-            _strip(road, length_m, ((side * a, top), (b, top)), stone),
-            _strip(road, length_m, ((b, top), (c, top)), slabs),
-            _strip(road, length_m, ((c, top), (d, top)), grass),
+            _strip(road, ((side * a, 0.0), (side * a, top)), stone),
+            _strip(road, ((side * a, top), (b, top)), stone),
+            _strip(road, ((b, top), (c, top)), slabs),
+            _yard(road, c, grass)
+            if _inside(road, side)
+            else _strip(road, ((c, top), (d, top)), grass),
         ]
     return merge(strips)
 
 
-def _strip(
-    road: CentreLine, length_m: float, edges: tuple[tuple[float, float], ...], paint: Paint
-) -> TriangleSoup:
+def _strip(road: CentreLine, edges: tuple[tuple[float, float], ...], paint: Paint) -> TriangleSoup:
     """A band along the road between two edges (lateral, height)."""
-    along = np.arange(-_BEHIND_M, length_m + 50.0, 1.0)
+    along = _stations(road)
     rims, uvs = [], []
     run = 0.0
     for lateral, height in edges:
@@ -165,6 +173,29 @@ def _strip(
     return painted(corners, uv, paint)
 
 
+def _stations(road: CentreLine) -> Float64:
+    """Where the strips of the ground are cut: every metre, and at their very ends."""
+    first, last = road.span_m
+    if first < 0.0:  # an open road, whose ground goes on behind the last objects
+        return np.arange(first, float(road.along_m[-1]) - 10.0, 1.0)
+    return np.linspace(first, last, math.ceil(last - first) + 1)
+
+
+def _yard(road: CentreLine, lateral_m: float, paint: Paint) -> TriangleSoup:
+    """The land inside of a block: a fan from its middle to the pavement's inner edge."""
+    along = _stations(road)
+    rim = road.points(along, np.full(len(along), lateral_m))
+    middle = np.broadcast_to(rim.mean(axis=0), (len(rim) - 1, 2))
+    uv = np.stack([rim[:-1], rim[1:], middle], axis=1)
+    height = np.full((*uv.shape[:2], 1), KERB_M)
+    return painted(np.concatenate([uv, height], axis=2), uv, paint)
+
+
+def _inside(road: CentreLine, side: float) -> bool:
+    """Whether a side of the road is the inside of a block."""
+    return road.loop_m is not None and side > 0
+
+
 def _band(near: Float64, far: Float64) -> Float64:
     """Triangles (2·(N-1), 3, C) between two polylines (N, C)."""
     first = np.stack([near[:-1], near[1:], far[1:]], axis=1)
@@ -172,29 +203,35 @@ def _band(near: Float64, far: Float64) -> Float64:
     return np.concatenate([first, second])
 
 
-def _end(road: CentreLine) -> float:
-    """Where objects stop: the last 40 m of the road are bare, behind the closing row."""
-    return float(road.along_m[-1]) - 60.0
-
-
 def _houses(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
     """A row of houses with set-backs, and now and then the mouth of a side street."""
-    at = -_BEHIND_M
-    while at < _end(road):
+    at, end = road.span_m
+    while at < end:
         width = float(rng.uniform(8.0, 15.0))
         setback = float(rng.choice([0.0, 0.0, rng.uniform(0.3, 1.8)]))
         gap = float(rng.uniform(5.0, 8.0)) if rng.random() < 0.22 else float(rng.uniform(0.0, 0.15))
-        yield _stand(road, side, at, setback, width, rng)
+        if _room(road, side, at, width):
+            yield _stand(road, side, at, setback, width, rng)
         at += width + gap
 
 
 def _backdrop(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
     """Houses behind the first row, which close the views through its gaps."""
-    at = -_BEHIND_M
-    while at < _end(road) + 30.0:
+    at, end = road.span_m
+    end += 30.0 * (at < 0.0)
+    while at < end:
         width = float(rng.uniform(11.0, 18.0))
-        yield _stand(road, side, at, float(rng.uniform(20.0, 28.0)), width, rng)
+        if not _inside(road, side) and _room(road, side, at, width):
+            yield _stand(road, side, at, float(rng.uniform(20.0, 28.0)), width, rng)
         at += width + float(rng.uniform(0.5, 3.0))
+
+
+def _room(road: CentreLine, side: float, at_m: float, width_m: float) -> bool:
+    """Whether a house fits: within the lap or period, and off the inside of a corner."""
+    if road.span_m[0] < 0.0:
+        return True
+    end_m = at_m + width_m
+    return end_m <= road.span_m[1] and not (_inside(road, side) and road.bends(at_m, end_m))
 
 
 def _stand(
@@ -216,7 +253,8 @@ def _stand(
 
 def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
     """Cars in about half of the bays, most of them in the direction of their lane."""
-    for bay in np.arange(-18.0, _end(road), 6.0):
+    first, end = road.span_m
+    for bay in np.arange(max(first, -18.0), end, 6.0):
         if rng.random() < 0.45:
             continue
         soup, jitter = props.car(rng), rng.normal(0.0, [0.25, 0.1, 0.02])
@@ -235,12 +273,13 @@ def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[
         T = road.place(at_m, lateral_m, KERB_M) @ se3.make_transform(turn, np.zeros(3))
         return move(seedlings[int(rng.integers(_SEEDLINGS))], T)
 
-    at = -10.0 + float(rng.uniform(0.0, 8.0))
-    while at < _end(road):
+    first, end = road.span_m
+    at = max(first, -10.0) + float(rng.uniform(0.0, 8.0))
+    while at < end:
         yield grow(at, side * (ROAD_HALF_M + 0.75))
         at += float(rng.uniform(9.0, 22.0))
-    for lateral in np.arange(1.0, 26.0, 3.2):
-        yield grow(_end(road) + 8.0 + float(rng.uniform(0.0, 4.0)), side * float(lateral))
+    for lateral in np.arange(1.0, 26.0, 3.2) if first < 0.0 else ():
+        yield grow(end + 8.0 + float(rng.uniform(0.0, 4.0)), side * float(lateral))
 
 
 def _furniture(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
@@ -248,10 +287,11 @@ def _furniture(road: CentreLine, side: float, rng: np.random.Generator) -> Itera
     kerb = side * (ROAD_HALF_M + 0.45)
     # A stream of their own: the number of posts must not change what stands between them.
     lamps, rng = rng.spawn(2)
-    for at in np.arange(-12.0 + 12.0 * (side > 0), _end(road), 24.0):
+    first, end = road.span_m
+    for at in np.arange(max(first, -12.0) + 12.0 * (side > 0), end, 24.0):
         yield move(props.lamp_post(side, lamps), road.place(float(at), kerb, KERB_M))
-    at = -8.0
-    while at < _end(road):
+    at = max(first, -8.0)
+    while at < end:
         at += float(rng.uniform(2.5, 9.0))
         kind = rng.random()
         if kind < 0.3:
