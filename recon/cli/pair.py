@@ -15,7 +15,7 @@ Right = Annotated[Path, typer.Argument(help="Right picture.")]
 Ndisp = Annotated[
     int | None, typer.Option(min=1, help="Disparities to search (from the calibration).")
 ]
-_CALIB_HELP = "Calibration: KITTI or Middlebury calib.txt, or OpenCV stereo YAML."
+_CALIB_HELP = "Calibration: ours, KITTI, Middlebury, OpenCV, ROS CameraInfo or kalibr."
 
 
 def pair(

@@ -6,14 +6,20 @@ import re
 from typing import Final
 
 from recon.errors import FormatError
+from recon.formats.camera_info import read_camera_info
 from recon.formats.files import StrPath, read_text
+from recon.formats.kalibr import read_kalibr
 from recon.formats.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_calib
 from recon.formats.middlebury_calib import read_middlebury_calib
 from recon.formats.opencv_yaml import read_opencv_calibration
+from recon.formats.recon_yaml import MARK, read_recon_calibration
 from recon.structures import RectifiedCamera, StereoCalibration
 
 _KITTI: Final = re.compile(r"^P(?:_rect_0)?\d:", re.MULTILINE)
 _MIDDLEBURY: Final = re.compile(r"^\s*cam[01]\s*=", re.MULTILINE)
+_OURS: Final = re.compile(rf"^format:\s*{MARK}", re.MULTILINE)
+_CAMERA_INFO: Final = re.compile(r"^projection_matrix:", re.MULTILINE)
+_KALIBR: Final = re.compile(r"^cam0:", re.MULTILINE)
 _OPENCV: Final = re.compile(r"^%YAML|<opencv_storage>|opencv-matrix")
 
 
@@ -22,8 +28,9 @@ def read_calibration(
 ) -> RectifiedCamera | StereoCalibration:
     """Read a calibration file of a kind that need not be named.
 
-    Understood are KITTI's ``calib.txt`` (the grey pair where it has one, else the colour pair),
-    Middlebury's ``calib.txt``, and what OpenCV's ``FileStorage`` writes.
+    Understood are our own YAML, KITTI's ``calib.txt`` (the grey pair where it has one, else the
+    colour pair), Middlebury's ``calib.txt``, what OpenCV's ``FileStorage`` writes, ROS CameraInfo
+    (one of the two files; the other is found beside it), and kalibr's camera chain.
 
     Args:
         path: The file.
@@ -39,11 +46,17 @@ def read_calibration(
         CalibrationError: The numbers cannot give depth.
     """
     text = read_text(path)
+    if _OURS.search(text):
+        return read_recon_calibration(path)
     # OpenCV first: its extrinsics hold a ``P1:`` as well.
     if _OPENCV.search(text):
         return read_opencv_calibration(
             path, size_px=(width_px, height_px), metres_per_unit=metres_per_unit
         )
+    if _CAMERA_INFO.search(text):
+        return read_camera_info(path)
+    if _KALIBR.search(text):
+        return read_kalibr(path)
     if _MIDDLEBURY.search(text):
         return read_middlebury_calib(path).camera
     if _KITTI.search(text):
@@ -53,5 +66,6 @@ def read_calibration(
     raise FormatError(
         "not a calibration file",
         where=path,
-        expected="KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…) or OpenCV YAML/XML (M1 …)",
+        expected="our YAML, KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…), "
+        "OpenCV YAML/XML (M1 …), ROS CameraInfo or a kalibr camchain (cam0: …)",
     )

@@ -13,7 +13,7 @@ from recon.errors import CalibrationError, FormatError
 from recon.formats.atomic import write_text
 from recon.formats.files import StrPath, naming, read_text
 from recon.geometry.se3 import make_transform
-from recon.structures import CameraIntrinsics, StereoCalibration
+from recon.structures import CameraIntrinsics, LensModel, StereoCalibration
 from recon.structures.arrays import Float64
 
 # One spelling per line: OpenCV's samples, then what calibration tools and tutorials use.
@@ -26,6 +26,8 @@ _TRANSLATION: Final = ("T", "translation_vector")
 _SIZE: Final = ("image_size", "imageSize", "img_size")
 _WIDTH: Final = ("image_width", "imageWidth", "width")
 _HEIGHT: Final = ("image_height", "imageHeight", "height")
+_MODEL: Final = ("distortion_model", "camera_model", "model")
+_FISHEYE_NAMES: Final = frozenset({"fisheye", "equidistant"})
 
 # The numbers of coefficients that OpenCV's lens model knows.
 _DISTORTION_COUNTS: Final = frozenset({0, 4, 5, 8, 12, 14})
@@ -61,8 +63,9 @@ def read_opencv_calibration(
     nodes = _read_nodes(intrinsics)
     outer = _find_extrinsics(intrinsics, extrinsics, nodes)
     size = _size(nodes, size_px, intrinsics)
-    left = _camera(nodes, _LEFT_MATRIX, _LEFT_DISTORTION, size, intrinsics)
-    right = _camera(nodes, _RIGHT_MATRIX, _RIGHT_DISTORTION, size, intrinsics)
+    model = _model(intrinsics)
+    left = _camera(nodes, (_LEFT_MATRIX, _LEFT_DISTORTION), size, model, intrinsics)
+    right = _camera(nodes, (_RIGHT_MATRIX, _RIGHT_DISTORTION), size, model, intrinsics)
     outer_nodes = _read_nodes(outer)
     rotation = _matrix(outer_nodes, _ROTATION, (3, 3), outer)
     translation = _matrix(outer_nodes, _TRANSLATION, (3,), outer)
@@ -77,18 +80,34 @@ def read_opencv_calibration(
 def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> None:
     """Write one YAML file that OpenCV's ``FileStorage`` reads, ``T`` in metres, atomically.
 
+    OpenCV has no place for the lens model; ``distortion_model`` says it where it is no pinhole.
+
     Raises:
+        CalibrationError: One camera is a fisheye and the other is not.
         OutputError: The file cannot be written.
     """
+    models = {calibration.left.model, calibration.right.model}
+    if len(models) > 1:
+        raise CalibrationError("an OpenCV file cannot hold two lens models", where=path)
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", calibration.left.width_px)
     storage.write("image_height", calibration.left.height_px)
+    if "fisheye" in models:
+        storage.write("distortion_model", "fisheye")
     for number, camera in enumerate((calibration.left, calibration.right), start=1):
         storage.write(f"M{number}", np.array(camera.matrix))
         storage.write(f"D{number}", np.array(camera.distortion).reshape(1, -1))
     storage.write("R", np.array(calibration.T_right_left[:3, :3]))
     storage.write("T", np.array(calibration.T_right_left[:3, 3]).reshape(3, 1))
     write_text(path, storage.releaseAndGetString())
+
+
+def _model(path: StrPath) -> LensModel:
+    """The lens model that a file names in passing; a pinhole where it names none."""
+    storage = cv2.FileStorage(read_text(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    nodes = [storage.getNode(name) for name in _MODEL]
+    named = {node.string().lower() for node in nodes if node.isString()}
+    return "fisheye" if named & _FISHEYE_NAMES else "pinhole"
 
 
 def _read_nodes(path: StrPath) -> Nodes:
@@ -140,11 +159,12 @@ def _matrix(nodes: Nodes, names: Sequence[str], shape: tuple[int, ...], path: St
 
 def _camera(
     nodes: Nodes,
-    matrix_names: Sequence[str],
-    distortion_names: Sequence[str],
+    names: tuple[Sequence[str], Sequence[str]],
     size_px: tuple[int, int],
+    model: LensModel,
     path: StrPath,
 ) -> CameraIntrinsics:
+    matrix_names, distortion_names = names
     matrix = _matrix(nodes, matrix_names, (3, 3), path)
     found = _find(nodes, distortion_names)
     distortion = np.zeros(0) if found is None else found.ravel()
@@ -156,7 +176,7 @@ def _camera(
             expected="4, 5, 8, 12 or 14",
         )
     with naming(path):
-        return CameraIntrinsics(matrix, distortion, *size_px)
+        return CameraIntrinsics(matrix, distortion, *size_px, model)
 
 
 def _size(nodes: Nodes, given: tuple[int, int] | None, path: StrPath) -> tuple[int, int]:

@@ -10,7 +10,12 @@ from recon.rectification.inspect import (
     inspect_pair,
     match_features,
 )
-from recon.rectification.rectify import RectificationSettings, Rectifier
+from recon.rectification.rectify import (
+    RectificationSettings,
+    Rectifier,
+    RectifyingTurns,
+    plan_turns,
+)
 
 __all__ = [
     "GreyMode",
@@ -19,9 +24,11 @@ __all__ = [
     "PairInspection",
     "RectificationSettings",
     "Rectifier",
+    "RectifyingTurns",
     "check_inspection",
     "inspect_features",
     "inspect_pair",
     "match_features",
+    "plan_turns",
     "to_grey",
 ]

@@ -10,12 +10,13 @@ import cv2
 import numpy as np
 from pydantic import Field
 
+from recon.adapters.opencv_lens import rectifying_maps
 from recon.errors import CalibrationError
 from recon.geometry.se3 import angle_rad
 from recon.rectification.grey import GreyMode, to_grey
+from recon.rectification.wide import plan_wide_view
 from recon.settings import Settings
 from recon.structures import (
-    CameraIntrinsics,
     RectifiedCamera,
     RectifiedPair,
     StereoCalibration,
@@ -156,10 +157,30 @@ class Rectifier:
             )
 
 
-def plan_rectification(
-    calibration: StereoCalibration, settings: RectificationSettings
-) -> tuple[RectifiedCamera, tuple[View, View]]:
-    """Find the rectified camera and where its left and right pixels come from.
+@dataclass(frozen=True, eq=False)
+class RectifyingTurns:
+    """How the two cameras are turned, and what the turned views look like.
+
+    Attributes:
+        R_left: float64 (3, 3), from the raw left camera's axes to the rectified ones.
+        R_right: The same for the right camera.
+        camera: Geometry of the rectified views.
+    """
+
+    R_left: Float64
+    R_right: Float64
+    camera: RectifiedCamera
+
+    @property
+    def matrices(self) -> tuple[Float64, Float64]:
+        """float64 (3, 3) pinhole matrices of the left and the right view."""
+        right = self.camera.matrix
+        right[0, 2] = self.camera.cx_right_px
+        return self.camera.matrix, right
+
+
+def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) -> RectifyingTurns:
+    """Find how to turn the cameras of a rig, and the rectified camera.
 
     Raises:
         CalibrationError: See `Rectifier`.
@@ -170,30 +191,54 @@ def plan_rectification(
     left, right = calibration.left, calibration.right
     size = (left.width_px, left.height_px)
     try:
-        R1, R2, P1, P2, *_ = cv2.stereoRectify(
-            left.matrix,
-            left.distortion,
-            right.matrix,
-            right.distortion,
-            size,
-            calibration.T_right_left[:3, :3],
-            calibration.T_right_left[:3, 3:],
-            flags=cv2.CALIB_ZERO_DISPARITY if settings.same_principal_point else 0,
-            alpha=-1 if settings.alpha is None else settings.alpha,
-        )
-        views = (_make_view(left, R1, P1), _make_view(right, R2, P2))
+        if "fisheye" in (left.model, right.model):
+            R1, R2, P1, P2 = plan_wide_view(
+                calibration, settings.alpha, same_principal_point=settings.same_principal_point
+            )
+        else:
+            R1, R2, P1, P2 = _plan_pinholes(calibration, size, settings)
     except cv2.error as error:
         raise CalibrationError("cameras cannot be rectified", got=error.err) from error
-    return _camera_of(P1, P2, size), views
+    return RectifyingTurns(R1, R2, _camera_of(P1, P2, size))
 
 
-def _make_view(camera: CameraIntrinsics, rotation: Float64, projection: Float64) -> View:
-    size = (camera.width_px, camera.height_px)
-    return View(
-        *cv2.initUndistortRectifyMap(
-            camera.matrix, camera.distortion, rotation, projection, size, cv2.CV_32FC1
+def plan_rectification(
+    calibration: StereoCalibration, settings: RectificationSettings
+) -> tuple[RectifiedCamera, tuple[View, View]]:
+    """Find the rectified camera and where its left and right pixels come from.
+
+    Raises:
+        CalibrationError: See `Rectifier`.
+    """
+    turns = plan_turns(calibration, settings)
+    size = (turns.camera.width_px, turns.camera.height_px)
+    cameras, rotations = (calibration.left, calibration.right), (turns.R_left, turns.R_right)
+    try:
+        left, right = (
+            View(*rectifying_maps(camera, rotation, matrix, size))
+            for camera, rotation, matrix in zip(cameras, rotations, turns.matrices, strict=True)
         )
+    except cv2.error as error:
+        raise CalibrationError("cameras cannot be rectified", got=error.err) from error
+    return turns.camera, (left, right)
+
+
+def _plan_pinholes(
+    calibration: StereoCalibration, size: tuple[int, int], settings: RectificationSettings
+) -> tuple[Float64, Float64, Float64, Float64]:
+    left, right = calibration.left, calibration.right
+    R1, R2, P1, P2, *_ = cv2.stereoRectify(
+        left.matrix,
+        left.distortion,
+        right.matrix,
+        right.distortion,
+        size,
+        calibration.T_right_left[:3, :3],
+        calibration.T_right_left[:3, 3:],
+        flags=cv2.CALIB_ZERO_DISPARITY if settings.same_principal_point else 0,
+        alpha=-1 if settings.alpha is None else settings.alpha,
     )
+    return R1, R2, P1, P2
 
 
 def _camera_of(P1: Float64, P2: Float64, size: tuple[int, int]) -> RectifiedCamera:

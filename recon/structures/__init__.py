@@ -1,6 +1,6 @@
 """Values: frozen, checked when they are made, numpy only; they neither read files nor draw."""
 
-from recon.structures.camera import CameraIntrinsics, RectifiedCamera, StereoCalibration
+from recon.structures.camera import CameraIntrinsics, LensModel, RectifiedCamera, StereoCalibration
 from recon.structures.cloud import Frame, PointCloud
 from recon.structures.disparity import Disparity, Reason
 from recon.structures.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
@@ -25,6 +25,7 @@ __all__ = [
     "DisparityMetrics",
     "DisparityTruth",
     "Frame",
+    "LensModel",
     "MapMetrics",
     "OccupancyGrid",
     "OccupancyVoxels",

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from recon.errors import CalibrationError
 from recon.structures.arrays import Float64, freeze
+
+LensModel = Literal["pinhole", "fisheye"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,16 +19,20 @@ class CameraIntrinsics:
     """One raw camera.
 
     Attributes:
-        matrix: float64 (3, 3), the pinhole matrix in pixels; pixel centres are at integers.
-        distortion: float64 (N,), OpenCV's order (k1 k2 p1 p2 k3 …); empty = none.
+        matrix: float64 (3, 3), the camera matrix in pixels; pixel centres are at integers.
+        distortion: float64 (N,). Of a pinhole in OpenCV's order (k1 k2 p1 p2 k3 …), empty =
+            none; of a fisheye always four (k1 k2 k3 k4).
         width_px: Image width.
         height_px: Image height.
+        model: ``pinhole`` projects by the tangent of a ray's angle, ``fisheye`` by the angle
+            itself (also called equidistant, or Kannala-Brandt).
     """
 
     matrix: Float64
     distortion: Float64
     width_px: int
     height_px: int
+    model: LensModel = "pinhole"
 
     def __post_init__(self) -> None:
         freeze(self, "matrix", np.float64, (3, 3))
@@ -34,6 +41,10 @@ class CameraIntrinsics:
             raise CalibrationError("camera matrix or distortion is not finite")
         if min(self.matrix[0, 0], self.matrix[1, 1]) <= 0:
             raise CalibrationError("focal length is not positive", got=f"{self.matrix[0, 0]:g} px")
+        if self.model == "fisheye" and self.distortion.size != 4:
+            raise CalibrationError(
+                "a fisheye has four coefficients of distortion", got=self.distortion.size
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,20 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.adapters.opencv_lens import project as project_raw
+from recon.adapters.opencv_lens import unproject as unproject_raw
 from recon.errors import CalibrationError, SettingsError
 from recon.formats.calibration import read_calibration
 from recon.formats.image import read_image
 from recon.geometry.projection import unproject
 from recon.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.geometry.triangulation import disparity_from_depth
-from recon.rectification.rectify import RectificationSettings, Rectifier, plan_rectification
+from recon.rectification.rectify import (
+    RectificationSettings,
+    Rectifier,
+    plan_rectification,
+    plan_turns,
+)
 from recon.structures import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
 
 WIDTH, HEIGHT = 320, 240
@@ -264,3 +271,84 @@ def test_corners_of_a_real_chessboard_share_their_rows(recon_data: Path) -> None
             assert (left[:, 0] - right[:, 0] > 10).all()
     # The calibration itself has a reprojection error of 0.45 px.
     assert 0 < np.sqrt(np.mean(np.concatenate(offsets) ** 2)) < 0.5
+
+
+def fisheye_rig(focal: float = 110.0) -> StereoCalibration:
+    """Two lenses of about 160 degrees."""
+
+    def camera(cx: float, cy: float) -> CameraIntrinsics:
+        matrix = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]])
+        lens = np.array([0.02, -0.008, 0.002, -0.0004])
+        return CameraIntrinsics(matrix, lens, WIDTH, HEIGHT, "fisheye")
+
+    return StereoCalibration(camera(163, 117), camera(158, 124), rig().T_right_left)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.5, 1.0, None])
+@pytest.mark.parametrize("same", [True, False])
+@pytest.mark.parametrize("mixed", [False, True])
+def test_a_point_seen_by_fisheyes_lies_on_one_row_at_its_disparity(
+    alpha: float | None, same: bool, mixed: bool
+) -> None:
+    calibration = replace(fisheye_rig(), right=rig().right) if mixed else fisheye_rig()
+    settings = RectificationSettings(alpha=alpha, same_principal_point=same)
+    turns = plan_turns(calibration, settings)
+    xyz = np.random.default_rng(3).uniform((-1, -0.7, 0.7), (1, 0.7, 6), (300, 3))
+    seen = []
+    sides = (calibration.left, calibration.right)
+    poses = (np.eye(4), calibration.T_right_left)
+    rotations = (turns.R_left, turns.R_right)
+    for camera, T, R, K in zip(sides, poses, rotations, turns.matrices, strict=True):
+        rays_of_pixels = unproject_raw(camera, project_raw(camera, apply(T, xyz))) @ R.T
+        seen.append((rays_of_pixels / rays_of_pixels[:, 2:]) @ K.T)
+    left, right = seen
+    np.testing.assert_allclose(left[:, 1], right[:, 1], rtol=0, atol=1e-6)
+    depth_m = (xyz @ turns.R_left.T)[:, 2]
+    np.testing.assert_allclose(
+        left[:, 0] - right[:, 0], disparity_from_depth(depth_m, turns.camera), rtol=0, atol=1e-4
+    )
+    assert turns.camera.cx_px == turns.camera.cx_right_px or not same
+
+
+def test_alpha_0_of_a_fisheye_leaves_only_pixels_with_a_source() -> None:
+    whole = Rectifier(fisheye_rig())
+    assert whole.valid is not None
+    assert whole.valid.all()
+    wider = Rectifier(fisheye_rig(), RectificationSettings(alpha=1.0))
+    assert wider.camera.focal_px < whole.camera.focal_px
+
+
+def test_a_fisheye_beyond_a_half_space_still_gives_a_view_of_at_most_120_degrees_of_height() -> (
+    None
+):
+    rectifier = Rectifier(fisheye_rig(focal=70.0), RectificationSettings(alpha=1.0))
+    half_height = rectifier.camera.height_px / 2 / rectifier.camera.focal_px
+    assert 1.0 < half_height < np.tan(np.radians(61))
+
+
+def test_stripes_of_epipolar_planes_are_level_through_fisheyes_too() -> None:
+    rectified = Rectifier(fisheye_rig()).rectify(fisheye_stripes())
+    spread = [image.astype(float).std(axis=1).max() for image in (rectified.left, rectified.right)]
+    assert max(spread) < 3
+    means = [image.mean(axis=1) for image in (rectified.left, rectified.right)]
+    assert np.abs(means[0] - means[1]).max() < 1.5
+    assert np.ptp(means[0]) > 100
+
+
+def fisheye_stripes() -> StereoPair:
+    """Both raw views of a world whose grey depends on the epipolar plane alone."""
+    calibration = fisheye_rig()
+    T_left_right = invert(calibration.T_right_left)
+    centre = T_left_right[:3, 3]
+    across = np.cross(centre, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    forward = np.cross(across, centre / np.linalg.norm(centre))
+    v, u = np.mgrid[0:HEIGHT, 0:WIDTH]
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
+    images = []
+    for camera, T in ((calibration.left, np.eye(4)), (calibration.right, T_left_right)):
+        directions = unproject_raw(camera, pixels) @ T[:3, :3].T
+        angle = np.arctan2(directions @ across, directions @ forward)
+        grey = np.nan_to_num(128 + 100 * np.sin(angle * 12), nan=0.0)
+        images.append(np.rint(grey).astype(np.uint8).reshape(HEIGHT, WIDTH))
+    return StereoPair(images[0], images[1])

@@ -1,0 +1,96 @@
+"""What a lens does to a ray, and its inverse: OpenCV's two models behind one pair of functions."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.structures import CameraIntrinsics
+from recon.structures.arrays import Float32, Float64
+
+_ORIGIN: Final = np.zeros(3)
+# OpenCV inverts a lens by iteration and by default stops early (five rounds, 0.01).
+_EXACT: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
+
+
+def project(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
+    """float64 (N, 2), pixels of points (N, 3) in the camera's axes; NaN at or behind its plane."""
+    return project_with_jacobian(camera, xyz)[0]
+
+
+def project_with_jacobian(
+    camera: CameraIntrinsics, xyz: NDArray[Any]
+) -> tuple[Float64, Float64, Float64]:
+    """Project points, and tell how their pixels move.
+
+    Args:
+        camera: The raw camera.
+        xyz: (N, 3), in its axes.
+
+    Returns:
+        Pixels float64 (N, 2), NaN for points at or behind the camera's plane; their derivatives
+        by the point, (N, 2, 3); and by (fx, fy, cx, cy, distortion …), (N, 2, 4 + D).
+    """
+    points = np.ascontiguousarray(xyz, dtype=np.float64).reshape(-1, 1, 3)
+    matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
+    count = distortion.size
+    if camera.model == "fisheye":
+        pixels, J = cv2.fisheye.projectPoints(points, _ORIGIN, _ORIGIN, matrix, distortion)
+        by_point, by_lens = J[:, 11:14], J[:, :8]
+    else:
+        # OpenCV has no lens with fewer than four coefficients.
+        padded = distortion if count else np.zeros(4)
+        pixels, J = cv2.projectPoints(points, _ORIGIN, _ORIGIN, matrix, padded)
+        by_point, by_lens = J[:, 3:6], J[:, 6 : 10 + count]
+    pixels = pixels.reshape(-1, 2)
+    pixels[points[:, 0, 2] <= 0] = np.nan
+    return pixels, by_point.reshape(-1, 2, 3), by_lens.reshape(len(pixels), 2, -1)
+
+
+def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
+    """float64 (N, 3), the rays of pixels (N, 2) in the camera's axes, with z = 1.
+
+    Where the lens model cannot be inverted (outside the picture) the ray is NaN.
+    """
+    points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
+    matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
+    if not len(points):
+        return np.zeros((0, 3))
+    if camera.model == "fisheye":
+        plane = cv2.fisheye.undistortPoints(points, matrix, distortion, criteria=_EXACT)
+    else:
+        plane = cv2.undistortPoints(points, matrix, distortion, criteria=_EXACT)
+    rays = np.concatenate([plane.reshape(-1, 2), np.ones((len(points), 1))], axis=1)
+    # OpenCV marks a fisheye's failures with -1e6.
+    rays[np.abs(rays).max(axis=1) > 1e5] = np.nan
+    return rays
+
+
+def rectifying_maps(
+    camera: CameraIntrinsics, rotation: Float64, matrix: Float64, size: tuple[int, int]
+) -> tuple[Float32, Float32]:
+    """Columns and rows in the raw picture of each pixel of a turned pinhole view.
+
+    Args:
+        camera: The raw camera.
+        rotation: float64 (3, 3), from the camera's axes to those of the view.
+        matrix: float64 (3, 3) or (3, 4), the view's pinhole matrix.
+        size: (width, height) of the view, pixels.
+    """
+    make = (
+        cv2.fisheye.initUndistortRectifyMap
+        if camera.model == "fisheye"
+        else cv2.initUndistortRectifyMap
+    )
+    maps = make(
+        np.array(camera.matrix),
+        np.array(camera.distortion),
+        rotation,
+        np.array(matrix[:, :3]),
+        size,
+        cv2.CV_32FC1,
+    )
+    return np.asarray(maps[0]), np.asarray(maps[1])

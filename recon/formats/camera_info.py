@@ -1,0 +1,147 @@
+"""ROS CameraInfo as YAML: one file for each camera of a rig."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from recon.errors import CalibrationError, FormatError
+from recon.formats.atomic import write_text
+from recon.formats.fields import Fields
+from recon.formats.files import StrPath, naming
+from recon.formats.lens_models import ROS_MODELS, lens_of, name_lens
+from recon.formats.yaml_file import read_yaml
+from recon.geometry.se3 import make_transform, orthonormalise
+from recon.structures import CameraIntrinsics, RectifiedCamera, StereoCalibration
+from recon.structures.arrays import Float64
+
+_SIDES: Final = ("left", "right")
+
+
+def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
+    """Names of the two files: ``left`` and ``right`` in a name change places, or are added."""
+    given = Path(path)
+    for side in _SIDES:
+        if re.search(side, given.stem):
+            names = [re.sub(side, other, given.stem) + given.suffix for other in _SIDES]
+            return given.with_name(names[0]), given.with_name(names[1])
+    names = [f"{given.stem}_{side}{given.suffix}" for side in _SIDES]
+    return given.with_name(names[0]), given.with_name(names[1])
+
+
+def read_camera_info(path: StrPath) -> StereoCalibration:
+    """Read a rig from one of its two files; the other is found by its name.
+
+    The pose of the right camera is taken from the two rectifications: with
+    ``P[0, 3] = -fx · baseline`` the file alone tells it.
+
+    Raises:
+        FormatError: A file is missing, damaged or of an unknown lens model.
+        CalibrationError: The numbers cannot give depth.
+    """
+    left_path, right_path = camera_info_paths(path)
+    if not (left_path.is_file() and right_path.is_file()):
+        missing = right_path if left_path.is_file() else left_path
+        raise FormatError(
+            "the other camera's CameraInfo is not there",
+            where=missing,
+            hint="the two files are told by 'left' and 'right' in their names",
+        )
+    left, R_left, _ = _read_one(left_path)
+    right, R_right, P_right = _read_one(right_path)
+    if P_right[0, 3] >= 0:
+        raise CalibrationError(
+            "CameraInfo has no baseline",
+            where=right_path,
+            got=f"P[0, 3] = {P_right[0, 3]:g}",
+            expected="-fx * baseline, below 0",
+            hint="these may be files of two single calibrations, or left and right swapped",
+        )
+    offset = np.array([P_right[0, 3] / P_right[0, 0], 0.0, 0.0])
+    with naming(path):
+        T = orthonormalise(make_transform(R_right.T @ R_left, R_right.T @ offset))
+        return StereoCalibration(left, right, T)
+
+
+def write_camera_info(
+    path: StrPath,
+    calibration: StereoCalibration,
+    rotations: tuple[Float64, Float64],
+    rectified: RectifiedCamera,
+) -> tuple[Path, Path]:
+    """Write the two files of a rig, each atomically.
+
+    Args:
+        path: See `camera_info_paths`.
+        calibration: The raw cameras.
+        rotations: float64 (3, 3) of each camera, from its axes to the rectified ones.
+        rectified: The rectified camera.
+
+    Returns:
+        The two files.
+
+    Raises:
+        CalibrationError: ROS has no name for a lens.
+        OutputError: A file cannot be written.
+    """
+    paths = camera_info_paths(path)
+    cameras = (calibration.left, calibration.right)
+    shifts = (0.0, -rectified.focal_px * rectified.baseline_m)
+    texts = []
+    for side, camera, rotation, shift in zip(_SIDES, cameras, rotations, shifts, strict=True):
+        P = np.hstack([rectified.matrix, [[shift], [0.0], [0.0]]])
+        P[0, 2] = rectified.cx_right_px if side == "right" else rectified.cx_px
+        texts.append(_text(side, camera, rotation, P))
+    for target, text in zip(paths, texts, strict=True):
+        write_text(target, text)
+    return paths
+
+
+def _text(side: str, camera: CameraIntrinsics, rotation: Float64, P: Float64) -> str:
+    name, coefficients = name_lens(ROS_MODELS, camera, "ROS CameraInfo")
+    content = {
+        "image_width": camera.width_px,
+        "image_height": camera.height_px,
+        "camera_name": side,
+        "camera_matrix": _matrix(camera.matrix),
+        "distortion_model": name,
+        "distortion_coefficients": _matrix(coefficients.reshape(1, -1)),
+        "rectification_matrix": _matrix(rotation),
+        "projection_matrix": _matrix(P),
+    }
+    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
+
+
+def _matrix(values: NDArray[Any]) -> dict[str, Any]:
+    rows, columns = values.shape
+    return {"rows": rows, "cols": columns, "data": values.ravel().tolist()}
+
+
+def _read_one(path: Path) -> tuple[CameraIntrinsics, Float64, Float64]:
+    """A camera, its rectifying rotation (3, 3) and its projection (3, 4)."""
+    fields = Fields(read_yaml(path), path)
+    data = {
+        name: fields.below(name)
+        for name in ("camera_matrix", "distortion_coefficients", "rectification_matrix")
+    }
+    model, distortion = lens_of(
+        ROS_MODELS,
+        fields.text("distortion_model"),
+        data["distortion_coefficients"].numbers("data"),
+        path,
+    )
+    with naming(path):
+        camera = CameraIntrinsics(
+            data["camera_matrix"].numbers("data", (3, 3)),
+            distortion,
+            fields.count("image_width"),
+            fields.count("image_height"),
+            model,
+        )
+    rotation = data["rectification_matrix"].numbers("data", (3, 3))
+    return camera, rotation, fields.below("projection_matrix").numbers("data", (3, 4))
