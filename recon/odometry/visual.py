@@ -141,7 +141,7 @@ def _empty(T_world_camera: Float64) -> TrackWindow:
 
 def _health(window: TrackWindow, tracks: int, camera: RectifiedCamera) -> OdometryHealth:
     newest = window.seen[-1]
-    error = reprojection(window, camera)[-1, newest, :2]
+    error = reprojection(window, camera)[newest, :2]
     return OdometryHealth(
         tracks=tracks,
         inliers=int(newest.sum()),

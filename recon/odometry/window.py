@@ -9,14 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from recon.geometry.se3 import exp_so3, invert, make_transform
+from recon.geometry.se3 import apply, exp_so3, invert, make_transform
+from recon.kernels import bundle
 from recon.odometry.settings import WindowSettings
 from recon.structures import RectifiedCamera
 from recon.structures.arrays import Bool, Float64
-
-MIN_DEPTH_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,15 +69,26 @@ class TrackWindow:
 
 
 def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
-    """Observed minus predicted column, row and disparity (W, N, 3); NaN = not seen."""
-    residual, _ = _residuals(window, camera)
-    return np.where(np.isfinite(window.uvd), residual, np.nan)
+    """Observed minus predicted column, row, disparity (N, 3) in the newest frame; NaN = not seen."""
+    xyz = apply(invert(window.T_world_camera[-1]), window.xyz_world)
+    z = np.maximum(xyz[:, 2], bundle.MIN_DEPTH_M)
+    f = camera.focal_px
+    predicted = np.stack(
+        [
+            f * xyz[:, 0] / z + camera.cx_px,
+            f * xyz[:, 1] / z + camera.cy_px,
+            f * camera.baseline_m / z - camera.doffs_px,
+        ],
+        axis=-1,
+    )
+    return np.asarray(window.uvd[-1] - predicted)
 
 
 def misfits(window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings) -> Bool:
     """bool (N,), points whose newest observation is too far from its prediction."""
-    residual, _ = _residuals(window, camera)
-    square = np.square(residual[-1] / _sigmas(settings)).sum(axis=1)
+    residual = np.nan_to_num(reprojection(window, camera))
+    sigmas = [settings.sigma_uv_px, settings.sigma_uv_px, settings.sigma_d_px]
+    square = np.square(residual / np.array(sigmas)).sum(axis=1)
     return np.asarray(square > settings.max_sigmas**2)
 
 
@@ -105,11 +114,12 @@ def adjust(window: TrackWindow, camera: RectifiedCamera, settings: WindowSetting
 def _levenberg_marquardt(
     window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings
 ) -> TrackWindow:
+    model = _model(camera, settings)
     damping = 1e-4
-    cost = _cost(window, camera, settings)
+    cost, normal = _cost(window, model), _linearise(window, model)
     for _ in range(settings.iterations):
-        proposal = _step(window, camera, settings, damping)
-        proposed = _cost(proposal, camera, settings)
+        proposal = _moved(window, *bundle.solve_step(normal, damping))
+        proposed = _cost(proposal, model)
         if not proposed < cost:
             damping *= 10.0
             continue
@@ -117,6 +127,7 @@ def _levenberg_marquardt(
         window, cost, damping = proposal, proposed, 0.1 * damping
         if gain < settings.min_gain:
             break
+        normal = _linearise(window, model)
     return window
 
 
@@ -131,140 +142,41 @@ def pose_information(
     """
     usable = window.seen[-1] & (window.seen.sum(axis=0) >= 2)
     part = TrackWindow(window.T_world_camera, window.uvd[:, usable], window.xyz_world[usable])
-    normal = _normal_equations(part, camera, settings)
-    folded = np.einsum("inj,njk->ink", normal.H_cross[-1], np.linalg.inv(_damped(normal.H_point)))
-    return np.asarray(normal.H_pose[-1] - np.einsum("ink,jnk->ij", folded, normal.H_cross[-1]))
+    normal = _linearise(part, _model(camera, settings))
+    inverse = np.linalg.inv(normal.H_point + bundle.RIDGE * np.eye(3))
+    cross = normal.H_cross[-1]
+    folded = (cross @ inverse) @ cross.transpose(0, 2, 1)
+    return np.asarray(normal.H_pose[-1] - folded.sum(axis=0))
 
 
-@dataclass(frozen=True, eq=False)
-class _NormalEquations:
-    """Blocks of the Gauss-Newton system: poses (W, 6), points (N, 3), and what ties them."""
-
-    H_pose: Float64
-    g_pose: Float64
-    H_point: Float64
-    g_point: Float64
-    H_cross: Float64
+def _linearise(window: TrackWindow, model: bundle.BundleModel) -> bundle.NormalEquations:
+    return bundle.linearise(invert(window.T_world_camera), window.uvd, window.xyz_world, model)
 
 
-def _normal_equations(
-    window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings
-) -> _NormalEquations:
-    residual, xyz_camera = _residuals(window, camera)
-    white, weight = _whiten(residual, window.seen, settings)
-    J_camera = _projection_jacobian(xyz_camera, camera) / _sigmas(settings)[:, None]
-    J_camera *= np.isfinite(window.uvd)[:, :, :, None]
-    J_point = J_camera @ invert(window.T_world_camera)[:, None, :3, :3]
-    J_pose = _pose_jacobian(J_camera, xyz_camera)
-    weighted_pose = J_pose * weight[:, :, None, None]
-    weighted_point = J_point * weight[:, :, None, None]
-    return _NormalEquations(
-        H_pose=np.einsum("wnki,wnkj->wij", weighted_pose, J_pose),
-        g_pose=np.einsum("wnki,wnk->wi", weighted_pose, white),
-        H_point=np.einsum("wnki,wnkj->nij", weighted_point, J_point),
-        g_point=np.einsum("wnki,wnk->ni", weighted_point, white),
-        H_cross=np.einsum("wnki,wnkj->winj", weighted_pose, J_point),
-    )
+def _cost(window: TrackWindow, model: bundle.BundleModel) -> float:
+    T_camera_world = invert(window.T_world_camera)
+    return float(bundle.cost(T_camera_world, window.uvd, window.xyz_world, tuple(model)))
 
 
-def _step(
-    window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings, damping: float
-) -> TrackWindow:
-    """One damped Gauss-Newton step of all poses but the oldest, and of all points."""
-    step_pose, step_point = _solve(_normal_equations(window, camera, settings), damping)
+def _moved(window: TrackWindow, step_pose: Float64, step_point: Float64) -> TrackWindow:
+    """A window after a step; that of a pose is a translation and a rotation in its own axes."""
     poses = np.stack(
-        [_moved(T, step) for T, step in zip(window.T_world_camera, step_pose, strict=True)]
+        [
+            T @ make_transform(exp_so3(step[3:]), step[:3])
+            for T, step in zip(window.T_world_camera, step_pose, strict=True)
+        ]
     )
     return replace(window, T_world_camera=poses, xyz_world=window.xyz_world + step_point)
 
 
-def _solve(normal: _NormalEquations, damping: float) -> tuple[Float64, Float64]:
-    """Steps of the poses (W, 6) and of the points (N, 3); the first pose's is zero."""
-    free = 6 * (len(normal.H_pose) - 1)
-    inverse = np.linalg.inv(_damped(normal.H_point, damping))
-    blocks = normal.H_cross[1:].reshape(free, -1, 3)
-    folded = np.einsum("anj,njk->ank", blocks, inverse).reshape(free, -1)
-    cross = blocks.reshape(free, -1)
-    S = _block_diagonal(_damped(normal.H_pose[1:], damping)) - folded @ cross.T
-    g = normal.g_pose[1:].reshape(-1) - folded @ normal.g_point.reshape(-1)
-    step_pose = np.linalg.solve(S, g)
-    rest = normal.g_point - (cross.T @ step_pose).reshape(-1, 3)
-    step_point = np.einsum("nij,nj->ni", inverse, rest)
-    return np.concatenate([np.zeros((1, 6)), step_pose.reshape(-1, 6)]), step_point
-
-
-def _damped(H: Float64, damping: float = 0.0) -> Float64:
-    """Blocks (N, K, K) with their diagonals raised, so that each can be inverted."""
-    diagonal = np.einsum("nii->ni", H)
-    raised: Float64 = H.copy()
-    np.einsum("nii->ni", raised)[:] += damping * diagonal + 1e-9
-    return raised
-
-
-def _block_diagonal(blocks: Float64) -> Float64:
-    count, size, _ = blocks.shape
-    full = np.zeros((count, size, count, size))
-    full[np.arange(count), :, np.arange(count), :] = blocks
-    return full.reshape(count * size, count * size)
-
-
-def _moved(T_world_camera: Float64, step: Float64) -> Float64:
-    """A pose after a step (translation, rotation vector) in its own axes."""
-    return np.asarray(T_world_camera @ make_transform(exp_so3(step[3:]), step[:3]))
-
-
-def _residuals(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Float64]:
-    """Observed minus predicted (W, N, 3), zero where not seen, and points in camera axes."""
-    T_camera_world = invert(window.T_world_camera)
-    xyz = np.einsum("wij,nj->wni", T_camera_world[:, :3, :3], window.xyz_world)
-    xyz += T_camera_world[:, None, :3, 3]
-    z = np.maximum(xyz[:, :, 2], MIN_DEPTH_M)
-    f = camera.focal_px
-    predicted = np.stack(
-        [
-            f * xyz[:, :, 0] / z + camera.cx_px,
-            f * xyz[:, :, 1] / z + camera.cy_px,
-            f * camera.baseline_m / z - camera.doffs_px,
-        ],
-        axis=-1,
+def _model(camera: RectifiedCamera, settings: WindowSettings) -> bundle.BundleModel:
+    return bundle.BundleModel(
+        focal=camera.focal_px,
+        cx=camera.cx_px,
+        cy=camera.cy_px,
+        fb=camera.focal_px * camera.baseline_m,
+        doffs=camera.doffs_px,
+        sigma_uv=settings.sigma_uv_px,
+        sigma_d=settings.sigma_d_px,
+        cauchy=settings.cauchy_sigmas,
     )
-    return np.where(np.isfinite(window.uvd), window.uvd - predicted, 0.0), xyz
-
-
-def _projection_jacobian(xyz: Float64, camera: RectifiedCamera) -> Float64:
-    """Derivative (W, N, 3, 3) of column, row and disparity by the point in camera axes."""
-    z = np.maximum(xyz[:, :, 2], MIN_DEPTH_M)
-    f = camera.focal_px
-    J = np.zeros((*xyz.shape, 3))
-    J[:, :, 0, 0] = J[:, :, 1, 1] = f / z
-    J[:, :, 0, 2] = -f * xyz[:, :, 0] / z**2
-    J[:, :, 1, 2] = -f * xyz[:, :, 1] / z**2
-    J[:, :, 2, 2] = -f * camera.baseline_m / z**2
-    return J
-
-
-def _pose_jacobian(J_point_camera: Float64, xyz_camera: Float64) -> Float64:
-    """Derivative (W, N, 3, 6) by a step of the pose in its own axes."""
-    return np.concatenate(
-        [-J_point_camera, np.cross(J_point_camera, xyz_camera[:, :, None, :])], axis=-1
-    )
-
-
-def _sigmas(settings: WindowSettings) -> Float64:
-    return np.array([settings.sigma_uv_px, settings.sigma_uv_px, settings.sigma_d_px])
-
-
-def _whiten(
-    residual: Float64, seen: Bool, settings: WindowSettings
-) -> tuple[Float64, NDArray[np.float64]]:
-    """Residuals in standard deviations (W, N, 3), and the Cauchy weight of each observation."""
-    white = residual / _sigmas(settings)
-    square = np.einsum("wnk,wnk->wn", white, white)
-    return white, np.where(seen, 1.0 / (1.0 + square / settings.cauchy_sigmas**2), 0.0)
-
-
-def _cost(window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings) -> float:
-    residual, _ = _residuals(window, camera)
-    white = residual / _sigmas(settings)
-    square = np.einsum("wnk,wnk->wn", white, white)
-    return float(np.log1p(square / settings.cauchy_sigmas**2).sum())
