@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from kiss_icp.config import KISSConfig
@@ -18,7 +20,7 @@ from kiss_icp.kiss_icp import KissICP
 from numpy.typing import NDArray
 
 from recon.errors import RegistrationError
-from recon.geometry.se3 import orthonormalise
+from recon.geometry.se3 import angle_rad, orthonormalise
 from recon.structures.arrays import Float64
 
 
@@ -74,8 +76,9 @@ class KissIcp:
     """
 
     def __init__(self, options: KissIcpOptions) -> None:
+        self._options = options
         with _our_errors():
-            self._icp = _RangedKissIcp(_config(options), options.source_range_m)
+            self._icp = _RangedKissIcp(_config(options), options)
 
     def register(self, xyz_camera: NDArray[np.floating]) -> IcpAlignment:
         """Register a frame as kiss-icp does by itself: its motion model, its threshold, its map.
@@ -129,18 +132,66 @@ class KissIcp:
             self._icp.settle(frame, pose)
 
     def map_points(self) -> Float64:
-        """float64 (M, 3), the points of the local map, world axes."""
+        """float64 (M, 3), the points of the local map, world axes, in ascending order."""
         with _our_errors():
-            return np.array(self._icp.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3)
+            points = np.array(self._icp.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3)
+        # The order of kiss-icp's hash depends on its history, that of the numbers does not.
+        return points[np.lexsort(points.T[::-1])]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All that decides what comes next, as plain values: a drive can be resumed from it."""
+        icp = self._icp
+        return {
+            "options": self._options,
+            "points": np.array(icp.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3),
+            "last_pose": np.array(icp.last_pose),
+            "last_delta": np.array(icp.last_delta),
+            "threshold": icp.adaptive_threshold,
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        KissIcp.__init__(self, state["options"])
+        if len(state["points"]):
+            self._icp.local_map.add_points(state["points"].copy())
+        self._icp.last_pose = state["last_pose"]
+        self._icp.last_delta = state["last_delta"]
+        self._icp.adaptive_threshold = state["threshold"]
+
+
+class _AdaptiveThreshold:
+    """kiss-icp's threshold, whose own class cannot be saved: how far the motion model is off.
+
+    Ref:
+        Vizzo et al., "KISS-ICP: in defense of point-to-point ICP", RA-L 2023, section III-C.
+    """
+
+    def __init__(self, options: KissIcpOptions) -> None:
+        self._max_range_m = options.max_range_m
+        self._min_motion_m = options.min_motion_m
+        self._sum_m2 = options.initial_threshold_m**2
+        self._count = 1
+
+    def get_threshold(self) -> float:
+        """Root mean square of the deviations so far, metres."""
+        return math.sqrt(self._sum_m2 / self._count)
+
+    def update_model_deviation(self, model_deviation: Float64) -> None:
+        """Count one more deviation, a transform (4, 4)."""
+        turn_m = 2.0 * self._max_range_m * math.sin(0.5 * float(angle_rad(model_deviation)))
+        error_m = turn_m + float(np.linalg.norm(model_deviation[:3, 3]))
+        if error_m > self._min_motion_m:
+            self._sum_m2 += error_m**2
+            self._count += 1
 
 
 class _RangedKissIcp(KissICP):  # type: ignore[misc]
     """kiss-icp whose source is cut shorter than its map, and whose steps can be taken apart."""
 
-    def __init__(self, config: KISSConfig, source_range_m: float) -> None:
+    def __init__(self, config: KISSConfig, options: KissIcpOptions) -> None:
         super().__init__(config)
         self.last_pose: Float64 = np.eye(4)
-        self._source_range_m = source_range_m
+        self.adaptive_threshold = _AdaptiveThreshold(options)
+        self._source_range_m = options.source_range_m
 
     def voxelize(self, iframe: Float64) -> tuple[Float64, Float64]:
         """Source and map points; points at the rim of the map would be pulled inwards."""

@@ -14,6 +14,7 @@ from recon.odometry.gate import (
     as_step,
     as_transform,
     covariance_of,
+    icp_may_help,
     judge,
     step_covariance,
 )
@@ -72,18 +73,31 @@ class FusedOdometry:
         self._measured = 0
         self._lost = 0
         self._mapped = False
+        self._frames = 0
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
         """Register the next frame.
 
-        Without a visual motion the last one goes on and ICP may correct it; without either the
-        health says that the pose rests on no measurement, and the map is left as it is.
+        ICP costs as much as vision and seldom knows better, so it is asked every few frames, and
+        whenever the prior is unsure. Without a visual motion the last one goes on and ICP may
+        correct it; without either the health says that the pose rests on no measurement, and the
+        map is left as it is.
         """
         prior = self._prior(self._visual.track(frame))
-        points = select_points(frame, self._settings.points)
-        result = self._corrected(prior, points)
+        due = self._frames % self._settings.icp.every == 0
+        self._frames += 1
+        if due or not prior.seen or icp_may_help(prior.covariance, self._settings.gate):
+            result = self._asked(prior, frame)
+        else:
+            result = OdometryResult(prior.T_world_camera, prior.visual.result.health)
         self._T_visual = prior.visual.result.T_world_camera
         self._T_world_camera = result.T_world_camera
+        return result
+
+    def _asked(self, prior: _Prior, frame: OdometryFrame) -> OdometryResult:
+        """The prior after ICP was heard; its map has the frame afterwards."""
+        points = select_points(frame, self._settings.points)
+        result = self._corrected(prior, points)
         if result.health.ok and len(points) >= self._settings.icp.min_points:
             self._icp.update(points.xyz, result.T_world_camera)
             self._mapped = True

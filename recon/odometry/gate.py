@@ -74,6 +74,13 @@ def judge(
     return Verdict(step, accepted=True)
 
 
+def icp_may_help(prior_covariance: Float64, settings: GateSettings) -> bool:
+    """Whether ICP at its best, at its floor in every direction, would know better than a prior."""
+    floor = step_covariance(settings.icp_floor_m, settings.icp_floor_deg)
+    share, _ = _shares(prior_covariance, prior_covariance + floor)
+    return bool(share.max() >= settings.min_share)
+
+
 def icp_covariance(fit: Fit, settings: GateSettings) -> Float64:
     """Covariance (6, 6) of ICP: from the surfaces it rests on, with a floor for their bias."""
     floor = step_covariance(settings.icp_floor_m, settings.icp_floor_deg)
@@ -101,17 +108,22 @@ def as_transform(step: Float64) -> Float64:
 
 
 def _worthwhile(prior: Float64, both: Float64, news: Float64, min_share: float) -> Float64:
-    """The Kalman step, without the directions in which little of the news would be taken.
+    """The Kalman step, without the directions in which little of the news would be taken."""
+    share, directions = _shares(prior, both)
+    kept = np.where(share >= min_share, share, 0.0)
+    return np.asarray(directions @ (kept * np.linalg.solve(directions, news)))
 
-    With ``both = L·Lᵀ`` the gain ``prior·both⁻¹`` becomes symmetric, and its eigenvalues are the
-    shares taken in independent directions.
+
+def _shares(prior: Float64, both: Float64) -> tuple[Float64, Float64]:
+    """Shares (6,) taken in independent directions, and these (6, 6), one a column.
+
+    With ``both = L·Lᵀ`` the Kalman gain ``prior·both⁻¹`` becomes symmetric; its eigenvalues are
+    the shares.
     """
     L = np.linalg.cholesky(both)
     half = np.linalg.solve(L, prior)
     share, axes = np.linalg.eigh(np.linalg.solve(L, half.T))
-    kept = np.where(share >= min_share, share, 0.0)
-    step: Float64 = L @ (axes * kept) @ axes.T @ np.linalg.solve(L, news)
-    return step
+    return share, np.asarray(L @ axes)
 
 
 def _refused(note: str) -> Verdict:

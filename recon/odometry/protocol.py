@@ -75,7 +75,10 @@ class OdometryResult:
 
 @runtime_checkable
 class Odometry(Protocol):
-    """Follows the camera from frame to frame; holds state, so frames come in order."""
+    """Follows the camera from frame to frame; holds state, so frames come in order.
+
+    The state can be pickled: from it a drive goes on as if it had never been broken off.
+    """
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
         """Register the next frame. A poor or empty frame gives a health record, not a jump."""

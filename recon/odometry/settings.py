@@ -27,6 +27,13 @@ class TrackSettings(Settings):
 
     window_px: int = Field(17, ge=5, le=63, description="Edge of the tracked patch")
     levels: int = Field(3, ge=0, le=8, description="Picture sizes below full size")
+    return_levels: int = Field(
+        0,
+        ge=0,
+        le=8,
+        description="The same for the way back, which begins where it should end: it only has to "
+        "tell whether it stays there",
+    )
     max_return_px: float = Field(
         0.5, gt=0.0, le=10.0, description="Largest distance of forward plus backward tracking"
     )
@@ -131,6 +138,12 @@ class IcpSettings(Settings):
     iterations: int = Field(50, ge=1, description="ICP steps at most")
     convergence: float = Field(1e-3, gt=0.0, description="Length of a step that is the last")
     min_points: int = Field(300, ge=10, description="Frames with fewer points are left to vision")
+    every: int = Field(
+        4,
+        ge=1,
+        description="ICP is asked and its map updated every so many frames; in between only where "
+        "the prior is so unsure that ICP may know better",
+    )
     surface_m: float = Field(
         1.0, gt=0.0, description="Edge of the cells in which the map is described by its surfaces"
     )

@@ -32,8 +32,8 @@ def follow(
     """
     if not len(uv):
         return uv.copy(), np.zeros(0, np.bool_)
-    there, found = _lucas_kanade(source, target, uv, guess_uv, settings)
-    back, found_back = _lucas_kanade(target, source, there, uv, settings)
+    there, found = _lucas_kanade(source, target, uv, guess_uv, settings, settings.levels)
+    back, found_back = _lucas_kanade(target, source, there, uv, settings, settings.return_levels)
     returned = np.abs(back - uv).max(axis=1) <= settings.max_return_px
     height, width = target.shape
     inside = (there >= 0).all(axis=1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
@@ -69,7 +69,12 @@ def sample_disparity(disparity: Disparity, uv: Float32, settings: TrackSettings)
 
 
 def _lucas_kanade(
-    source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32, settings: TrackSettings
+    source: UInt8,
+    target: UInt8,
+    uv: Float32,
+    guess_uv: Float32,
+    settings: TrackSettings,
+    levels: int,
 ) -> tuple[Float32, Bool]:
     """One way of `follow`."""
     end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
@@ -79,7 +84,7 @@ def _lucas_kanade(
         uv.reshape(-1, 1, 2),
         guess_uv.reshape(-1, 1, 2).copy(),
         winSize=(settings.window_px, settings.window_px),
-        maxLevel=settings.levels,
+        maxLevel=levels,
         criteria=end,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=settings.min_eigenvalue,

@@ -69,7 +69,7 @@ class TrackWindow:
 
 
 def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
-    """Observed minus predicted column, row, disparity (N, 3) in the newest frame; NaN = not seen."""
+    """Observed minus predicted column, row, disparity (N, 3) in the newest frame; NaN = unseen."""
     xyz = apply(invert(window.T_world_camera[-1]), window.xyz_world)
     z = np.maximum(xyz[:, 2], bundle.MIN_DEPTH_M)
     f = camera.focal_px

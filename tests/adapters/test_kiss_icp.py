@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -124,3 +126,52 @@ def test_no_foreign_exception_leaks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(icp._icp, "register_frame", fail)
     with pytest.raises(RegistrationError, match="from the library"):
         icp.register(room())
+
+
+def test_the_threshold_is_that_of_kiss_icp() -> None:
+    """Ours can be saved; it gives the same numbers."""
+    from kiss_icp.pybind import kiss_icp_pybind
+
+    from recon.adapters.kiss_icp import _AdaptiveThreshold
+
+    options = KissIcpOptions(max_range_m=30.0, source_range_m=24.0, voxel_m=0.3)
+    theirs = kiss_icp_pybind._AdaptiveThreshold(
+        initial_threshold=options.initial_threshold_m,
+        min_motion_th=options.min_motion_m,
+        max_range=options.max_range_m,
+    )
+    ours, rng = _AdaptiveThreshold(options), np.random.default_rng(4)
+    for size in (0.0, 0.001, 0.01, 0.1, 0.5):
+        T = make_transform(exp_so3(size * rng.normal(size=3)), size * rng.normal(size=3))
+        ours.update_model_deviation(T)
+        theirs._update_model_deviation(model_deviation=T)
+        assert ours.get_threshold() == pytest.approx(theirs._compute_threshold(), rel=1e-9)
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_a_saved_state_goes_on_to_the_bit(alone: bool) -> None:
+    rng = np.random.default_rng(5)
+    world = rng.uniform([-10, -2, 0], [10, 2, 40], (6000, 3))
+    options = KissIcpOptions(max_range_m=30.0, source_range_m=24.0, voxel_m=0.5)
+
+    def advance(icp: KissIcp, frames: range) -> list[np.ndarray]:
+        poses = []
+        for n in frames:
+            points = world - [0, 0, 0.3 * n]
+            if alone:
+                poses.append(icp.register(points).T_world_camera)
+                continue
+            T = make_transform(np.eye(3), np.array([0.02, 0.0, 0.3 * n]))
+            poses.append(icp.align(points, T, 0.5).T_world_camera)
+            icp.update(points, poses[-1])
+        return poses
+
+    unbroken = KissIcp(options)
+    first = advance(unbroken, range(4))
+    saved = copy.deepcopy(unbroken)
+    np.testing.assert_array_equal(saved.map_points(), unbroken.map_points())
+    for ours, theirs in zip(
+        advance(saved, range(4, 9)), advance(unbroken, range(4, 9)), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    assert len(first) == 4

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterable
 
 import numpy as np
@@ -8,13 +9,21 @@ import pytest
 from recon.geometry.se3 import invert
 from recon.odometry.fused import FusedOdometry
 from recon.odometry.protocol import OdometryFrame, OdometryResult
-from recon.odometry.settings import FusedSettings, VisualSettings
+from recon.odometry.registry import make_odometry
+from recon.odometry.settings import FusedSettings, GateSettings, IcpSettings, VisualSettings
 
 See = Callable[..., OdometryFrame]
 
 
-def follow(frames: Iterable[OdometryFrame]) -> list[OdometryResult]:
-    odometry = FusedOdometry(FusedSettings(), VisualSettings())
+def always() -> FusedSettings:
+    """ICP is asked in every frame."""
+    return FusedSettings(icp=IcpSettings(every=1))
+
+
+def follow(
+    frames: Iterable[OdometryFrame], settings: FusedSettings | None = None
+) -> list[OdometryResult]:
+    odometry = FusedOdometry(settings or FusedSettings(), VisualSettings())
     return [odometry.register(frame) for frame in frames]
 
 
@@ -24,7 +33,7 @@ def error_m(result: OdometryResult, truth: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def results(street: tuple[OdometryFrame, ...]) -> list[OdometryResult]:
-    return follow(street)
+    return follow(street, always())
 
 
 def test_the_street_is_followed(results: list[OdometryResult], street_poses: np.ndarray) -> None:
@@ -53,8 +62,31 @@ def test_what_is_refused_says_why(results: list[OdometryResult]) -> None:
 def test_two_runs_are_equal_to_the_bit(
     results: list[OdometryResult], street: tuple[OdometryFrame, ...]
 ) -> None:
-    for once, again in zip(results, follow(street), strict=True):
+    for once, again in zip(results, follow(street, always()), strict=True):
         np.testing.assert_array_equal(once.T_world_camera, again.T_world_camera)
+
+
+def test_a_sure_prior_asks_icp_now_and_then(
+    street: tuple[OdometryFrame, ...], street_poses: np.ndarray
+) -> None:
+    # An ICP that is never better than this cannot help.
+    poor = GateSettings(icp_floor_m=1.0, icp_floor_deg=10.0)
+    found = follow(street, FusedSettings(icp=IcpSettings(every=5), gate=poor))
+    asked = [index for index, result in enumerate(found) if result.health.icp_points]
+    assert asked == [0, 5, 10]
+    assert error_m(found[-1], street_poses[-1]) < 0.055
+
+
+@pytest.mark.parametrize("name", ["visual", "kiss", "fused"])
+def test_a_saved_odometry_goes_on_to_the_bit(name: str, street: tuple[OdometryFrame, ...]) -> None:
+    unbroken = make_odometry(name)
+    for frame in street[:6]:
+        unbroken.register(frame)
+    saved = copy.deepcopy(unbroken)
+    for frame in street[6:]:
+        ours, theirs = saved.register(frame), unbroken.register(frame)
+        np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
+        assert repr(ours.health) == repr(theirs.health)
 
 
 def test_poses_stay_rigid(results: list[OdometryResult]) -> None:
