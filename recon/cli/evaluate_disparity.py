@@ -21,6 +21,9 @@ def disparity(
         float,
         typer.Option(min=1e-3, help="Figures in pixels so much finer: 4 for quarter-size maps."),
     ] = 1.0,
+    confidence: Annotated[
+        Path | None, typer.Option(help="PFM of the map's confidence, to see whether it is true.")
+    ] = None,
     json: Json = False,
 ) -> None:
     """Middlebury's figures and KITTI's D1 of one disparity map, as found and with holes filled.
@@ -30,7 +33,7 @@ def disparity(
     with session():
         from recon.pipeline.evaluate_run import compare_disparities
 
-        figures = compare_disparities(estimate, truth, mask, scale=scale)
+        figures = compare_disparities(estimate, truth, mask, scale=scale, confidence=confidence)
     if json:
         print_json(figures)
         return
@@ -38,4 +41,6 @@ def disparity(
     for kind in ("sparse", "dense"):
         flat = {f"bad {limit}": share for limit, share in figures[kind]["bad"].items()}
         shown |= {f"{kind} {name}": value for name, value in (flat | figures[kind]).items()}
+    rated = figures.get("confidence", {})
+    shown |= {f"confidence {name}": rated[name] for name in ("ece", "ause") if name in rated}
     print_figures(f"{estimate} against {truth}", shown)

@@ -5,6 +5,7 @@ from recon.evaluation.confidence import (
     Sparsification,
     measure_reliability,
     measure_sparsification,
+    share_within_sigma,
 )
 from recon.evaluation.disparity import evaluate_depth, evaluate_disparity
 from recon.evaluation.map import evaluate_map
@@ -22,4 +23,5 @@ __all__ = [
     "evaluate_trajectory",
     "measure_reliability",
     "measure_sparsification",
+    "share_within_sigma",
 ]

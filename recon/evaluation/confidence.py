@@ -1,4 +1,4 @@
-"""Whether a confidence means what it says: reliability, and what is gained by believing it."""
+"""Whether a confidence, and a standard deviation, mean what they say."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from recon.errors import EvaluationError
 from recon.structures import Disparity, DisparityTruth
-from recon.structures.arrays import Float32, Float64, freeze
+from recon.structures.arrays import Bool, Float32, Float64, freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +123,24 @@ def measure_sparsification(
     )
 
 
+def share_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float = 1.0) -> float:
+    """Share of the pixels, in [0, 1], whose error is less than so many standard deviations.
+
+    Of a normal distribution 0.683 lie within one and 0.954 within two.
+
+    Args:
+        estimate: The disparity, with its standard deviation.
+        truth: The truth at the same size.
+        sigmas: How many.
+
+    Raises:
+        EvaluationError: The sizes differ, or no pixel has both a value and a known truth.
+    """
+    both = _compared(estimate, truth)
+    error_px = np.abs(estimate.values[both].astype(np.float64) - truth.values[both])
+    return float(np.mean(error_px < sigmas * estimate.sigma_px[both]))
+
+
 def _shared_by_equals(confidence: Float32, wrong: Float64) -> Float64:
     """Wrong pixels from the most certain to the least, spread evenly over equal confidences."""
     _, group, size = np.unique(-confidence, return_inverse=True, return_counts=True)
@@ -132,6 +150,13 @@ def _shared_by_equals(confidence: Float32, wrong: Float64) -> Float64:
 
 def _pixels(estimate: Disparity, truth: DisparityTruth) -> tuple[Float32, Float64]:
     """Confidence and absolute error of the pixels that have a value and a known truth."""
+    both = _compared(estimate, truth)
+    error_px = np.abs(estimate.values[both].astype(np.float64) - truth.values[both])
+    return estimate.confidence[both], error_px
+
+
+def _compared(estimate: Disparity, truth: DisparityTruth) -> Bool:
+    """bool (H, W), the pixels that have a value and a known truth."""
     if estimate.values.shape != truth.values.shape:
         raise EvaluationError(
             "disparity and truth differ in size",
@@ -141,5 +166,4 @@ def _pixels(estimate: Disparity, truth: DisparityTruth) -> tuple[Float32, Float6
     both = estimate.valid & np.isfinite(truth.values)
     if not both.any():
         raise EvaluationError("no pixel has both a disparity and a known truth")
-    error_px = np.abs(estimate.values[both].astype(np.float64) - truth.values[both])
-    return estimate.confidence[both], error_px
+    return both

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.errors import EvaluationError
 from recon.evaluation.disparity import evaluate_disparity
-from recon.structures import DisparityMetrics, DisparityTruth
+from recon.structures import Disparity, DisparityMetrics, DisparityTruth
 from recon.structures.arrays import Float32
 
 HALF_WEIGHT: Final = frozenset({"PianoL", "Playroom", "Playtable", "Shelves", "Vintage"})
@@ -61,16 +62,31 @@ def at_truth_size(values: Float32, shape: tuple[int, ...]) -> Float32:
     Raises:
         EvaluationError: Neither size is 1, 2 or 4 times the other, a row and column less or more.
     """
-    for factor in (1, 2, 4):
-        if _fits(shape, values.shape, factor):
-            return np.multiply(_taken(values, shape, 1 / factor), factor, dtype=np.float32)
-        if _fits(values.shape, shape, factor):
-            return np.divide(_taken(values, shape, factor), factor, dtype=np.float32)
-    raise EvaluationError(
-        "result and truth differ in size",
-        got=f"{values.shape[1]}x{values.shape[0]} against {shape[1]}x{shape[0]}",
-        expected="one 1, 2 or 4 times the other",
+    step = _step(values.shape, shape)
+    return np.asarray(_taken(values, shape, step) / np.float32(step), dtype=np.float32)
+
+
+def estimate_at_truth_size(estimate: Disparity, shape: tuple[int, ...]) -> tuple[Disparity, float]:
+    """`at_truth_size` of all that is known of a result.
+
+    Args:
+        estimate: The result.
+        shape: (H, W) of the truth.
+
+    Returns:
+        The result at that size, and how many pixels of its own size a pixel there is.
+
+    Raises:
+        EvaluationError: The sizes do not fit.
+    """
+    step = _step(estimate.values.shape, shape)
+    sized = Disparity(
+        values=at_truth_size(estimate.values, shape),
+        confidence=_taken(estimate.confidence, shape, step),
+        sigma_px=at_truth_size(estimate.sigma_px, shape),
+        reason=_taken(estimate.reason, shape, step),
     )
+    return sized, step
 
 
 def by_the_rules(values: Float32, shape: tuple[int, ...], rules: MiddleburyRules) -> Float32:
@@ -122,11 +138,25 @@ def weighted_mean(figures: Mapping[str, float]) -> float:
     return float(np.average(np.array(list(figures.values()), dtype=np.float64), weights=weights))
 
 
+def _step(shape: tuple[int, ...], truth_shape: tuple[int, ...]) -> float:
+    """Pixels of a result for each pixel of the truth, along a row: 4, 2, 1, 0.5 or 0.25."""
+    for factor in (1, 2, 4):
+        if _fits(truth_shape, shape, factor):
+            return 1 / factor
+        if _fits(shape, truth_shape, factor):
+            return factor
+    raise EvaluationError(
+        "result and truth differ in size",
+        got=f"{shape[1]}x{shape[0]} against {truth_shape[1]}x{truth_shape[0]}",
+        expected="one 1, 2 or 4 times the other",
+    )
+
+
 def _fits(large: tuple[int, ...], small: tuple[int, ...], factor: int) -> bool:
     return all(abs(a - b * factor) < factor for a, b in zip(large, small, strict=True))
 
 
-def _taken(values: Float32, shape: tuple[int, ...], step: float) -> Float32:
+def _taken(values: NDArray[Any], shape: tuple[int, ...], step: float) -> NDArray[Any]:
     """The pixel at ``step`` times row and column, whole parts."""
     rows, columns = (
         np.minimum((np.arange(n) * step).astype(np.intp), limit - 1)

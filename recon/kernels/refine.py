@@ -23,6 +23,9 @@ NO_FIT, EQUIANGULAR, PARABOLA = range(3)
 SIGMA_LARGEST_PX: Final = 2.0
 """A flat minimum tells no more than this."""
 
+WRONG_PX: Final = 1.0
+"""A pixel counts as wrong from this error on; so a wrong one is off by no less."""
+
 ODDS: Final = 2.2
 """Odds of being right at margin 1 and a standard deviation of 1 px (see `refine_minima`)."""
 
@@ -108,6 +111,10 @@ def refine_minima(
     ``odds · sqrt(m / sigma³)``. The powers are rounded from a logistic regression on Middlebury
     scenes and the factor is fitted to them (`docs/evaluation.md` has the scenes held out).
 
+    The standard deviation that is told is that of a mixture of right and wrong: its square is
+    ``c·sigma² + (1 - c)·max(sigma, WRONG_PX)²``. The noise alone explains the errors on level
+    surfaces; how often windows that span a step of depth are wrong, only the confidence knows.
+
     Args:
         minima: What the search found.
         texture: float32 (H, W), in the unit of ``rules.texture``; NaN = no picture there (BORDER).
@@ -184,11 +191,15 @@ def _measure(minima: Minima, rules: Rules, y: int, x: int, refined: Refined) -> 
     if slope > 0.0:
         noise = 0.5 * np.pi * vertex / (slope * np.sqrt(rules.window_pixels))
         sigma = min(np.sqrt(rules.sigma_floor_px**2 + noise * noise), sigma)
-    refined.sigma_px[y, x] = np.float32(sigma)
+    confidence = 0.0
     if second < NO_COST:
         margin = (second - best) / (rules.window_pixels + best)
         odds = rules.odds * np.sqrt(margin / (sigma * sigma * sigma))
-        refined.confidence[y, x] = np.float32(odds / (odds + 1.0))
+        confidence = odds / (odds + 1.0)
+    refined.confidence[y, x] = np.float32(confidence)
+    if_wrong = max(sigma, WRONG_PX)
+    variance = confidence * (sigma * sigma) + (1.0 - confidence) * (if_wrong * if_wrong)
+    refined.sigma_px[y, x] = np.float32(np.sqrt(variance))
 
 
 @njit(cache=True, nogil=True)

@@ -19,6 +19,7 @@ from recon.kernels.refine import (
     OUT_OF_RANGE,
     SIGMA_LARGEST_PX,
     VALID,
+    WRONG_PX,
     Refined,
     Rules,
 )
@@ -36,10 +37,12 @@ def refine_minima_reference(minima: Minima, texture: NDArray[np.float32], rules:
         margin = (second - best) / (rules.window_pixels + best)
         odds = rules.odds * np.sqrt(margin / (sigma * sigma * sigma))
         confidence = np.where(second < NO_COST, odds / (odds + 1.0), 0.0)
+        if_wrong = np.maximum(sigma, WRONG_PX)
+        mixed = np.sqrt(confidence * sigma**2 + (1.0 - confidence) * if_wrong**2)
     return Refined(
         values=np.where(keep, values, np.nan).astype(np.float32),
         confidence=np.where(keep, confidence, 0.0).astype(np.float32),
-        sigma_px=np.where(keep, sigma, np.nan).astype(np.float32),
+        sigma_px=np.where(keep, mixed, np.nan).astype(np.float32),
         reason=reason,
     )
 

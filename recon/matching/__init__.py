@@ -2,7 +2,13 @@
 
 from recon.matching.fill import fill_holes
 from recon.matching.protocol import Matcher
-from recon.matching.registry import MATCHERS, MatchingSettings, field_of, make_matcher
+from recon.matching.registry import (
+    MATCHERS,
+    MatchingSettings,
+    field_of,
+    make_matcher,
+    rates_matches,
+)
 from recon.matching.sad import SadMatcher, SadSettings
 from recon.matching.sgm import SgmMatcher, SgmSettings
 
@@ -17,4 +23,5 @@ __all__ = [
     "field_of",
     "fill_holes",
     "make_matcher",
+    "rates_matches",
 ]

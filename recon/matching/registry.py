@@ -19,6 +19,7 @@ from recon.matching.protocol import Matcher
 from recon.matching.range import AutoRangeMatcher
 from recon.matching.sad import SadMatcher, SadSettings
 from recon.matching.sgm import SgmMatcher, SgmSettings
+from recon.matching.unrated import UnratedSettings
 from recon.settings import Settings
 
 MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
@@ -76,6 +77,16 @@ def make_matcher(
     if settings.range == "usual" or getattr(own, "ndisp", 0) is not None:
         return matcher
     return AutoRangeMatcher(matcher, own.min_disparity_px)
+
+
+def rates_matches(name: str) -> bool:
+    """Whether the matcher of a name tells how sure it is of each match.
+
+    Args:
+        name: A key of `MATCHERS`.
+    """
+    settings = MatchingSettings.model_fields[field_of(name)].annotation
+    return not (isinstance(settings, type) and issubclass(settings, UnratedSettings))
 
 
 def field_of(name: str) -> str:

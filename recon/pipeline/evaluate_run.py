@@ -11,16 +11,18 @@ import numpy as np
 from recon.errors import EvaluationError, FormatError
 from recon.evaluation import evaluate_disparity, evaluate_map, evaluate_trajectory
 from recon.formats.image import read_grey_levels
+from recon.formats.pfm import read_pfm
 from recon.formats.ply import read_ply
 from recon.formats.trajectory import read_trajectory
 from recon.geometry.se3 import invert
 from recon.geometry.transform import transform_cloud
+from recon.pipeline.middlebury_confidence import curve_figures
 from recon.pipeline.middlebury_score import dense_map, named_figures
 from recon.pipeline.pair_input import read_disparity
 from recon.pipeline.run_directory import RECORD
 from recon.pipeline.summary import plain
-from recon.structures import DisparityTruth, PointCloud
-from recon.structures.arrays import Float64
+from recon.structures import Disparity, DisparityTruth, PointCloud, Reason
+from recon.structures.arrays import Float32, Float64
 
 ReferenceFrame = Literal["camera", "map"]
 _COUNTED: Final = 255
@@ -38,7 +40,12 @@ def compare_trajectories(estimate: Path, truth: Path) -> dict[str, Any]:
 
 
 def compare_disparities(
-    estimate: Path, truth: Path, mask: Path | None = None, *, scale: float = 1.0
+    estimate: Path,
+    truth: Path,
+    mask: Path | None = None,
+    *,
+    scale: float = 1.0,
+    confidence: Path | None = None,
 ) -> dict[str, Any]:
     """Figures of one disparity map file (PFM or 16-bit PNG) against another.
 
@@ -47,6 +54,8 @@ def compare_disparities(
         truth: The true one, of the same size.
         mask: A picture that is 255 where pixels are compared; None = all with a truth.
         scale: Pixels of the size that figures are given in per pixel here.
+        confidence: PFM of the map's confidence, in [0, 1]; a pixel is right when it is off by no
+            more than a pixel of the map.
 
     Raises:
         FormatError: A file cannot be read.
@@ -66,7 +75,34 @@ def compare_disparities(
         ("dense", evaluate_disparity(dense_map(values), known, scale=scale)),
     ):
         figures[name] = {**named_figures(metrics), "d1": metrics.d1}
+    if confidence is not None:
+        compared = np.where(counted, true, np.float32(np.nan))
+        rated = _rated(values, confidence)
+        figures["confidence"] = curve_figures(
+            rated, DisparityTruth(compared, np.isfinite(compared)), limit_px=1.0
+        )
     return dict(plain(figures))
+
+
+def _rated(values: Float32, path: Path) -> Disparity:
+    """A map with the confidence of a file."""
+    confidence = read_pfm(path)
+    if confidence.shape != values.shape:
+        raise EvaluationError(
+            "confidence and map differ in size",
+            where=path,
+            got=confidence.shape,
+            expected=values.shape,
+        )
+    known = np.isfinite(values)
+    if not ((confidence[known] >= 0) & (confidence[known] <= 1)).all():
+        raise EvaluationError("confidence is not between 0 and 1", where=path)
+    return Disparity(
+        values=values,
+        confidence=np.where(known, confidence, np.float32(0)),
+        sigma_px=np.full(values.shape, np.nan, np.float32),
+        reason=np.where(known, np.uint8(Reason.VALID), np.uint8(Reason.AMBIGUOUS)),
+    )
 
 
 def compare_maps(

@@ -12,8 +12,9 @@ import numpy as np
 
 from recon.evaluation.middlebury import by_the_rules
 from recon.formats.files import naming
-from recon.matching import Matcher, make_matcher
+from recon.matching import Matcher, make_matcher, rates_matches
 from recon.pipeline.config import ReconConfig
+from recon.pipeline.middlebury_confidence import confidence_figures
 from recon.pipeline.middlebury_scenes import ScoredScene
 from recon.pipeline.middlebury_score import Figures, dense_map, score_result
 from recon.rectification import Rectifier
@@ -31,7 +32,8 @@ class SceneResult:
         scene: The scene.
         matcher: Name of the matcher.
         disparity: What it found, at the size of the pictures.
-        figures: As `score_result` gives them.
+        figures: As `score_result` gives them, and ``confidence`` as `confidence_figures` does;
+            None of a matcher that does not tell how sure it is.
         seconds: Of matching alone.
     """
 
@@ -80,6 +82,8 @@ class Bench:
                 disparity = matcher.match(pair)
                 seconds = time.perf_counter() - start
                 figures = score_result(scene, disparity.values)
+                rated = confidence_figures(disparity, scene.truth) if rates_matches(name) else None
+                figures["confidence"] = rated
                 yield SceneResult(scene, name, disparity, figures, seconds)
 
     def _matchers(self, pair: RectifiedPair) -> dict[str, Matcher]:

@@ -17,8 +17,9 @@ from recon.matching import MATCHERS
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.machine import peak_memory_mb, use_threads
 from recon.pipeline.middlebury_bench import Bench, SceneResult
+from recon.pipeline.middlebury_confidence import weighted_confidence
 from recon.pipeline.middlebury_scenes import check_folder, find_scenes, read_scored_scene
-from recon.pipeline.middlebury_score import Figures, weighted_figures
+from recon.pipeline.middlebury_score import MASKS, Figures, weighted_figures
 from recon.pipeline.record import fingerprint, write_record
 from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.summary import plain
@@ -177,12 +178,11 @@ def _kept(result: SceneResult, options: MiddleburyOptions, directory: RunDirecto
 def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str) -> Figures:
     """What ``summary.json`` has of one matcher."""
     own = {name: figures[matcher] for name, figures in scenes.items() if figures}
-    masked = {
-        name: {key: value for key, value in figures.items() if isinstance(value, dict)}
-        for name, figures in own.items()
-    }
+    masked = {name: {mask: figures[mask] for mask in MASKS} for name, figures in own.items()}
+    rated = {name: figures["confidence"] for name, figures in own.items()}
+    weighted = {**weighted_figures(masked), "confidence": weighted_confidence(rated)}
     seconds = sum(figures["seconds"] for figures in own.values())
-    return {"scenes": own, "weighted": weighted_figures(masked), "seconds": round(seconds, 4)}
+    return {"scenes": own, "weighted": weighted, "seconds": round(seconds, 4)}
 
 
 def _write(

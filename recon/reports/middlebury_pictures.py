@@ -10,14 +10,17 @@ from recon.formats.image import write_image
 from recon.pipeline.middlebury_bench import SceneResult
 from recon.pipeline.run_directory import RunDirectory
 from recon.reports.colour import colour_disparity, colour_error, value_range
+from recon.reports.html import render_html
+from recon.reports.middlebury_report import middlebury_report
 from recon.reports.middlebury_tables import csv_table, markdown_tables, text_tables
+from recon.reports.present import command_line
 
 ERROR_LIMIT_PX: Final = 4.0
 """Error that gets the last colour, full-size pixels: the largest limit of the table."""
 
 
 def present_middlebury(summary: Mapping[str, Any], directory: RunDirectory) -> None:
-    """Write the tables as text, Markdown and CSV.
+    """Write the tables as text, Markdown and CSV, and ``report.html``.
 
     Raises:
         OutputError: A file cannot be written.
@@ -25,6 +28,9 @@ def present_middlebury(summary: Mapping[str, Any], directory: RunDirectory) -> N
     write_text(directory.path("tables.txt"), text_tables(summary))
     write_text(directory.path("tables.md"), markdown_tables(summary))
     write_text(directory.path("figures.csv"), csv_table(summary))
+    config = directory.path("config.yaml").read_text(encoding="utf-8")
+    content = middlebury_report(summary, directory, config=config, command=command_line())
+    write_text(directory.path("report.html"), render_html(content))
 
 
 def draw_result(result: SceneResult, directory: RunDirectory) -> None:

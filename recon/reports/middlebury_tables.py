@@ -15,6 +15,7 @@ _LIMITS: Final = ("0.5", "1", "2", "4")
 _LENGTHS: Final = ("avgerr", "rms", "a50", "a90", "a95", "a99")
 _DEPTHS: Final = ("mean_m", "median_m", "rms_m", "median_percent", "over_5_percent", "infinite")
 _HEAD: Final = ("matcher", *(f"bad{t}" for t in _LIMITS), "invalid", *_LENGTHS)
+_CONFIDENCE: Final = ("ece", "ause", "within_1_sigma", "within_2_sigma")
 _KINDS: Final = (("nonocc", "dense"), ("nonocc", "sparse"), ("all", "dense"), ("all", "sparse"))
 
 
@@ -28,12 +29,21 @@ def markdown_tables(summary: Figures) -> str:
     return "\n\n".join(f"### {title}\n{_markdown(rows)}" for title, rows in _tables(summary)) + "\n"
 
 
+def report_tables(summary: Figures) -> list[tuple[str, list[Row]]]:
+    """Titles and rows, the first of which is the head."""
+    return list(_tables(summary))
+
+
 def csv_table(summary: Figures) -> str:
-    """All figures of all matchers: a row per scene, mask and filling."""
+    """All figures of all matchers: a row per scene, mask and filling.
+
+    Those of the confidence stand where they are counted: all pixels with a value.
+    """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     depths = [f"depth_{name}" for name in _DEPTHS]
-    writer.writerow([_HEAD[0], "scene", "mask", "holes", *_HEAD[1:], *depths, "seconds"])
+    names = [*_HEAD[1:], *depths, *_CONFIDENCE]
+    writer.writerow([_HEAD[0], "scene", "mask", "holes", *names, "seconds"])
     for matcher, found in summary["matchers"].items():
         mean = {**found["weighted"], "seconds": found["seconds"]}
         for scene, figures in [*found["scenes"].items(), (WEIGHTED, mean)]:
@@ -53,6 +63,11 @@ def _tables(summary: Figures) -> Iterator[tuple[str, list[Row]]]:
         yield f"bad {limit} of each scene, nonocc, dense", rows
     rows = _scene_rows(matchers, lambda one: one["nonocc"]["dense"]["avgerr"])
     yield "avgerr (px) of each scene, nonocc, dense", rows
+    if any(found["weighted"].get("confidence") for found in matchers.values()):
+        yield "Confidence, weighted mean, all, sparse", _confidence_rows(matchers)
+        for name in _CONFIDENCE[:2]:
+            rows = _scene_rows(matchers, lambda one, n=name: _rated(one, n), digits=3)
+            yield f"{name} of each scene", rows
     rows = _scene_rows(matchers, lambda one: one["seconds"], digits=3)
     yield "seconds of each scene, matching alone", rows
 
@@ -66,6 +81,18 @@ def _weighted_rows(matchers: Figures, mask: str, holes: str) -> list[Row]:
         shown = f"{_number(depth)} %" if depth is not None else "–"
         rows.append((name, *cells, shown, _number(found["seconds"])))
     return rows
+
+
+def _confidence_rows(matchers: Figures) -> list[Row]:
+    rows: list[Row] = [("matcher", *_CONFIDENCE)]
+    for name, found in matchers.items():
+        rows.append((name, *(_number(_rated(found["weighted"], one), 3) for one in _CONFIDENCE)))
+    return rows
+
+
+def _rated(figures: Figures, name: str) -> float | None:
+    """A figure of the confidence; None of a matcher that has none."""
+    return (figures.get("confidence") or {}).get(name)
 
 
 def _scene_rows(matchers: Figures, pick: Any, digits: int = 2) -> list[Row]:
@@ -87,7 +114,9 @@ def _cells(figures: Figures, mask: str, holes: str) -> list[Any]:
 
 def _all_cells(figures: Figures, mask: str, holes: str) -> list[Any]:
     depth = figures[mask][holes].get("depth", {})
-    cells = [*_cells(figures, mask, holes), *(depth.get(name) for name in _DEPTHS)]
+    counted = (mask, holes) == _KINDS[-1]
+    rated = [_rated(figures, name) if counted else None for name in _CONFIDENCE]
+    cells = [*_cells(figures, mask, holes), *(depth.get(name) for name in _DEPTHS), *rated]
     return ["" if cell is None else f"{cell:.6g}" for cell in cells]
 
 

@@ -164,19 +164,34 @@ def test_confidence_grows_with_the_margin_and_is_nought_without_a_rival() -> Non
     assert refine_one(one_pixel((20, 60, 40, NO_COST)))[1] == 0
 
 
-def test_confidence_is_the_odds_of_margin_and_sigma() -> None:
-    _, confidence, sigma_px, _ = refine_one(one_pixel((20, 60, 40, 100)), RULES._replace(odds=3))
+def test_confidence_is_the_odds_of_margin_and_noise() -> None:
+    _, confidence, _, _ = refine_one(one_pixel((20, 60, 40, 100)), RULES._replace(odds=3))
     margin = (100 - 20) / (25 + 20)
-    # 1e-5: both are float32.
+    # Slope 40, vertex 10, 25 pixels; the floor is 0.1.
+    noise_px = 0.5 * np.pi * 10 / (40 * 5)
+    sigma_px = np.hypot(0.1, noise_px)
+    # 1e-5: float32.
     assert confidence / (1 - confidence) == pytest.approx(
         3 * (margin / sigma_px**3) ** 0.5, rel=1e-5
     )
 
 
-@pytest.mark.parametrize(("steeper", "sigma_px"), [(1, 2.0), (2, 0.1)])
-def test_sigma_is_the_floor_without_noise_and_the_limit_without_slope(
-    steeper: int, sigma_px: float
+def test_sigma_is_that_of_right_and_wrong_together() -> None:
+    _, confidence, sigma_px, _ = refine_one(one_pixel((20, 60, 40, 100)))
+    right_px = np.hypot(0.1, 0.5 * np.pi * 10 / (40 * 5))
+    expected = confidence * right_px**2 + (1 - confidence) * refine.WRONG_PX**2
+    # 1e-5: float32.
+    assert sigma_px**2 == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize(("costs", "sigma_px"), [((20, 20, 20, 100), 2.0), ((0, 50, 50, 100), 0.1)])
+def test_sigma_is_the_limit_without_slope_and_the_floor_without_noise_or_doubt(
+    costs: tuple[int, int, int, int], sigma_px: float
 ) -> None:
-    costs = (20, 20, 20, 100) if steeper == 1 else (0, 50, 50, 100)
-    # 1e-6: float32.
-    assert refine_one(one_pixel(costs))[2] == pytest.approx(sigma_px, abs=1e-6)
+    # 1e-4: with such odds the confidence is 1 to float32, and 1e-9 short of it.
+    sure = RULES._replace(odds=1e9)
+    assert refine_one(one_pixel(costs), sure)[2] == pytest.approx(sigma_px, abs=1e-4)
+
+
+def test_sigma_of_a_pixel_without_a_rival_is_that_of_a_wrong_one() -> None:
+    assert refine_one(one_pixel((20, 60, 40, NO_COST)))[2] == refine.WRONG_PX

@@ -1,0 +1,121 @@
+"""The report of an evaluation on Middlebury scenes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+import matplotlib.image
+import numpy as np
+
+from recon.formats.image import read_image
+from recon.pipeline.machine import versions
+from recon.pipeline.run_directory import RunDirectory
+from recon.reports.confidence_figures import reliability_figure, sparsification_figure
+from recon.reports.html import Block, FigureBlock, ReportContent, Section, TableBlock
+from recon.reports.middlebury_tables import report_tables
+from recon.structures.arrays import UInt8
+
+_WIDTH_PX: Final = 400
+"""Pictures in the report are made smaller by whole factors until they are about as wide."""
+
+_GAP_PX: Final = 6
+
+
+def middlebury_report(
+    summary: Mapping[str, Any], directory: RunDirectory, *, config: str = "", command: str = ""
+) -> ReportContent:
+    """Compose the report: tables, whether confidences are true, and the maps of each scene.
+
+    Args:
+        summary: The figures of ``summary.json``.
+        directory: Where the pictures of all results are.
+        config: The effective configuration as text.
+        command: The command line, or "".
+    """
+    tables = [TableBlock(title, rows[0], rows[1:]) for title, rows in report_tables(summary)]
+    scenes = next(iter(summary["matchers"].values()))["scenes"]
+    sections = (
+        Section("Tables", tables, "Errors are in pixels of the full size."),
+        Section("Confidence", _confidence_blocks(summary)),
+        Section("Scenes", [_scene_block(name, summary, directory) for name in scenes]),
+    )
+    return ReportContent(
+        title=f"Middlebury: {', '.join(summary['matchers'])}",
+        subtitle=f"{len(scenes)} scenes of {summary['folder']}, {summary['seconds']:.0f} s",
+        command=command,
+        warnings=summary["warnings"],
+        figures=list(_figures(summary)),
+        sections=sections,
+        config=config,
+        versions=versions(),
+    )
+
+
+def _figures(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    for name, found in summary["matchers"].items():
+        bad = found["weighted"]["nonocc"]["dense"]["bad"]["2"]
+        yield f"{name}: bad 2, nonocc, dense", f"{bad:.1f} %"
+
+
+def _confidence_blocks(summary: Mapping[str, Any]) -> list[Block]:
+    rated = {
+        name: found["weighted"]["confidence"]
+        for name, found in summary["matchers"].items()
+        if found["weighted"]["confidence"]
+    }
+    if not rated:
+        return []
+    return [
+        FigureBlock(
+            "Reliability",
+            reliability_figure(rated),
+            "Right is what is off by no more than a pixel of the map. Above the dashed line "
+            "pixels are right more often than the matcher says. Matchers that do not rate their "
+            "matches are left out.",
+            wide=False,
+        ),
+        FigureBlock(
+            "Sparsification",
+            sparsification_figure(rated),
+            "The nearer to the dotted line, the better the confidence sorts.",
+            wide=False,
+        ),
+    ]
+
+
+def _scene_block(scene: str, summary: Mapping[str, Any], directory: RunDirectory) -> FigureBlock:
+    """A row of pictures for each matcher: what it found, and how far it is off."""
+    rows = [
+        np.concatenate(_spaced([_small(directory, name, scene, one) for one in _PAIR], 1), axis=1)
+        for name in summary["matchers"]
+    ]
+    buffer = io.BytesIO()
+    matplotlib.image.imsave(buffer, np.concatenate(_spaced(rows, 0), axis=0))
+    caption = (
+        f"From top to bottom: {', '.join(summary['matchers'])}. Left the disparity, right its "
+        "error: blue is right, red is off by 4 full-size pixels or more, dark is not known."
+    )
+    return FigureBlock(scene, buffer.getvalue(), caption, wide=False)
+
+
+_PAIR: Final = ("disparity", "error")
+
+
+def _small(directory: RunDirectory, matcher: str, scene: str, name: str) -> UInt8:
+    """A picture of a result at `_WIDTH_PX`: uint8 (H, W, 3)."""
+    picture = read_image(directory.path(f"pictures/{matcher}/{scene}_{name}.png"))
+    rows, columns = (
+        np.linspace(0, n - 1, max(1, round(n * min(1.0, _WIDTH_PX / picture.shape[1])))).astype(int)
+        for n in picture.shape[:2]
+    )
+    return picture[np.ix_(rows, columns)]
+
+
+def _spaced(pictures: list[UInt8], axis: int) -> list[UInt8]:
+    """The pictures with a white gap after each but the last."""
+    shape = list(pictures[0].shape)
+    shape[axis] = _GAP_PX
+    gap = np.full(shape, 255, np.uint8)
+    return [part for picture in pictures for part in (picture, gap)][:-1]
