@@ -6,8 +6,8 @@ import io
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-import matplotlib.image
 import numpy as np
+from PIL import Image
 
 from recon.formats.image import read_image
 from recon.pipeline.machine import versions
@@ -21,6 +21,7 @@ _WIDTH_PX: Final = 400
 """Pictures in the report are made smaller by whole factors until they are about as wide."""
 
 _GAP_PX: Final = 6
+_MANY_COLUMNS: Final = 7
 
 
 def middlebury_report(
@@ -34,7 +35,10 @@ def middlebury_report(
         config: The effective configuration as text.
         command: The command line, or "".
     """
-    tables = [TableBlock(title, rows[0], rows[1:]) for title, rows in report_tables(summary)]
+    tables = [
+        TableBlock(title, rows[0], rows[1:], wide=len(rows[0]) > _MANY_COLUMNS)
+        for title, rows in report_tables(summary)
+    ]
     scenes = next(iter(summary["matchers"].values()))["scenes"]
     sections = (
         Section("Tables", tables, "Errors are in pixels of the full size."),
@@ -92,7 +96,7 @@ def _scene_block(scene: str, summary: Mapping[str, Any], directory: RunDirectory
         for name in summary["matchers"]
     ]
     buffer = io.BytesIO()
-    matplotlib.image.imsave(buffer, np.concatenate(_spaced(rows, 0), axis=0))
+    Image.fromarray(np.concatenate(_spaced(rows, 0), axis=0)).save(buffer, "PNG")
     caption = (
         f"From top to bottom: {', '.join(summary['matchers'])}. Left the disparity, right its "
         "error: blue is right, red is off by 4 full-size pixels or more, dark is not known."
@@ -110,7 +114,7 @@ def _small(directory: RunDirectory, matcher: str, scene: str, name: str) -> UInt
         np.linspace(0, n - 1, max(1, round(n * min(1.0, _WIDTH_PX / picture.shape[1])))).astype(int)
         for n in picture.shape[:2]
     )
-    return picture[np.ix_(rows, columns)]
+    return np.asarray(picture[np.ix_(rows, columns)])
 
 
 def _spaced(pictures: list[UInt8], axis: int) -> list[UInt8]:

@@ -35,7 +35,7 @@ from recon.reports.scene3d import T_UPRIGHT_CAMERA, Scene, plot_scene
 from recon.structures import PointCloud, RectifiedCamera
 
 _ERROR_LIMIT_PX: Final = 4.0
-_MAX_POINTS: Final = 60_000
+_MAX_POINTS: Final = 20_000
 _NEAR_SHARE: Final = 0.9
 _LOOK_FROM: Final = (-1.15, 0.4, 0.4)  # from the middle of a cloud, in lengths of its longest side
 _UNKNOWN: Final = "–"

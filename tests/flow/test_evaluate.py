@@ -102,7 +102,8 @@ def test_every_matcher_has_all_scenes_and_their_weighted_mean(
 ) -> None:
     summary = run[0]
     assert list(summary["matchers"]) == MATCHERS.split(",")
-    for found in summary["matchers"].values():
+    for name, found in summary["matchers"].items():
+        assert (found["weighted"]["confidence"] is None) == name.startswith("opencv")
         assert set(found) == {"scenes", "weighted", "seconds"}
         assert len(found["scenes"]) == 4
         assert found["seconds"] > 0
@@ -165,6 +166,8 @@ def test_tables_maps_and_pictures_are_written(run: tuple[dict[str, Any], Path, s
     mean = next(r for r in rows if r["scene"] == "weighted" and r["matcher"] == "sad")
     expected = summary["matchers"]["sad"]["weighted"]["nonocc"]["dense"]["bad"]["2"]
     assert float(mean["bad2"]) == pytest.approx(expected, rel=1e-5)
+    report = (out / "report.html").read_text()
+    assert all(title in report for title in ("Reliability", "Sparsification", "2003/Cones"))
     picture = read_image(out / "pictures/sad/MiddEval3/trainingQ/Teddy_error.png")
     assert picture.shape == (HEIGHT, WIDTH, 3)
     assert (out / "disparity/opencv-bm/MiddEval3/trainingH/Teddy.pfm").is_file()
@@ -235,6 +238,25 @@ def test_one_map_is_compared_in_either_format(tmp_path: Path) -> None:
     masked = ("--mask", tmp_path / "mask.png", "--json")
     done = recon("evaluate", "disparity", tmp_path / "est.pfm", tmp_path / "gt.png", *masked)
     assert json.loads(done.stdout)["sparse"]["bad"]["0.5"] == 0
+
+
+def test_the_confidence_of_one_map_is_judged_where_a_file_is_given(tmp_path: Path) -> None:
+    truth = np.full((4, 10), 20, np.float32)
+    estimate = truth.copy()
+    estimate[0] += 8
+    files = [tmp_path / name for name in ("est.pfm", "gt.pfm", "sure.pfm", "wild.pfm")]
+    sure = np.full((4, 10), 0.75, np.float32)
+    for file, values in zip(files, (estimate, truth, sure, sure + 1), strict=True):
+        write_pfm(file, values)
+    command = ["evaluate", "disparity", *map(str, files[:2]), "--confidence"]
+    done = CliRunner().invoke(app, [*command, str(files[2]), "--json"])
+    figures = json.loads(done.stdout)["confidence"]
+    assert figures["ece"] == pytest.approx(0)
+    assert figures["reliability"]["right"][7] == pytest.approx(0.75)
+    done = CliRunner().invoke(app, [*command, str(files[3])])
+    assert done.exit_code == 1
+    assert len(done.stderr.splitlines()) == 1
+    assert "not between 0 and 1" in done.stderr
 
 
 def test_maps_of_two_sizes_are_refused_in_one_line(tmp_path: Path) -> None:

@@ -22,7 +22,10 @@ def summary(error: float | None = 3.25, *, depth: bool = True) -> dict[str, Any]
     figures = {mask: masked(error, depth=depth) for mask in ("nonocc", "all")}
     scenes = {name: {**figures, "seconds": 0.5} for name in ("Piano", "Teddy")}
     found = {"scenes": scenes, "weighted": figures, "seconds": 1.0}
-    return {"matchers": {"sad": found, "opencv-bm": found}}
+    rated = dict.fromkeys(("ece", "ause", "within_1_sigma", "within_2_sigma"), 0.125)
+    sure = {name: {**one, "confidence": rated} for name, one in scenes.items()}
+    sad = {"scenes": sure, "weighted": {**figures, "confidence": rated}, "seconds": 1.0}
+    return {"matchers": {"sad": sad, "opencv-bm": found}}
 
 
 def test_a_table_has_a_row_per_matcher_and_a_column_per_figure() -> None:
@@ -52,6 +55,23 @@ def test_csv_has_every_scene_mask_and_filling() -> None:
     assert len(rows) == 2 * 3 * 4
     assert rows[0]["scene"] == "Piano"
     assert float(rows[0]["depth_median_m"]) == 0.5
+
+
+def test_the_confidence_of_a_matcher_that_has_none_is_a_dash() -> None:
+    tables = dict(part.split("\n", 1) for part in text_tables(summary()).split("\n\n"))
+    rows = tables["Confidence, weighted mean, all, sparse"].splitlines()
+    assert rows[1].split() == ["sad", "0.125", "0.125", "0.125", "0.125"]
+    assert rows[2].split() == ["opencv-bm", "–", "–", "–", "–"]
+    assert tables["ece of each scene"].splitlines()[1].split() == ["Piano", "0.125", "–"]
+
+
+def test_csv_has_the_confidence_where_it_is_counted() -> None:
+    rows = list(csv.DictReader(io.StringIO(csv_table(summary()))))
+    counted = [row for row in rows if row["ece"]]
+    assert {(row["matcher"], row["mask"], row["holes"]) for row in counted} == {
+        ("sad", "all", "sparse")
+    }
+    assert len(counted) == 3
 
 
 def test_a_figure_that_is_not_known_is_a_dash_or_an_empty_cell() -> None:
