@@ -18,7 +18,7 @@ from recon.reports.middlebury_tables import report_tables
 from recon.structures.arrays import UInt8
 
 _WIDTH_PX: Final = 400
-"""Pictures in the report are made smaller by whole factors until they are about as wide."""
+"""Pictures in the report are at most as wide."""
 
 _GAP_PX: Final = 6
 _MANY_COLUMNS: Final = 7
@@ -91,10 +91,7 @@ def _confidence_blocks(summary: Mapping[str, Any]) -> list[Block]:
 
 def _scene_block(scene: str, summary: Mapping[str, Any], directory: RunDirectory) -> FigureBlock:
     """A row of pictures for each matcher: what it found, and how far it is off."""
-    rows = [
-        np.concatenate(_spaced([_small(directory, name, scene, one) for one in _PAIR], 1), axis=1)
-        for name in summary["matchers"]
-    ]
+    rows = [_both_pictures(directory, name, scene) for name in summary["matchers"]]
     buffer = io.BytesIO()
     Image.fromarray(np.concatenate(_spaced(rows, 0), axis=0)).save(buffer, "PNG")
     caption = (
@@ -104,15 +101,21 @@ def _scene_block(scene: str, summary: Mapping[str, Any], directory: RunDirectory
     return FigureBlock(scene, buffer.getvalue(), caption, wide=False)
 
 
-_PAIR: Final = ("disparity", "error")
+def _both_pictures(directory: RunDirectory, matcher: str, scene: str) -> UInt8:
+    """Disparity and error side by side: uint8 (H, W, 3)."""
+    stem = f"pictures/{matcher}/{scene}"
+    found = read_image(directory.path(f"{stem}_disparity.png"))
+    # The error has the size of the truth, which may be another.
+    error = read_image(directory.path(f"{stem}_error.png"))
+    width = min(_WIDTH_PX, found.shape[1])
+    size = (max(1, round(found.shape[0] * width / found.shape[1])), width)
+    return np.concatenate(_spaced([_sized(found, size), _sized(error, size)], 1), axis=1)
 
 
-def _small(directory: RunDirectory, matcher: str, scene: str, name: str) -> UInt8:
-    """A picture of a result at `_WIDTH_PX`: uint8 (H, W, 3)."""
-    picture = read_image(directory.path(f"pictures/{matcher}/{scene}_{name}.png"))
+def _sized(picture: UInt8, size: tuple[int, int]) -> UInt8:
+    """The nearest pixels of a picture: uint8 (H, W, 3) with ``size`` rows and columns."""
     rows, columns = (
-        np.linspace(0, n - 1, max(1, round(n * min(1.0, _WIDTH_PX / picture.shape[1])))).astype(int)
-        for n in picture.shape[:2]
+        np.arange(n) * old // n for n, old in zip(size, picture.shape[:2], strict=True)
     )
     return np.asarray(picture[np.ix_(rows, columns)])
 

@@ -2,10 +2,12 @@ from __future__ import annotations
 
 import base64
 import gzip
+import io
 import re
 from html.parser import HTMLParser
 
 import numpy as np
+from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from recon.reports.html import (
@@ -56,6 +58,30 @@ def parse(page: str) -> Loads:
     return parser
 
 
+def png(picture: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def embedded(picture: np.ndarray) -> tuple[str, np.ndarray]:
+    """Kind and pixels of a picture in a page."""
+    block = FigureBlock("a", png(picture))
+    page = render_html(ReportContent("t", sections=(Section("s", (block,)),)))
+    (kind, data), *_ = re.findall(r'src="data:image/(\w+);base64,([^"]+)"', page)
+    with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+        return kind, np.asarray(image.convert("RGB"))
+
+
+def test_a_picture_is_packed_where_that_makes_it_smaller() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    kind, pixels = embedded(noise)
+    assert (kind, pixels.shape) == ("webp", noise.shape)
+    kind, pixels = embedded(np.zeros((1, 1, 3), np.uint8))
+    np.testing.assert_array_equal(pixels, 0)
+    assert kind in {"png", "webp"}
+
+
 def scene() -> SceneBlock:
     cloud = PointCloud(np.eye(3, dtype=np.float32))
     return SceneBlock("In 3-D", plot_scene(Scene(np.eye(4), cloud)))
@@ -65,7 +91,7 @@ def full_report(text: str = "plain") -> ReportContent:
     section = Section(
         f"Section {text}",
         (
-            FigureBlock(f"Figure {text}", b"\x89PNG", f"Caption {text}"),
+            FigureBlock(f"Figure {text}", png(np.zeros((2, 2, 3), np.uint8)), f"Caption {text}"),
             TableBlock(f"Table {text}", (text,), ((text, text),)),
             TextBlock(f"Text {text}", text),
             scene(),
