@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from recon.cloud.normals import normals_from_disparity
 from recon.errors import ShapeError
-from recon.geometry.projection import unproject
-from recon.geometry.triangulation import depth_from_disparity, depth_sigma
+from recon.kernels import points
 from recon.settings import Settings
-from recon.structures import Disparity, PointCloud, RectifiedPair
-from recon.structures.arrays import Bool, Float32, UInt8
-
-Index = NDArray[np.intp]
+from recon.structures import Disparity, PointCloud, RectifiedCamera, RectifiedPair
 
 
 class CloudSettings(Settings):
@@ -59,50 +55,43 @@ def back_project(disparity: Disparity, pair: RectifiedPair, settings: CloudSetti
             got=f"disparity {disparity.values.shape}",
             expected=f"{pair.left.shape}",
         )
-    rows, columns, depth_m, sigma_m = _pixels(disparity, pair, settings)
-    at = (rows, columns)
-    u, v = columns.astype(np.float32), rows.astype(np.float32)
-    radius_px = settings.normals_radius_px
+    found = points.make_points(_maps(disparity, pair), _rules(pair.camera, settings))
     return PointCloud(
-        xyz=unproject(u, v, depth_m, pair.camera),
-        rgb=_colours(pair, at),
-        normals=None
-        if radius_px is None
-        else normals_from_disparity(disparity.values, at, pair.camera, radius_px),
-        sigma_m=sigma_m,
-        confidence=disparity.confidence[at],
+        xyz=found.xyz,
+        rgb=found.colours,
+        normals=None if settings.normals_radius_px is None else found.normals,
+        sigma_m=found.sigma,
+        confidence=found.confidence,
         frame="camera",
     )
 
 
-def _pixels(
-    disparity: Disparity, pair: RectifiedPair, settings: CloudSettings
-) -> tuple[Index, Index, Float32, Float32]:
-    """Rows, columns, depths and depth errors of the pixels that become points."""
-    usable = disparity.valid & (disparity.confidence >= settings.min_confidence)
-    if pair.valid is not None:
-        usable &= pair.valid
-    step = settings.stride
-    rows, columns = np.nonzero(usable[::step, ::step])
-    rows, columns = rows * step, columns * step
-    depth_m = depth_from_disparity(disparity.values[rows, columns], pair.camera)
-    sigma_m = depth_sigma(depth_m, disparity.sigma_px[rows, columns], pair.camera)
-    keep = _in_range(depth_m, sigma_m, settings)
-    return rows[keep], columns[keep], depth_m[keep], sigma_m[keep]
+def _maps(disparity: Disparity, pair: RectifiedPair) -> points.Maps:
+    return points.Maps(
+        values=disparity.values,
+        confidence=disparity.confidence,
+        sigma=disparity.sigma_px,
+        colours=pair.left[:, :, None] if pair.left_rgb is None else pair.left_rgb,
+        usable=np.zeros((0, 0), np.bool_) if pair.valid is None else pair.valid,
+    )
 
 
-def _in_range(depth_m: Float32, sigma_m: Float32, settings: CloudSettings) -> Bool:
-    """bool (N,): in front of the camera, neither too near, too far nor too uncertain."""
-    keep = np.isfinite(depth_m) & (depth_m >= settings.min_range_m)
-    if settings.max_range_m is not None:
-        keep &= depth_m <= settings.max_range_m
-    if settings.max_relative_sigma is not None:
-        keep &= sigma_m <= settings.max_relative_sigma * depth_m
-    return np.asarray(keep)
+def _rules(camera: RectifiedCamera, settings: CloudSettings) -> points.PointRules:
+    return points.PointRules(
+        focal=float(camera.focal_px),
+        cx=float(camera.cx_px),
+        cy=float(camera.cy_px),
+        fb=float(camera.focal_px * camera.baseline_m),
+        doffs=float(camera.doffs_px),
+        nearest=settings.min_range_m,
+        farthest=_or_infinity(settings.max_range_m),
+        relative_sigma=_or_infinity(settings.max_relative_sigma),
+        confidence=settings.min_confidence,
+        stride=settings.stride,
+        radius=settings.normals_radius_px or 0,
+    )
 
 
-def _colours(pair: RectifiedPair, at: tuple[Index, Index]) -> UInt8:
-    """uint8 (N, 3), the colours of some pixels, or their grey thrice."""
-    if pair.left_rgb is not None:
-        return pair.left_rgb[at]
-    return np.repeat(pair.left[at][:, None], 3, axis=1)
+def _or_infinity(limit: float | None) -> float:
+    # The largest number, not infinity: 0 · inf is NaN, and a depth that is infinite is none.
+    return sys.float_info.max if limit is None else limit

@@ -1,0 +1,79 @@
+"""The compiled back-projection equals its twin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recon.kernels.points import Maps, PointRules, make_points
+from recon.kernels.points_reference import make_points_reference
+
+RULES = PointRules(
+    focal=100.0,
+    cx=12.3,
+    cy=7.7,
+    fb=20.0,
+    doffs=2.0,
+    nearest=0.1,
+    farthest=8.0,
+    relative_sigma=0.2,
+    confidence=0.2,
+    stride=1,
+    radius=3,
+)
+
+
+def make_maps(seed: int, height: int, width: int, *, known: float, channels: int) -> Maps:
+    """A slanted surface with noise, steps, holes, negative values."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[:height, :width]
+    values = 6 + 0.3 * u - 0.2 * v + np.where(u > width // 2, 9.0, 0.0)
+    values += rng.normal(0, 0.3, values.shape)
+    values[rng.random(values.shape) < 0.05] = -3.0
+    values[rng.random(values.shape) > known] = np.nan
+    return Maps(
+        values.astype(np.float32),
+        rng.random(values.shape).astype(np.float32),
+        rng.uniform(0.05, 0.6, values.shape).astype(np.float32),
+        rng.integers(0, 256, (height, width, channels), dtype=np.uint8),
+        rng.random(values.shape) < 0.9 if channels == 3 else np.zeros((0, 0), np.bool_),
+    )
+
+
+maps = st.builds(
+    make_maps,
+    seed=st.integers(0, 2**20),
+    height=st.integers(1, 20),
+    width=st.integers(1, 30),
+    known=st.sampled_from([0.0, 0.1, 0.6, 1.0]),
+    channels=st.sampled_from([1, 3]),
+)
+
+
+@given(maps, st.integers(0, 4), st.integers(1, 3))
+@settings(max_examples=150, deadline=None)
+def test_points_equal_their_twin(given_maps: Maps, radius: int, stride: int) -> None:
+    rules = RULES._replace(radius=radius, stride=stride)
+    ours, twin = make_points(given_maps, rules), make_points_reference(given_maps, rules)
+    np.testing.assert_allclose(ours.xyz, twin.xyz, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(ours.sigma, twin.sigma, rtol=1e-6)
+    np.testing.assert_array_equal(ours.confidence, twin.confidence)
+    np.testing.assert_array_equal(ours.colours, twin.colours)
+    # Sums in single precision; a normal that all but vanishes has no direction to agree on.
+    np.testing.assert_allclose(ours.normals, twin.normals, atol=2e-3)
+
+
+def test_without_a_radius_there_are_no_normals() -> None:
+    given_maps = make_maps(1, 12, 20, known=1.0, channels=1)
+    assert make_points(given_maps, RULES._replace(radius=0)).normals.shape == (0, 3)
+
+
+@pytest.mark.parametrize("limit", ["nearest", "farthest", "relative_sigma", "confidence"])
+def test_each_limit_drops_points(limit: str) -> None:
+    given_maps = make_maps(2, 20, 30, known=1.0, channels=1)
+    free = RULES._replace(nearest=0.0, farthest=1e9, relative_sigma=1e9, confidence=0.0)
+    strict = {"nearest": 1.0, "farthest": 1.0, "relative_sigma": 0.02, "confidence": 0.5}
+    fewer = make_points(given_maps, free._replace(**{limit: strict[limit]}))
+    assert 0 < len(fewer.xyz) < len(make_points(given_maps, free).xyz)
