@@ -75,8 +75,8 @@ def _slopes(
     known = np.isfinite(d)
     n = known.sum(axis=1, keepdims=True)
 
-    def centred(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        x = np.where(known, x, 0.0)
+    def centred(x: NDArray[np.floating | np.integer]) -> NDArray[np.float64]:
+        x = np.where(known, x, 0.0).astype(np.float64)
         return np.where(known, x - x.sum(axis=1, keepdims=True) / n, 0.0)
 
     u, v, d = centred(du), centred(dv), centred(d)
