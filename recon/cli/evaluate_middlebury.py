@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,13 @@ import typer
 
 from recon.cli.options import Config, Json, Matcher, Out, Quiet, Set, Threads
 from recon.cli.session import print_json, session
+
+
+class Range(str, Enum):
+    """Where the range of disparities comes from."""
+
+    scene = "scene"
+    auto = "auto"
 
 
 def middlebury(
@@ -24,6 +32,14 @@ def middlebury(
     parallel: Annotated[
         int, typer.Option(min=1, help="Scenes worked on at once. Above 1, seconds are no measure.")
     ] = 1,
+    range_: Annotated[
+        Range,
+        typer.Option(
+            "--range",
+            help="How far to search: as the scene says (or its truth, before 2014), or as found "
+            "from each pair, as where nothing is known.",
+        ),
+    ] = Range.scene,
     out: Out = None,
     config: Config = None,
     set_: Set = None,
@@ -50,6 +66,7 @@ def middlebury(
             out=out,
             threads=threads,
             parallel=parallel,
+            auto_range=range_ is Range.auto,
             observer=choose_scene_viewer(quiet=quiet),
             draw=draw_result,
             present=present_middlebury,

@@ -43,7 +43,8 @@ def scene_weight(name: str) -> float:
     Args:
         name: Name of its folder, or a path that ends in it.
     """
-    return 4.0 if name.rpartition("/")[2] in HALF_WEIGHT else 8.0
+    scene = name.rpartition("/")[2].removesuffix("-perfect").removesuffix("-imperfect")
+    return 4.0 if scene in HALF_WEIGHT else 8.0
 
 
 def at_truth_size(values: Float32, shape: tuple[int, ...]) -> Float32:

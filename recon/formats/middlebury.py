@@ -21,6 +21,7 @@ from recon.formats.middlebury_layout import (
     full_size_factor,
     generation_of,
     levels_per_pixel,
+    scene_root,
 )
 from recon.formats.middlebury_truth import read_middlebury_truth
 from recon.structures import DisparityTruth, RectifiedCamera, StereoPair
@@ -73,15 +74,16 @@ def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
         )
     pair = _read_pair(path, layout)
     height_px, width_px = pair.left.shape[:2]
-    factor = full_size_factor(layout, width_px, height_px, path.parent.name)
-    calib = _read_calib(path, generation_of(layout, width_px), pair.left, factor)
+    factor = full_size_factor(layout, width_px, height_px, path)
+    root = scene_root(path)
+    calib = _read_calib(root, generation_of(layout, width_px), pair.left, factor)
     scale = levels_per_pixel(layout, width_px, height_px)
     return MiddleburyScene(
         name=path.name,
         generation=generation_of(layout, width_px),
         pair=pair,
         camera=calib.camera if calib else None,
-        truth=read_middlebury_truth(path, layout, scale, (height_px, width_px)),
+        truth=read_middlebury_truth(root, layout, scale, (height_px, width_px)),
         ndisp=calib.camera.ndisp if calib else _read_ndisp(path),
         isint=calib.isint if calib else False,
         full_size_factor=factor,
@@ -132,7 +134,7 @@ def _read_calib(
     if generation == "2005" and (path / "dmin.txt").is_file():
         table, _ = read_table(path / "dmin.txt", (1,))
         return MiddleburyCalib(nominal_camera_2005(width_px, height_px, float(table[0, 0]), factor))
-    if generation != "2014":
+    if generation != "2014" or not (path / "calib.txt").is_file():
         return None
     calib = read_middlebury_calib(path / "calib.txt")
     if (calib.camera.width_px, calib.camera.height_px) != (width_px, height_px):

@@ -4,6 +4,7 @@
 year       pictures            truth                   grey levels per pixel of disparity
 =========  ==================  ======================  =========================================
 2001       im3, im4 (Tsukuba)  disp3                   16
+2001       scene1.row3.col3    truedisp.row3.col3      16 (Tsukuba as published)
 2001       im2, im6            disp2, disp6            8
 2001       im0, im1 (Map)      disp0, disp1            8
 2003       im2, im6            disp2, disp6            4, 2, 1 at quarter, half, full size
@@ -12,11 +13,16 @@ year       pictures            truth                   grey levels per pixel of 
 MiddEval3  im0, im1, calib     disp0GT, disp1GT (PFM)  floats, inf = unknown
 =========  ==================  ======================  =========================================
 
+The pictures of 2005 and 2006 may lie in folders for light and exposure (``Aloe/Illum1/Exp1``), the
+truth above them. ``calib.txt`` may be missing where the truth is PFM.
+
 Ref: https://vision.middlebury.edu/stereo/data/
 """
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -27,6 +33,15 @@ _PICTURES: Final = (".png", ".ppm", ".pgm", ".jpg")
 _2003_FACTORS: Final = {1800: 1, 900: 2, 450: 4}
 _2005_FULL_HEIGHT_PX: Final = 1110
 _EVAL3_FACTORS: Final = {"F": 1, "H": 2, "Q": 4}
+_EVAL3_WIDTHS_PX: Final = {"ArtL": 1390, "Computer": 1330, "Teddy": 1800}
+_EVAL3_WIDTH_PX: Final = 2800
+_EVAL3_SCENES: Final = frozenset({
+    "Adirondack", "ArtL", "Jadeplant", "Motorcycle", "MotorcycleE", "Piano", "PianoL", "Pipes",
+    "Playroom", "Playtable", "PlaytableP", "Recycle", "Shelves", "Teddy", "Vintage",
+    "Australia", "AustraliaP", "Bicycle2", "Classroom2", "Classroom2E", "Computer", "Crusade",
+    "CrusadeP", "Djembe", "DjembeL", "Hoops", "Livingroom", "Newkuba", "Plants", "Staircase",
+})  # fmt: skip
+_VARIANT: Final = re.compile(r"(Illum|Exp)\d+", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -38,7 +53,7 @@ class Layout:
         right: Right picture.
         truth_left: True disparity of the left view.
         truth_right: True disparity of the right view.
-        calibrated: True where there is a ``calib.txt``, and the truth is in PFM.
+        calibrated: True where there should be a ``calib.txt``, and the truth is in PFM.
     """
 
     left: str
@@ -49,6 +64,9 @@ class Layout:
 
 
 _TSUKUBA: Final = Layout("im3", "im4", "disp3", "disp4")
+_TSUKUBA_2001: Final = Layout(
+    "scene1.row3.col3", "scene1.row3.col4", "truedisp.row3.col3", "truedisp.row3.col4"
+)
 _MAP: Final = Layout("im0", "im1", "disp0", "disp1")
 _2001_2003: Final = Layout("im2", "im6", "disp2", "disp6")
 _2005: Final = Layout("view1", "view5", "disp1", "disp5")
@@ -58,10 +76,11 @@ _EVAL3: Final = Layout("im0", "im1", "disp0GT", "disp1GT", calibrated=True)
 
 def find_layout(folder: Path) -> Layout | None:
     """The layout that a folder's files fit, or None; one picture of the two is enough."""
-    if (folder / "calib.txt").is_file():
+    marks = ("calib.txt", "disp0GT.pfm", "disp0.pfm")
+    if any((folder / mark).is_file() for mark in marks):
         eval3 = (folder / "disp0GT.pfm").is_file()
         return (_EVAL3 if eval3 else _2014) if _has_picture(folder, _2014) else None
-    known = (_2005, _2001_2003, _TSUKUBA)
+    known = (_2005, _2001_2003, _TSUKUBA, _TSUKUBA_2001)
     layout = next((one for one in known if _has_picture(folder, one)), None)
     if layout is None and _has_picture(folder, _MAP) and find_picture(folder, "disp0"):
         return _MAP
@@ -89,27 +108,40 @@ def levels_per_pixel(layout: Layout, width_px: int, height_px: int) -> float | N
     if generation == "2014":
         return None
     if generation == "2001":
-        return 16.0 if layout == _TSUKUBA else 8.0
-    return full_size_factor(layout, width_px, height_px, "")
+        return 16.0 if layout in {_TSUKUBA, _TSUKUBA_2001} else 8.0
+    return full_size_factor(layout, width_px, height_px, Path())
 
 
-def full_size_factor(layout: Layout, width_px: int, height_px: int, collection: str) -> float:
+def scene_root(folder: Path) -> Path:
+    """The folder that a scene is named after: above those for light and exposure."""
+    while _VARIANT.fullmatch(folder.name):
+        folder = folder.parent
+    return folder
+
+
+def full_size_factor(layout: Layout, width_px: int, height_px: int, folder: Path) -> float:
     """Full-size pixels per pixel of the scene at hand.
+
+    MiddEval3 tells the size by the last letter of the collection (``trainingQ``); scenes of its
+    table that lie elsewhere are known by their names.
 
     Args:
         layout: The layout.
         width_px: Width of the pictures.
         height_px: Height of the pictures.
-        collection: Name of the folder that the scene lies in; MiddEval3 tells the size by its
-            last letter (``trainingQ``).
+        folder: Folder of the scene.
     """
     generation = generation_of(layout, width_px)
     if generation == "2003":
         return float(_2003_FACTORS[width_px])
     if generation == "2005":
         return float(max(1, round(_2005_FULL_HEIGHT_PX / height_px)))
+    collection = folder.parent.name
     if generation == "2014" and collection.startswith(("training", "test")):
         return float(_EVAL3_FACTORS.get(collection[-1], 1))
+    if generation == "2014" and folder.name in _EVAL3_SCENES:
+        full_px = _EVAL3_WIDTHS_PX.get(folder.name, _EVAL3_WIDTH_PX)
+        return 2.0 ** min(max(round(math.log2(full_px / width_px)), 0), 2)
     return 1.0
 
 

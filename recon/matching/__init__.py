@@ -8,6 +8,7 @@ from recon.matching.registry import (
     field_of,
     make_matcher,
     rates_matches,
+    searched_ndisp,
 )
 from recon.matching.sad import SadMatcher, SadSettings
 from recon.matching.sgm import SgmMatcher, SgmSettings
@@ -24,4 +25,5 @@ __all__ = [
     "fill_holes",
     "make_matcher",
     "rates_matches",
+    "searched_ndisp",
 ]

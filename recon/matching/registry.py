@@ -16,11 +16,13 @@ from recon.matching.opencv import (
     OpencvSgbmSettings,
 )
 from recon.matching.protocol import Matcher
-from recon.matching.range import AutoRangeMatcher
+from recon.matching.range import AutoRangeMatcher, estimate_ndisp
 from recon.matching.sad import SadMatcher, SadSettings
+from recon.matching.search import SearchSettings
 from recon.matching.sgm import SgmMatcher, SgmSettings
 from recon.matching.unrated import UnratedSettings
 from recon.settings import Settings
+from recon.structures import RectifiedPair
 
 MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
     "sad": SadMatcher,
@@ -87,6 +89,25 @@ def rates_matches(name: str) -> bool:
     """
     settings = MatchingSettings.model_fields[field_of(name)].annotation
     return not (isinstance(settings, type) and issubclass(settings, UnratedSettings))
+
+
+def searched_ndisp(name: str, settings: MatchingSettings, pair: RectifiedPair) -> int | None:
+    """How many disparities the matcher of a name searches in a pair, before it rounds them.
+
+    Args:
+        name: A key of `MATCHERS`.
+        settings: The settings of all matchers.
+        pair: The pair.
+
+    Returns:
+        Their number, or None of a matcher that searches no range.
+    """
+    own = getattr(settings, field_of(name))
+    if not isinstance(own, SearchSettings):
+        return None
+    if settings.range == "auto" and own.ndisp is None and pair.camera.ndisp is None:
+        return estimate_ndisp(pair, own.min_disparity_px)
+    return own.ndisp_for(pair.camera)
 
 
 def field_of(name: str) -> str:

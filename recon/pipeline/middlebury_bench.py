@@ -12,7 +12,7 @@ import numpy as np
 
 from recon.evaluation.middlebury import by_the_rules
 from recon.formats.files import naming
-from recon.matching import Matcher, make_matcher, rates_matches
+from recon.matching import Matcher, make_matcher, rates_matches, searched_ndisp
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.middlebury_confidence import confidence_figures
 from recon.pipeline.middlebury_scenes import ScoredScene
@@ -32,8 +32,9 @@ class SceneResult:
         scene: The scene.
         matcher: Name of the matcher.
         disparity: What it found, at the size of the pictures.
-        figures: As `score_result` gives them, and ``confidence`` as `confidence_figures` does;
-            None of a matcher that does not tell how sure it is.
+        figures: As `score_result` gives them; ``ndisp``, the number of disparities searched; and
+            ``confidence`` as `confidence_figures` gives it, None of a matcher that does not tell
+            how sure it is.
         seconds: Of matching alone.
     """
 
@@ -60,12 +61,17 @@ class Bench:
         names: The matchers.
         config: Their settings, and how pictures become grey.
         threads: Threads of each matcher.
+        auto_range: Whether the range of disparities is found from each pair, as where none is
+            known, instead of taken from the scene.
     """
 
-    def __init__(self, names: Sequence[str], config: ReconConfig, threads: int) -> None:
+    def __init__(
+        self, names: Sequence[str], config: ReconConfig, threads: int, *, auto_range: bool = False
+    ) -> None:
         self._names = names
         self._config = config
         self._threads = threads
+        self._auto_range = auto_range
         self._own = threading.local()
 
     def results(self, scene: ScoredScene) -> Iterator[SceneResult]:
@@ -74,14 +80,15 @@ class Bench:
         Raises:
             ReconError: A matcher cannot match the scene; the message names it.
         """
-        rectifier = Rectifier(scene.camera, self._config.rectification)
-        pair = rectifier.rectify(scene.pair)
+        camera = replace(scene.camera, ndisp=None) if self._auto_range else scene.camera
+        pair = Rectifier(camera, self._config.rectification).rectify(scene.pair)
         with naming(scene.name):
             for name, matcher in self._matchers(pair).items():
                 start = time.perf_counter()
                 disparity = matcher.match(pair)
                 seconds = time.perf_counter() - start
                 figures = score_result(scene, disparity.values)
+                figures["ndisp"] = searched_ndisp(name, self._config.matching, pair)
                 rated = confidence_figures(disparity, scene.truth) if rates_matches(name) else None
                 figures["confidence"] = rated
                 yield SceneResult(scene, name, disparity, figures, seconds)

@@ -57,6 +57,7 @@ class MiddleburyOptions:
         threads: Threads to use; None = all cores. Changes no result.
         parallel: Scenes worked on at once; they share the threads. Above 1 the seconds are those
             of a busy machine.
+        auto_range: Whether the range of disparities is found from each pair.
         observer: Is told of each scene.
         draw: Draws the pictures of one result.
         present: Writes the tables.
@@ -67,6 +68,7 @@ class MiddleburyOptions:
     out: Path | None = None
     threads: int | None = None
     parallel: int = 1
+    auto_range: bool = False
     observer: SceneObserver | None = None
     draw: Callable[[SceneResult, RunDirectory], None] | None = None
     present: Callable[[Mapping[str, Any], RunDirectory], None] | None = None
@@ -90,7 +92,8 @@ def run_middlebury(folder: Path, config: ReconConfig, options: MiddleburyOptions
         check_folder(options.truth)
     paths, threads = find_scenes(folder), use_threads(options.threads)
     with RunDirectory.for_command(COMMAND, options.out) as directory:
-        bench = Bench(names, config, max(1, threads // options.parallel))
+        own_threads = max(1, threads // options.parallel)
+        bench = Bench(names, config, own_threads, auto_range=options.auto_range)
         scenes = dict(_scenes(bench, folder, paths, options, directory))
         skipped = [name for name, figures in scenes.items() if not figures]
         if len(skipped) == len(scenes):
@@ -169,7 +172,6 @@ def _kept(result: SceneResult, options: MiddleburyOptions, directory: RunDirecto
         "seconds": round(result.seconds, 4),
         "width_px": scene.camera.width_px,
         "height_px": scene.camera.height_px,
-        "ndisp": scene.camera.ndisp,
         "full_size_factor": scene.rules.full_size_factor,
         "weight": scene_weight(scene.name),
     }

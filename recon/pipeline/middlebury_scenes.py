@@ -12,7 +12,7 @@ import numpy as np
 from recon.errors import SourceError
 from recon.evaluation import MiddleburyRules
 from recon.formats.middlebury import MiddleburyScene, read_middlebury_scene, stand_in_camera
-from recon.formats.middlebury_layout import find_layout
+from recon.formats.middlebury_layout import find_layout, scene_root
 from recon.structures import DisparityTruth, RectifiedCamera, StereoPair
 
 _STEP: Final = 16
@@ -136,8 +136,12 @@ def _scenes_below(folder: Path) -> Iterator[Path]:
             yield from _scenes_below(path)
 
 
+def _short(path: Path) -> str:
+    return path.relative_to(scene_root(path).parent).as_posix()
+
+
 def _names(folder: Path, paths: Sequence[Path]) -> list[str]:
-    short = [path.resolve().name for path in paths]
+    short = [_short(path.resolve()) for path in paths]
     if len(set(short)) == len(short):
         return short
     return [path.relative_to(folder).as_posix() for path in paths]

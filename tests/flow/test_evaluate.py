@@ -217,6 +217,20 @@ def test_what_cannot_be_evaluated_gets_one_line(
     assert not out.exists()
 
 
+def test_the_range_can_be_found_from_the_pairs(scenes: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "Teddy"
+    shutil.copytree(scenes / "MiddEval3/trainingQ/Teddy", scene)
+    calib = (scene / "calib.txt").read_text()
+    (scene / "calib.txt").write_text(calib.replace("ndisp=16", "ndisp=90"))
+    command = ["evaluate", "middlebury", str(scene)]
+    options = ["--matcher", "sad,opencv-bm", "--range", "auto", "--json", "--quiet"]
+    done = CliRunner().invoke(app, [*command, *options, "--out", str(tmp_path / "run")])
+    assert done.exit_code == 0, done.stderr
+    for found in json.loads(done.stdout)["matchers"].values():
+        # Nothing is nearer than 12 px, so the usual tenth of the width is enough.
+        assert found["scenes"]["Teddy"]["ndisp"] == 16
+
+
 def test_one_map_is_compared_in_either_format(tmp_path: Path) -> None:
     truth = np.full((4, 10), 20, np.float32)
     estimate = truth.copy()

@@ -9,10 +9,11 @@ from recon.errors import CalibrationError, FormatError
 from recon.formats.image import write_image
 from recon.formats.middlebury import read_middlebury_scene, stand_in_camera
 from recon.formats.middlebury_calib import nominal_camera_2005, read_middlebury_calib
-from recon.formats.middlebury_layout import find_layout
+from recon.formats.middlebury_layout import Layout, find_layout, full_size_factor
 from recon.formats.middlebury_truth import cross_check
 from recon.formats.pfm import write_pfm
 from recon.geometry.triangulation import depth_from_disparity
+from recon.pipeline.middlebury_scenes import find_scenes, read_scored_scene
 
 CALIB = """cam0=[999.421 0 294.182; 0 999.421 252.932; 0 0 1]
 cam1=[999.421 0 326.96; 0 999.421 252.932; 0 0 1]
@@ -83,7 +84,7 @@ def test_resizing_doffs_is_what_the_publishers_half_size_file_says() -> None:
 
 
 @pytest.mark.parametrize(
-    ("collection", "factor"), [("trainingQ", 4), ("trainingH", 2), ("trainingF", 1), ("scenes", 1)]
+    ("collection", "factor"), [("trainingQ", 4), ("trainingH", 2), ("trainingF", 1)]
 )
 def test_full_size_factor_follows_the_collection(
     tmp_path: Path, collection: str, factor: float
@@ -91,6 +92,57 @@ def test_full_size_factor_follows_the_collection(
     scene = read_middlebury_scene(make_2014(tmp_path / collection / "Motorcycle"))
     assert (scene.name, scene.full_size_factor) == ("Motorcycle", factor)
     assert scene.truth is None
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "factor"),
+    [
+        ("Piano", (705, 480), 4), ("Piano", (1410, 960), 2), ("Piano", (2820, 1920), 1),
+        ("ArtL", (347, 277), 4), ("ArtL", (694, 554), 2), ("ArtL", (1388, 1108), 1),
+        ("Teddy", (450, 375), 4), ("Teddy", (1800, 1500), 1), ("Jadeplant", (658, 497), 4),
+        ("Adirondack-perfect", (2880, 1988), 1), ("artroom1", (1920, 1080), 1),
+        ("mine", (640, 480), 1),
+    ],
+)  # fmt: skip
+def test_full_size_factor_elsewhere_follows_the_name_of_the_scene(
+    name: str, size: tuple[int, int], factor: float
+) -> None:
+    layout = Layout("im0", "im1", "disp0", "disp1", calibrated=True)
+    assert full_size_factor(layout, *size, Path("anywhere") / name) == factor
+
+
+def test_truth_in_pfm_makes_a_scene_without_its_calibration(tmp_path: Path) -> None:
+    folder = make_2014(tmp_path / "Adirondack-perfect")
+    (folder / "calib.txt").unlink()
+    write_pfm(folder / "disp0.pfm", np.full((12, 24), 4.0, np.float32))
+    scene = read_middlebury_scene(folder)
+    assert (scene.camera, scene.ndisp) == (None, None)
+    assert scene.truth is not None
+
+
+def test_truth_of_2006_may_lie_above_folders_of_light_and_exposure(tmp_path: Path) -> None:
+    inner = tmp_path / "Aloe" / "Illum1" / "Exp2"
+    inner.mkdir(parents=True)
+    for view in ("view1.png", "view5.png"):
+        write_image(inner / view, picture(370, 30))
+    write_image(tmp_path / "Aloe" / "disp1.png", np.full((370, 30), 9, np.uint8))
+    (tmp_path / "Aloe" / "dmin.txt").write_text("150\n")
+    scene = read_middlebury_scene(inner)
+    assert scene.truth is not None
+    assert (scene.truth.values == 3).all()
+    assert scene.camera is not None
+    assert scene.camera.doffs_px == pytest.approx(50)
+    assert list(find_scenes(tmp_path)) == ["Aloe/Illum1/Exp2"]
+    assert read_scored_scene("Aloe/Illum1/Exp2", inner, None) is not None
+
+
+def test_tsukuba_as_published_is_read(tmp_path: Path) -> None:
+    for column in (1, 2, 3, 4, 5):
+        write_image(tmp_path / f"scene1.row3.col{column}.ppm", picture(288, 384))
+    write_image(tmp_path / "truedisp.row3.col3.pgm", np.full((288, 384), 160, np.uint8))
+    truth = read_middlebury_scene(tmp_path).truth
+    assert truth is not None
+    assert (truth.values == 10).all()
 
 
 def test_eval3_truth_has_nan_for_inf_and_the_mask_of_its_file(tmp_path: Path) -> None:
