@@ -2,7 +2,7 @@
 
 A ray is walked cell by cell (Amanatides and Woo 1987). What one frame says of a cell is
 collected first, so that a thousand rays through it count once, and a hit outweighs every miss:
-OctoMap's rule (Hornung et al. 2013). Then the frame is added to the log-odds.
+OctoMap's rule (Hornung et al. 2013). Then `recon.kernels.clamped` adds the frame to the log-odds.
 
 A measurement is not a point but a normal distribution along its ray: a cell is hit by the share
 of the distribution that lies in it, and only what lies well before it is free.
@@ -25,7 +25,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from recon.kernels.voxels import (
-    EMPTY,
     copy_rows,
     enter_keys,
     find_or_add,
@@ -42,14 +41,13 @@ _SQRT2: Final = math.sqrt(2.0)
 
 
 class Blocks(NamedTuple):
-    """Blocks of cells, one row each: the map (log-odds), or what one frame says (evidence).
+    """Blocks of cells, one row each: what one frame says of them (evidence).
 
     Attributes:
         table: int64 (C, 2), hash from packed block index to row.
         keys: int64 (B,), packed index of each block.
-        values: float32 (B, 512). In the map: log-odds; NaN = never observed. In the evidence:
-            change of the log-odds; 0 = not touched. Cell (i, j, k) of a block is column
-            ``(i·8 + j)·8 + k``.
+        values: float32 (B, 512), change of the log-odds; 0 = not touched. Cell (i, j, k) of a
+            block is column ``(i·8 + j)·8 + k``.
         used: int64 (1,), number of rows in use.
     """
 
@@ -141,22 +139,22 @@ def _measure_points(
         values[n, 3] = 1.0 if near else 0.0
 
 
-def make_blocks(rows: int, fill: float) -> Blocks:
-    """No blocks yet, room for ``rows``, whose cells will start as ``fill``."""
+def make_blocks(rows: int) -> Blocks:
+    """No blocks yet, room for ``rows``, of whose cells nothing is said."""
     return Blocks(
         table=make_table(rows),
         keys=np.zeros(rows, np.int64),
-        values=np.full((rows, BLOCK_CELLS), fill, np.float32),
+        values=np.zeros((rows, BLOCK_CELLS), np.float32),
         used=np.zeros(1, np.int64),
     )
 
 
-def reserve_blocks(blocks: Blocks, rows: int, fill: float) -> Blocks:
+def reserve_blocks(blocks: Blocks, rows: int) -> Blocks:
     """Room for ``rows`` blocks: the same, or twice as much (or more) with the same content."""
     have, used = len(blocks.keys), int(blocks.used[0])
     if rows <= have:
         return blocks
-    larger = make_blocks(max(rows, 2 * have), fill)
+    larger = make_blocks(max(rows, 2 * have))
     copy_rows(blocks[1:-1], larger[1:-1], used)
     larger.used[0] = used
     enter_keys(larger.table, larger.keys[:used])
@@ -186,7 +184,7 @@ def cast_rays(evidence: Blocks, rays: Rays, spread: float) -> Blocks:
         done = _cast_rays(tuple(evidence), tuple(rays), done, spread)
         if done == len(rays.ends):
             return evidence
-        evidence = reserve_blocks(evidence, len(evidence.keys) + 1, 0.0)
+        evidence = reserve_blocks(evidence, len(evidence.keys) + 1)
 
 
 @njit(cache=True, nogil=True)
@@ -271,49 +269,3 @@ def _normal_cdf(value: float, mean: float, sigma: float) -> float:
     if sigma <= 0:
         return 1.0 if value > mean else 0.0
     return 0.5 * (1.0 + math.erf((value - mean) / (sigma * _SQRT2)))
-
-
-def apply_evidence(blocks: Blocks, evidence: Blocks, lowest: float, highest: float) -> Blocks:
-    """Add a frame's evidence to the map and clamp; clear the evidence for the next frame.
-
-    Args:
-        blocks: The map; written, or replaced by larger stores where they are full.
-        evidence: What the frame says; empty afterwards.
-        lowest: Log-odds never fall below.
-        highest: Log-odds never rise above.
-
-    Returns:
-        The stores that hold the map.
-    """
-    rows = int(blocks.used[0]) + int(evidence.used[0])
-    blocks = reserve_blocks(blocks, rows, np.nan)
-    _apply_evidence(tuple(blocks), tuple(evidence), lowest, highest)
-    return blocks
-
-
-@njit(cache=True, nogil=True)
-def _apply_evidence(
-    blocks: tuple[NDArray[Any], ...],
-    evidence: tuple[NDArray[Any], ...],
-    lowest: float,
-    highest: float,
-) -> None:
-    """The loop of `apply_evidence`; the map has room for every block."""
-    table, keys, log_odds, used = blocks
-    frame_table, frame_keys, changes, frame_used = evidence
-    low, high = np.float32(lowest), np.float32(highest)
-    for touched in range(frame_used[0]):
-        row = find_or_add(table, frame_keys[touched], used[0])
-        if row == used[0]:
-            keys[row] = frame_keys[touched]
-            used[0] += 1
-        for cell in range(BLOCK_CELLS):
-            change = changes[touched, cell]
-            if change == 0:
-                continue
-            before = log_odds[row, cell]
-            after = change if np.isnan(before) else before + change
-            log_odds[row, cell] = min(max(after, low), high)
-            changes[touched, cell] = 0
-    frame_table[:, 0] = EMPTY
-    frame_used[0] = 0

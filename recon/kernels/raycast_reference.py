@@ -95,11 +95,3 @@ def _below(value: float, mean: float, sigma: float) -> float:
     if sigma <= 0:
         return float(value > mean)
     return 0.5 * (1.0 + math.erf((value - mean) / (sigma * math.sqrt(2.0))))
-
-
-def apply_evidence_reference(
-    log_odds: dict[Cell, float], evidence: dict[Cell, float], lowest: float, highest: float
-) -> None:
-    """Add a frame's evidence to a map and clamp."""
-    for cell, change in evidence.items():
-        log_odds[cell] = min(max(log_odds.get(cell, 0.0) + change, lowest), highest)

@@ -116,11 +116,25 @@ def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
     return np.asarray(np.stack(parts, axis=1) - KEY_LIMIT, dtype=np.int32)
 
 
+def pack_keys(cells: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+    """int64 (N,) packed cells of cell indices (N, 3)."""
+    i, j, k = cells.astype(np.int64).T + KEY_LIMIT
+    return np.asarray((i << (2 * KEY_BITS)) | (j << KEY_BITS) | k)
+
+
 @njit(cache=True, nogil=True)
 def pack_key(i: int, j: int, k: int) -> int:
     """One int64 of three cell indices in ``[-KEY_LIMIT, KEY_LIMIT)``; never negative."""
     high = (i + KEY_LIMIT) << (2 * KEY_BITS)
     return high | ((j + KEY_LIMIT) << KEY_BITS) | (k + KEY_LIMIT)
+
+
+@njit(cache=True, nogil=True)
+def _place(key: int, mask: int) -> int:
+    """Where the search for a packed cell begins."""
+    # Two rounds of multiplicative hashing; 32-bit factors keep the products inside an int64.
+    mixed = ((key >> 32) * 0x9E3779B1 ^ key) & 0x7FFFFFFF
+    return ((mixed * 0x85EBCA6B) >> 22) & mask
 
 
 @njit(cache=True, nogil=True)
@@ -130,9 +144,7 @@ def find_or_add(table: NDArray[np.int64], key: int, next_row: int) -> int:
     The hash must have an unused place.
     """
     mask = len(table) - 1
-    # Two rounds of multiplicative hashing; 32-bit factors keep the products inside an int64.
-    mixed = ((key >> 32) * 0x9E3779B1 ^ key) & 0x7FFFFFFF
-    place = ((mixed * 0x85EBCA6B) >> 22) & mask
+    place = _place(key, mask)
     while table[place, 0] != EMPTY:
         if table[place, 0] == key:
             return int(table[place, 1])
@@ -140,6 +152,18 @@ def find_or_add(table: NDArray[np.int64], key: int, next_row: int) -> int:
     table[place, 0] = key
     table[place, 1] = next_row
     return next_row
+
+
+@njit(cache=True, nogil=True)
+def find(table: NDArray[np.int64], key: int) -> int:
+    """Row of a packed cell, or `EMPTY` where it is not in the hash."""
+    mask = len(table) - 1
+    place = _place(key, mask)
+    while table[place, 0] != EMPTY:
+        if table[place, 0] == key:
+            return int(table[place, 1])
+        place = (place + 1) & mask
+    return EMPTY
 
 
 @njit(cache=True, nogil=True)
@@ -212,3 +236,48 @@ def _add_points(
             best[row] = w
     used[0] = rows
     return len(xyz)
+
+
+def add_rows(
+    voxels: VoxelSums,
+    keys: NDArray[np.int64],
+    sums: NDArray[np.float32],
+    information: NDArray[np.float32],
+    frames: NDArray[np.int32],
+) -> VoxelSums:
+    """Add what other frames summed up per voxel.
+
+    Args:
+        voxels: The rows; written, or replaced by larger ones where they are full.
+        keys: int64 (N,), packed cells, each once.
+        sums: float32 (N, 4 + C), as in `VoxelSums`.
+        information: float32 (N,).
+        frames: int32 (N,), of frames that are not in ``voxels``.
+
+    Returns:
+        The rows that hold the result.
+    """
+    voxels = reserve_sums(voxels, int(voxels.used[0]) + len(keys))
+    _add_rows(tuple(voxels), keys, sums, information, frames)
+    return voxels
+
+
+@njit(cache=True, nogil=True)
+def _add_rows(
+    voxels: tuple[NDArray[Any], ...],
+    new_keys: NDArray[np.int64],
+    new_sums: NDArray[np.float32],
+    new_information: NDArray[np.float32],
+    new_frames: NDArray[np.int32],
+) -> None:
+    """The loop of `add_rows`; there is room for every row."""
+    table, keys, sums, information, _, frames, _, used = voxels
+    for n in range(len(new_keys)):
+        row = find_or_add(table, new_keys[n], used[0])
+        if row == used[0]:
+            keys[row] = new_keys[n]
+            used[0] += 1
+        for c in range(sums.shape[1]):
+            sums[row, c] += new_sums[n, c]
+        information[row] += new_information[n]
+        frames[row] += new_frames[n]

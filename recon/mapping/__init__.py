@@ -5,6 +5,7 @@ from recon.mapping.fused import FusionSettings, MapBuilder, fusion_range_m
 from recon.mapping.grid import GridSettings, flatten
 from recon.mapping.ground import GroundSettings, GroundSurface, estimate_ground_surface
 from recon.mapping.occupancy import OccupancyBuilder, OccupancySettings
+from recon.mapping.submaps import Submap, SubmapBuilder, SubmapMotion, SubmapSettings
 
 __all__ = [
     "AxesSettings",
@@ -16,6 +17,10 @@ __all__ = [
     "MapBuilder",
     "OccupancyBuilder",
     "OccupancySettings",
+    "Submap",
+    "SubmapBuilder",
+    "SubmapMotion",
+    "SubmapSettings",
     "estimate_ground",
     "estimate_ground_surface",
     "flatten",

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Final
 
 import numpy as np
 from pydantic import Field
 
 from recon.errors import MappingError
 from recon.kernels import voxels
+from recon.mapping.fused_part import CONFIDENCE, KNOWABLE, NORMAL, RGB, VALUES, FusedPart
 from recon.settings import Settings
 from recon.structures import PointCloud, RectifiedCamera
-from recon.structures.arrays import Bool, Float32
-
-_RGB: Final = slice(0, 3)
-_NORMAL: Final = slice(3, 6)
-_CONFIDENCE: Final = 6
-_VALUES: Final = 7
+from recon.structures.arrays import Float32
 
 
 class FusionSettings(Settings):
@@ -84,9 +79,9 @@ class MapBuilder:
 
     def __init__(self, settings: FusionSettings) -> None:
         self._settings = settings
-        self._sums = voxels.make_sums(1, _VALUES)
+        self._sums = voxels.make_sums(1, VALUES)
         self._frames = 0
-        self._known = {"rgb": True, "normals": True, "sigma_m": True, "confidence": True}
+        self._known = dict.fromkeys(KNOWABLE, True)
 
     def __len__(self) -> int:
         """Number of voxels seen by at least one frame."""
@@ -117,27 +112,45 @@ class MapBuilder:
             min_count: Voxels seen by fewer frames are left out; None = as in the settings.
 
         Returns:
-            Frame ``world``. ``sigma_m`` treats frames as independent, and the points of one
-            frame in one voxel as one measurement. Voxels whose normals cancel are left out.
+            As `FusedPart.cloud` gives it.
         """
-        least = self._settings.min_count if min_count is None else min_count
-        rows = np.flatnonzero(self._sums.frames[: len(self)] >= least)
-        rows = rows[self._has_direction(rows)]
-        sums = self._sums.sums[rows]
-        weight = sums[:, :1]
-        centres = (voxels.unpack_keys(self._sums.keys[rows]) + 0.5) * self._settings.voxel_m
-        values = sums[:, 4:] / weight
-        known = self._known if self._frames else dict.fromkeys(self._known, False)
-        return PointCloud(
-            xyz=(centres + sums[:, 1:4] / weight).astype(np.float32),
-            rgb=np.rint(values[:, _RGB]).astype(np.uint8) if known["rgb"] else None,
-            normals=_unit(values[:, _NORMAL]) if known["normals"] else None,
-            sigma_m=self._sums.information[rows] ** np.float32(-0.5) if known["sigma_m"] else None,
-            confidence=values[:, _CONFIDENCE].copy() if known["confidence"] else None,
-            weight=weight[:, 0].copy(),
-            count=self._sums.frames[rows],
-            frame="world",
+        return self.part().cloud(self._settings.voxel_m, min_count or self._settings.min_count)
+
+    def part(self) -> FusedPart:
+        """What was seen since the start, or since the last `take`."""
+        n, s = len(self), self._sums
+        known = tuple(name for name, value in self._known.items() if value)
+        return FusedPart(
+            s.keys[:n].copy(),
+            s.sums[:n].copy(),
+            s.information[:n].copy(),
+            s.frames[:n].copy(),
+            known if self._frames else (),
         )
+
+    def take(self) -> FusedPart:
+        """The part so far, which the builder forgets: the next part begins."""
+        part = self.part()
+        self._sums = voxels.make_sums(1, VALUES)
+        self._known, self._frames = dict.fromkeys(self._known, True), 0
+        return part
+
+    def resume(self, part: FusedPart, frames: int) -> None:
+        """Go on after a part that was taken from another builder.
+
+        Args:
+            part: The part.
+            frames: Number of frames that were integrated into it.
+        """
+        empty = voxels.make_sums(max(1, len(part)), VALUES)
+        self._sums = voxels.add_rows(empty, part.keys, part.sums, part.information, part.frames)
+        self._known = {name: name in part.known or frames == 0 for name in self._known}
+        self._frames = frames
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the voxels seen so far; the same after `resume` as before."""
+        return len(self) * sum(array[:1].nbytes for array in self._sums[1:-1])
 
     def _weights(self, cloud: PointCloud) -> Float32:
         """Weight of each point; 0 = not used. float32 (N,)."""
@@ -148,15 +161,6 @@ class MapBuilder:
         bounded = np.maximum(cloud.sigma_m, np.float32(s.min_sigma_m))
         weights = confidence / bounded**2
         return np.where(cloud.sigma_m <= s.max_sigma_m, weights, 0).astype(np.float32)
-
-    def _has_direction(self, rows: np.ndarray[tuple[int], np.dtype[np.intp]]) -> Bool:
-        """Which voxels have normals that do not cancel; all, where normals are not known."""
-        if not self._known["normals"]:
-            return np.ones(len(rows), dtype=np.bool_)
-        sums = self._sums.sums[rows]
-        # 1e-3: below, the direction is that of rounding errors.
-        length = np.linalg.norm(sums[:, 4:][:, _NORMAL], axis=1)
-        return np.asarray(length > 1e-3 * sums[:, 0])
 
     def _check(self, cloud: PointCloud) -> None:
         """Refuse what would silently spoil the map."""
@@ -178,17 +182,12 @@ class MapBuilder:
 
 def _values(cloud: PointCloud) -> Float32:
     """What is averaged of each point: colour, normal, confidence; 0 where unknown. (N, 7)."""
-    values = np.zeros((len(cloud), _VALUES), np.float32)
+    values = np.zeros((len(cloud), VALUES), np.float32)
     for columns, array in (
-        (_RGB, cloud.rgb),
-        (_NORMAL, cloud.normals),
-        (_CONFIDENCE, cloud.confidence),
+        (RGB, cloud.rgb),
+        (NORMAL, cloud.normals),
+        (CONFIDENCE, cloud.confidence),
     ):
         if array is not None:
             values[:, columns] = array
     return values
-
-
-def _unit(vectors: Float32) -> Float32:
-    """Vectors (N, 3) at unit length."""
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from recon.errors import MappingError
-from recon.kernels import raycast, voxels
+from recon.kernels import clamped, raycast, voxels
+from recon.mapping.occupancy_part import OccupancyPart
 from recon.settings import Settings
 from recon.structures import OccupancyVoxels, PointCloud
 from recon.structures.arrays import Float32, Float64
@@ -64,8 +65,8 @@ class OccupancyBuilder:
     def __init__(self, settings: OccupancySettings, T_map_world: NDArray[Any]) -> None:
         self._settings = settings
         self._T_map_world = np.asarray(T_map_world, dtype=np.float64)
-        self._map = raycast.make_blocks(256, np.nan)
-        self._evidence = raycast.make_blocks(256, 0.0)
+        self._map = clamped.make_clamped(256)
+        self._evidence = raycast.make_blocks(256)
 
     def integrate(self, cloud: PointCloud, T_world_camera: NDArray[Any]) -> None:
         """Add what one frame saw.
@@ -83,21 +84,29 @@ class OccupancyBuilder:
         s = self._settings
         self._evidence = raycast.cast_rays(self._evidence, rays, s.spread_sigmas)
         low, high = _log_odds(s.min_probability), _log_odds(s.max_probability)
-        self._map = raycast.apply_evidence(self._map, self._evidence, low, high)
+        self._map = clamped.add_evidence(self._map, self._evidence, low, high)
 
     def voxels(self) -> OccupancyVoxels:
         """Every voxel that was observed so far, block by block as first touched."""
-        used = int(self._map.used[0])
-        log_odds = self._map.values[:used]
-        block, cell = np.nonzero(~np.isnan(log_odds))
-        edge = raycast.BLOCK_EDGE
-        corner = voxels.unpack_keys(self._map.keys[:used]) * edge
-        local = np.stack(np.unravel_index(cell, (edge, edge, edge)), axis=1)
-        return OccupancyVoxels(
-            keys=(corner[block] + local).astype(np.int32),
-            log_odds=log_odds[block, cell],
-            resolution_m=self._settings.resolution_m,
-        )
+        return self.part().voxels(self._settings.resolution_m)
+
+    def part(self) -> OccupancyPart:
+        """What was observed since the start, or since the last `take`."""
+        return OccupancyPart(clamped.observed_rows(self._map))
+
+    def take(self) -> OccupancyPart:
+        """The part so far, which the builder forgets: the next part begins."""
+        part, self._map = self.part(), clamped.make_clamped(256)
+        return part
+
+    def resume(self, part: OccupancyPart) -> None:
+        """Go on after a part that was taken from another builder."""
+        self._map = clamped.chain_rows(clamped.make_clamped(256), part.rows)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the blocks observed so far; the same after `resume` as before."""
+        return int(self._map.used[0]) * self._map.cells[:1].nbytes
 
     def _rays(self, cloud: PointCloud, T_map_camera: Float64) -> raycast.Rays:
         """One ray per voxel in which enough points end; lengths in voxels."""

@@ -17,6 +17,7 @@ from recon.mapping import (
     GridSettings,
     GroundSettings,
     OccupancySettings,
+    SubmapSettings,
 )
 from recon.matching import MatchingSettings
 from recon.meshing import MeshSettings
@@ -48,6 +49,7 @@ class ReconConfig(Settings):
     axes: AxesSettings = AxesSettings()
     fusion: FusionSettings = FusionSettings()
     occupancy: OccupancySettings = OccupancySettings()
+    submaps: SubmapSettings = SubmapSettings()
     ground: GroundSettings = GroundSettings()
     grid: GridSettings = GridSettings()
     mesh: MeshSettings = MeshSettings()

@@ -29,6 +29,7 @@ from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.sequence import MappedSequence, map_sequence
 from recon.pipeline.stopwatch import Stopwatch
 from recon.pipeline.summary import cost, health_warnings, plain
+from recon.pipeline.workspace import Workspace
 from recon.sources import StereoSource
 from recon.structures import (
     MapMetrics,
@@ -115,7 +116,7 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
             known_poses=options.known_poses,
             observers=options.observers,
             threads=threads,
-            stopwatch=watch,
+            workspace=Workspace(watch, directory.state("submaps")),
         )
         run = _finish(source, config, mapped, options, watch)
         with watch.stage("write"):
@@ -154,7 +155,8 @@ def _finish(
 ) -> MapRun:
     """Make the products that need the whole drive."""
     warnings = health_warnings(mapped.health)
-    cloud = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
+    with watch.stage("export"):
+        cloud = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
     _tell(options.observers, "grid")
     with watch.stage("grid"):
         path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)

@@ -21,6 +21,7 @@ from recon.errors import OutputError
 
 RECORD: Final = "run.json"
 _PARTIAL: Final = ".partial"
+_STATE: Final = ".state"
 
 
 def default_folder(command: str, base: Path = Path("outputs")) -> Path:
@@ -56,10 +57,16 @@ class RunDirectory:
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
 
+    def state(self, name: str) -> Path:
+        """Where to keep under ``name`` what the run needs until it is done, and not after."""
+        target = self._partial / _STATE / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return target
+
     def files(self) -> list[str]:
-        """Names of the files written so far, sorted."""
-        written = (p for p in self._partial.rglob("*") if p.is_file())
-        return sorted(p.relative_to(self._partial).as_posix() for p in written)
+        """Names of the files written so far, sorted; what is of the state is not among them."""
+        written = (p.relative_to(self._partial) for p in self._partial.rglob("*") if p.is_file())
+        return sorted(p.as_posix() for p in written if p.parts[0] != _STATE)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write a JSON file, NaN refused: it would not load elsewhere."""

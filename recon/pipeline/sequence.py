@@ -5,26 +5,23 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from recon.cloud import filter_cloud
 from recon.errors import RegistrationError
 from recon.geometry.transform import transform_cloud
-from recon.mapping import (
-    MapBuilder,
-    OccupancyBuilder,
-    estimate_ground,
-    fusion_range_m,
-    map_axes,
-)
+from recon.mapping import SubmapBuilder, estimate_ground, fusion_range_m, map_axes
 from recon.odometry import KnownPoses, Odometry, OdometryFrame, OdometryHealth, make_odometry
 from recon.pipeline.config import ReconConfig
+from recon.pipeline.drive_map import DriveMap
 from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
 from recon.pipeline.lookahead import look_ahead
 from recon.pipeline.machine import serial_algebra
 from recon.pipeline.observer import FrameResult, Observer
 from recon.pipeline.stopwatch import Stopwatch
+from recon.pipeline.submap_store import SubmapStore
+from recon.pipeline.workspace import Workspace
 from recon.sources import StereoSource
 from recon.structures import OccupancyVoxels, PointCloud, RectifiedCamera, Trajectory
 from recon.structures.arrays import Float64
@@ -37,22 +34,55 @@ class MappedSequence:
     Attributes:
         trajectory: Pose of the left camera in each frame.
         health: How far each pose can be trusted.
-        cloud: Fused cloud, frame ``world``.
-        voxels: 3-D occupancy, map axes.
+        submaps: Fused cloud and occupancy in pieces of consecutive frames.
+        config: The configuration.
         T_map_world: float64 (4, 4).
         camera: The rectified camera.
         sample: The frame in the middle of the drive, to look at.
         seconds: Wall-clock time from the first frame to the last.
+        T_corrected_world: float64 (S, 4, 4), a motion that each submap still has to make; the
+            trajectory has made it. None = none.
     """
 
     trajectory: Trajectory
     health: tuple[OdometryHealth, ...]
-    cloud: PointCloud
-    voxels: OccupancyVoxels
+    submaps: SubmapStore
+    config: ReconConfig
     T_map_world: Float64
     camera: RectifiedCamera
     sample: ReconstructedFrame
     seconds: float
+    T_corrected_world: Float64 | None = None
+
+    @cached_property
+    def map(self) -> DriveMap:
+        """Fused cloud and occupancy, tile by tile."""
+        return DriveMap(self.submaps, self.config, self.T_map_world, self.T_corrected_world)
+
+    @cached_property
+    def cloud(self) -> PointCloud:
+        """The whole fused cloud, frame ``world``; for long drives, see `map`."""
+        return self.map.cloud()
+
+    @cached_property
+    def voxels(self) -> OccupancyVoxels:
+        """The whole 3-D occupancy, map axes; for long drives, see `map`."""
+        return self.map.voxels()
+
+    def corrected(self, T_corrected_world: Float64) -> MappedSequence:
+        """The drive with each submap, and the path in it, moved rigidly.
+
+        Args:
+            T_corrected_world: float64 (S, 4, 4), one motion for each submap.
+        """
+        entries = self.submaps.entries
+        of_frame = np.repeat(np.arange(len(entries)), [entry.frames for entry in entries])
+        poses = T_corrected_world[of_frame] @ self.trajectory.T_world_camera
+        return replace(
+            self,
+            trajectory=replace(self.trajectory, T_world_camera=poses),
+            T_corrected_world=T_corrected_world,
+        )
 
 
 def map_sequence(
@@ -62,7 +92,7 @@ def map_sequence(
     known_poses: Trajectory | None = None,
     observers: Iterable[Observer] = (),
     threads: int | None = None,
-    stopwatch: Stopwatch | None = None,
+    workspace: Workspace | None = None,
 ) -> MappedSequence:
     """Register and fuse all frames of a source.
 
@@ -74,16 +104,20 @@ def map_sequence(
         known_poses: Poses to use instead of odometry, one per frame of the source.
         observers: Told of the progress.
         threads: Threads to use; None = all cores. Changes no result.
-        stopwatch: Told the seconds per stage.
+        workspace: What the run may keep on the disk, and who times it; None = in memory, nobody.
 
     Raises:
         ReconError: A frame cannot be read, matched or registered.
     """
-    watch = stopwatch or Stopwatch()
+    work = workspace or Workspace()
+    watch = work.stopwatch
     audience = tuple(observers)
     reconstructor = FrameReconstructor(source.calibration, config, threads=threads, stopwatch=watch)
     odometry = _odometry(config, known_poses, frames=len(source))
-    mapper = _Mapper(config, reconstructor.camera, odometry, watch, sample_at=len(source) // 2)
+    store = SubmapStore(work.folder)
+    mapper = _Mapper(
+        config, reconstructor.camera, odometry, watch, store, sample_at=len(source) // 2
+    )
     for observer in audience:
         observer.on_start(source.name, len(source))
     start = last = time.perf_counter()
@@ -114,6 +148,7 @@ class _Mapper:
         camera: RectifiedCamera,
         odometry: Odometry,
         stopwatch: Stopwatch,
+        store: SubmapStore,
         *,
         sample_at: int,
     ) -> None:
@@ -122,9 +157,9 @@ class _Mapper:
         self._stopwatch = stopwatch
         self._sample_at = sample_at
         self._camera = camera
-        self._fused = MapBuilder(config.fusion)
         self._fusion_range_m = fusion_range_m(camera, config.fusion)
-        self._occupancy: OccupancyBuilder | None = None
+        self._store = store
+        self._builder: SubmapBuilder | None = None
         self._T_map_world = np.eye(4)
         self._poses: list[Float64] = []
         self._times_s: list[float] = []
@@ -137,11 +172,14 @@ class _Mapper:
             registered = self._odometry.register(OdometryFrame(frame.pair, frame.disparity))
         T_world_camera = registered.T_world_camera
         health = replace(registered.health, warnings=(*frame.warnings, *registered.health.warnings))
-        with stage("fuse"):
+        with stage("map"):
             near = frame.cloud.select(frame.cloud.xyz[:, 2] <= self._fusion_range_m)
-            self._fused.integrate(transform_cloud(near, T_world_camera, frame="world"))
-        with stage("occupancy"):
-            self._occupancy_of(frame).integrate(frame.cloud, T_world_camera)
+            cloud_world = transform_cloud(near, T_world_camera, frame="world")
+            builder = self._builder_from(frame)
+            builder.integrate(cloud_world, frame.cloud, T_world_camera)
+        with stage("store"):
+            if builder.full:
+                self._store.add(builder.close())
         self._poses.append(T_world_camera)
         self._times_s.append(frame.pair.timestamp_s)
         self._health.append(health)
@@ -151,32 +189,31 @@ class _Mapper:
         return FrameResult(index, total, 0.0, valid_share, len(frame.cloud), T_world_camera, health)
 
     def finish(self, *, seconds: float) -> MappedSequence:
-        if self._sample is None or self._occupancy is None:
+        if self._sample is None or self._builder is None:
             raise RegistrationError("the source has no frame")
-        trajectory = Trajectory(np.stack(self._poses), np.array(self._times_s))
-        with self._stopwatch.stage("export"):
-            # A drive of fewer frames than the least count must still give a map.
-            least = min(self._config.fusion.min_count, len(self._poses))
-            cloud = filter_cloud(self._fused.cloud(least), self._config.map_filters)
-            voxels = self._occupancy.voxels()
+        if self._builder.frames:
+            self._store.add(self._builder.close())
         return MappedSequence(
-            trajectory=trajectory,
+            trajectory=Trajectory(np.stack(self._poses), np.array(self._times_s)),
             health=tuple(self._health),
-            cloud=cloud,
-            voxels=voxels,
+            submaps=self._store,
+            config=self._config,
             T_map_world=self._T_map_world,
             camera=self._camera,
             sample=self._sample,
             seconds=seconds,
         )
 
-    def _occupancy_of(self, frame: ReconstructedFrame) -> OccupancyBuilder:
-        """The occupancy map, whose axes are fixed by the first frame."""
-        if self._occupancy is None:
-            ground = estimate_ground(frame.cloud, self._config.axes)
-            self._T_map_world = map_axes(ground, self._config.axes)
-            self._occupancy = OccupancyBuilder(self._config.occupancy, self._T_map_world)
-        return self._occupancy
+    def _builder_from(self, frame: ReconstructedFrame) -> SubmapBuilder:
+        """The maps that are being built; the first frame fixes their axes."""
+        if self._builder is None:
+            config = self._config
+            ground = estimate_ground(frame.cloud, config.axes)
+            self._T_map_world = map_axes(ground, config.axes)
+            self._builder = SubmapBuilder(
+                config.submaps, config.fusion, config.occupancy, self._T_map_world
+            )
+        return self._builder
 
 
 def _odometry(config: ReconConfig, known_poses: Trajectory | None, *, frames: int) -> Odometry:

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.kernels import raycast, voxels
+from recon.kernels import clamped, raycast, voxels
+from recon.kernels.clamped_reference import apply_evidence_reference
 from recon.kernels.raycast_reference import (
-    apply_evidence_reference,
     cast_rays_reference,
     measure_points_reference,
     walk_reference,
@@ -45,22 +45,22 @@ class _Map:
     """The kernel with the smallest stores, so that every test also tests growth."""
 
     def __init__(self) -> None:
-        self.blocks = raycast.make_blocks(1, np.nan)
-        self.evidence = raycast.make_blocks(1, 0.0)
+        self.blocks = clamped.make_clamped(1)
+        self.evidence = raycast.make_blocks(1)
 
     def cast(self, rays: raycast.Rays, spread: float) -> None:
         self.evidence = raycast.cast_rays(self.evidence, rays, spread)
-        self.blocks = raycast.apply_evidence(self.blocks, self.evidence, -2.0, 3.5)
+        self.blocks = clamped.add_evidence(self.blocks, self.evidence, -2.0, 3.5)
 
     def cells(self) -> dict[Cell, float]:
-        used = int(self.blocks.used[0])
-        corners = voxels.unpack_keys(self.blocks.keys[:used]) * raycast.BLOCK_EDGE
-        cells = {}
-        for corner, values in zip(corners, self.blocks.values[:used], strict=True):
-            for n in np.flatnonzero(~np.isnan(values)).tolist():
-                i, j, k = (corner + np.unravel_index(n, (8, 8, 8))).tolist()
-                cells[i, j, k] = float(values[n])
-        return cells
+        rows = clamped.observed_rows(self.blocks)
+        corners = voxels.unpack_keys(rows.blocks) * raycast.BLOCK_EDGE
+        corner = np.repeat(corners, np.diff(rows.starts), axis=0)
+        local = np.stack(np.unravel_index(rows.cells, (8, 8, 8)), axis=1)
+        change, low, high = rows.values.T
+        values = np.minimum(np.maximum(change, low), high).tolist()
+        keys = (tuple(key) for key in (corner + local).tolist())
+        return dict(zip(keys, values, strict=True))
 
 
 def _cast(rays: raycast.Rays, spread: float = 1.0) -> dict[Cell, float]:

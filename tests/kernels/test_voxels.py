@@ -86,3 +86,33 @@ def test_neighbouring_cells_spread_over_the_table() -> None:
     empty = np.flatnonzero(table[:, 0] == voxels.EMPTY)
     # At half load a random hash gives a longest run of some tens; clusters give thousands.
     assert np.diff(empty).max() < 200
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), sizes=st.lists(st.integers(0, 60), min_size=2, max_size=4))
+def test_sums_of_parts_add_up_to_those_of_all_frames(seed: int, sizes: list[int]) -> None:
+    rng = np.random.default_rng(seed)
+    frames = [_random_frame(rng, size) for size in sizes]
+    total = voxels.make_sums(1, 2)
+    for frame in frames:
+        part = _sum([frame], 0.5)
+        n = int(part.used[0])
+        total = voxels.add_rows(
+            total, part.keys[:n], part.sums[:n], part.information[:n], part.frames[:n]
+        )
+    whole = sum_points_reference([(xyz.astype(np.float64), w, v) for xyz, w, v in frames], 0.5)
+    cells = [tuple(cell) for cell in voxels.unpack_keys(total.keys[: total.used[0]]).tolist()]
+    assert cells == list(whole)
+    for row, cell in enumerate(cells):
+        # float32 sums of values below 255 · 5, as above.
+        np.testing.assert_allclose(total.sums[row], whole[cell]["sums"], rtol=1e-4, atol=1e-2)
+        assert total.information[row] == pytest.approx(whole[cell]["information"], rel=1e-5)
+        assert total.frames[row] == whole[cell]["frames"]
+
+
+def test_a_row_is_found_where_it_was_entered_and_nowhere_else() -> None:
+    table = voxels.make_table(10)
+    keys = voxels.pack_keys(np.array([[1, 2, 3], [-4, 0, 9]]))
+    voxels.enter_keys(table, keys)
+    assert [voxels.find(table, key) for key in keys.tolist()] == [0, 1]
+    assert voxels.find(table, voxels.pack_key(1, 2, 4)) == voxels.EMPTY

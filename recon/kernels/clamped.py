@@ -1,0 +1,257 @@
+"""Log-odds in blocks of 8×8×8 voxels, kept so that parts of a drive can be put together later.
+
+A frame changes the log-odds of a cell by ``x → min(max(x + change, lowest), highest)``. Functions
+of this form stay of this form when one follows the other:
+
+    x → min(max(x + sum, low), high)
+
+So three numbers per cell say all that a part of a drive did to it, whatever was known before it
+began; parts that are chained in order give what one long drive would have given, the clamps
+included. A sum of clamped log-odds would not: a car that was seen ten times and then, in the next
+part, looked through ten times would stay.
+
+The twins in plain Python stand in `recon.kernels.clamped_reference`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from recon.kernels.raycast import BLOCK_BITS, BLOCK_CELLS, BLOCK_EDGE, Blocks
+from recon.kernels.voxels import (
+    EMPTY,
+    KEY_BITS,
+    KEY_LIMIT,
+    copy_rows,
+    enter_keys,
+    find,
+    find_or_add,
+    make_table,
+    pack_key,
+    pack_keys,
+    unpack_keys,
+)
+
+_LOW: Final = BLOCK_EDGE - 1
+_MASK: Final = (1 << KEY_BITS) - 1
+
+
+class ClampedBlocks(NamedTuple):
+    """Blocks of cells, one row each.
+
+    Attributes:
+        table: int64 (C, 2), hash from packed block index to row.
+        keys: int64 (B,), packed index of each block.
+        cells: float32 (B, 512, 3): sum, low and high of each cell; a sum of NaN = never observed.
+            Cell (i, j, k) of a block is column ``(i·8 + j)·8 + k``.
+        used: int64 (1,), number of rows in use.
+    """
+
+    table: NDArray[np.int64]
+    keys: NDArray[np.int64]
+    cells: NDArray[np.float32]
+    used: NDArray[np.int64]
+
+
+class CellRows(NamedTuple):
+    """The observed cells of some blocks, one after the other.
+
+    Attributes:
+        blocks: int64 (B,), packed index of each block.
+        starts: int64 (B + 1,), where the cells of each block begin and the last ones end.
+        cells: uint16 (N,), column of each cell in its block.
+        values: float32 (N, 3), sum, low and high.
+    """
+
+    blocks: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    cells: NDArray[np.uint16]
+    values: NDArray[np.float32]
+
+
+def make_clamped(rows: int) -> ClampedBlocks:
+    """No blocks yet, room for ``rows``."""
+    return ClampedBlocks(
+        table=make_table(rows),
+        keys=np.zeros(rows, np.int64),
+        cells=np.full((rows, BLOCK_CELLS, 3), np.nan, np.float32),
+        used=np.zeros(1, np.int64),
+    )
+
+
+def reserve_clamped(blocks: ClampedBlocks, rows: int) -> ClampedBlocks:
+    """Room for ``rows`` blocks: the same, or twice as much (or more) with the same content."""
+    have, used = len(blocks.keys), int(blocks.used[0])
+    if rows <= have:
+        return blocks
+    larger = make_clamped(max(rows, 2 * have))
+    copy_rows(blocks[1:-1], larger[1:-1], used)
+    larger.used[0] = used
+    enter_keys(larger.table, larger.keys[:used])
+    return larger
+
+
+def add_evidence(
+    blocks: ClampedBlocks, evidence: Blocks, lowest: float, highest: float
+) -> ClampedBlocks:
+    """Add a frame's evidence to the map; clear the evidence for the next frame.
+
+    Args:
+        blocks: The map; written, or replaced by larger stores where they are full.
+        evidence: What the frame says; empty afterwards.
+        lowest: Log-odds never fall below.
+        highest: Log-odds never rise above.
+
+    Returns:
+        The stores that hold the map.
+    """
+    blocks = reserve_clamped(blocks, int(blocks.used[0]) + int(evidence.used[0]))
+    # Plain tuples: numba's cache on disk would remember the classes by name, and break when one
+    # is renamed.
+    _add_evidence(tuple(blocks), tuple(evidence), lowest, highest)
+    return blocks
+
+
+@njit(cache=True, nogil=True)
+def _add_evidence(
+    blocks: tuple[NDArray[Any], ...],
+    evidence: tuple[NDArray[Any], ...],
+    lowest: float,
+    highest: float,
+) -> None:
+    """The loop of `add_evidence`; the map has room for every block."""
+    table, keys, cells, used = blocks
+    frame_table, frame_keys, changes, frame_used = evidence
+    lo, hi = np.float32(lowest), np.float32(highest)
+    for touched in range(frame_used[0]):
+        row = find_or_add(table, frame_keys[touched], used[0])
+        if row == used[0]:
+            keys[row] = frame_keys[touched]
+            used[0] += 1
+        for cell in range(BLOCK_CELLS):
+            change = changes[touched, cell]
+            if change == 0:
+                continue
+            before = cells[row, cell, 0]
+            if np.isnan(before):
+                cells[row, cell, 0] = change
+                cells[row, cell, 1] = lo
+                cells[row, cell, 2] = hi
+            else:
+                cells[row, cell, 0] = before + change
+                cells[row, cell, 1] = min(max(cells[row, cell, 1] + change, lo), hi)
+                cells[row, cell, 2] = min(max(cells[row, cell, 2] + change, lo), hi)
+            changes[touched, cell] = 0
+    frame_table[:, 0] = EMPTY
+    frame_used[0] = 0
+
+
+def observed_rows(blocks: ClampedBlocks) -> CellRows:
+    """The observed cells, block by block as first touched."""
+    used = int(blocks.used[0])
+    cells = blocks.cells[:used]
+    seen = ~np.isnan(cells[:, :, 0])
+    starts = np.concatenate([[0], np.cumsum(seen.sum(axis=1))])
+    column = np.nonzero(seen)[1]
+    return CellRows(
+        blocks.keys[:used].copy(), starts.astype(np.int64), column.astype(np.uint16), cells[seen]
+    )
+
+
+def chain_rows(blocks: ClampedBlocks, rows: CellRows) -> ClampedBlocks:
+    """Let a later part of a drive follow: what it did to each cell is done to the map.
+
+    Args:
+        blocks: The map; written, or replaced by larger stores where they are full.
+        rows: What the later part did.
+
+    Returns:
+        The stores that hold the map.
+    """
+    blocks = reserve_clamped(blocks, int(blocks.used[0]) + len(rows.blocks))
+    _chain_rows(tuple(blocks), tuple(rows))
+    return blocks
+
+
+@njit(cache=True, nogil=True)
+def _chain_rows(blocks: tuple[NDArray[Any], ...], rows: tuple[NDArray[Any], ...]) -> None:
+    """The loop of `chain_rows`; the map has room for every block."""
+    table, keys, cells, used = blocks
+    new_blocks, starts, columns, values = rows
+    for block in range(len(new_blocks)):
+        row = find_or_add(table, new_blocks[block], used[0])
+        if row == used[0]:
+            keys[row] = new_blocks[block]
+            used[0] += 1
+        for n in range(starts[block], starts[block + 1]):
+            cell = columns[n]
+            change, low, high = values[n, 0], values[n, 1], values[n, 2]
+            before = cells[row, cell, 0]
+            if np.isnan(before):
+                cells[row, cell, 0] = change
+                cells[row, cell, 1] = low
+                cells[row, cell, 2] = high
+            else:
+                cells[row, cell, 0] = before + change
+                cells[row, cell, 1] = min(max(cells[row, cell, 1] + change, low), high)
+                cells[row, cell, 2] = min(max(cells[row, cell, 2] + change, low), high)
+
+
+def move_blocks(blocks: ClampedBlocks, T_new_old: NDArray[np.float64]) -> ClampedBlocks:
+    """The map turned and shifted: each new cell takes what the old cell at its centre has.
+
+    Args:
+        blocks: The map.
+        T_new_old: float64 (4, 4), a rigid motion; its translation is in cells.
+    """
+    targets = _blocks_reached(blocks, T_new_old)
+    moved = make_clamped(max(1, len(targets)))
+    moved.keys[: len(targets)] = targets
+    moved.used[0] = len(targets)
+    enter_keys(moved.table, targets)
+    _fill_moved(tuple(blocks), tuple(moved), np.linalg.inv(T_new_old))
+    return moved
+
+
+def _blocks_reached(blocks: ClampedBlocks, T_new_old: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Packed indices of all blocks that a moved block may touch, in order."""
+    corners = unpack_keys(blocks.keys[: int(blocks.used[0])]) * BLOCK_EDGE
+    centres = corners + BLOCK_EDGE / 2
+    home = np.floor((centres @ T_new_old[:3, :3].T + T_new_old[:3, 3]) / BLOCK_EDGE)
+    around = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1
+    return np.unique(pack_keys((home[:, None].astype(np.int64) + around).reshape(-1, 3)))
+
+
+@njit(cache=True, nogil=True)
+def _fill_moved(
+    old: tuple[NDArray[Any], ...], new: tuple[NDArray[Any], ...], T_old_new: NDArray[np.float64]
+) -> None:
+    """Look every new cell up in the old map."""
+    table, _, old_cells, _ = old
+    _, keys, new_cells, used = new
+    last_key, last_row = -1, -1
+    for row in range(used[0]):
+        bi = (keys[row] >> (2 * KEY_BITS)) - KEY_LIMIT
+        bj = ((keys[row] >> KEY_BITS) & _MASK) - KEY_LIMIT
+        bk = (keys[row] & _MASK) - KEY_LIMIT
+        for cell in range(BLOCK_CELLS):
+            x = bi * BLOCK_EDGE + (cell >> (2 * BLOCK_BITS)) + 0.5
+            y = bj * BLOCK_EDGE + ((cell >> BLOCK_BITS) & _LOW) + 0.5
+            z = bk * BLOCK_EDGE + (cell & _LOW) + 0.5
+            T = T_old_new
+            i = math.floor(T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3])
+            j = math.floor(T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3])
+            k = math.floor(T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3])
+            key = pack_key(i >> BLOCK_BITS, j >> BLOCK_BITS, k >> BLOCK_BITS)
+            if key != last_key:
+                last_key, last_row = key, find(table, key)
+            if last_row == EMPTY:
+                continue
+            place = ((i & _LOW) << (2 * BLOCK_BITS)) | ((j & _LOW) << BLOCK_BITS) | (k & _LOW)
+            for n in range(3):
+                new_cells[row, cell, n] = old_cells[last_row, place, n]

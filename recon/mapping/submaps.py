@@ -1,0 +1,222 @@
+"""A drive in pieces: submaps of consecutive frames, each with its own part of both maps.
+
+A piece is built in the world of the odometry. Where nothing corrects the odometry, pieces put
+together are the map that one long drive would have given; where a loop closure moves a piece, its
+voxels are moved with it, and nothing has to be matched again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from recon.geometry.se3 import invert
+from recon.kernels import clamped
+from recon.mapping.fused import FusionSettings, MapBuilder
+from recon.mapping.fused_part import FusedPart
+from recon.mapping.occupancy import OccupancyBuilder, OccupancySettings
+from recon.mapping.occupancy_part import OccupancyPart
+from recon.settings import Settings
+from recon.structures import PointCloud
+from recon.structures.arrays import Float64
+
+
+class SubmapSettings(Settings):
+    """Where a drive is cut, and in which tiles its map is put together.
+
+    Cuts and tiles bound the memory; apart from rounding they change no result.
+    """
+
+    length_m: float = Field(
+        25.0, gt=0.0, le=10_000.0, description="Path after which a new submap begins."
+    )
+    max_frames: int = Field(
+        100, ge=1, le=100_000, description="Frames after which a new submap begins at the latest."
+    )
+    tile_m: float = Field(
+        50.0, ge=5.0, le=10_000.0, description="Edge of the tiles, rounded to whole voxels."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """What consecutive frames saw.
+
+    Attributes:
+        index: Number of the submap in its drive, from 0.
+        first_frame: Number of its first frame.
+        frames: Number of its frames.
+        fused: Its part of the fused cloud, world axes.
+        occupancy: Its part of the occupancy, map axes.
+    """
+
+    index: int
+    first_frame: int
+    frames: int
+    fused: FusedPart
+    occupancy: OccupancyPart
+
+    def moved(self, motion: SubmapMotion) -> Submap:
+        """The submap after a correction of its pose."""
+        return replace(
+            self,
+            fused=self.fused.moved(motion.T_corrected_world, motion.voxel_m),
+            occupancy=self.occupancy.moved(motion.T_corrected_map, motion.resolution_m),
+        )
+
+    def to_tree(self) -> dict[str, Any]:
+        """Everything, as a tree of arrays and plain values."""
+        fused, rows = self.fused, self.occupancy.rows
+        return {
+            "index": self.index,
+            "first_frame": self.first_frame,
+            "frames": self.frames,
+            "fused": {
+                "keys": fused.keys,
+                "sums": fused.sums,
+                "information": fused.information,
+                "frames": fused.frames,
+                "known": list(fused.known),
+            },
+            "occupancy": rows._asdict(),
+        }
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> Submap:
+        """What `to_tree` gave."""
+        fused = {**tree["fused"], "known": tuple(tree["fused"]["known"])}
+        return cls(
+            tree["index"],
+            tree["first_frame"],
+            tree["frames"],
+            FusedPart(**fused),
+            OccupancyPart(clamped.CellRows(**tree["occupancy"])),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SubmapMotion:
+    """A correction of a submap's pose.
+
+    Attributes:
+        T_corrected_world: float64 (4, 4), from the world of the odometry to the corrected one.
+        T_map_world: float64 (4, 4), from world to map axes.
+        voxel_m: Edge of a voxel of the fused cloud.
+        resolution_m: Edge of a cell of the occupancy.
+    """
+
+    T_corrected_world: Float64
+    T_map_world: Float64
+    voxel_m: float
+    resolution_m: float
+
+    @property
+    def T_corrected_map(self) -> Float64:
+        """The same motion in map axes."""
+        return np.asarray(self.T_map_world @ self.T_corrected_world @ invert(self.T_map_world))
+
+
+class SubmapBuilder:
+    """Builds the submaps of a drive, one after the other.
+
+    Args:
+        settings: Where to cut.
+        fusion: How to fuse.
+        occupancy: How clouds become occupancy.
+        T_map_world: float64 (4, 4), from world to map axes.
+        max_bytes: Size of a submap at which a new one begins; None = no limit.
+    """
+
+    def __init__(
+        self,
+        settings: SubmapSettings,
+        fusion: FusionSettings,
+        occupancy: OccupancySettings,
+        T_map_world: Float64,
+        max_bytes: int | None = None,
+    ) -> None:
+        self._settings = settings
+        self._max_bytes = max_bytes
+        self._fused = MapBuilder(fusion)
+        self._occupancy = OccupancyBuilder(occupancy, T_map_world)
+        self._index = 0
+        self._first_frame = 0
+        self._frames = 0
+        self._path_m = 0.0
+        self._last_m: Float64 | None = None
+
+    @property
+    def frames(self) -> int:
+        """Number of frames in the submap so far."""
+        return self._frames
+
+    def integrate(
+        self, cloud_world: PointCloud, cloud_camera: PointCloud, T_world_camera: Float64
+    ) -> None:
+        """Add what one frame saw.
+
+        Args:
+            cloud_world: What is fused, world axes.
+            cloud_camera: What occupies and frees space, camera axes.
+            T_world_camera: float64 (4, 4).
+
+        Raises:
+            MappingError: A point or the pose would spoil the map.
+        """
+        self._fused.integrate(cloud_world)
+        self._occupancy.integrate(cloud_camera, T_world_camera)
+        place = T_world_camera[:3, 3]
+        if self._last_m is not None:
+            self._path_m += float(np.linalg.norm(place - self._last_m))
+        self._last_m = place.copy()
+        self._frames += 1
+
+    @property
+    def full(self) -> bool:
+        """Whether the submap is to be closed."""
+        s, limit = self._settings, self._max_bytes
+        long = self._path_m >= s.length_m or self._frames >= s.max_frames
+        return long or (limit is not None and self._fused.nbytes + self._occupancy.nbytes >= limit)
+
+    def current(self) -> Submap:
+        """The submap so far; without frames it is empty."""
+        return Submap(
+            self._index,
+            self._first_frame,
+            self._frames,
+            self._fused.part(),
+            self._occupancy.part(),
+        )
+
+    def close(self) -> Submap:
+        """The submap, whose place the next one takes."""
+        submap = Submap(
+            self._index,
+            self._first_frame,
+            self._frames,
+            self._fused.take(),
+            self._occupancy.take(),
+        )
+        self._first_frame += self._frames
+        self._index, self._frames, self._path_m = self._index + 1, 0, 0.0
+        return submap
+
+    def state(self) -> dict[str, Any]:
+        """All that decides what comes later, as a tree of arrays and plain values."""
+        return {
+            "submap": self.current().to_tree(),
+            "path_m": self._path_m,
+            "last_m": self._last_m,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a `state`."""
+        submap = Submap.from_tree(state["submap"])
+        self._index, self._first_frame = submap.index, submap.first_frame
+        self._frames = submap.frames
+        self._path_m, self._last_m = state["path_m"], state["last_m"]
+        self._fused.resume(submap.fused, submap.frames)
+        self._occupancy.resume(submap.occupancy)

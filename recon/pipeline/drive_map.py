@@ -1,0 +1,218 @@
+"""The map of a drive, put together from its submaps tile by tile."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.cloud import filter_cloud
+from recon.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
+from recon.mapping import Submap, SubmapMotion
+from recon.mapping.fused_part import join_fused
+from recon.mapping.occupancy_part import join_occupancy
+from recon.pipeline.config import ReconConfig
+from recon.pipeline.submap_store import SubmapStore
+from recon.structures import OccupancyVoxels, PointCloud
+from recon.structures.arrays import Float64
+
+Tile = tuple[int, int]
+_MARGIN_M: Final = 1.0
+"""What the filters of the fused cloud see beyond a tile, at least."""
+_CACHED: Final = 6
+_ROW_BITS: Final = 32
+_ROW_MASK: Final = (1 << _ROW_BITS) - 1
+_ROW_ZERO: Final = 1 << (_ROW_BITS - 1)
+
+
+@dataclass(frozen=True)
+class _Reach:
+    """The tiles that a submap has something in."""
+
+    fused: frozenset[Tile]
+    occupancy: frozenset[Tile]
+
+
+class DriveMap:
+    """Fused cloud and occupancy of a drive; only the submaps of one tile are in memory.
+
+    Args:
+        store: The submaps.
+        config: The configuration.
+        T_map_world: float64 (4, 4), from world to map axes.
+        T_corrected_world: float64 (S, 4, 4), a rigid correction of each submap; None = they
+            stay where the odometry put them.
+    """
+
+    def __init__(
+        self,
+        store: SubmapStore,
+        config: ReconConfig,
+        T_map_world: Float64,
+        T_corrected_world: Float64 | None = None,
+    ) -> None:
+        self._store = store
+        self._config = config
+        self._T_map_world = T_map_world
+        self._T_corrected_world = T_corrected_world
+        self._moved: OrderedDict[int, Submap] = OrderedDict()
+        self._frames = sum(entry.frames for entry in store.entries)
+        tile_m = config.submaps.tile_m
+        self._voxels_per_tile = max(1, round(tile_m / config.fusion.voxel_m))
+        cells = math.log2(tile_m / config.occupancy.resolution_m)
+        # A power of two, so that a tile is a branch of an octree.
+        self._blocks_per_tile = 1 << max(0, round(cells) - BLOCK_BITS)
+        filters = config.map_filters
+        margin_m = max(_MARGIN_M, 2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
+        self._margin_voxels = math.ceil(margin_m / config.fusion.voxel_m)
+        self._margin_blocks = math.ceil(config.grid.min_blob_cells / BLOCK_EDGE)
+        self._reach = [self._reach_of(self._submap(n)) for n in range(len(store))]
+
+    @property
+    def cloud_tile_m(self) -> float:
+        """Edge of a tile of the cloud."""
+        return self._voxels_per_tile * self._config.fusion.voxel_m
+
+    @property
+    def occupancy_tile_cells(self) -> int:
+        """Edge of a tile of the occupancy, in cells; a power of two, at least 8."""
+        return self._blocks_per_tile << BLOCK_BITS
+
+    def submaps(self) -> Iterator[Submap]:
+        """The submaps where they have been moved to, in order."""
+        return (self._submap(index) for index in range(len(self._store)))
+
+    def cloud_tiles(self) -> Iterator[tuple[Tile, PointCloud]]:
+        """The fused and filtered cloud, frame ``world``, tile by tile along the drive.
+
+        Filters see a margin around the tile, so that the tiles together are the filtered whole
+        (statistical limits are those of the tile).
+        """
+        for tile in _along_the_drive(reach.fused for reach in self._reach):
+            cloud = self._cloud_of(tile)
+            if len(cloud):
+                yield tile, cloud
+
+    def occupancy_tiles(self) -> Iterator[tuple[Tile, OccupancyVoxels]]:
+        """The observed voxels, map axes, tile by tile along the drive, each with its margin."""
+        for tile in _along_the_drive(reach.occupancy for reach in self._reach):
+            yield tile, self.occupancy_of(tile)
+
+    def occupancy_of(self, tile: Tile) -> OccupancyVoxels:
+        """The observed voxels of a tile, and of as many cells around it as small blobs have."""
+        edge, margin = self._blocks_per_tile, self._margin_blocks
+        low, high = np.array(tile) * edge - margin, (np.array(tile) + 1) * edge + margin
+        parts = []
+        for index in self._near(tile, lambda reach: reach.occupancy):
+            part = self._submap(index).occupancy
+            parts.append(part.select(_inside(part.blocks[:, :2], low, high)))
+        return join_occupancy(parts).voxels(self._config.occupancy.resolution_m)
+
+    def inner(self, tile: Tile, voxels: OccupancyVoxels) -> OccupancyVoxels:
+        """The voxels of a tile without its margin."""
+        keep = (voxels.keys[:, :2] // self.occupancy_tile_cells == tile).all(axis=1)
+        return OccupancyVoxels(voxels.keys[keep], voxels.log_odds[keep], voxels.resolution_m)
+
+    def cloud(self) -> PointCloud:
+        """The whole cloud, frame ``world``: memory in proportion to the map."""
+        return join_clouds([cloud for _, cloud in self.cloud_tiles()], self._nothing())
+
+    def voxels(self) -> OccupancyVoxels:
+        """All observed voxels, map axes: memory in proportion to the map."""
+        tiles = [self.inner(tile, voxels) for tile, voxels in self.occupancy_tiles()]
+        return OccupancyVoxels(
+            np.concatenate([np.zeros((0, 3), np.int32), *(tile.keys for tile in tiles)]),
+            np.concatenate([np.zeros(0, np.float32), *(tile.log_odds for tile in tiles)]),
+            self._config.occupancy.resolution_m,
+        )
+
+    def _cloud_of(self, tile: Tile) -> PointCloud:
+        """The filtered points of a tile."""
+        config, edge, margin = self._config, self._voxels_per_tile, self._margin_voxels
+        low, high = np.array(tile) * edge - margin, (np.array(tile) + 1) * edge + margin
+        parts = []
+        for index in self._near(tile, lambda reach: reach.fused):
+            part = self._submap(index).fused
+            parts.append(part.select(_inside(part.cells[:, [0, 2]], low, high)))
+        # A drive of fewer frames than the least count must still give a map.
+        least = min(config.fusion.min_count, self._frames)
+        cloud = filter_cloud(
+            join_fused(parts).cloud(config.fusion.voxel_m, least), config.map_filters
+        )
+        home = np.floor(cloud.xyz[:, [0, 2]] / np.float32(self.cloud_tile_m))
+        return cloud.select((home == tile).all(axis=1))
+
+    def _near(self, tile: Tile, kind: Callable[[_Reach], frozenset[Tile]]) -> list[int]:
+        """Numbers of the submaps that have something in a tile or its margin, in order."""
+        return [n for n, reach in enumerate(self._reach) if tile in kind(reach)]
+
+    def _reach_of(self, submap: Submap) -> _Reach:
+        cells, blocks = submap.fused.cells[:, [0, 2]], submap.occupancy.blocks[:, :2]
+        return _Reach(
+            _tiles(cells, self._voxels_per_tile, self._margin_voxels),
+            _tiles(blocks, self._blocks_per_tile, self._margin_blocks),
+        )
+
+    def _submap(self, index: int) -> Submap:
+        """A submap where it was moved to."""
+        if self._T_corrected_world is None or np.array_equal(
+            self._T_corrected_world[index], np.eye(4)
+        ):
+            return self._store.get(index)
+        if index not in self._moved:
+            motion = SubmapMotion(
+                self._T_corrected_world[index],
+                self._T_map_world,
+                self._config.fusion.voxel_m,
+                self._config.occupancy.resolution_m,
+            )
+            self._moved[index] = self._store.get(index).moved(motion)
+            while len(self._moved) > _CACHED:
+                self._moved.popitem(last=False)
+        self._moved.move_to_end(index)
+        return self._moved[index]
+
+    def _nothing(self) -> PointCloud:
+        return PointCloud(np.zeros((0, 3), np.float32), frame="world")
+
+
+def join_clouds(clouds: list[PointCloud], nothing: PointCloud) -> PointCloud:
+    """Clouds of one frame as one; what one of them does not know, the whole does not know."""
+    if not clouds:
+        return nothing
+    fields: dict[str, Any] = {}
+    for name in ("rgb", "normals", "sigma_m", "confidence", "weight", "count"):
+        arrays = [getattr(cloud, name) for cloud in clouds]
+        if all(array is not None for array in arrays):
+            fields[name] = np.concatenate(arrays)
+    xyz = np.concatenate([cloud.xyz for cloud in clouds])
+    return PointCloud(xyz, frame=clouds[0].frame, **fields)
+
+
+def _tiles(cells: NDArray[np.int32], edge: int, margin: int) -> frozenset[Tile]:
+    """The tiles of ``edge`` cells that have a cell (N, 2) in them or within the margin."""
+    found: set[Tile] = set()
+    for move in product((-margin, margin), repeat=2):
+        column, row = ((cells.astype(np.int64) + move) // edge).T
+        # One number for two: numpy sorts rows slowly.
+        numbers = np.unique((column << _ROW_BITS) + row + _ROW_ZERO)
+        found.update((n >> _ROW_BITS, (n & _ROW_MASK) - _ROW_ZERO) for n in numbers.tolist())
+    return frozenset(found)
+
+
+def _along_the_drive(groups: Iterable[frozenset[Tile]]) -> list[Tile]:
+    """All tiles, in the order of the first submap of each."""
+    return list(dict.fromkeys(tile for group in groups for tile in sorted(group)))
+
+
+def _inside(
+    cells: NDArray[np.int32], low: NDArray[np.int64], high: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Which cells (N, 2) lie in [low, high)."""
+    return np.asarray(((cells >= low) & (cells < high)).all(axis=1))
