@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from recon.pipeline.map_run import MapOptions, run_map
     from recon.pipeline.pair_run import PairInput, PairOptions, run_pair
     from recon.pipeline.sequence import MappedSequence, map_sequence
-    from recon.sources import StereoSource, open_source
+    from recon.sources import SourceSettings, StereoSource, open_source
     from recon.sources.synthetic import SyntheticSource
     from recon.structures import (
         CameraIntrinsics,
@@ -61,7 +61,7 @@ _HOMES = {
     "recon.pipeline.map_run": ("MapOptions", "run_map"),
     "recon.pipeline.pair_run": ("PairInput", "PairOptions", "run_pair"),
     "recon.pipeline.sequence": ("MappedSequence", "map_sequence"),
-    "recon.sources": ("StereoSource", "open_source"),
+    "recon.sources": ("SourceSettings", "StereoSource", "open_source"),
     "recon.sources.synthetic": ("SyntheticSource",),
     "recon.structures": (
         "CameraIntrinsics",
@@ -95,6 +95,7 @@ __all__ = [
     "ReconError",
     "RectifiedCamera",
     "RectifiedPair",
+    "SourceSettings",
     "StereoCalibration",
     "StereoPair",
     "StereoSource",

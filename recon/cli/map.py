@@ -8,7 +8,23 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Matcher, Mesh, Out, Quiet, Set, Threads, Verbose
+from recon.cli.options import (
+    Calib,
+    Config,
+    Json,
+    LeftView,
+    Matcher,
+    Mesh,
+    Out,
+    Quiet,
+    RightView,
+    Set,
+    SourceArgument,
+    SourceKind,
+    Threads,
+    Tolerance,
+    Verbose,
+)
 from recon.cli.session import print_json, print_run, session
 
 
@@ -21,8 +37,13 @@ class OdometryName(str, Enum):
 
 
 def map_(
-    source: Annotated[Path, typer.Argument(help="Folder of a drive in KITTI's odometry layout.")],
+    source: SourceArgument,
     out: Out = None,
+    kind: SourceKind = None,
+    calib: Calib = None,
+    left: LeftView = None,
+    right: RightView = None,
+    tolerance: Tolerance = None,
     odometry: Annotated[
         OdometryName | None,
         typer.Option(help="Visual prior with gated kiss-icp (fused, the default), or one alone."),
@@ -41,18 +62,25 @@ def map_(
 ) -> None:
     """Map a stereo drive: trajectory, fused cloud, Nav2 grid, OctoMap, mesh, report.
 
-    Example: recon map ~/kitti/sequences/06 --out outputs/kitti06
+    Examples:
+      recon map ~/kitti/sequences/06 --out outputs/kitti06
+      recon map drive.bag --calib camchain.yaml --left /cam0/image_raw --right /cam1/image_raw
+      recon map left.mp4 --right right.mp4 --calib stereo.yaml
     """
     with session():
         from recon.formats.trajectory import read_trajectory
-        from recon.pipeline.config import load_config, matching_overrides
+        from recon.pipeline.config import load_config, matching_overrides, source_overrides
         from recon.pipeline.map_run import MapOptions, run_map
         from recon.reports import present_map
         from recon.sources import open_source
-        from recon.viewers import choose_viewer
+        from recon.viewers import announce, choose_viewer
 
         method = [] if odometry is None else [f"odometry.method={odometry.value}"]
-        overrides = [*(set_ or ()), *method, *matching_overrides(matcher)]
+        asked = source_overrides(calib, left, right, tolerance)
+        overrides = [*(set_ or ()), *method, *matching_overrides(matcher), *asked]
+        settings = load_config(config, overrides)
+        drive = open_source(source, kind, settings.source)
+        announce(drive, quiet=quiet)
         options = MapOptions(
             out=out,
             threads=threads,
@@ -61,5 +89,5 @@ def map_(
             observers=(choose_viewer(quiet=quiet),),
             present=present_map,
         )
-        run = run_map(open_source(source), load_config(config, overrides), options)
+        run = run_map(drive, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

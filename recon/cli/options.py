@@ -34,3 +34,32 @@ Threads = Annotated[
     int | None,
     typer.Option("--threads", min=1, help="Threads to use (all cores)."),
 ]
+SourceArgument = Annotated[
+    Path,
+    typer.Argument(
+        help="KITTI drive (odometry or raw), EuRoC or TUM folder, left and right folders, video, "
+        "ROS bag or MCAP file, Middlebury scene."
+    ),
+]
+SourceKind = Annotated[
+    str | None,
+    typer.Option(
+        "--source",
+        help="What the source is: kitti, kitti-raw, euroc, tum, folders, video, bag, middlebury. "
+        "[default: told by its files]",
+    ),
+]
+Calib = Annotated[
+    Path | None, typer.Option("--calib", help="Calibration file. [default: that of the source]")
+]
+LeftView = Annotated[
+    str | None, typer.Option("--left", help="Left folder or topic. [default: found by name]")
+]
+RightView = Annotated[
+    str | None,
+    typer.Option("--right", help="Right folder or topic; or the right video, SOURCE is the left."),
+]
+Tolerance = Annotated[
+    float | None,
+    typer.Option("--tolerance", help="Seconds that the stamps of a pair may differ. [0.01]"),
+]

@@ -54,18 +54,38 @@ def read_camera_info(path: StrPath) -> StereoCalibration:
         )
     left, R_left, _ = _read_one(left_path)
     right, R_right, P_right = _read_one(right_path)
+    return rig_of_camera_infos((left, R_left), (right, R_right), P_right, right_path)
+
+
+def rig_of_camera_infos(
+    left: tuple[CameraIntrinsics, Float64],
+    right: tuple[CameraIntrinsics, Float64],
+    P_right: Float64,
+    where: StrPath,
+) -> StereoCalibration:
+    """The rig that two CameraInfos describe, whether from files or from messages.
+
+    Args:
+        left: The left camera, and float64 (3, 3), the rotation of its rectification.
+        right: The same of the right one.
+        P_right: float64 (3, 4), the rectified right camera.
+        where: Named in errors.
+
+    Raises:
+        CalibrationError: The numbers cannot give depth.
+    """
     if P_right[0, 3] >= 0:
         raise CalibrationError(
             "CameraInfo has no baseline",
-            where=right_path,
+            where=where,
             got=f"P[0, 3] = {P_right[0, 3]:g}",
             expected="-fx * baseline, below 0",
-            hint="these may be files of two single calibrations, or left and right swapped",
+            hint="these may be of two single calibrations, or left and right swapped",
         )
     offset = np.array([P_right[0, 3] / P_right[0, 0], 0.0, 0.0])
-    with naming(path):
-        T = orthonormalise(make_transform(R_right.T @ R_left, R_right.T @ offset))
-        return StereoCalibration(left, right, T)
+    with naming(where):
+        T = orthonormalise(make_transform(right[1].T @ left[1], right[1].T @ offset))
+        return StereoCalibration(left[0], right[0], T)
 
 
 def write_camera_info(

@@ -41,7 +41,11 @@ def read_image(path: StrPath) -> UInt8:
     Raises:
         FormatError: The file is missing, empty, truncated, no image, or of floating-point pixels.
     """
-    levels = read_levels(path)
+    return _eight_bits(read_levels(path))
+
+
+def _eight_bits(levels: NDArray[Any]) -> UInt8:
+    """16 bits scaled to 8, rounded."""
     if levels.dtype == np.uint8:
         return levels
     return ((levels.astype(np.uint32) + 128) // 257).astype(np.uint8)
@@ -56,10 +60,27 @@ def read_levels(path: StrPath) -> NDArray[Any]:
     Raises:
         FormatError: As in `read_image`.
     """
-    content = read_bytes(path)
+    return decode_levels(read_bytes(path), path)
+
+
+def decode_image(content: bytes, where: StrPath) -> UInt8:
+    """Like `read_image`, from bytes that came in a message.
+
+    Raises:
+        FormatError: As in `read_image`.
+    """
+    return _eight_bits(decode_levels(content, where))
+
+
+def decode_levels(content: bytes, path: StrPath) -> NDArray[Any]:
+    """Like `read_levels`, from the bytes of a file.
+
+    Raises:
+        FormatError: As in `read_image`.
+    """
     check_image_bytes(content, path)
     try:
-        with _silent_opencv() if is_tiff(content) else nullcontext():
+        with silent_opencv() if is_tiff(content) else nullcontext():
             image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise FormatError("image cannot be decoded", where=path, got=error.err) from error
@@ -72,7 +93,7 @@ def read_levels(path: StrPath) -> NDArray[Any]:
             got=image.dtype.name,
             expected="8 or 16 bits",
         )
-    return image if image.ndim == 2 else _swap_red_and_blue(image[:, :, :3])
+    return image if image.ndim == 2 else swap_red_and_blue(image[:, :, :3])
 
 
 def read_grey_levels(path: StrPath) -> NDArray[Any]:
@@ -103,7 +124,7 @@ def write_image(path: StrPath, image: NDArray[Any]) -> None:
     _check_pixels(image)
     suffix = Path(path).suffix.lower()
     _check_suffix(path, suffix, image)
-    pixels = image if image.ndim == 2 else _swap_red_and_blue(image)
+    pixels = image if image.ndim == 2 else swap_red_and_blue(image)
     try:
         done, content = cv2.imencode(suffix, pixels)
     except cv2.error as error:
@@ -114,7 +135,7 @@ def write_image(path: StrPath, image: NDArray[Any]) -> None:
 
 
 @contextmanager
-def _silent_opencv() -> Iterator[None]:
+def silent_opencv() -> Iterator[None]:
     """Keep OpenCV from writing to standard error what is raised as an error anyway.
 
     Only a damaged TIFF gets that far; the level is one for all threads, hence the lock.
@@ -129,7 +150,8 @@ def _silent_opencv() -> Iterator[None]:
             log.setLogLevel(before)
 
 
-def _swap_red_and_blue(image: NDArray[Any]) -> NDArray[Any]:
+def swap_red_and_blue(image: NDArray[Any]) -> NDArray[Any]:
+    """RGB from OpenCV's BGR, or the other way round."""
     return np.ascontiguousarray(image[:, :, ::-1])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -25,6 +26,7 @@ from recon.odometry import OdometrySettings
 from recon.pipeline.paper_settings import PaperSettings
 from recon.rectification import InspectionSettings, RectificationSettings
 from recon.settings import Settings
+from recon.sources.settings import SourceSettings
 from recon.synthetic import StreetSettings
 
 NO_FILTER: Final = FilterSettings(voxel_m=None)
@@ -34,6 +36,7 @@ NO_ISLANDS: Final = FilterSettings(voxel_m=None, radius_m=0.3, radius_neighbours
 class ReconConfig(Settings):
     """All that decides a result. Written beside every result as ``config.yaml``."""
 
+    source: SourceSettings = SourceSettings()
     rectification: RectificationSettings = RectificationSettings()
     inspection: InspectionSettings = InspectionSettings()
     matching: MatchingSettings = MatchingSettings()
@@ -99,6 +102,22 @@ def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> 
         if "ndisp" in getattr(field.annotation, "model_fields", ())
     ]
     return chosen + ([] if ndisp is None else [f"matching.{name}.ndisp={ndisp}" for name in ranged])
+
+
+def source_overrides(
+    calib: Path | None, left: str | None, right: str | None, tolerance_s: float | None
+) -> list[str]:
+    """Overrides that say what the files of a source do not tell; None = as it is."""
+    given = {
+        "calibration": None if calib is None else str(calib),
+        "left": left,
+        "right": right,
+        "tolerance_s": tolerance_s,
+    }
+    # Quoted, for a topic or folder may be called 0 or null.
+    return [
+        f"source.{key}={json.dumps(value)}" for key, value in given.items() if value is not None
+    ]
 
 
 def dump_config(config: ReconConfig) -> str:

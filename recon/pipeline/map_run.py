@@ -136,6 +136,7 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
             options.command,
             {
                 "source": source.name,
+                "source_description": source.description,
                 "inputs": inputs,
                 "T_map_world": mapped.T_map_world.tolist(),
                 "timings": watch.seconds,

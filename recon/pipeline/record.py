@@ -6,10 +6,12 @@ import hashlib
 from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from recon.pipeline.machine import versions
 from recon.pipeline.run_directory import RECORD, RunDirectory
+
+_PIECE_BYTES: Final = 1 << 20
 
 
 def fingerprint(files: Iterable[Path]) -> dict[str, Any]:
@@ -19,9 +21,13 @@ def fingerprint(files: Iterable[Path]) -> dict[str, Any]:
     """
     digest, count, size = hashlib.sha256(), 0, 0
     for path in files:
-        content = path.read_bytes()
-        digest.update(path.name.encode() + b"\0" + len(content).to_bytes(8, "little") + content)
-        count, size = count + 1, size + len(content)
+        length = path.stat().st_size
+        digest.update(path.name.encode() + b"\0" + length.to_bytes(8, "little"))
+        # In pieces: a recording may be larger than the memory.
+        with path.open("rb") as content:
+            while piece := content.read(_PIECE_BYTES):
+                digest.update(piece)
+        count, size = count + 1, size + length
     return {"files": count, "bytes": size, "sha256": digest.hexdigest()}
 
 

@@ -1,6 +1,7 @@
-"""Where stereo pairs come from: one class per kind of input."""
+"""Where stereo pairs come from: one module per kind of input."""
 
 from recon.sources.protocol import StereoSource
-from recon.sources.registry import SOURCES, open_source
+from recon.sources.registry import SOURCES, open_source, recognise_source
+from recon.sources.settings import SourceSettings
 
-__all__ = ["SOURCES", "StereoSource", "open_source"]
+__all__ = ["SOURCES", "SourceSettings", "StereoSource", "open_source", "recognise_source"]

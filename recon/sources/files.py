@@ -11,6 +11,7 @@ from recon.formats.files import StrPath
 from recon.formats.image import read_image
 from recon.formats.middlebury import stand_in_camera
 from recon.structures import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
+from recon.structures.arrays import UInt8
 
 
 class FilesSource:
@@ -53,6 +54,11 @@ class FilesSource:
         return self._pair.name
 
     @property
+    def description(self) -> str:
+        """One line."""
+        return "two pictures"
+
+    @property
     def calibration(self) -> RectifiedCamera | StereoCalibration:
         """A `RectifiedCamera` where the pictures are rectified already."""
         return self._calibration
@@ -71,7 +77,11 @@ class FilesSource:
         return 1
 
     def __iter__(self) -> Iterator[StereoPair]:
-        yield self._pair
+        return self.frames()
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """Yield the pair, or nothing from any later start."""
+        yield from (self._pair,)[start:]
 
 
 def read_pair(left: StrPath, right: StrPath) -> StereoPair:
@@ -90,6 +100,17 @@ def read_pair(left: StrPath, right: StrPath) -> StereoPair:
             got=f"left {sizes[0]}, right {sizes[1]}",
             hint="both cameras must record the same size",
         )
-    if pictures[0].ndim != pictures[1].ndim:
-        pictures = [p if p.ndim == 3 else p[:, :, None].repeat(3, axis=2) for p in pictures]
-    return StereoPair(pictures[0], pictures[1], name=Path(left).name)
+    return join_pair(pictures[0], pictures[1], name=Path(left).name)
+
+
+def join_pair(
+    left: UInt8, right: UInt8, timestamp_s: float = 0.0, index: int = 0, name: str = ""
+) -> StereoPair:
+    """Two pictures of one size as a pair; where one is grey and one in colours, both get colours.
+
+    Raises:
+        ShapeError: They differ in size.
+    """
+    if left.ndim != right.ndim:
+        left, right = (p if p.ndim == 3 else p[:, :, None].repeat(3, axis=2) for p in (left, right))
+    return StereoPair(left, right, timestamp_s, index, name)

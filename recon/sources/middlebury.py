@@ -42,6 +42,11 @@ class MiddleburySource:
         return self.scene.name
 
     @property
+    def description(self) -> str:
+        """One line."""
+        return "a Middlebury scene: one rectified pair"
+
+    @property
     def calibration(self) -> RectifiedCamera:
         """The rectified camera."""
         return self._camera
@@ -60,4 +65,8 @@ class MiddleburySource:
         return 1
 
     def __iter__(self) -> Iterator[StereoPair]:
-        yield self.scene.pair
+        return self.frames()
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """Yield the pair, or nothing from any later start."""
+        yield from (self.scene.pair,)[start:]

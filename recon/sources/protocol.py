@@ -19,6 +19,11 @@ class StereoSource(Protocol):
         ...
 
     @property
+    def description(self) -> str:
+        """What it was taken for and how it was read, in one line for the user."""
+        ...
+
+    @property
     def calibration(self) -> RectifiedCamera | StereoCalibration:
         """A `RectifiedCamera` where the pictures are already rectified."""
         ...
@@ -38,7 +43,14 @@ class StereoSource(Protocol):
         ...
 
     def __iter__(self) -> Iterator[StereoPair]:
-        """Yield the pairs in order, one in memory at a time.
+        """Yield all pairs, as ``frames()``."""
+        ...
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """Yield the pairs in order, one in memory at a time, from pair ``start`` on.
+
+        The pairs before ``start`` are skipped as cheaply as the input allows: pictures are not
+        read, a bag is entered by its index, a video is decoded up to there.
 
         Raises:
             FormatError: A picture is missing, truncated or of another size.

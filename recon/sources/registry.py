@@ -1,4 +1,4 @@
-"""Which kinds of source there are, and which of them a folder is."""
+"""Which kinds of source there are, and which of them a path is."""
 
 from __future__ import annotations
 
@@ -8,55 +8,106 @@ from typing import Final
 
 from recon.errors import SourceError
 from recon.formats.files import StrPath
+from recon.formats.frames_csv import FRAMES
 from recon.formats.middlebury_layout import find_layout
-from recon.sources.kitti import KittiSource
+from recon.formats.video import VIDEOS
+from recon.sources.bag import BAGS, find_bags, open_bag
+from recon.sources.euroc import open_euroc
+from recon.sources.folders import find_views, open_folders
+from recon.sources.kitti import open_kitti
+from recon.sources.kitti_raw import open_kitti_raw
 from recon.sources.middlebury import MiddleburySource
 from recon.sources.protocol import StereoSource
+from recon.sources.settings import SourceSettings
+from recon.sources.tum import list_files, open_tum
+from recon.sources.video import list_videos, open_video_source
 
-SOURCES: Final[dict[str, Callable[[StrPath], StereoSource]]] = {
-    "kitti": KittiSource,
-    "middlebury": MiddleburySource,
+
+def _open_middlebury(path: Path, settings: SourceSettings) -> StereoSource:
+    del settings  # a scene has its own calibration
+    return MiddleburySource(path)
+
+
+SOURCES: Final[dict[str, Callable[[Path, SourceSettings], StereoSource]]] = {
+    "kitti": open_kitti,
+    "kitti-raw": open_kitti_raw,
+    "euroc": open_euroc,
+    "tum": open_tum,
+    "folders": open_folders,
+    "video": open_video_source,
+    "bag": open_bag,
+    "middlebury": _open_middlebury,
 }
+EXPECTED: Final = (
+    "a KITTI drive (odometry or raw), an EuRoC or TUM folder, left and right folders, videos, "
+    "a ROS bag or MCAP file, or a Middlebury scene"
+)
 
 
-def open_source(path: StrPath, kind: str | None = None) -> StereoSource:
-    """Open a folder as a source of stereo pairs.
+def open_source(
+    path: StrPath, kind: str | None = None, settings: SourceSettings | None = None
+) -> StereoSource:
+    """Open a folder or file as a source of stereo pairs.
 
     Args:
-        path: The folder.
+        path: The folder or file.
         kind: A key of `SOURCES`; None = recognise it by its files.
+        settings: What its files do not tell.
 
     Raises:
-        SourceError: The folder is missing, empty or of no kind that is understood, or cannot
+        SourceError: The path is missing, empty or of no kind that is understood, or cannot
             give pairs.
         FormatError: A file in it is damaged.
         CalibrationError: Its calibration cannot give depth.
+        MissingDependencyError: A bag, and the extra ``ros`` is not installed.
     """
+    settings = settings or SourceSettings()
     if kind is None:
-        kind = recognise_source(path)
+        kind = recognise_source(path, settings)
     if kind not in SOURCES:
         raise SourceError("unknown kind of source", got=kind, expected=", ".join(SOURCES))
-    return SOURCES[kind](path)
+    return SOURCES[kind](Path(path), settings)
 
 
-def recognise_source(path: StrPath) -> str:
-    """Tell by its files which kind of source (a key of `SOURCES`) a folder is.
+def recognise_source(path: StrPath, settings: SourceSettings | None = None) -> str:
+    """Tell by its files which kind of source (a key of `SOURCES`) a path is.
 
     Raises:
-        SourceError: The folder is missing, empty or of no kind that is understood.
+        SourceError: The path is missing, empty or of no kind that is understood.
     """
-    folder = Path(path)
-    if not folder.is_dir():
-        what = "not a folder" if folder.exists() else "folder does not exist"
-        raise SourceError(what, where=path)
-    if not any(folder.iterdir()):
+    place = Path(path)
+    if place.is_file():
+        return _recognise_file(place)
+    if not place.is_dir():
+        raise SourceError("folder does not exist", where=path)
+    if not any(place.iterdir()):
         raise SourceError("folder is empty", where=path)
-    if find_layout(folder) is not None:
-        return "middlebury"
-    if any((folder / f"image_{camera}").exists() for camera in range(4)):
-        return "kitti"
-    raise SourceError(
-        "folder is no source of stereo pairs",
-        where=path,
-        expected="a KITTI drive (image_0, image_1, calib.txt, times.txt) or a Middlebury scene",
+    kind = next((kind for kind, fits in _signs(place, settings or SourceSettings()) if fits), None)
+    if kind is None:
+        raise SourceError("folder is no source of stereo pairs", where=path, expected=EXPECTED)
+    return kind
+
+
+def _recognise_file(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix in VIDEOS:
+        return "video"
+    if suffix in BAGS:
+        return "bag"
+    raise SourceError("file is no source of stereo pairs", where=path, expected=EXPECTED)
+
+
+def _signs(folder: Path, settings: SourceSettings) -> tuple[tuple[str, bool], ...]:
+    """What each kind is known by; the surest signs come first."""
+    views = range(4)
+    return (
+        ("bag", bool(find_bags(folder))),
+        ("euroc", any((f / "cam0" / "data.csv").is_file() for f in (folder / "mav0", folder))),
+        ("kitti-raw", any((folder / f"image_{n:02d}" / "data").is_dir() for n in views)),
+        ("folders", (folder / FRAMES).is_file()),
+        ("middlebury", find_layout(folder) is not None),
+        ("kitti", any((folder / f"image_{n}").exists() for n in views)),
+        ("tum", bool(list_files(folder))),
+        ("video", bool(list_videos(folder))),
+        ("folders", find_views(folder, settings) is not None),
     )

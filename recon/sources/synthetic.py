@@ -49,6 +49,11 @@ class SyntheticSource:
         """The seed and the length."""
         return f"synthetic street {self.settings.seed}, {self.settings.frames} frames"
 
+    @property
+    def description(self) -> str:
+        """One line."""
+        return "a rendered street"
+
     @cached_property
     def world(self) -> StreetWorld:
         """The street."""
@@ -84,7 +89,11 @@ class SyntheticSource:
         return self.settings.frames
 
     def __iter__(self) -> Iterator[StereoPair]:
-        return (self.camera.pair(index) for index in range(len(self)))
+        return self.frames()
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """Render the pairs from number ``start`` on."""
+        return (self.camera.pair(index) for index in range(start, len(self)))
 
     def frame(self, index: int) -> SyntheticFrame:
         """One pair with depth, disparity, pose and ground.

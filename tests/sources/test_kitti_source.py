@@ -9,7 +9,7 @@ import pytest
 from recon.errors import CalibrationError, FormatError, ReconError, SourceError
 from recon.formats.image import write_image
 from recon.formats.trajectory import read_kitti_poses
-from recon.sources.kitti import KittiSource
+from recon.sources.kitti import open_kitti
 from recon.sources.protocol import StereoSource
 
 CALIB = {
@@ -40,7 +40,7 @@ def make_drive(
 
 
 def test_a_drive_gives_its_pairs_in_order_with_times_and_names(tmp_path: Path) -> None:
-    source = KittiSource(make_drive(tmp_path / "drive"))
+    source = open_kitti(make_drive(tmp_path / "drive"))
     assert isinstance(source, StereoSource)
     pairs = list(source)
     assert (source.name, len(source), len(pairs)) == ("drive", 3, 3)
@@ -56,7 +56,7 @@ def test_a_drive_gives_its_pairs_in_order_with_times_and_names(tmp_path: Path) -
 def test_all_files_that_are_read_are_listed_and_exist(tmp_path: Path) -> None:
     folder = make_drive(tmp_path, 2, poses=IDENTITY * 2)
     (folder / "notes.md").write_text("not read")
-    names = [path.relative_to(folder).as_posix() for path in KittiSource(folder).files]
+    names = [path.relative_to(folder).as_posix() for path in open_kitti(folder).files]
     assert names[:3] == ["calib.txt", "times.txt", "poses.txt"]
     assert names[3:5] == ["image_0/000000.png", "image_1/000000.png"]
     assert len(names) == len(set(names)) == 7
@@ -64,20 +64,20 @@ def test_all_files_that_are_read_are_listed_and_exist(tmp_path: Path) -> None:
 
 
 def test_a_source_can_be_iterated_again(tmp_path: Path) -> None:
-    source = KittiSource(make_drive(tmp_path))
+    source = open_kitti(make_drive(tmp_path))
     assert len(list(source)) == len(list(source)) == 3
 
 
 def test_the_grey_pair_is_taken_unless_only_the_colour_pair_is_whole(tmp_path: Path) -> None:
     both = make_drive(tmp_path / "both", cameras=(0, 1, 2, 3))
-    assert next(iter(KittiSource(both))).left.ndim == 2
-    assert next(iter(KittiSource(both, cameras=(2, 3)))).left.ndim == 3
+    assert next(iter(open_kitti(both))).left.ndim == 2
+    assert next(iter(open_kitti(both, cameras=(2, 3)))).left.ndim == 3
     colour = make_drive(tmp_path / "colour", cameras=(0, 2, 3))
-    assert next(iter(KittiSource(colour))).left.ndim == 3
+    assert next(iter(open_kitti(colour))).left.ndim == 3
 
 
 def test_truth_starts_at_the_identity(tmp_path: Path) -> None:
-    truth = KittiSource(make_drive(tmp_path, 2, poses=TURNED + TURNED)).truth
+    truth = open_kitti(make_drive(tmp_path, 2, poses=TURNED + TURNED)).truth
     assert truth is not None
     assert truth.trajectory is not None
     expected = np.stack([np.eye(4)] * 2)
@@ -87,7 +87,7 @@ def test_truth_starts_at_the_identity(tmp_path: Path) -> None:
 
 def test_truth_of_the_colour_pair_is_that_of_its_own_left_camera(tmp_path: Path) -> None:
     folder = make_drive(tmp_path, 2, cameras=(2, 3), poses=IDENTITY + TURNED)
-    truth = KittiSource(folder).truth
+    truth = open_kitti(folder).truth
     assert truth is not None
     assert truth.trajectory is not None
     # Camera 2 sits at x = -0.1 m. Turned to the right about camera 0 it comes to z = 1 + 0.1 m.
@@ -98,13 +98,13 @@ def test_poses_of_the_official_download_are_found_beside_the_sequences(tmp_path:
     folder = make_drive(tmp_path / "sequences" / "06")
     (tmp_path / "poses").mkdir()
     (tmp_path / "poses" / "06.txt").write_text(IDENTITY * 3)
-    assert KittiSource(folder).truth is not None
+    assert open_kitti(folder).truth is not None
 
 
 def test_lines_beyond_the_last_picture_are_ignored(tmp_path: Path) -> None:
     folder = make_drive(tmp_path, 3, poses=IDENTITY * 5)
     (folder / "times.txt").write_text("0\n1\n2\n3\n4\n")
-    source = KittiSource(folder)
+    source = open_kitti(folder)
     assert source.truth is not None
     assert source.truth.trajectory is not None
     assert len(source) == len(source.truth.trajectory) == 3
@@ -114,7 +114,7 @@ def test_other_files_among_the_pictures_are_no_frames(tmp_path: Path) -> None:
     folder = make_drive(tmp_path)
     (folder / "image_0" / "Thumbs.db").write_text("x")
     (folder / "image_0" / "._000000.png").write_text("x")
-    assert len(KittiSource(folder)) == 3
+    assert len(open_kitti(folder)) == 3
 
 
 def remove(name: str) -> Callable[[Path], None]:
@@ -176,7 +176,7 @@ def test_a_spoiled_drive_is_refused_before_the_run_with_one_line_that_names_the_
     folder = make_drive(tmp_path, poses=IDENTITY * 3)
     spoil(folder)
     with pytest.raises(error, match=message) as caught:
-        KittiSource(folder)
+        open_kitti(folder)
     assert "\n" not in str(caught.value)
     assert str(tmp_path) in str(caught.value)
 
@@ -185,7 +185,7 @@ def test_a_spoiled_drive_is_refused_before_the_run_with_one_line_that_names_the_
 def test_a_picture_of_another_size_is_named_when_its_turn_comes(tmp_path: Path, name: str) -> None:
     folder = make_drive(tmp_path)
     write_image(folder / name, np.zeros((16, 31), dtype=np.uint8))
-    source = KittiSource(folder)
+    source = open_kitti(folder)
     with pytest.raises(FormatError, match=rf"{name}: .*another size.*got 31x16, expected 32x16"):
         list(source)
 
@@ -194,7 +194,7 @@ def test_a_truncated_picture_is_named_when_its_turn_comes(tmp_path: Path) -> Non
     folder = make_drive(tmp_path)
     path = folder / "image_1" / "000001.png"
     path.write_bytes(path.read_bytes()[:100])
-    pairs = iter(KittiSource(folder))
+    pairs = iter(open_kitti(folder))
     next(pairs)
     with pytest.raises(FormatError, match=r"000001\.png: PNG image is truncated"):
         next(pairs)
@@ -202,12 +202,12 @@ def test_a_truncated_picture_is_named_when_its_turn_comes(tmp_path: Path) -> Non
 
 def test_a_missing_folder_is_told(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="drive: folder does not exist"):
-        KittiSource(tmp_path / "drive")
+        open_kitti(tmp_path / "drive")
     with pytest.raises(SourceError, match="image_2: folder does not exist"):
-        KittiSource(make_drive(tmp_path), cameras=(2, 3))
+        open_kitti(make_drive(tmp_path), cameras=(2, 3))
     (tmp_path / "other").mkdir()
     with pytest.raises(SourceError, match="other: folder has no pictures in KITTI's layout"):
-        KittiSource(tmp_path / "other")
+        open_kitti(tmp_path / "other")
 
 
 @pytest.mark.real
@@ -219,7 +219,7 @@ def test_real_drives_open_with_their_truth(
     recon_data: Path, drive: str, frames: int, size: tuple[int, int], baseline_m: float
 ) -> None:
     folder = recon_data / "driven" / drive
-    source = KittiSource(folder)
+    source = open_kitti(folder)
     camera = source.calibration
     assert (len(source), (camera.width_px, camera.height_px)) == (frames, size)
     assert camera.baseline_m == pytest.approx(baseline_m, abs=1e-4)

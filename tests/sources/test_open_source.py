@@ -8,10 +8,9 @@ import pytest
 from recon.errors import CalibrationError, FormatError, ReconError, SourceError
 from recon.formats.image import write_image
 from recon.sources.files import FilesSource, read_pair
-from recon.sources.kitti import KittiSource
 from recon.sources.middlebury import MiddleburySource
 from recon.sources.protocol import StereoSource
-from recon.sources.registry import SOURCES, open_source
+from recon.sources.registry import open_source, recognise_source
 
 KITTI = "P0: 700 0 16 0 0 700 8 0 0 0 1 0\nP1: 700 0 16 -350 0 700 8 0 0 0 1 0\n"
 MIDDLEBURY = (
@@ -52,8 +51,8 @@ def test_each_kind_is_recognised_by_its_files_and_keeps_the_protocol(
     tmp_path: Path, kind: str, make: type
 ) -> None:
     folder = make(tmp_path / "folder")
+    assert recognise_source(folder) == kind
     for source in (open_source(folder), open_source(folder, kind)):
-        assert type(source) is SOURCES[kind]
         assert isinstance(source, StereoSource)
         assert source.name == "folder"
         assert folder / "calib.txt" in source.files
@@ -133,7 +132,7 @@ def make_other(folder: Path) -> None:
     ("make", "message"),
     [
         (make_nothing, "folder does not exist"),
-        (make_file, "not a folder"),
+        (make_file, "file is no source of stereo pairs"),
         (make_empty, "folder is empty"),
         (make_other, "folder is no source of stereo pairs.*KITTI drive.*Middlebury scene"),
     ],
@@ -145,8 +144,8 @@ def test_what_is_no_source_is_one_clear_line(tmp_path: Path, make: type, message
 
 
 def test_an_unknown_kind_gets_the_choices(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=r"got euroc, expected kitti, middlebury"):
-        open_source(tmp_path, "euroc")
+    with pytest.raises(SourceError, match=r"got rosbag, expected kitti, kitti-raw, euroc, "):
+        open_source(tmp_path, "rosbag")
 
 
 def test_half_a_drive_is_told_as_a_drive_and_not_as_unknown(tmp_path: Path) -> None:
@@ -161,15 +160,16 @@ def test_half_a_drive_is_told_as_a_drive_and_not_as_unknown(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("path", "kind"),
     [
-        ("driven/kitti_06_51", KittiSource),
-        ("middlebury/MiddEval3/trainingQ/Piano", MiddleburySource),
-        ("middlebury/2005/Art", MiddleburySource),
+        ("driven/kitti_06_51", "kitti"),
+        ("middlebury/MiddEval3/trainingQ/Piano", "middlebury"),
+        ("middlebury/2005/Art", "middlebury"),
         ("middlebury/2003/Cones", None),
     ],
 )
-def test_real_folders_are_recognised(recon_data: Path, path: str, kind: type | None) -> None:
+def test_real_folders_are_recognised(recon_data: Path, path: str, kind: str | None) -> None:
     if kind is None:
         with pytest.raises(ReconError, match="no calibration is published"):
             open_source(recon_data / path)
     else:
-        assert isinstance(open_source(recon_data / path), kind)
+        assert recognise_source(recon_data / path) == kind
+        assert len(open_source(recon_data / path)) > 0

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from recon.errors import OutputError
-from recon.sources.kitti import KittiSource
+from recon.sources.kitti import open_kitti
 from recon.sources.protocol import StereoSource
 from recon.sources.synthetic import SyntheticSource, write_kitti
 from recon.synthetic.settings import StreetSettings
@@ -81,7 +81,7 @@ def test_grey_pictures_are_the_weighted_colours(source, written):
 
 @pytest.mark.parametrize("cameras", [(0, 1), (2, 3)])
 def test_the_kitti_source_reads_the_same_drive(source, written, cameras):
-    kitti = KittiSource(written, cameras)
+    kitti = open_kitti(written, cameras=cameras)
     assert len(kitti) == 3
     for name in ("focal_px", "cx_px", "cy_px", "cx_right_px", "baseline_m"):
         assert getattr(kitti.calibration, name) == pytest.approx(getattr(source.calibration, name))
@@ -94,7 +94,7 @@ def test_the_kitti_source_reads_the_same_drive(source, written, cameras):
 def test_grey_may_be_left_out(source, tmp_path):
     write_kitti(source, tmp_path / "drive", grey=False)
     assert not (tmp_path / "drive" / "image_0").exists()
-    assert len(KittiSource(tmp_path / "drive")) == 3
+    assert len(open_kitti(tmp_path / "drive")) == 3
 
 
 def test_a_folder_that_cannot_be_made_is_our_error(source, tmp_path):

@@ -1,0 +1,244 @@
+"""Bags of ROS 1 (.bag), ROS 2 (a folder, .db3) and MCAP, read with rosbags: no ROS is needed.
+
+Only the three kinds of message that a stereo source needs are looked at, so a bag may hold any
+other kinds, known or not. What rosbags and the libraries below it raise becomes a `FormatError`.
+"""
+
+from __future__ import annotations
+
+import heapq
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import FormatError, ReconError
+from recon.optional import require
+from recon.structures.arrays import Float64
+
+IMAGE: Final = "sensor_msgs/msg/Image"
+COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
+_EXTRA: Final = "ros"
+_NS_PER_S: Final = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """One topic of a kind that is understood.
+
+    Attributes:
+        name: Its name.
+        kind: `IMAGE`, `COMPRESSED` or `CAMERA_INFO`.
+        messages: How many messages it has.
+    """
+
+    name: str
+    kind: str
+    messages: int
+
+
+@dataclass(frozen=True, eq=False)
+class BagImage:
+    """A picture as it was recorded; a compressed one has an encoding alone.
+
+    Attributes:
+        encoding: ROS's name: ``mono8``, ``bgr8`` …; of a compressed one its ``format``.
+        data: The bytes.
+        width_px: Width; 0 where compressed.
+        height_px: Height; 0 where compressed.
+        step: Bytes per row; 0 where compressed.
+        big_endian: Order of bytes of 16-bit pixels.
+    """
+
+    encoding: str
+    data: NDArray[np.uint8]
+    width_px: int = 0
+    height_px: int = 0
+    step: int = 0
+    big_endian: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class BagCameraInfo:
+    """``sensor_msgs/CameraInfo``.
+
+    Attributes:
+        width_px: Width of the pictures.
+        height_px: Height of the pictures.
+        model: Name of the lens model.
+        D: float64 (N,), distortion.
+        K: float64 (3, 3), the raw camera.
+        R: float64 (3, 3), rotation of the rectification.
+        P: float64 (3, 4), the rectified camera.
+    """
+
+    width_px: int
+    height_px: int
+    model: str
+    D: Float64
+    K: Float64
+    R: Float64
+    P: Float64
+
+
+class Bag:
+    """A recording in one or more files.
+
+    Args:
+        paths: ROS 1 files that belong together, or one folder or file of ROS 2.
+
+    Attributes:
+        topics: The topics that are understood, by name.
+
+    Raises:
+        MissingDependencyError: rosbags is not installed.
+        FormatError: The recording is missing, cut off or damaged.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.paths = tuple(paths)
+        self._ros1 = self.paths[0].suffix == ".bag"
+        module = "rosbags.rosbag1" if self._ros1 else "rosbags.rosbag2"
+        self._reader = require(module, extra=_EXTRA).Reader
+        typesys = require("rosbags.typesys", extra=_EXTRA)
+        store = typesys.Stores.ROS1_NOETIC if self._ros1 else typesys.Stores.ROS2_HUMBLE
+        self._store = typesys.get_typestore(store)
+        self.topics = self._list_topics()
+
+    def scan(self, topics: Sequence[str]) -> dict[str, NDArray[np.int64]]:
+        """Read the times of all messages of some topics, and nothing else of them.
+
+        Returns:
+            For each topic int64 (N, 2), nanoseconds: when recorded, and the header's stamp;
+            in the order of recording.
+
+        Raises:
+            FormatError: The recording is cut off or damaged.
+        """
+        times: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
+        for topic, recorded_ns, content in self._messages(topics):
+            times[topic].append((recorded_ns, self._stamp_ns(content, topic)))
+        return {
+            topic: np.array(found, dtype=np.int64).reshape(-1, 2) for topic, found in times.items()
+        }
+
+    def images(self, topic: str, start_ns: int | None = None) -> Iterator[BagImage]:
+        """Yield the pictures of a topic in the order of recording.
+
+        Args:
+            topic: An image topic.
+            start_ns: Skip what was recorded before.
+
+        Raises:
+            FormatError: The recording is cut off or damaged.
+        """
+        compressed = self.topics[topic].kind == COMPRESSED
+        for _, _, content in self._messages([topic], start_ns):
+            message = self._parse(content, topic)
+            if compressed:
+                yield BagImage(message.format, message.data)
+            else:
+                yield BagImage(
+                    message.encoding,
+                    message.data,
+                    message.width,
+                    message.height,
+                    message.step,
+                    bool(message.is_bigendian),
+                )
+
+    def camera_info(self, topic: str) -> BagCameraInfo:
+        """Read the first message of a camera's calibration.
+
+        Raises:
+            FormatError: There is none, or the recording is damaged.
+        """
+        for _, _, content in self._messages([topic]):
+            message = self._parse(content, topic)
+            # ROS 1 writes the matrices' names in capitals.
+            matrix = {
+                name: np.array(getattr(message, name if self._ros1 else name.lower()))
+                for name in "DKRP"
+            }
+            return BagCameraInfo(
+                width_px=int(message.width),
+                height_px=int(message.height),
+                model=str(message.distortion_model),
+                D=matrix["D"].astype(np.float64),
+                K=matrix["K"].reshape(3, 3),
+                R=matrix["R"].reshape(3, 3),
+                P=matrix["P"].reshape(3, 4),
+            )
+        raise FormatError("topic has no message", where=self.paths[0], got=topic)
+
+    def _list_topics(self) -> dict[str, BagTopic]:
+        found: dict[str, BagTopic] = {}
+        with self._telling(), self._opened() as readers:
+            for connection in (c for reader in readers for c in reader.connections):
+                name, kind = connection.topic, connection.msgtype
+                if kind in {IMAGE, COMPRESSED, CAMERA_INFO}:
+                    before = found[name].messages if name in found else 0
+                    found[name] = BagTopic(name, kind, before + connection.msgcount)
+        return found
+
+    def _messages(
+        self, topics: Sequence[str], start_ns: int | None = None
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Topic, time of recording and content of each message, in that order."""
+        with self._telling(), self._opened() as readers:
+            streams = []
+            for reader in readers:
+                wanted = [c for c in reader.connections if c.topic in topics]
+                if wanted:
+                    streams.append(reader.messages(wanted, start=start_ns))
+            for connection, recorded_ns, content in heapq.merge(*streams, key=lambda m: m[1]):
+                yield connection.topic, recorded_ns, content
+
+    def _parse(self, content: bytes, topic: str) -> Any:
+        kind = self.topics[topic].kind
+        with self._telling():
+            if self._ros1:
+                return self._store.deserialize_ros1(content, kind)
+            return self._store.deserialize_cdr(content, kind)
+
+    def _stamp_ns(self, content: bytes, topic: str) -> int:
+        """The header's stamp: every kind here begins with a header."""
+        try:
+            if self._ros1:
+                _, seconds, nanoseconds = struct.unpack_from("<III", content)
+            else:
+                # CDR's second byte tells the order of bytes.
+                order = "<" if content[1] & 1 else ">"
+                seconds, nanoseconds = struct.unpack_from(order + "iI", content, 4)
+        except (struct.error, IndexError) as error:
+            raise FormatError(
+                "message is too short", where=self.paths[0], got=f"{len(content)} bytes on {topic}"
+            ) from error
+        return int(seconds) * _NS_PER_S + int(nanoseconds)
+
+    @contextmanager
+    def _opened(self) -> Iterator[list[Any]]:
+        with ExitStack() as stack:
+            yield [stack.enter_context(self._reader(path)) for path in self.paths]
+
+    @contextmanager
+    def _telling(self) -> Iterator[None]:
+        """Turn whatever a damaged file makes the libraries raise into one line."""
+        try:
+            yield
+        except (ReconError, MemoryError):
+            raise
+        except Exception as error:
+            raise FormatError(
+                "recording cannot be read",
+                where=self.paths[0],
+                got=str(error) or type(error).__name__,
+                hint="it may be cut off; copy it again, or mend it with rosbag reindex, "
+                "ros2 bag reindex or mcap recover",
+            ) from error

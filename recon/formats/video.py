@@ -1,0 +1,128 @@
+"""Video files, frame by frame. Decoded with OpenCV's FFmpeg; nothing is kept in memory."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import cv2
+
+from recon.errors import FormatError
+from recon.formats.files import StrPath
+from recon.formats.image import silent_opencv, swap_red_and_blue
+from recon.structures.arrays import UInt8
+
+VIDEOS: Final = frozenset(
+    {".avi", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ts", ".webm"}
+)
+# A container may know its number of frames by its duration alone, and round it.
+_COUNT_TOLERANCE: Final = 2
+
+
+@dataclass(frozen=True)
+class VideoFile:
+    """What the container says, checked by walking through its packets once.
+
+    Attributes:
+        path: The file.
+        frames: Number of frames.
+        width_px: Width of a frame, as recorded: an orientation tag is ignored.
+        height_px: Height of a frame.
+        rate_hz: Frames per second.
+    """
+
+    path: Path
+    frames: int
+    width_px: int
+    height_px: int
+    rate_hz: float
+
+    def read(self, start: int = 0) -> Iterator[tuple[float, UInt8]]:
+        """Decode the frames from number ``start`` on; those before are decoded and dropped.
+
+        Yields:
+            Seconds from the start of the file, and uint8 (H, W, 3) RGB.
+
+        Raises:
+            FormatError: The file cannot be opened, or a frame cannot be decoded.
+        """
+        with _opened(self.path) as capture:
+            for index in range(self.frames):
+                if not capture.grab():
+                    raise self._broken(index)
+                if index < start:
+                    continue
+                stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+                done, image = capture.retrieve()
+                if not done:
+                    raise self._broken(index)
+                yield stamp_s, swap_red_and_blue(image)
+
+    def _broken(self, index: int) -> FormatError:
+        return FormatError(
+            "video cannot be decoded to its end",
+            where=self.path,
+            got=f"{index} frames",
+            expected=f"{self.frames}",
+            hint="copy the file again, or cut it before the damage",
+        )
+
+
+def open_video(path: StrPath) -> VideoFile:
+    """Look at a video file, and count its frames without decoding them.
+
+    Raises:
+        FormatError: The file is missing, no video, cut off, or of a codec that is not understood.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise FormatError("file does not exist", where=file)
+    with _opened(file) as capture:
+        promised = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        rate_hz = capture.get(cv2.CAP_PROP_FPS)
+        size = [int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+        if not capture.grab() or not rate_hz > 0:
+            raise FormatError("video has no frame that can be decoded", where=file)
+    frames = _count(file)
+    if frames < promised - _COUNT_TOLERANCE:
+        raise FormatError(
+            "video is truncated",
+            where=file,
+            got=f"{frames} frames",
+            expected=f"{promised:.0f}, as its header says",
+            hint=f"copy the file again, or repair it: ffmpeg -i {file.name} -c copy whole.mkv",
+        )
+    return VideoFile(file, frames, size[0], size[1], rate_hz)
+
+
+def _count(path: Path) -> int:
+    """Number of packets: of a video stream, one for each frame."""
+    with _opened(path) as capture:
+        capture.set(cv2.CAP_PROP_FORMAT, -1)  # packets as they are, not decoded
+        count = 0
+        while capture.grab():
+            count += 1
+    return count
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
+    # FFmpeg would write to standard error what is raised as an error anyway.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    with silent_opencv():
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        if not capture.isOpened():
+            raise FormatError(
+                "not a video that can be read",
+                where=path,
+                hint="it may be cut off or of an unknown codec; try: ffmpeg -i FILE copy.mkv",
+            )
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        yield capture
+    finally:
+        capture.release()

@@ -1,0 +1,40 @@
+"""Poses between poses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.geometry.se3 import exp_so3, log_so3, make_transform
+from recon.structures import Trajectory
+from recon.structures.arrays import Float64
+
+
+def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
+    """Poses at given times: turned and moved evenly between the two around each.
+
+    Args:
+        trajectory: At least one pose.
+        stamps_s: float64 (N,), within the trajectory's times; beyond them its ends stand still.
+
+    Returns:
+        float64 (N, 4, 4).
+    """
+    times = trajectory.timestamps_s
+    after = np.clip(np.searchsorted(times, stamps_s), 1, max(1, len(times) - 1))
+    after = np.minimum(after, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    span = np.where(times[after] > times[before], times[after] - times[before], 1.0)
+    shares = np.clip((stamps_s - times[before]) / span, 0.0, 1.0)
+    poses = trajectory.T_world_camera
+    return np.stack(
+        [
+            _between(poses[i], poses[j], float(share))
+            for i, j, share in zip(before, after, shares, strict=True)
+        ]
+    )
+
+
+def _between(first: Float64, second: Float64, share: float) -> Float64:
+    turn = log_so3(first[:3, :3].T @ second[:3, :3])
+    position = (1 - share) * first[:3, 3] + share * second[:3, 3]
+    return make_transform(first[:3, :3] @ exp_so3(share * turn), position)

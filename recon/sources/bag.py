@@ -1,0 +1,224 @@
+"""Drives in bags of ROS 1, ROS 2 and MCAP."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.adapters.rosbags import CAMERA_INFO, Bag, BagImage
+from recon.errors import FormatError, SourceError
+from recon.formats.image import decode_image
+from recon.formats.ros_image import pixels_of_ros_image
+from recon.sources.bag_rig import rig_of_messages
+from recon.sources.bag_topics import camera_info_topic, choose_topics, list_topics, names_rectified
+from recon.sources.files import join_pair
+from recon.sources.pairing import StampPairs, check_increasing, pair_stamps
+from recon.sources.pictures import check_size
+from recon.sources.rig import Rig, as_rectified, read_rig
+from recon.sources.settings import SourceSettings
+from recon.structures import SequenceTruth, StereoPair
+from recon.structures.arrays import Float64, UInt8
+
+BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
+_S: Final = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class BagSource:
+    """A drive in a recording; each camera's messages are read one at a time.
+
+    Attributes:
+        name: Name of the file or folder.
+        description: What it was taken for, and which topics were chosen.
+        calibration: The rectified camera, or the two raw ones.
+        bag: The recording.
+        topics: Left and right image topic.
+        pairs: Which messages belong together.
+        stamps_s: float64 (N,), stamps of the left messages, all of them.
+        recorded_ns: int64 (N,) and (M,), when left and right messages were recorded.
+        texts: The calibration file, where one was given.
+    """
+
+    name: str
+    description: str
+    calibration: Rig
+    bag: Bag
+    topics: tuple[str, str]
+    pairs: StampPairs
+    stamps_s: Float64
+    recorded_ns: tuple[NDArray[np.int64], NDArray[np.int64]]
+    texts: tuple[Path, ...]
+
+    @property
+    def truth(self) -> SequenceTruth | None:
+        """None: which of a bag's poses are true, only its maker knows."""
+        return None
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """The calibration file, then those of the recording."""
+        inside = (
+            sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else [path]
+            for path in self.bag.paths
+        )
+        return [*self.texts, *(file for files in inside for file in files)]
+
+    def __len__(self) -> int:
+        return len(self.pairs.left)
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return self.frames()
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """Read the pairs from number ``start`` on; the recording is entered there.
+
+        Raises:
+            FormatError: A message is damaged, of another size than the calibration, or of an
+                encoding that is not understood.
+        """
+        if start >= len(self):
+            return
+        # One reader for each camera: a pair whose messages lie far apart needs no memory.
+        views = zip(
+            self._pictures(0, self.pairs.left[start:]),
+            self._pictures(1, self.pairs.right[start:]),
+            strict=True,
+        )
+        for index, (left, right) in enumerate(views, start=start):
+            stamp_s = float(self.stamps_s[self.pairs.left[index]])
+            yield join_pair(left, right, stamp_s, index, f"{self.topics[0]}, pair {index}")
+
+    def _pictures(self, side: int, wanted: Sequence[int]) -> Iterator[UInt8]:
+        """The pictures of one camera whose positions are wanted, in order."""
+        times, topic = self.recorded_ns[side], self.topics[side]
+        start_ns = int(times[wanted[0]])
+        position = int(np.searchsorted(times, start_ns))
+        messages = self.bag.images(topic, start_ns)
+        for target in wanted:
+            message = next(islice(messages, target - position, None), None)
+            if message is None:
+                raise FormatError(
+                    "recording ends early", where=self.bag.paths[0], got=f"{target} of {topic}"
+                )
+            position = target + 1
+            image = decode_message(message, f"{self.bag.paths[0]}: {topic}, message {target}")
+            check_size(image, self.calibration, f"{self.bag.paths[0]}: {topic}, message {target}")
+            yield image
+
+
+def open_bag(path: Path, settings: SourceSettings) -> BagSource:
+    """Open a recording. Its times are read through once, so that pairs and length are known.
+
+    Raises:
+        MissingDependencyError: The extra ``ros`` is not installed.
+        SourceError: There are no image topics of two cameras, or none of the names given, their
+            stamps are out of order, or no messages belong together; or there is no calibration.
+        FormatError: The recording is cut off or damaged.
+        CalibrationError: The calibration cannot give depth.
+    """
+    bag = Bag(_find_files(path))
+    topics, also = choose_topics(bag, settings)
+    times = bag.scan(topics)
+    stamps, clock = _stamps(times, topics, path)
+    pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(path))
+    rig, texts, source = _read_rig(bag, topics, pairs, settings, path)
+    kind = {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(bag.paths[0].suffix, "ROS 2 bag")
+    return BagSource(
+        name=path.resolve().name,
+        description=f"{kind}, {topics[0]} and {topics[1]}, {pairs}{clock}, {source}{also}",
+        calibration=rig,
+        bag=bag,
+        topics=topics,
+        pairs=pairs,
+        stamps_s=stamps[0],
+        recorded_ns=(times[topics[0]][:, 0], times[topics[1]][:, 0]),
+        texts=texts,
+    )
+
+
+def find_bags(folder: Path) -> list[Path]:
+    """The recording in a folder: itself, the parts of a ROS 1 bag, or the one file of ROS 2."""
+    if (folder / "metadata.yaml").is_file():
+        return [folder]
+    parts = sorted(folder.glob("*.bag"))
+    single = [path for path in sorted(folder.iterdir()) if path.suffix in {".mcap", ".db3"}]
+    return parts or (single if len(single) == 1 else [])
+
+
+def decode_message(message: BagImage, where: str) -> UInt8:
+    """Turn an image message into a picture.
+
+    Raises:
+        FormatError: It is damaged, or of an encoding that is not understood.
+    """
+    if not message.step:
+        return decode_image(message.data.tobytes(), where)
+    return pixels_of_ros_image(
+        message.data,
+        message.encoding,
+        (message.height_px, message.width_px),
+        message.step,
+        big_endian=message.big_endian,
+        where=where,
+    )
+
+
+def _find_files(path: Path) -> list[Path]:
+    if not path.exists():
+        raise SourceError("file does not exist", where=path)
+    found = [path] if path.is_file() else find_bags(path)
+    if not found or (path.is_file() and path.suffix not in BAGS):
+        raise SourceError(
+            "not a recording",
+            where=path,
+            expected="a .bag, .mcap or .db3 file, or a ROS 2 folder with metadata.yaml",
+        )
+    return found
+
+
+def _stamps(
+    times: dict[str, NDArray[np.int64]], topics: tuple[str, str], path: Path
+) -> tuple[tuple[Float64, Float64], str]:
+    """Seconds of both cameras' messages; those of recording where the headers have none."""
+    empty = next((topic for topic in topics if not len(times[topic])), None)
+    if empty is not None:
+        raise SourceError("topic has no message", where=path, got=empty)
+    stamped = all((times[topic][:, 1] != 0).all() for topic in topics)
+    left, right = (
+        (times[topic][:, 1 if stamped else 0] * _S).astype(np.float64) for topic in topics
+    )
+    for topic, stamps in zip(topics, (left, right), strict=True):
+        check_increasing(stamps, f"{path}: {topic}")
+    return (left, right), "" if stamped else ", times of recording: the headers have none"
+
+
+def _read_rig(
+    bag: Bag,
+    topics: tuple[str, str],
+    pairs: StampPairs,
+    settings: SourceSettings,
+    path: Path,
+) -> tuple[Rig, tuple[Path, ...], str]:
+    """The calibration, the files it was read from, and what to say of it."""
+    infos = [camera_info_topic(bag, topic) for topic in topics]
+    if settings.calibration is not None:
+        first = next(islice(bag.images(topics[0]), pairs.left[0], None))
+        image = decode_message(first, f"{path}: {topics[0]}")
+        rig, texts = read_rig(settings, path, (image.shape[1], image.shape[0]))
+        return rig, texts, f"calibration {settings.calibration}"
+    if None in infos:
+        raise SourceError(
+            "recording has no calibration of both cameras",
+            where=path,
+            got=list_topics(bag, (CAMERA_INFO,)) or "no CameraInfo",
+            hint="name a file with --calib",
+        )
+    left, right = (bag.camera_info(topic) for topic in infos if topic is not None)
+    rectified = all(map(names_rectified, topics))
+    return as_rectified(rig_of_messages(left, right, path, rectified)), (), "its CameraInfo"

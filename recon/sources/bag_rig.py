@@ -1,0 +1,63 @@
+"""The rig that two CameraInfo messages describe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from recon.adapters.rosbags import BagCameraInfo
+from recon.errors import CalibrationError
+from recon.formats.camera_info import rig_of_camera_infos
+from recon.formats.files import naming
+from recon.formats.lens_models import ROS_MODELS, lens_of
+from recon.sources.rig import Rig
+from recon.structures import CameraIntrinsics, RectifiedCamera
+
+
+def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rectified: bool) -> Rig:
+    """Two CameraInfo messages as a rig.
+
+    Args:
+        left: Of the left camera.
+        right: Of the right camera.
+        where: Named in errors.
+        rectified: Whether the pictures are rectified: then ``P`` alone counts.
+
+    Raises:
+        FormatError: The lens model is not understood.
+        CalibrationError: The numbers cannot give depth, such as of a camera never calibrated.
+    """
+    for info in (left, right):
+        if not info.P[0, 0] > 0 or not info.K[0, 0] > 0:
+            raise CalibrationError(
+                "CameraInfo is of a camera that is not calibrated",
+                where=where,
+                got=f"focal length {info.P[0, 0]:g} px",
+                hint="name a calibration file with --calib",
+            )
+    if rectified:
+        return _rectified(left, right, where)
+    cameras = [(_camera(info, where), info.R) for info in (left, right)]
+    return rig_of_camera_infos(cameras[0], cameras[1], right.P, where)
+
+
+def _rectified(left: BagCameraInfo, right: BagCameraInfo, where: Path) -> RectifiedCamera:
+    with naming(where):
+        return RectifiedCamera(
+            focal_px=float(left.P[0, 0]),
+            cx_px=float(left.P[0, 2]),
+            cy_px=float(left.P[1, 2]),
+            cx_right_px=float(right.P[0, 2]),
+            baseline_m=float((left.P[0, 3] - right.P[0, 3]) / left.P[0, 0]),
+            width_px=left.width_px,
+            height_px=left.height_px,
+        )
+
+
+def _camera(info: BagCameraInfo, where: Path) -> CameraIntrinsics:
+    # A driver of rectified pictures may leave the name empty.
+    name = info.model or "plumb_bob"
+    model, distortion = lens_of(ROS_MODELS, name, np.asarray(info.D), where)
+    with naming(where):
+        return CameraIntrinsics(info.K, distortion, info.width_px, info.height_px, model)

@@ -1,0 +1,93 @@
+"""Which topics of a bag are the two cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+
+from recon.adapters.rosbags import CAMERA_INFO, COMPRESSED, IMAGE, Bag
+from recon.errors import SourceError
+from recon.sources.pairing import find_partners, partner_names
+from recon.sources.settings import SourceSettings
+
+_PICTURES = (IMAGE, COMPRESSED)
+
+
+def choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], str]:
+    """The left and right image topic: as named, else guessed by their names.
+
+    Of several pairs, the first of: rectified, uncompressed, in the order of the alphabet.
+
+    Returns:
+        The topics, and what to say of other pairs that might have been meant.
+
+    Raises:
+        SourceError: A name is not there, or no two topics look like a left and a right camera.
+    """
+    if settings.left or settings.right:
+        return _named(bag, settings), ""
+    images = [
+        topic.name
+        for topic in bag.topics.values()
+        if topic.kind in _PICTURES and topic.messages and "depth" not in topic.name.lower()
+    ]
+    pairs = [
+        (left, right)
+        for left, right in find_partners(images)
+        if bag.topics[left].kind == bag.topics[right].kind
+    ]
+    if not pairs:
+        raise SourceError(
+            "recording has no image topics of a left and a right camera",
+            where=bag.paths[0],
+            got=list_topics(bag, _PICTURES) or "no image topic",
+            hint="name them with --left and --right",
+        )
+    best, *others = sorted(pairs, key=lambda pair: _rank(bag, pair[0]))
+    also = ", ".join(left for left, _ in others)
+    return best, f" (also there: {also}; choose with --left)" if also else ""
+
+
+def list_topics(bag: Bag, kinds: Sequence[str]) -> str:
+    """The topics of some kinds with their numbers of messages, for a message."""
+    return ", ".join(
+        f"{topic.name} ({topic.messages})"
+        for topic in sorted(bag.topics.values(), key=lambda topic: topic.name)
+        if topic.kind in kinds
+    )
+
+
+def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
+    """The calibration that belongs to an image topic: beside it, or one level up."""
+    place = PurePosixPath(image_topic.removesuffix("/compressed")).parent
+    for candidate in (place / "camera_info", place.parent / "camera_info"):
+        topic = bag.topics.get(str(candidate))
+        if topic is not None and topic.kind == CAMERA_INFO and topic.messages:
+            return topic.name
+    return None
+
+
+def names_rectified(image_topic: str) -> bool:
+    """Whether the name of a topic says that its pictures are rectified, as ROS names them."""
+    return "rect" in image_topic.removesuffix("/compressed").rsplit("/", 1)[-1]
+
+
+def _named(bag: Bag, settings: SourceSettings) -> tuple[str, str]:
+    left, right = settings.left, settings.right
+    if right is None and left is not None:
+        right = next((name for name in partner_names(left) if name in bag.topics), None)
+    if left is None:
+        left = next((one for one, other in find_partners(bag.topics) if other == right), None)
+    for name in (left, right):
+        if name is None or name not in bag.topics or bag.topics[name].kind not in _PICTURES:
+            raise SourceError(
+                "recording has no such image topic",
+                where=bag.paths[0],
+                got=name or "one name alone",
+                expected=list_topics(bag, _PICTURES) or "an image topic",
+            )
+    return str(left), str(right)
+
+
+def _rank(bag: Bag, topic: str) -> tuple[bool, bool, str]:
+    return not names_rectified(topic), bag.topics[topic].kind == COMPRESSED, topic

@@ -1,0 +1,98 @@
+"""Drives in the layout of EuRoC (ASL), which TUM VI and others use as well.
+
+::
+
+    folder/
+      mav0/                            (or the folder itself is it)
+        cam0/ cam1/
+          data.csv                     time [ns], file name
+          data/1403636579763555584.png
+          sensor.yaml                  lens, size, T_BS
+        state_groundtruth_estimate0/   optional: the true path of the body
+          data.csv
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.errors import SourceError
+from recon.formats.euroc import NS, read_euroc_camera, read_euroc_truth
+from recon.geometry.se3 import invert
+from recon.sources.pairing import check_increasing, pair_stamps
+from recon.sources.pictures import PictureFrame, PictureSource, picture_size
+from recon.sources.rig import Rig, as_rectified, read_rig
+from recon.sources.settings import SourceSettings
+from recon.sources.times import read_stamped_names
+from recon.sources.truth import truth_at
+from recon.structures import SequenceTruth, StereoCalibration
+from recon.structures.arrays import Float64
+
+_TRUTH: Final = "state_groundtruth_estimate0"
+
+
+def open_euroc(folder: Path, settings: SourceSettings) -> PictureSource:
+    """Open a drive; its pictures are paired by their stamps.
+
+    The true path is known where it covers every frame; it is interpolated to their stamps.
+
+    Raises:
+        SourceError: A folder is missing, or no pictures belong together.
+        FormatError: A file is damaged.
+        CalibrationError: The calibration cannot give depth.
+    """
+    root = folder / "mav0" if (folder / "mav0").is_dir() else folder
+    views = [root / (settings.left or "cam0"), root / (settings.right or "cam1")]
+    lists = [_read_list(view) for view in views]
+    stamps = [np.array([stamp for stamp, _ in entries]) for entries in lists]
+    pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(root))
+    frames = [
+        PictureFrame(lists[0][left][1], lists[1][right][1], lists[0][left][0])
+        for left, right in zip(pairs.left, pairs.right, strict=True)
+    ]
+    rig, calibration_files = _read_rig(root, settings, views, picture_size(frames[0].left))
+    truth, note = _read_truth(root, views[0], np.array([frame.timestamp_s for frame in frames]))
+    return PictureSource(
+        name=folder.resolve().name,
+        description=f"EuRoC drive, {views[0].name} and {views[1].name}, {pairs}{note}",
+        calibration=rig,
+        pictures=frames,
+        truth=truth,
+        texts=(*calibration_files, *(view / "data.csv" for view in views)),
+    )
+
+
+def _read_list(view: Path) -> list[tuple[float, Path]]:
+    if not view.is_dir():
+        raise SourceError("folder of a camera is missing", where=view)
+    path = view / "data.csv"
+    entries = read_stamped_names(path, unit_s=NS)
+    check_increasing(np.array([stamp for stamp, _ in entries]), str(path))
+    listed = [(stamp, view / "data" / name) for stamp, name in entries]
+    missing = next((picture for _, picture in listed if not picture.is_file()), None)
+    if missing is not None:
+        raise SourceError("picture is missing", where=missing, hint=f"{path} lists it")
+    return listed
+
+
+def _read_rig(
+    root: Path, settings: SourceSettings, views: list[Path], size: tuple[int, int]
+) -> tuple[Rig, tuple[Path, ...]]:
+    if settings.calibration is not None:
+        return read_rig(settings, root, size)
+    paths = [view / "sensor.yaml" for view in views]
+    (left, T_body_left), (right, T_body_right) = (read_euroc_camera(path) for path in paths)
+    rig = StereoCalibration(left, right, invert(T_body_right) @ T_body_left)
+    return as_rectified(rig), tuple(paths)
+
+
+def _read_truth(root: Path, left: Path, stamps_s: Float64) -> tuple[SequenceTruth | None, str]:
+    """Truth at the frames' stamps, and what to say where it does not reach them all."""
+    path, sensor = root / _TRUTH / "data.csv", left / "sensor.yaml"
+    if not (path.is_file() and sensor.is_file()):
+        return None, ""
+    _, T_body_camera = read_euroc_camera(sensor)
+    return truth_at(read_euroc_truth(path), stamps_s, T_body_camera)

@@ -1,0 +1,219 @@
+"""Plain folders of pictures: one for each camera, or both cameras' pictures in one.
+
+::
+
+    folder/
+      left/ right/     pictures (or cam0 cam1, infra1 infra2, image_left image_right …)
+      frames.csv       optional, what `recon capture` writes: left file, right file, their times
+      times.txt        optional: seconds, one line per pair
+      groundtruth.txt  optional: t tx ty tz qx qy qz qw of the left camera
+      calib.txt        or any other calibration that is understood
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.errors import SourceError
+from recon.formats.frames_csv import FRAMES, read_frames
+from recon.sources.pairing import (
+    check_increasing,
+    find_partners,
+    pair_stamps,
+    partner_names,
+    stamp_of_name,
+)
+from recon.sources.pictures import (
+    PictureFrame,
+    PictureSource,
+    is_picture,
+    list_pictures,
+    picture_size,
+)
+from recon.sources.rig import read_rig
+from recon.sources.settings import SourceSettings
+from recon.sources.times import read_times
+from recon.sources.truth import read_tum_truth
+from recon.structures.arrays import Float64
+
+DEFAULT_RATE_HZ: Final = 10.0
+_INSIDE: Final = ("", "data", "images", "image", "img")
+
+
+@dataclass(frozen=True)
+class _Pairing:
+    """Pairs in order; ``stamps_s`` is None where nothing tells their times."""
+
+    pairs: list[tuple[Path, Path]]
+    stamps_s: Float64 | None
+    how: str
+    texts: tuple[Path, ...] = ()
+
+
+def open_folders(folder: Path, settings: SourceSettings) -> PictureSource:
+    """Open plain folders; how the pictures are paired is told in the description.
+
+    Raises:
+        SourceError: No two cameras are found, the pictures cannot be paired, or the calibration
+            is missing.
+        FormatError: A file is damaged.
+        CalibrationError: The calibration cannot give depth.
+    """
+    found = _pair(folder, settings)
+    stamps_s, clock = _times(found, settings)
+    rig, texts = read_rig(settings, folder, picture_size(found.pairs[0][0]))
+    truth, note = read_tum_truth(folder, stamps_s)
+    return PictureSource(
+        name=folder.resolve().name,
+        description=f"plain folders, {found.how}{clock}{note}",
+        calibration=rig,
+        pictures=[
+            PictureFrame(left, right, float(stamp))
+            for (left, right), stamp in zip(found.pairs, stamps_s, strict=True)
+        ],
+        truth=truth,
+        texts=(*texts, *found.texts),
+    )
+
+
+def find_views(folder: Path, settings: SourceSettings) -> tuple[Path, Path] | None:
+    """The folders of the left and right pictures; both are ``folder`` where it holds all."""
+    if settings.right is not None:
+        left = folder / settings.left if settings.left else folder
+        inside = folder / settings.right
+        right = inside if inside.is_dir() else Path(settings.right)
+        return _with_pictures(left) or left, _with_pictures(right) or right
+    if settings.left is not None:
+        names = [path.name for path in folder.iterdir() if path.is_dir()]
+        right_name = next((n for n in partner_names(settings.left) if n in names), None)
+        if right_name is not None:
+            return find_views(folder, settings.model_copy(update={"right": right_name}))
+    inside_of = {path.name: _with_pictures(path) for path in folder.iterdir() if path.is_dir()}
+    holding = {name: inside for name, inside in inside_of.items() if inside is not None}
+    pairs = find_partners(holding)
+    if pairs:
+        return holding[pairs[0][0]], holding[pairs[0][1]]
+    if find_partners(path.stem for path in folder.iterdir() if is_picture(path)):
+        return folder, folder
+    return None
+
+
+def _with_pictures(folder: Path) -> Path | None:
+    """The folder itself, or the one in it that holds the pictures."""
+    places = [folder / name for name in _INSIDE]
+    return next((p for p in places if p.is_dir() and any(map(is_picture, p.iterdir()))), None)
+
+
+def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
+    if (folder / FRAMES).is_file() and settings.pair_by == "auto":
+        return _pair_as_listed(folder)
+    views = find_views(folder, settings)
+    if views is None:
+        raise SourceError(
+            "folder has no pictures of two cameras",
+            where=folder,
+            expected="left/ and right/, cam0/ and cam1/, or the like",
+            hint="name them with --left and --right",
+        )
+    left, right = _list_both(*views)
+    by = settings.pair_by
+    stamps = _stamps(left, right) if by in {"auto", "stamp"} else None
+    if stamps is not None:
+        return _pair_by_stamp(left, right, stamps, settings, folder)
+    if by == "stamp":
+        raise SourceError("names of the pictures are no time stamps", where=left[0])
+    named = _by_name(left, right) if by in {"auto", "name"} else None
+    how = "by name"
+    if named is None:
+        named, how = _by_index(left, right, by, folder), "by their order"
+    label = f"{views[0].name} and {views[1].name}" if views[0] != views[1] else "one folder"
+    stamps_s, texts = _listed_times(folder, len(named))
+    return _Pairing(named, stamps_s, f"{label}, paired {how}", texts)
+
+
+def _list_both(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
+    if left != right:
+        return list_pictures(left), list_pictures(right)
+    by_stem = {path.stem: path for path in list_pictures(left)}
+    pairs = find_partners(by_stem)
+    return [by_stem[name] for name, _ in pairs], [by_stem[name] for _, name in pairs]
+
+
+def _pair_as_listed(folder: Path) -> _Pairing:
+    frames = read_frames(folder / FRAMES)
+    check_increasing(np.array([frame.left_s for frame in frames]), str(folder / FRAMES))
+    pairs = [(folder / frame.left, folder / frame.right) for frame in frames]
+    missing = next((path for pair in pairs for path in pair if not path.is_file()), None)
+    if missing is not None:
+        raise SourceError("picture is missing", where=missing, hint=f"{FRAMES} lists it")
+    stamps_s = np.array([frame.left_s for frame in frames])
+    return _Pairing(pairs, stamps_s, f"paired as {FRAMES} says", (folder / FRAMES,))
+
+
+def _stamps(left: list[Path], right: list[Path]) -> tuple[Float64, Float64] | None:
+    """The stamps that all names tell, or None."""
+    found = [[stamp_of_name(path.stem) for path in paths] for paths in (left, right)]
+    if any(stamp is None for stamps in found for stamp in stamps):
+        return None
+    first, second = (np.array(stamps, dtype=np.float64) for stamps in found)
+    return first, second
+
+
+def _pair_by_stamp(
+    left: list[Path],
+    right: list[Path],
+    stamps: tuple[Float64, Float64],
+    settings: SourceSettings,
+    folder: Path,
+) -> _Pairing:
+    for series, paths in zip(stamps, (left, right), strict=True):
+        check_increasing(series, str(paths[0].parent))
+    pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(folder))
+    chosen = [(left[i], right[j]) for i, j in zip(pairs.left, pairs.right, strict=True)]
+    return _Pairing(chosen, stamps[0][list(pairs.left)], str(pairs))
+
+
+def _by_name(left: list[Path], right: list[Path]) -> list[tuple[Path, Path]] | None:
+    """Pairs of equal names, or of names that differ in the side alone; None if one has none."""
+    rights = {path.stem: path for path in right}
+    pairs = []
+    for path in left:
+        names = [path.stem, *partner_names(path.stem)]
+        partner = next((rights[name] for name in names if name in rights), None)
+        if partner is None:
+            return None
+        pairs.append((path, partner))
+    return pairs if len(pairs) == len(right) else None
+
+
+def _by_index(
+    left: list[Path], right: list[Path], by: str, folder: Path
+) -> list[tuple[Path, Path]]:
+    if len(left) != len(right) or by == "name":
+        raise SourceError(
+            "left and right pictures cannot be paired by name"
+            if by == "name"
+            else "numbers of left and right pictures differ",
+            where=folder,
+            got=f"{len(left)} left and {len(right)} right pictures",
+            hint="name both pictures of a pair alike, or by their time stamps",
+        )
+    return list(zip(left, right, strict=True))
+
+
+def _listed_times(folder: Path, pairs: int) -> tuple[Float64 | None, tuple[Path, ...]]:
+    path = folder / "times.txt"
+    return (read_times(path, pairs), (path,)) if path.is_file() else (None, ())
+
+
+def _times(found: _Pairing, settings: SourceSettings) -> tuple[Float64, str]:
+    """Stamps of the pairs, and what to say where they are assumed."""
+    if found.stamps_s is not None and settings.rate_hz is None:
+        return found.stamps_s, ""
+    rate_hz = settings.rate_hz or DEFAULT_RATE_HZ
+    given = "" if settings.rate_hz else ", no times: assumed"
+    return np.arange(len(found.pairs)) / rate_hz, f"{given or ','} {rate_hz:g} Hz"

@@ -1,0 +1,90 @@
+"""Drives in the layout of KITTI's raw recordings, rectified (``_sync``) or not (``_extract``).
+
+::
+
+    2011_09_26/
+      calib_cam_to_cam.txt            (or in the drive's folder)
+      2011_09_26_drive_0013_sync/
+        image_00/ image_01/           (or image_02, image_03)
+          data/0000000000.png
+          timestamps.txt              date and time, one line per picture
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from recon.errors import SourceError
+from recon.formats.kitti_raw import read_kitti_raw_calib
+from recon.sources.kitti import choose_cameras
+from recon.sources.pairing import check_increasing, pair_stamps
+from recon.sources.pictures import PictureFrame, PictureSource, list_pictures, picture_size
+from recon.sources.rig import Rig, as_rectified, read_rig
+from recon.sources.settings import SourceSettings
+from recon.sources.times import read_dates
+from recon.structures import RectifiedCamera
+from recon.structures.arrays import Float64
+
+_CALIBRATION: Final = "calib_cam_to_cam.txt"
+
+
+def open_kitti_raw(folder: Path, settings: SourceSettings) -> PictureSource:
+    """Open a raw drive; its pictures are paired by their stamps.
+
+    Raises:
+        SourceError: A folder, the times or the calibration are missing, or no pictures belong
+            together.
+        FormatError: A file is damaged.
+        CalibrationError: The calibration cannot give depth.
+    """
+    cameras = choose_cameras(folder, "image_{:02d}")
+    views = [folder / f"image_{camera:02d}" for camera in cameras]
+    pictures = [list_pictures(view / "data") for view in views]
+    stamps = [_read_stamps(v, len(p)) for v, p in zip(views, pictures, strict=True)]
+    pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(folder))
+    rig, calibration_files = _read_rig(folder, settings, cameras, picture_size(pictures[0][0]))
+    rectified = "rectified" if isinstance(rig, RectifiedCamera) else "not rectified"
+    return PictureSource(
+        name=folder.resolve().name,
+        description=f"KITTI raw drive, {views[0].name} and {views[1].name}, {rectified}, {pairs}",
+        calibration=rig,
+        pictures=[
+            PictureFrame(pictures[0][left], pictures[1][right], float(stamps[0][left]))
+            for left, right in zip(pairs.left, pairs.right, strict=True)
+        ],
+        texts=(*calibration_files, *(view / "timestamps.txt" for view in views)),
+    )
+
+
+def _read_stamps(view: Path, pictures: int) -> Float64:
+    path = view / "timestamps.txt"
+    if not path.exists():
+        raise SourceError("times are missing", where=path)
+    stamps = read_dates(path)
+    if len(stamps) != pictures:
+        raise SourceError(
+            "number of times is not that of the pictures",
+            where=path,
+            got=f"{len(stamps)} times",
+            expected=f"{pictures}",
+        )
+    check_increasing(stamps, str(path))
+    return stamps
+
+
+def _read_rig(
+    folder: Path, settings: SourceSettings, cameras: tuple[int, int], size: tuple[int, int]
+) -> tuple[Rig, tuple[Path, ...]]:
+    if settings.calibration is not None:
+        return read_rig(settings, folder, size)
+    candidates = [place / _CALIBRATION for place in (folder, folder.resolve().parent)]
+    path = next((candidate for candidate in candidates if candidate.is_file()), None)
+    if path is None:
+        raise SourceError(
+            "calibration is missing",
+            where=folder,
+            expected=f"{_CALIBRATION} in the folder of the drive or of its day",
+            hint="download the calibration of the day, or name a file with --calib",
+        )
+    return as_rectified(read_kitti_raw_calib(path, *size, cameras)), (path,)

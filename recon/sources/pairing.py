@@ -1,0 +1,152 @@
+"""Which pictures belong together: by name, or by time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from recon.errors import SourceError
+from recon.structures.arrays import Float64
+
+# What names the left camera, and what the right one is called then.
+SIDES: Final = (
+    ("left", "right"),
+    ("Left", "Right"),
+    ("LEFT", "RIGHT"),
+    ("cam0", "cam1"),
+    ("cam_0", "cam_1"),
+    ("camera0", "camera1"),
+    ("camera_0", "camera_1"),
+    ("infra1", "infra2"),
+    ("image_0", "image_1"),
+    ("image_2", "image_3"),
+    ("view1", "view5"),
+    ("im0", "im1"),
+    ("l", "r"),
+    ("L", "R"),
+    ("0", "1"),
+)
+_DIGITS: Final = re.compile(r"(\d+)")
+_STAMP: Final = re.compile(r"\d{10}(\.\d+)?|\d{13}|\d{16}|\d{19}|\d+\.\d+")
+
+
+@dataclass(frozen=True, eq=False)
+class StampPairs:
+    """Which of two series of stamps belong together.
+
+    Attributes:
+        left: Positions in the left series, increasing.
+        right: Their partners in the right series, increasing.
+        alone: How many of (left, right) have no partner.
+    """
+
+    left: Sequence[int]
+    right: Sequence[int]
+    alone: tuple[int, int]
+
+    def __str__(self) -> str:
+        if not any(self.alone):
+            return "paired by stamps"
+        return f"paired by stamps, {self.alone[0]} left and {self.alone[1]} right without a partner"
+
+
+def natural_key(name: str) -> list[tuple[int, str]]:
+    """Sort key under which 2 comes before 10."""
+    parts = _DIGITS.split(name)
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts if part]
+
+
+def partner_names(name: str) -> list[str]:
+    """What the right camera may be called where the left one is called so, likeliest first."""
+    found = []
+    for left, right in SIDES:
+        bounded = rf"(?<![A-Za-z0-9]){left}(?![A-Za-z0-9])" if len(left) == 1 else left
+        matches = list(re.finditer(bounded, name))
+        # All places together ("left/left_raw"), else the last alone ("cam0/cam0_0").
+        if matches:
+            found.append(re.sub(bounded, right, name))
+            last = matches[-1]
+            found.append(name[: last.start()] + right + name[last.end() :])
+    return list(dict.fromkeys(found))
+
+
+def find_partners(names: Iterable[str]) -> list[tuple[str, str]]:
+    """All (left, right) among some names, in natural order."""
+    known = set(names)
+    pairs = []
+    for name in sorted(known, key=natural_key):
+        partner = next((other for other in partner_names(name) if other in known), None)
+        if partner is not None:
+            pairs.append((name, partner))
+    return pairs
+
+
+def stamp_of_name(stem: str) -> float | None:
+    """Seconds that a file's name tells: seconds, or an integer of ms, µs or ns since 1970.
+
+    None where it is no stamp.
+    """
+    if _STAMP.fullmatch(stem) is None:
+        return None
+    if "." in stem or len(stem) == 10:
+        return float(stem)
+    return float(int(stem) / 10 ** (len(stem) - 10))
+
+
+def check_increasing(stamps_s: Float64, where: str) -> None:
+    """Refuse stamps that stand still or run backwards.
+
+    Raises:
+        SourceError: They do.
+    """
+    backwards = np.flatnonzero(np.diff(stamps_s) <= 0)
+    if backwards.size:
+        at = int(backwards[0]) + 1
+        still = stamps_s[at] == stamps_s[at - 1]
+        raise SourceError(
+            "two pictures have one time stamp" if still else "time stamps are out of order",
+            where=f"{where}, picture {at}",
+            got=f"{stamps_s[at]:.6f} s after {stamps_s[at - 1]:.6f} s",
+            hint="each camera's pictures must be in the order of their exposure",
+        )
+
+
+def pair_stamps(left_s: Float64, right_s: Float64, tolerance_s: float, where: str) -> StampPairs:
+    """Pair two series by their stamps: each with the nearest of the other, and it with it.
+
+    Args:
+        left_s: float64 (N,), seconds, increasing.
+        right_s: float64 (M,), seconds, increasing.
+        tolerance_s: Largest difference within a pair.
+        where: Named in the error.
+
+    Raises:
+        SourceError: No two are near enough.
+    """
+    to_right, to_left = _nearest(left_s, right_s), _nearest(right_s, left_s)
+    mutual = to_left[to_right] == np.arange(len(left_s))
+    apart_s = np.abs(right_s[to_right] - left_s)
+    chosen = np.flatnonzero(mutual & (apart_s <= tolerance_s))
+    if not chosen.size:
+        raise SourceError(
+            "no left and right picture were taken at one time",
+            where=where,
+            got=f"at best {apart_s.min():.4g} s apart",
+            expected=f"at most {tolerance_s:g} s",
+            hint="raise the tolerance if that is the cameras' true skew",
+        )
+    alone = (len(left_s) - len(chosen), len(right_s) - len(chosen))
+    return StampPairs(chosen.tolist(), to_right[chosen].tolist(), alone)
+
+
+def _nearest(of_s: Float64, among_s: Float64) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    """For each stamp, the position of the nearest among others; both increase."""
+    after = np.clip(np.searchsorted(among_s, of_s), 1, max(1, len(among_s) - 1))
+    before = after - 1
+    after = np.minimum(after, len(among_s) - 1)
+    nearer = np.abs(among_s[after] - of_s) < np.abs(among_s[before] - of_s)
+    return np.where(nearer, after, before)

@@ -1,0 +1,104 @@
+"""Times of exposure, as the layouts write them down."""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+
+from recon.errors import FormatError, SourceError
+from recon.formats.files import read_table, read_text
+from recon.structures.arrays import Float64
+
+
+def read_times(path: Path, frames: int) -> Float64:
+    """Read ``times.txt``: seconds, one line per frame; lines beyond the last frame are ignored.
+
+    Returns:
+        float64 (frames,), not decreasing.
+
+    Raises:
+        SourceError: The file is missing or too short.
+        FormatError: A line is no number, or time runs backwards.
+    """
+    if not path.exists():
+        raise SourceError(
+            "times are missing", where=path, hint="write one line per frame: its time in seconds"
+        )
+    table, lines = read_table(path, (1,))
+    times: Float64 = table[:frames, 0].copy()
+    if len(times) < frames:
+        raise SourceError(
+            "fewer times than pictures",
+            where=path,
+            got=f"{len(times)} times",
+            expected=f"{frames}",
+        )
+    backwards = np.diff(times) < 0
+    if backwards.any():
+        raise FormatError(
+            "time runs backwards", where=f"{path}:{lines[int(np.argmax(backwards)) + 1]}"
+        )
+    return times
+
+
+def read_dates(path: Path) -> Float64:
+    """Read KITTI raw's ``timestamps.txt``: a date and a time of day per line.
+
+    Returns:
+        float64 (N,), seconds since 1970. A double resolves them to 0.2 µs.
+
+    Raises:
+        FormatError: The file is missing, or a line is no date.
+    """
+    stamps = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        if line.strip():
+            stamps.append(_parse_date(line.strip(), f"{path}:{number}"))
+    return np.array(stamps)
+
+
+def _parse_date(text: str, where: str) -> float:
+    # Python before 3.11 reads six decimals at most.
+    whole, _, fraction = text.partition(".")
+    try:
+        day = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
+        return day.timestamp() + float(f"0.{fraction or 0}")
+    except ValueError as error:
+        raise FormatError(
+            "not a time", where=where, got=text[:40], expected="2011-09-26 13:02:25.964389445"
+        ) from error
+
+
+def read_stamped_names(path: Path, *, unit_s: float = 1.0) -> list[tuple[float, str]]:
+    """Read a list of pictures: a stamp and a file name per line, apart by spaces or a comma.
+
+    Args:
+        path: TUM's ``rgb.txt`` or EuRoC's ``data.csv``; ``#`` starts a comment.
+        unit_s: Unit of the stamps: 1e-9 for EuRoC.
+
+    Returns:
+        (seconds, name) of each line.
+
+    Raises:
+        FormatError: The file is missing or empty, or a line is no stamp and name.
+    """
+    entries = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if words:
+            entries.append(_parse_entry(words, unit_s, f"{path}:{number}"))
+    if not entries:
+        raise FormatError("file lists no pictures", where=path)
+    return entries
+
+
+def _parse_entry(words: list[str], unit_s: float, where: str) -> tuple[float, str]:
+    try:
+        stamp = float(words[0]) if unit_s == 1 else int(words[0]) * unit_s
+    except ValueError as error:
+        raise FormatError("not a time stamp", where=where, got=words[0][:40]) from error
+    if len(words) < 2 or not np.isfinite(stamp):
+        raise FormatError("not a time stamp and a file name", where=where, got=" ".join(words)[:60])
+    return stamp, words[1]

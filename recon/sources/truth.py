@@ -1,0 +1,47 @@
+"""A true path that was measured at other times than the pictures were taken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from recon.formats.trajectory import read_tum
+from recon.geometry.interpolation import interpolate_poses
+from recon.geometry.se3 import invert
+from recon.structures import SequenceTruth, Trajectory
+from recon.structures.arrays import Float64
+
+
+def truth_at(
+    path: Trajectory, stamps_s: Float64, T_body_camera: Float64 | None = None
+) -> tuple[SequenceTruth | None, str]:
+    """The true pose of the left camera in each frame, the first one the identity.
+
+    Args:
+        path: ``T_world_body`` at the times of the instrument.
+        stamps_s: float64 (N,), the frames' times.
+        T_body_camera: float64 (4, 4), where the left camera is; None = it is the body.
+
+    Returns:
+        The truth, or None where it does not cover every frame; and then what to say about it.
+    """
+    covered = (stamps_s >= path.timestamps_s[0]) & (stamps_s <= path.timestamps_s[-1])
+    if not covered.all():
+        return None, f", true path for {covered.sum()} of {len(stamps_s)} frames alone: not used"
+    poses = interpolate_poses(path, stamps_s)
+    if T_body_camera is not None:
+        poses = poses @ T_body_camera
+    return SequenceTruth(Trajectory(invert(poses[0]) @ poses, stamps_s)), ""
+
+
+def read_tum_truth(folder: Path, stamps_s: Float64) -> tuple[SequenceTruth | None, str]:
+    """Truth from TUM's ``groundtruth.txt`` of the left camera, where a folder has one.
+
+    Raises:
+        FormatError: The file is damaged.
+    """
+    path = folder / "groundtruth.txt"
+    if not path.is_file():
+        return None, ""
+    return truth_at(read_tum(path), np.asarray(stamps_s))

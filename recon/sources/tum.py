@@ -1,0 +1,89 @@
+"""Drives whose pictures are listed with their times, as the TUM benchmarks do.
+
+::
+
+    folder/
+      left.txt right.txt        time [s] and file, one line per picture (or cam0.txt cam1.txt …)
+      left/1305031102.175304.png …
+      groundtruth.txt           optional: t tx ty tz qx qy qz qw of the left camera
+      calib.txt                 or any other calibration that is understood
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from recon.errors import SourceError
+from recon.sources.pairing import check_increasing, find_partners, pair_stamps
+from recon.sources.pictures import PictureFrame, PictureSource, is_picture, picture_size
+from recon.sources.rig import read_rig
+from recon.sources.settings import SourceSettings
+from recon.sources.times import read_stamped_names
+from recon.sources.truth import read_tum_truth
+
+
+def open_tum(folder: Path, settings: SourceSettings) -> PictureSource:
+    """Open a drive with two lists; its pictures are paired by their stamps.
+
+    Raises:
+        SourceError: A list, a picture or the calibration is missing, or no pictures belong
+            together.
+        FormatError: A file is damaged.
+        CalibrationError: The calibration cannot give depth.
+    """
+    paths = _find_lists(folder, settings)
+    lists = [_read_list(path) for path in paths]
+    stamps = [np.array([stamp for stamp, _ in entries]) for entries in lists]
+    pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(folder))
+    frames = [
+        PictureFrame(lists[0][left][1], lists[1][right][1], lists[0][left][0])
+        for left, right in zip(pairs.left, pairs.right, strict=True)
+    ]
+    rig, texts = read_rig(settings, folder, picture_size(frames[0].left))
+    truth, note = read_tum_truth(folder, np.array([frame.timestamp_s for frame in frames]))
+    return PictureSource(
+        name=folder.resolve().name,
+        description=f"TUM drive, {paths[0].name} and {paths[1].name}, {pairs}{note}",
+        calibration=rig,
+        pictures=frames,
+        truth=truth,
+        texts=(*texts, *paths),
+    )
+
+
+def list_files(folder: Path) -> list[tuple[str, str]]:
+    """The (left, right) names of text files in a folder that list pictures."""
+    names = [path.name for path in folder.iterdir() if path.suffix == ".txt" and _lists(path)]
+    return find_partners(names)
+
+
+def _lists(path: Path) -> bool:
+    """Tell a list by its first entry: a number, then the name of a picture."""
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        words = next((line.split() for line in lines if line.strip() and line[0] != "#"), [])
+    return len(words) >= 2 and is_picture(Path(words[1]))
+
+
+def _find_lists(folder: Path, settings: SourceSettings) -> tuple[Path, Path]:
+    if settings.left and settings.right:
+        return folder / settings.left, folder / settings.right
+    found = list_files(folder)
+    if not found:
+        raise SourceError(
+            "folder has no lists of pictures of two cameras",
+            where=folder,
+            expected="left.txt and right.txt, or the like",
+            hint="name them with --left and --right",
+        )
+    return folder / found[0][0], folder / found[0][1]
+
+
+def _read_list(path: Path) -> list[tuple[float, Path]]:
+    listed = [(stamp, path.parent / name) for stamp, name in read_stamped_names(path)]
+    check_increasing(np.array([stamp for stamp, _ in listed]), str(path))
+    missing = next((picture for _, picture in listed if not picture.is_file()), None)
+    if missing is not None:
+        raise SourceError("picture is missing", where=missing, hint=f"{path} lists it")
+    return listed

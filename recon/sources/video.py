@@ -1,0 +1,204 @@
+"""Drives in video files: one for each camera, or one with both views in each frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.errors import FormatError, SourceError
+from recon.formats.video import VIDEOS, VideoFile, open_video
+from recon.sources.pairing import find_partners
+from recon.sources.pictures import check_size
+from recon.sources.rig import Rig, read_rig
+from recon.sources.settings import SourceSettings
+from recon.structures import SequenceTruth, StereoPair
+from recon.structures.arrays import UInt8
+
+_STACKED: Final = frozenset({"top-bottom", "bottom-top"})
+
+
+@dataclass(frozen=True, eq=False)
+class VideoSource:
+    """A drive in one or two video files.
+
+    Attributes:
+        name: Name of the file or folder.
+        description: What it was taken for.
+        calibration: The rectified camera, or the two raw ones.
+        videos: One file with both views, or left and right.
+        settings: Where the views are, and the rate if the file's is not to be believed.
+        texts: The calibration file.
+    """
+
+    name: str
+    description: str
+    calibration: Rig
+    videos: tuple[VideoFile, ...]
+    settings: SourceSettings
+    texts: tuple[Path, ...]
+
+    @property
+    def truth(self) -> SequenceTruth | None:
+        """None: videos have no place for it."""
+        return None
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """The calibration, then the videos."""
+        return [*self.texts, *(video.path for video in self.videos)]
+
+    def __len__(self) -> int:
+        return self.videos[0].frames
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return self.frames()
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """Decode the pairs from number ``start`` on.
+
+        Raises:
+            SourceError: The times of the two files run apart.
+            FormatError: A frame cannot be decoded, or times stand still or run backwards.
+        """
+        last_s = -np.inf
+        for index, (stamp_s, left, right) in enumerate(self._views(start), start=start):
+            for view in (left, right):
+                check_size(view, self.calibration, self.videos[0].path)
+            time_s = index / self.settings.rate_hz if self.settings.rate_hz else stamp_s
+            if time_s <= last_s:
+                raise FormatError(
+                    "times of the video stand still or run backwards",
+                    where=f"{self.videos[0].path}, frame {index}",
+                    hint="give the rate with --set source.rate_hz=",
+                )
+            last_s = time_s
+            yield StereoPair(left, right, time_s, index, f"frame {index}")
+
+    def _views(self, start: int) -> Iterator[tuple[float, UInt8, UInt8]]:
+        if len(self.videos) == 1:
+            for stamp_s, image in self.videos[0].read(start):
+                yield stamp_s, *split_views(image, self.settings)
+            return
+        pairs = zip(*(video.read(start) for video in self.videos), strict=True)
+        apart_s: float | None = None
+        for index, ((left_s, left), (right_s, right)) in enumerate(pairs, start=start):
+            # Two containers may begin at different times; what counts is that both go on alike.
+            apart_s = right_s - left_s if apart_s is None else apart_s
+            self._check_pace(index, right_s - left_s - apart_s)
+            yield left_s, left, right
+
+    def _check_pace(self, index: int, drift_s: float) -> None:
+        period_s = 1 / self.videos[0].rate_hz
+        if abs(drift_s) > period_s / 2 and self.settings.rate_hz is None:
+            raise SourceError(
+                "left and right video run apart",
+                where=f"{self.videos[1].path}, frame {index}",
+                got=f"{drift_s:+.4g} s since the start",
+                expected=f"less than half a frame, {period_s / 2:.4g} s",
+                hint="frames were dropped; or give the rate with --set source.rate_hz=",
+            )
+
+
+def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
+    """Open a file with both views, a left file (``settings.right`` names the other), or a folder.
+
+    Raises:
+        SourceError: A file is missing, the two differ in number, rate or size of frames, or the
+            calibration is missing.
+        FormatError: A file is no video, or damaged.
+        CalibrationError: The calibration cannot give depth.
+    """
+    videos = tuple(open_video(file) for file in _find_videos(path, settings))
+    if len(videos) == 2:
+        _check_alike(*videos)
+    size = view_size(videos[0], settings) if len(videos) == 1 else _size(videos[0])
+    home = path if path.is_dir() else path.resolve().parent
+    rig, texts = read_rig(settings, home, size)
+    rate_hz = settings.rate_hz or videos[0].rate_hz
+    layout = f"{settings.side_by_side} in one video" if len(videos) == 1 else "two videos"
+    return VideoSource(
+        name=path.resolve().name,
+        description=f"{layout}, {rate_hz:g} Hz, paired frame by frame",
+        calibration=rig,
+        videos=videos,
+        settings=settings,
+        texts=texts,
+    )
+
+
+def list_videos(folder: Path) -> list[str]:
+    """Names of the video files in a folder."""
+    return sorted(
+        path.name for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file()
+    )
+
+
+def view_size(video: VideoFile, settings: SourceSettings) -> tuple[int, int]:
+    """Width and height of one of the two views in a video.
+
+    Raises:
+        SourceError: The frame cannot be halved.
+    """
+    stacked = settings.side_by_side in _STACKED
+    whole = video.height_px if stacked else video.width_px
+    if whole % 2:
+        raise SourceError(
+            "frames of the video cannot be halved",
+            where=video.path,
+            got=f"{video.width_px}x{video.height_px}",
+            hint="two videos are given as: recon map LEFT --right RIGHT",
+        )
+    width_px, height_px = _size(video)
+    return (width_px, height_px // 2) if stacked else (width_px // 2, height_px)
+
+
+def split_views(image: UInt8, settings: SourceSettings) -> tuple[UInt8, UInt8]:
+    """Left and right view of a frame that holds both."""
+    axis = 0 if settings.side_by_side in _STACKED else 1
+    first, second = (np.ascontiguousarray(view) for view in np.split(image, 2, axis=axis))
+    swapped = settings.side_by_side in {"right-left", "bottom-top"}
+    return (second, first) if swapped else (first, second)
+
+
+def _size(video: VideoFile) -> tuple[int, int]:
+    return video.width_px, video.height_px
+
+
+def _find_videos(path: Path, settings: SourceSettings) -> list[Path]:
+    if path.is_file():
+        return [path] if settings.right is None else [path, Path(settings.right)]
+    if not path.is_dir():
+        raise SourceError("file does not exist", where=path)
+    if settings.left and settings.right:
+        return [path / settings.left, path / settings.right]
+    names = list_videos(path)
+    pairs = find_partners(names)
+    if pairs:
+        return [path / name for name in pairs[0]]
+    if len(names) != 1:
+        raise SourceError(
+            "folder has neither one video nor a left and a right one",
+            where=path,
+            got=", ".join(names) or "no video",
+            hint="name them with --left and --right",
+        )
+    return [path / names[0]]
+
+
+def _check_alike(left: VideoFile, right: VideoFile) -> None:
+    for what, ours, theirs in (
+        ("numbers of frames", left.frames, right.frames),
+        ("sizes", "{}x{}".format(*_size(left)), "{}x{}".format(*_size(right))),
+        ("frame rates", round(left.rate_hz, 2), round(right.rate_hz, 2)),
+    ):
+        if ours != theirs:
+            raise SourceError(
+                f"left and right video have different {what}",
+                where=right.path,
+                got=f"left {ours}, right {theirs}",
+                hint="cut both to the frames that were taken together",
+            )

@@ -1,0 +1,128 @@
+"""Bags as recorders write them, of a drive or spoiled in some way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+
+from recon.structures import RectifiedCamera, StereoPair
+from tests.sources.drives import EPOCH_S, projections
+
+TOPICS = ("/stereo/left/image_rect", "/stereo/right/image_rect")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """How a bag is written.
+
+    ``kind`` is ros1, ros2 or mcap; ``compressed`` writes PNG messages; ``info`` writes CameraInfo.
+    """
+
+    kind: str
+    topics: tuple[str, str] = TOPICS
+    compressed: bool = False
+    info: bool = True
+    stamped: bool = True
+    encoding: str = "mono8"
+
+    @property
+    def name(self) -> str:
+        return {"ros1": "drive.bag", "ros2": "drive", "mcap": "drive"}[self.kind]
+
+
+class Recorder:
+    """Writes messages of one bag."""
+
+    def __init__(self, writer: Any, how: Recording) -> None:
+        self.writer, self.how = writer, how
+        self.ros1 = how.kind == "ros1"
+        self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
+        self.connections: dict[str, Any] = {}
+
+    def write(self, topic: str, recorded_ns: int, message: Any) -> None:
+        kind = message.__msgtype__
+        if topic not in self.connections:
+            self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
+        pack = self.store.serialize_ros1 if self.ros1 else self.store.serialize_cdr
+        self.writer.write(self.connections[topic], recorded_ns, pack(message, kind))
+
+    def header(self, stamp_ns: int) -> Any:
+        types = self.store.types
+        time = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        extra = {"seq": 0} if self.ros1 else {}
+        return types["std_msgs/msg/Header"](stamp=time, frame_id="cam", **extra)
+
+    def image(self, stamp_ns: int, image: np.ndarray) -> Any:
+        types, header = self.store.types, self.header(stamp_ns if self.how.stamped else 0)
+        if self.how.compressed:
+            data = cv2.imencode(".png", image)[1].ravel()
+            return types["sensor_msgs/msg/CompressedImage"](
+                header=header, format="mono8; png compressed", data=data
+            )
+        height, width = image.shape[:2]
+        padded = np.zeros((height, image[0].size + 3), np.uint8)  # rows end in padding
+        padded[:, :-3] = image.reshape(height, -1)
+        return types["sensor_msgs/msg/Image"](
+            header=header, height=height, width=width, encoding=self.how.encoding,
+            is_bigendian=0, step=padded.shape[1], data=padded.ravel(),
+        )  # fmt: skip
+
+    def camera_info(self, stamp_ns: int, camera: RectifiedCamera, P: np.ndarray) -> Any:
+        types = self.store.types
+        roi = types["sensor_msgs/msg/RegionOfInterest"](
+            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+        )
+        matrices = {
+            "D": np.zeros(5), "K": P[:, :3].ravel().copy(),
+            "R": np.eye(3).ravel(), "P": P.ravel().copy(),
+        }  # fmt: skip
+        named = {k if self.ros1 else k.lower(): v for k, v in matrices.items()}
+        return types["sensor_msgs/msg/CameraInfo"](
+            header=self.header(stamp_ns), height=camera.height_px, width=camera.width_px,
+            distortion_model="plumb_bob", binning_x=0, binning_y=0, roi=roi, **named,
+        )  # fmt: skip
+
+
+@contextmanager
+def recorder(folder: Path, how: Recording) -> Iterator[Recorder]:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / how.name
+    if how.kind == "ros1":
+        opened: Any = Writer1(path)
+    else:
+        plugin = StoragePlugin.MCAP if how.kind == "mcap" else StoragePlugin.SQLITE3
+        opened = Writer2(path, version=9, storage_plugin=plugin)
+    with opened as writer:
+        yield Recorder(writer, how)
+
+
+def write_bag(
+    pairs: list[StereoPair], camera: RectifiedCamera, folder: Path, how: Recording
+) -> Path:
+    """Left and right come apart and out of step: the right one is recorded a frame later."""
+    with recorder(folder, how) as bag:
+        late: list[tuple[int, Any]] = []
+        for pair in pairs:
+            stamp = EPOCH_S * 10**9 + round(pair.timestamp_s * 1e9)
+            for topic, P in zip(how.topics, projections(camera), strict=True):
+                if how.info:
+                    name = topic.removesuffix("/compressed").rsplit("/", 1)[0] + "/camera_info"
+                    bag.write(name, stamp, bag.camera_info(stamp, camera, P))
+            for recorded, message in late:
+                bag.write(how.topics[1], recorded, message)
+            bag.write(how.topics[0], stamp + 1_000_000, bag.image(stamp, pair.left))
+            late = [(stamp + 105_000_000, bag.image(stamp, pair.right))]
+        for recorded, message in late:
+            bag.write(how.topics[1], recorded, message)
+    path = folder / how.name
+    return next(path.glob("*.mcap")) if how.kind == "mcap" else path

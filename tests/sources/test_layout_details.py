@@ -1,0 +1,232 @@
+"""What single layouts add to pairs: raw lenses, true paths, names, encodings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recon.errors import ReconError
+from recon.formats.image import write_image
+from recon.formats.ros_image import pixels_of_ros_image
+from recon.sources import SourceSettings, open_source
+from recon.sources.pairing import find_partners, natural_key, pair_stamps, stamp_of_name
+from recon.structures import RectifiedCamera, StereoCalibration, StereoPair
+from tests.sources import drives
+
+CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)
+
+
+@pytest.fixture(scope="module")
+def pairs() -> list[StereoPair]:
+    rng = np.random.default_rng(3)
+    return [
+        StereoPair(*rng.integers(0, 256, (2, 32, 64), dtype=np.uint8), 0.1 * index, index)
+        for index in range(12)
+    ]
+
+
+def test_an_unrectified_kitti_drive_gets_its_raw_lenses(
+    pairs: list[StereoPair], tmp_path: Path
+) -> None:
+    drive = drives.write_kitti_raw(pairs, CAMERA, tmp_path)
+    calib = tmp_path / "calib_cam_to_cam.txt"
+    text = calib.read_text().replace("S_rect_00: 64 32", "S_rect_00: 60 30")
+    calib.write_text(text.replace("S_00: 1392 512", "S_00: 64 32"))
+    source = open_source(drive)
+    rig = source.calibration
+    assert isinstance(rig, StereoCalibration)
+    assert "not rectified" in source.description
+    assert rig.left.distortion[0] == -0.3
+    # xyz_1 = xyz_0 + T_01: the right camera is half a metre to the right.
+    np.testing.assert_allclose(rig.T_right_left[:3, 3], [-0.5, 0, 0], atol=1e-12)
+    calib.write_text(text)
+    with pytest.raises(ReconError, match=r"got 64x32, expected 60x30 rectified, 1392x512 not"):
+        open_source(drive)
+
+
+def test_the_true_path_of_euroc_is_that_of_the_left_camera(
+    pairs: list[StereoPair], tmp_path: Path
+) -> None:
+    drives.write_euroc(pairs, CAMERA, tmp_path)
+    # The body goes ahead along its x, 2 m/s, measured between the frames; it does not turn.
+    rows = [
+        f"{drives.EPOCH_S * 10**9 + k * 70_000_000 - 10_000_000},{0.14 * k},5,7,0.6,0,0,0.8"
+        for k in range(20)
+    ]
+    truth = tmp_path / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    truth.parent.mkdir()
+    truth.write_text("#timestamp,x,y,z,qw,qx,qy,qz\n" + "\n".join(rows) + "\n")
+    found = open_source(tmp_path).truth
+    assert found is not None
+    assert found.trajectory is not None
+    turn = 2 * np.arctan2(0.8, 0.6)  # the body is turned about its z axis, 106 degrees
+    ahead = 0.2 * np.arange(12)
+    # In axes of the first camera (x right, z ahead), which looks along the body's x.
+    expected = np.stack([ahead * np.sin(turn), 0 * ahead, ahead * np.cos(turn)], axis=1)
+    # Stamps of today have 0.2 µs in a double: 0.4 µm at 2 m/s.
+    np.testing.assert_allclose(found.trajectory.positions_m, expected, atol=2e-6)
+    truth.write_text("\n".join(rows[3:]) + "\n")
+    source = open_source(tmp_path)
+    assert source.truth is None
+    assert "true path for 10 of 12 frames alone: not used" in source.description
+
+
+def test_a_true_path_beside_plain_folders_is_read(pairs: list[StereoPair], tmp_path: Path) -> None:
+    drives.write_folders(pairs, CAMERA, tmp_path)
+    lines = [f"{0.1 * k:.3f} 0 0 {k} 0 0 0 1\n" for k in range(12)]
+    (tmp_path / "groundtruth.txt").write_text("".join(lines))
+    truth = open_source(tmp_path).truth
+    assert truth is not None
+    assert truth.trajectory is not None
+    assert truth.trajectory.path_length_m == pytest.approx(11, abs=1e-9)
+
+
+def test_both_cameras_in_one_folder_are_told_apart_by_name(
+    pairs: list[StereoPair], tmp_path: Path
+) -> None:
+    for number, pair in enumerate(pairs, start=1):
+        write_image(tmp_path / f"left{number:02d}.png", pair.left)
+        write_image(tmp_path / f"right{number:02d}.png", pair.right)
+    drives.write_calib(tmp_path, CAMERA)
+    read = list(open_source(tmp_path))
+    assert len(read) == 12
+    np.testing.assert_array_equal(read[10].right, pairs[10].right)
+
+
+@pytest.mark.real
+def test_the_chessboard_pictures_of_opencv_are_pairs(recon_data: Path) -> None:
+    source = open_source(recon_data / "calibration" / "opencv_chessboard")
+    pairs = list(source)
+    assert [pair.name for pair in pairs[7:10]] == ["left08.jpg", "left09.jpg", "left11.jpg"]
+    assert isinstance(source.calibration, StereoCalibration)
+
+
+def test_folders_of_any_name_and_place_can_be_named(
+    pairs: list[StereoPair], tmp_path: Path
+) -> None:
+    for pair in pairs:
+        write_image(tmp_path / "port" / f"{pair.index}.png", pair.left)
+        write_image(tmp_path / "starboard" / f"{pair.index}.png", pair.right)
+    calib = drives.write_calib(tmp_path / "papers", CAMERA)
+    inside = SourceSettings(left="port", right="starboard", calibration=str(calib))
+    beside = SourceSettings(right=str(tmp_path / "starboard"), calibration=str(calib))
+    for path, settings in ((tmp_path, inside), (tmp_path / "port", beside)):
+        np.testing.assert_array_equal(
+            list(open_source(path, "folders", settings))[11].right, pairs[11].right
+        )
+
+
+@pytest.mark.parametrize(
+    ("layout", "flip", "stack"),
+    [("right-left", True, np.hstack), ("top-bottom", False, np.vstack),
+     ("bottom-top", True, np.vstack)],
+)  # fmt: skip
+def test_views_may_stand_in_any_order_in_one_video(
+    pairs: list[StereoPair], tmp_path: Path, layout: str, flip: bool, stack: object
+) -> None:
+    images = [[p.left, p.right][:: -1 if flip else 1] for p in pairs]
+    drives.write_calib(tmp_path, CAMERA)
+    path = drives.write_video(tmp_path / "both.avi", [stack(both) for both in images])  # type: ignore[operator]
+    read = list(open_source(path, settings=SourceSettings(side_by_side=layout)))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(read[3].left[:, :, 0], pairs[3].left)
+    np.testing.assert_array_equal(read[3].right[:, :, 0], pairs[3].right)
+
+
+@pytest.mark.parametrize(
+    ("stem", "seconds"),
+    [("1305031102.175304", 1305031102.175304), ("1403636579763555584", 1403636579.763555584),
+     ("1600000000123", 1600000000.123), ("1600000000123456", 1600000000.123456),
+     ("0.25", 0.25), ("000012", None), ("left01", None), ("1_5", None)],
+)  # fmt: skip
+def test_names_that_are_stamps_are_told_from_counts(stem: str, seconds: float | None) -> None:
+    assert stamp_of_name(stem) == (seconds if seconds is None else pytest.approx(seconds, abs=1e-6))
+
+
+def test_partners_are_found_among_names_of_many_rigs() -> None:
+    for left, right in (
+        ("/camera/infra1/image_rect_raw", "/camera/infra2/image_rect_raw"),
+        ("/zed/left/image_rect", "/zed/right/image_rect"),
+        ("/left_cam/left/image", "/right_cam/right/image"),
+        ("/cam0/image_raw", "/cam1/image_raw"),
+        ("image_left", "image_right"),
+        ("L", "R"),
+    ):
+        assert find_partners([right, "/other", left]) == [(left, right)]
+    assert find_partners(["/front/image", "/rear/image"]) == []
+
+
+def test_ten_comes_after_nine() -> None:
+    assert sorted(["a10b", "a9b", "a9", "b1"], key=natural_key) == ["a9", "a9b", "a10b", "b1"]
+
+
+@given(
+    st.lists(st.integers(0, 10_000), min_size=1, max_size=30, unique=True),
+    st.lists(st.integers(0, 10_000), min_size=1, max_size=30, unique=True),
+    st.integers(1, 300),
+)
+def test_pairs_by_stamp_are_near_mutual_and_in_order(
+    left: list[int], right: list[int], tolerance: int
+) -> None:
+    ours, theirs = (np.array(sorted(s), dtype=np.float64) for s in (left, right))
+    try:
+        pairs = pair_stamps(ours, theirs, float(tolerance), "here")
+    except ReconError:
+        # Then the two nearest of all are too far apart: they would be each other's nearest.
+        assert np.abs(ours[:, None] - theirs[None]).min() > tolerance
+        return
+    assert list(pairs.left) == sorted(set(pairs.left))
+    assert list(pairs.right) == sorted(set(pairs.right))
+    for i, j in zip(pairs.left, pairs.right, strict=True):
+        gap = abs(ours[i] - theirs[j])
+        assert gap <= tolerance
+        assert gap == np.abs(theirs - ours[i]).min() == np.abs(ours - theirs[j]).min()
+    assert pairs.alone == (len(ours) - len(pairs.left), len(theirs) - len(pairs.right))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "pixel", "expected"),
+    [("rgb8", [10, 20, 30], [10, 20, 30]), ("bgr8", [30, 20, 10], [10, 20, 30]),
+     ("rgba8", [10, 20, 30, 255], [10, 20, 30]), ("bgra8", [30, 20, 10, 9], [10, 20, 30])],
+)  # fmt: skip
+def test_colours_of_a_message_become_rgb(
+    encoding: str, pixel: list[int], expected: list[int]
+) -> None:
+    data = np.tile(np.array(pixel, np.uint8), 6)
+    image = pixels_of_ros_image(data, encoding, (2, 3), 3 * len(pixel))
+    np.testing.assert_array_equal(image, np.broadcast_to(expected, (2, 3, 3)))
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_a_bayer_picture_of_one_colour_gives_that_colour(pattern: str) -> None:
+    colour = {"r": 200, "g": 90, "b": 20}
+    tile = np.array([colour[letter] for letter in pattern], np.uint8).reshape(2, 2)
+    mosaic = np.tile(tile, (4, 4))
+    image = pixels_of_ros_image(mosaic.ravel(), f"bayer_{pattern}8", (8, 8), 8)
+    np.testing.assert_array_equal(image[2:6, 2:6], np.broadcast_to([200, 90, 20], (4, 4, 3)))
+
+
+@pytest.mark.parametrize("big_endian", [False, True])
+def test_sixteen_bits_are_scaled_in_either_order_of_bytes(big_endian: bool) -> None:
+    values = np.array([[0, 257, 65535]], ">u2" if big_endian else "<u2")
+    data = np.frombuffer(values.tobytes(), np.uint8)
+    image = pixels_of_ros_image(data, "mono16", (1, 3), 6, big_endian=big_endian)
+    np.testing.assert_array_equal(image, [[0, 1, 255]])
+
+
+@pytest.mark.parametrize(("encoding", "order"), [("yuv422_yuy2", "yuyv"), ("yuv422", "uyvy")])
+def test_a_grey_yuv_picture_is_grey(encoding: str, order: str) -> None:
+    data = np.array([126 if letter == "y" else 128 for letter in order * 4], np.uint8)
+    image = pixels_of_ros_image(data, encoding, (2, 4), 8)
+    # Video levels: 16 is black, 235 white.
+    np.testing.assert_allclose(image, 255 * (126 - 16) / 219, atol=1)
+
+
+def test_a_message_with_too_few_bytes_is_refused() -> None:
+    with pytest.raises(ReconError, match=r"too few bytes \(got 9 bytes, 6 per row, expected 4x2"):
+        pixels_of_ros_image(np.zeros(9, np.uint8), "mono8", (2, 4), 6)
+    # The last row needs no padding.
+    assert pixels_of_ros_image(np.zeros(10, np.uint8), "mono8", (2, 4), 6).shape == (2, 4)

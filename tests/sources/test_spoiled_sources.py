@@ -1,0 +1,230 @@
+"""What is wrong with an input is told in one line, before a run begins where that is possible."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.errors import ReconError
+from recon.formats.image import write_image
+from recon.formats.video import VideoFile
+from recon.sources import SourceSettings, open_source
+from recon.sources.video import view_size
+from recon.structures import RectifiedCamera, StereoPair
+from tests.sources import drives
+
+pytest.importorskip("rosbags", reason="extra ros")
+from tests.sources.bags import TOPICS, Recording, recorder, write_bag
+
+Drive = tuple[list[StereoPair], RectifiedCamera]
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    """Noise: nothing here looks at what the pictures show."""
+    rng = np.random.default_rng(0)
+    camera = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)
+    pairs = [
+        StereoPair(*rng.integers(0, 256, (2, 32, 64), dtype=np.uint8), 0.1 * index, index)
+        for index in range(12)
+    ]
+    return pairs, camera
+
+
+def fails(path: Path, message: str, settings: SourceSettings | None = None) -> None:
+    with pytest.raises(ReconError, match=message) as caught:
+        list(open_source(path, settings=settings))
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value) or path.name in str(caught.value)
+
+
+def halve(path: Path, share: float = 0.5) -> Path:
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+    return path
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros2", "mcap"])
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.9])
+def test_a_cut_off_recording_is_one_line(
+    drive: Drive, tmp_path: Path, kind: str, share: float
+) -> None:
+    path = write_bag(*drive, tmp_path, Recording(kind))
+    halve(next(path.glob("*.db3")) if kind == "ros2" else path, share)
+    fails(path, "recording cannot be read.*reindex")
+
+
+def test_a_recording_cut_off_before_its_index_was_written_is_one_line(
+    drive: Drive, tmp_path: Path
+) -> None:
+    # A recorder that was killed leaves the place of the index at 0.
+    path = write_bag(*drive, tmp_path, Recording("ros1"))
+    content = path.read_bytes()
+    at = content.index(b"index_pos=") + len(b"index_pos=")
+    path.write_bytes(content[:at] + bytes(8) + content[at + 8 :])
+    fails(path, "recording cannot be read.*not indexed.*rosbag reindex")
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros2", "mcap"])
+def test_stamps_out_of_order_are_told_with_topic_and_place(
+    drive: Drive, tmp_path: Path, kind: str
+) -> None:
+    pairs, _ = drive
+    mixed = [*pairs[:5], pairs[6], pairs[5], *pairs[7:]]
+    with recorder(tmp_path, Recording(kind)) as bag:
+        for number, pair in enumerate(mixed):
+            stamp = round(pair.timestamp_s * 1e9) + 10**18
+            bag.write(TOPICS[0], number * 10**8, bag.image(stamp, pair.left))
+            bag.write(TOPICS[1], number * 10**8, bag.image(stamp, pair.right))
+    path = next(p for p in tmp_path.rglob("*") if p.suffix in {".bag", ".mcap", ".db3"})
+    fails(path, r"image_rect, picture 6: time stamps are out of order")
+
+
+def test_a_missing_topic_is_told_with_those_that_are_there(drive: Drive, tmp_path: Path) -> None:
+    path = write_bag(*drive, tmp_path, Recording("ros1"))
+    settings = SourceSettings(left="/front/image", right=TOPICS[1])
+    fails(path, r"no such image topic \(got /front/image, expected .*image_rect \(12\)", settings)
+
+
+def test_topics_that_look_like_no_pair_are_listed(drive: Drive, tmp_path: Path) -> None:
+    path = write_bag(*drive, tmp_path, Recording("mcap", topics=("/front/image", "/rear/image")))
+    fails(path, r"no image topics of a left and a right camera.*/front/image \(12\), /rear/image")
+    settings = SourceSettings(left="/front/image", right="/rear/image")
+    assert len(open_source(path, settings=settings)) == 12
+
+
+def test_a_recording_without_calibration_asks_for_a_file(drive: Drive, tmp_path: Path) -> None:
+    path = write_bag(*drive, tmp_path, Recording("ros2", info=False))
+    fails(path, "no calibration of both cameras.*--calib")
+    calib = drives.write_calib(tmp_path / "calibration", drive[1])
+    source = open_source(path, settings=SourceSettings(calibration=str(calib)))
+    assert len(list(source)) == 12
+
+
+def test_other_encodings_are_told(drive: Drive, tmp_path: Path) -> None:
+    path = write_bag(*drive, tmp_path, Recording("ros1", encoding="32FC1"))
+    fails(path, "message 0: image encoding is not understood.*got 32FC1")
+
+
+def test_of_several_pairs_of_topics_the_rectified_one_is_taken_and_the_other_named(
+    drive: Drive, tmp_path: Path
+) -> None:
+    pairs, camera = drive
+    raw = ("/stereo/left/image_raw", "/stereo/right/image_raw")
+    with recorder(tmp_path, Recording("ros1")) as bag:
+        for pair in pairs:
+            stamp = round(pair.timestamp_s * 1e9) + 10**18
+            for topics in (raw, TOPICS):
+                for topic, P in zip(topics, drives.projections(camera), strict=True):
+                    bag.write(topic, stamp, bag.image(stamp, pair.left))
+                    place = topic.rsplit("/", 1)[0]
+                    bag.write(f"{place}/camera_info", stamp, bag.camera_info(stamp, camera, P))
+    description = open_source(tmp_path / "drive.bag").description
+    assert f"{TOPICS[0]} and {TOPICS[1]}" in description
+    assert f"also there: {raw[0]}" in description
+
+
+def test_headers_without_stamps_fall_back_to_the_times_of_recording(
+    drive: Drive, tmp_path: Path
+) -> None:
+    path = write_bag(*drive, tmp_path, Recording("ros1", stamped=False))
+    # The right pictures are recorded 104 ms late here: nothing pairs within 10 ms ...
+    source = open_source(path, settings=SourceSettings(tolerance_s=0.11))
+    # ... and where the recording alone tells the times, that is said.
+    assert "times of recording" in source.description
+
+
+def spoil_video(write: drives.Writer, victim: str, share: float) -> Callable[[Drive, Path], Path]:
+    def spoil(drive: Drive, folder: Path) -> Path:
+        path = write(*drive, folder)
+        halve(path / victim if path.is_dir() else path, share)
+        return path
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (spoil_video(drives.write_lossy_videos, "left.mp4", 0.5), "not a video that can be read"),
+        (spoil_video(drives.write_two_videos, "right.avi", 0.5), "video is truncated"),
+        (spoil_video(drives.write_side_by_side, "", 0.0), "not a video that can be read"),
+        (spoil_video(drives.write_two_videos, "left.avi", 0.01), "video"),
+    ],
+)
+def test_a_video_that_cannot_be_read_is_one_line(
+    drive: Drive, tmp_path: Path, spoil: Callable[[Drive, Path], Path], message: str
+) -> None:
+    fails(spoil(drive, tmp_path), message)
+
+
+def test_videos_of_different_length_are_refused(drive: Drive, tmp_path: Path) -> None:
+    pairs, camera = drive
+    drives.write_two_videos(pairs, camera, tmp_path)
+    drives.write_video(tmp_path / "right.avi", [pair.right for pair in pairs[:-2]])
+    fails(tmp_path, r"different numbers of frames \(got left 12, right 10\)")
+
+
+def test_numbers_of_pictures_that_differ_are_refused(drive: Drive, tmp_path: Path) -> None:
+    drives.write_folders(*drive, tmp_path)
+    (tmp_path / "right" / "right3.png").unlink()
+    fails(tmp_path, r"numbers of left and right pictures differ \(got 12 left and 11 right")
+
+
+def test_stamps_that_never_meet_tell_how_far_they_are_apart(drive: Drive, tmp_path: Path) -> None:
+    pairs, camera = drive
+    drives.write_stamped(pairs[:1], camera, tmp_path)
+    settings = SourceSettings(tolerance_s=0.001)
+    fails(tmp_path, r"no left and right picture were taken at one time.*0\.002 s apart", settings)
+
+
+def test_a_video_that_cannot_be_halved_is_told() -> None:
+    video = VideoFile(Path("both.avi"), frames=3, width_px=127, height_px=32, rate_hz=10.0)
+    with pytest.raises(ReconError, match=r"both.avi: .*cannot be halved \(got 127x32\)"):
+        view_size(video, SourceSettings())
+    assert view_size(video, SourceSettings(side_by_side="top-bottom")) == (127, 16)
+
+
+def test_a_calibration_of_another_size_is_told(drive: Drive, tmp_path: Path) -> None:
+    drives.write_euroc(*drive, tmp_path)
+    for path in tmp_path.rglob("*.png"):
+        write_image(path, np.zeros((16, 32), np.uint8))
+    with pytest.raises(ReconError, match=r"another size.*got 32x16, expected 64x32"):
+        list(open_source(tmp_path))
+
+
+def test_a_listed_picture_that_is_missing_is_named(drive: Drive, tmp_path: Path) -> None:
+    drives.write_tum(*drive, tmp_path)
+    victim = sorted((tmp_path / "right").iterdir())[4]
+    victim.unlink()
+    with pytest.raises(ReconError, match=rf"{victim.name}: picture is missing"):
+        open_source(tmp_path)
+
+
+def test_no_calibration_is_told_with_the_option(drive: Drive, tmp_path: Path) -> None:
+    drives.write_folders(*drive, tmp_path)
+    (tmp_path / "calib.txt").unlink()
+    fails(tmp_path, r"calibration is missing.*--calib FILE")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ros1", "mcap", "video"])
+def test_the_command_line_tells_it_in_one_line_and_leaves_nothing(
+    drive: Drive, tmp_path: Path, kind: str
+) -> None:
+    if kind == "video":
+        path = drives.write_lossy_videos(*drive, tmp_path / "in")
+        halve(path / "left.mp4")
+    else:
+        path = halve(write_bag(*drive, tmp_path / "in", Recording(kind)))
+    command = [sys.executable, "-m", "recon", "map", str(path), "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
