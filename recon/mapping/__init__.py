@@ -1,8 +1,9 @@
 """From posed clouds to a fused cloud, 3-D occupancy and a flat grid."""
 
 from recon.mapping.axes import AxesSettings, GroundPlane, estimate_ground, map_axes
+from recon.mapping.floor import add_floor
 from recon.mapping.fused import FusionSettings, MapBuilder, fusion_range_m
-from recon.mapping.grid import GridSettings, flatten
+from recon.mapping.grid import GridSettings, drop_undecided, flatten
 from recon.mapping.ground import GroundSettings, GroundSurface, estimate_ground_surface
 from recon.mapping.occupancy import OccupancyBuilder, OccupancySettings
 from recon.mapping.submaps import Submap, SubmapBuilder, SubmapMotion, SubmapSettings
@@ -21,6 +22,8 @@ __all__ = [
     "SubmapBuilder",
     "SubmapMotion",
     "SubmapSettings",
+    "add_floor",
+    "drop_undecided",
     "estimate_ground",
     "estimate_ground_surface",
     "flatten",

@@ -27,14 +27,14 @@ class GridSettings(Settings):
         2.0, gt=0.0, le=100.0, description="Upper end of the band: what is higher is passed under."
     )
     free_height_m: float = Field(
-        1.0,
+        0.8,
         gt=0.0,
         le=100.0,
         description="Free voxels below this height make a cell free; higher ones may be seen "
         "over an obstacle that hides what is behind it.",
     )
     occupied_probability: float = Field(
-        0.65, ge=0.5, lt=1.0, description="Voxels at least this probable are obstacles."
+        0.55, ge=0.5, lt=1.0, description="Voxels at least this probable are obstacles."
     )
     free_probability: float = Field(
         0.35, gt=0.0, le=0.5, description="Voxels at most this probable are free."
@@ -51,8 +51,9 @@ def flatten(
     """Flatten an occupancy map.
 
     A cell is occupied where an occupied voxel lies in the height band above the ground of that
-    place. It is free where nothing is occupied and either the ground itself was seen or a free
-    voxel low enough. Everything else, and every cell without a known ground, is unknown.
+    place. It is free where nothing is occupied and a free voxel lies low enough. That the ground
+    was seen is no proof: it is also seen below a parked car. Everything else, and every cell
+    without a known ground, is unknown.
 
     Args:
         voxels: The observed voxels, map axes.
@@ -85,14 +86,25 @@ def flatten(
     full = voxels.log_odds >= _log_odds(s.occupied_probability)
     empty = voxels.log_odds <= _log_odds(s.free_probability)
     in_band = (height >= s.min_height_m) & (height <= s.max_height_m)
-    on_ground = np.abs(height) < s.min_height_m
     blocked = any_in(full & in_band, s.min_voxels)
-    seen = any_in(full & on_ground) | any_in(empty & (height >= 0) & (height <= s.free_height_m))
+    seen = any_in(empty & (height >= 0) & (height <= s.free_height_m))
     blocked = _without_small_blobs(blocked.reshape(rows, columns), s.min_blob_cells)
     cells = np.where(seen.reshape(rows, columns), np.int8(FREE), np.int8(UNKNOWN))
     cells[blocked] = OCCUPIED
     origin = (float(low[0]) * voxels.resolution_m, float(low[1]) * voxels.resolution_m)
     return OccupancyGrid(cells.astype(np.int8), voxels.resolution_m, origin)
+
+
+def drop_undecided(voxels: OccupancyVoxels, settings: GridSettings) -> OccupancyVoxels:
+    """The voxels that are occupied or free by the settings; the others count as unknown.
+
+    Programs that read an OctoMap call everything above 0.5 occupied, and the rest free: a voxel
+    that a single uncertain ray touched would be either.
+    """
+    full = voxels.log_odds >= _log_odds(settings.occupied_probability)
+    empty = voxels.log_odds <= _log_odds(settings.free_probability)
+    known = full | empty
+    return OccupancyVoxels(voxels.keys[known], voxels.log_odds[known], voxels.resolution_m)
 
 
 def _floor(

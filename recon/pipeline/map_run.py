@@ -19,7 +19,7 @@ from recon.formats.ply import write_ply
 from recon.formats.trajectory import write_kitti_poses, write_tum
 from recon.geometry.se3 import apply
 from recon.geometry.transform import transform_cloud
-from recon.mapping import estimate_ground_surface, flatten
+from recon.mapping import add_floor, drop_undecided, estimate_ground_surface, flatten
 from recon.meshing import reconstruct_mesh
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.machine import use_threads
@@ -161,7 +161,8 @@ def _finish(
     _tell(options.observers, "grid")
     with watch.stage("grid"):
         path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
-        ground = estimate_ground_surface(cloud, path_m, config.ground)
+        floor = add_floor(cloud, mapped.voxels, config.ground)
+        ground = estimate_ground_surface(floor, path_m, config.ground)
         grid = flatten(mapped.voxels, ground, config.grid)
     mesh = None
     if options.mesh:
@@ -252,7 +253,7 @@ def _write(run: MapRun, directory: RunDirectory) -> None:
     write_tum(path("trajectory_tum.txt"), run.mapped.trajectory)
     write_ply(path("map/cloud.ply"), run.cloud)
     write_nav2(path("map/grid"), run.grid)
-    write_octomap(path("map/octomap"), run.mapped.voxels)
+    write_octomap(path("map/octomap"), drop_undecided(run.mapped.voxels, run.config.grid))
     if run.mesh is not None:
         write_mesh(path("mesh/mesh.ply"), run.mesh)
         layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("map/cloud.ply")}

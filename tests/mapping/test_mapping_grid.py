@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.errors import MappingError
-from recon.mapping.grid import GridSettings, flatten
+from recon.mapping.grid import GridSettings, drop_undecided, flatten
 from recon.mapping.ground import GroundSurface
 from recon.structures import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
 
@@ -31,6 +31,12 @@ def _box(low: tuple[float, ...], high: tuple[float, ...]) -> np.ndarray:
     return np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
+def _road(low: tuple[float, float], high: tuple[float, float]) -> tuple[tuple, tuple]:
+    """Ground at -1.6 m that was seen, and the free space that it was seen through."""
+    ground, air = (_box((*low, z), (*high, z + 0.2)) for z in (-1.6, -1.2))
+    return (ground, 2.0), (air, -1.0)
+
+
 def _cell(grid: OccupancyGrid, x: float, y: float) -> int:
     column = int((x - grid.origin_m[0]) / grid.resolution_m)
     row = int((y - grid.origin_m[1]) / grid.resolution_m)
@@ -46,7 +52,7 @@ def _slanted_scene() -> OccupancyVoxels:
     columns = _box((0, -4, 0), (20, 4, 0.2))
     columns[:, 2] = np.floor((SLOPE * (columns[:, 0] + 0.5) * 0.2 - 1.6) / 0.2)
     box = _box((15, 2, -0.1), (16, 3, 0.9))
-    return _voxels((columns, 2.0), (box, 2.0))
+    return _voxels((columns, 2.0), (columns + np.array([0, 0, 2]), -1.0), (box, 2.0))
 
 
 def test_a_box_on_slanted_ground_is_occupied_and_the_ground_is_not() -> None:
@@ -63,8 +69,9 @@ def test_a_level_band_would_call_the_slope_an_obstacle() -> None:
 
 def test_the_grid_is_the_right_way_round() -> None:
     # One obstacle at x = 3, y = -1: row 0 has the smallest y.
-    seen = _box((0, -2, -1.6), (4, 2, -1.4))
-    grid = _flatten(_voxels((seen, 2.0), (_box((3, -1, -1), (3.6, -0.4, 0)), 2.0)), _ground())
+    grid = _flatten(
+        _voxels(*_road((0, -2), (4, 2)), (_box((3, -1, -1), (3.6, -0.4, 0)), 2.0)), _ground()
+    )
     assert grid.origin_m == pytest.approx((0.0, -2.0))
     assert grid.cells.shape == (20, 20)
     rows, columns = np.nonzero(grid.cells == OCCUPIED)
@@ -73,22 +80,43 @@ def test_the_grid_is_the_right_way_round() -> None:
 
 
 def test_what_hangs_above_the_band_can_be_driven_under() -> None:
-    seen = (_box((0, 0, -1.6), (4, 4, -1.4)), 2.0)
+    seen = _road((0, 0), (4, 4))
     bridge = (_box((1, 0, 1.0), (2, 4, 1.4)), 2.0)
-    assert _cell(_flatten(_voxels(seen, bridge), _ground()), 1.5, 2.0) == FREE
-    low = _flatten(_voxels(seen, bridge), _ground(), max_height_m=3.0)
+    assert _cell(_flatten(_voxels(*seen, bridge), _ground()), 1.5, 2.0) == FREE
+    low = _flatten(_voxels(*seen, bridge), _ground(), max_height_m=3.0)
     assert _cell(low, 1.5, 2.0) == OCCUPIED
 
 
 def test_unknown_stays_unknown() -> None:
-    seen = (_box((0, 0, -1.6), (2, 4, -1.4)), 2.0)
+    seen = _road((0, 0), (2, 4))
     above = (_box((2, 0, 0.0), (4, 4, 0.2)), -1.0)
     undecided = (_box((4, 0, -1.0), (5, 4, -0.6)), 0.1)
-    grid = _flatten(_voxels(seen, above, undecided), _ground())
+    grid = _flatten(_voxels(*seen, above, undecided), _ground())
     assert _cell(grid, 1.0, 2.0) == FREE
     # Free only at 1.6 m above ground, as behind a parked car that is looked over.
     assert _cell(grid, 3.0, 2.0) == UNKNOWN
     assert _cell(grid, 4.5, 2.0) == UNKNOWN
+
+
+def test_ground_seen_below_an_unknown_body_is_not_free() -> None:
+    # A parked car whose sides gave no match: the road below it is seen, nothing above it.
+    below = (_box((2, 0, -1.6), (4, 2, -1.4)), 2.0)
+    over = (_box((2, 0, 0.0), (4, 2, 0.4)), -2.0)
+    grid = _flatten(_voxels(*_road((0, 0), (2, 2)), below, over), _ground())
+    assert _cell(grid, 1.0, 1.0) == FREE
+    assert _cell(grid, 3.0, 1.0) == UNKNOWN
+
+
+def test_undecided_voxels_are_dropped() -> None:
+    voxels = OccupancyVoxels(
+        np.arange(15, dtype=np.int32).reshape(5, 3),
+        np.array([2.0, 0.3, 0.1, -0.4, -0.8], np.float32),
+        0.2,
+    )
+    # 0.55 and 0.35 are log-odds of 0.20 and -0.62: one look is not enough for free.
+    kept = drop_undecided(voxels, GridSettings())
+    assert kept.log_odds.tolist() == pytest.approx([2.0, 0.3, -0.8])
+    assert kept.keys[:, 0].tolist() == [0, 3, 12]
 
 
 def test_free_space_near_the_ground_frees() -> None:
@@ -102,10 +130,10 @@ def test_a_place_without_ground_is_unknown_even_when_full() -> None:
 
 
 def test_lone_cells_are_taken_for_noise() -> None:
-    seen = (_box((0, 0, -1.6), (4, 4, -1.4)), 2.0)
+    seen = _road((0, 0), (4, 4))
     speck = (_box((1, 1, -1), (1.2, 1.4, -0.6)), 2.0)
-    assert (_flatten(_voxels(seen, speck), _ground()).cells == FREE).all()
-    kept = _flatten(_voxels(seen, speck), _ground(), min_blob_cells=1)
+    assert (_flatten(_voxels(*seen, speck), _ground()).cells == FREE).all()
+    kept = _flatten(_voxels(*seen, speck), _ground(), min_blob_cells=1)
     assert (kept.cells == OCCUPIED).sum() == 2
 
 

@@ -1,0 +1,85 @@
+"""Ground that only the voxels know: farther out than clouds are fused, and less sharp."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.mapping.ground import GroundSettings
+from recon.structures import OccupancyVoxels, PointCloud
+from recon.structures.arrays import Bool, Float32, Int32
+
+_FULL: Final = math.log(0.6 / 0.4)
+_EMPTY: Final = math.log(0.45 / 0.55)
+_REACH: Final = 2
+"""A floor splits its evidence over two voxels, so the free one may be the second above."""
+
+
+def add_floor(cloud: PointCloud, voxels: OccupancyVoxels, settings: GroundSettings) -> PointCloud:
+    """A cloud to look for ground in: its points, and floors of voxels where it has too few.
+
+    A floor is an occupied voxel with free space right above it, so walls have none.
+
+    Args:
+        cloud: The fused cloud in map axes.
+        voxels: The observed voxels, map axes.
+        settings: Cells of the ground, and what makes a measured one.
+
+    Returns:
+        Points, and normals if the cloud has them (straight up for voxels); frame of the cloud.
+    """
+    floors = ((_floors(voxels) + 0.5) * voxels.resolution_m).astype(np.float32)
+    known = cloud.xyz
+    if cloud.normals is not None:
+        known = known[cloud.normals[:, 2] >= math.cos(math.radians(settings.max_tilt_deg))]
+    floors = floors[_unknown(floors, known, settings)]
+    xyz = np.concatenate([cloud.xyz, floors])
+    if cloud.normals is None:
+        return PointCloud(xyz, frame=cloud.frame)
+    up = np.tile(np.array([0, 0, 1], np.float32), (len(floors), 1))
+    return PointCloud(xyz, normals=np.concatenate([cloud.normals, up]), frame=cloud.frame)
+
+
+def _floors(voxels: OccupancyVoxels) -> Int32:
+    """int32 (N, 3), the occupied voxels that are free above."""
+    if len(voxels) == 0:
+        return voxels.keys
+    packed = _pack(voxels.keys)
+    order = np.argsort(packed)
+    packed, log_odds = packed[order], voxels.log_odds[order]
+    full = np.flatnonzero(log_odds > _FULL)
+    free = np.zeros(len(full), dtype=np.bool_)
+    roofed = np.zeros(len(full), dtype=np.bool_)
+    for up in range(1, _REACH + 1):
+        value = _value_at(packed, log_odds, packed[full] + up)
+        free |= ~roofed & (value < _EMPTY)
+        roofed |= value > _FULL
+    return np.asarray(voxels.keys[order[full[free]]])
+
+
+def _value_at(packed: NDArray[np.int64], log_odds: Float32, wanted: NDArray[np.int64]) -> Float32:
+    """Log-odds of cells among sorted ones; NaN where they were not observed."""
+    place = np.minimum(np.searchsorted(packed, wanted), len(packed) - 1)
+    return np.where(packed[place] == wanted, log_odds[place], np.float32(np.nan))
+
+
+def _unknown(floors: Float32, known: Float32, settings: GroundSettings) -> Bool:
+    """Which floors lie in cells of the ground where fewer than ``min_points`` are known."""
+    cells, counts = np.unique(_columns(known, settings.cell_m), return_counts=True)
+    measured = cells[counts >= settings.min_points]
+    return np.isin(_columns(floors, settings.cell_m), measured, invert=True)
+
+
+def _columns(xyz: Float32, cell_m: float) -> NDArray[np.int64]:
+    """One number for each point's cell of the ground."""
+    cells = np.floor(xyz[:, :2].astype(np.float64) / cell_m).astype(np.int64)
+    return np.asarray((cells[:, 0] << 32) + cells[:, 1])
+
+
+def _pack(keys: NDArray[Any]) -> NDArray[np.int64]:
+    """One number for each voxel, such that the next one up is the next number."""
+    wide = keys.astype(np.int64) + (1 << 20)
+    return np.asarray((wide[:, 0] << 42) | (wide[:, 1] << 21) | wide[:, 2])
