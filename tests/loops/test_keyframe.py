@@ -1,0 +1,63 @@
+"""A keyframe holds features all over the picture, and words that tell places apart."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.loops.detector import likeness
+from recon.loops.keyframe import make_keyframe, words_of
+from recon.loops.settings import CandidateSettings, KeyframeSettings
+from recon.structures import Disparity, Reason, RectifiedPair
+from tests.loops.conftest import LAP
+from tests.loops.test_verify import CAMERA
+
+WORDS = CandidateSettings()
+
+
+def _words(block, frame: int) -> np.ndarray:
+    return words_of(block.keyframe(frame).descriptors, WORDS)
+
+
+def test_the_same_place_is_more_alike_than_any_other(block):
+    here = _words(block, 3)
+
+    again = likeness(here, _words(block, LAP + 3))
+    elsewhere = [likeness(here, _words(block, frame)) for frame in (60, 100)]
+    assert again > 2 * max(elsewhere)
+
+
+def test_likeness_of_a_picture_with_itself_is_one(block):
+    words = _words(block, 3)
+
+    assert likeness(words, words) == 1.0
+    assert likeness(words, np.zeros(0, np.uint32)) == 0.0
+
+
+def test_features_are_spread_and_have_the_disparity_of_their_place(block):
+    keyframe = block.keyframe(3)
+    u, v, d = keyframe.uvd.T
+
+    assert 100 < len(d) <= KeyframeSettings().features
+    columns = np.unique((u // 80).astype(int))
+    assert set(columns) == {0, 1, 2, 3}
+    truth = block.drive.camera.disparity_truth(3).values
+    known = np.isfinite(d)
+    there = truth[np.rint(v[known]).astype(int), np.rint(u[known]).astype(int)]
+    # The median of nine disparities, each off by a quarter of a pixel.
+    assert np.nanmedian(np.abs(there - d[known])) < 0.2
+    assert known.mean() > 0.3
+
+
+def test_a_picture_without_texture_gives_a_keyframe_without_features():
+    grey = np.full((120, 320), 90, np.uint8)
+    unknown = Disparity(
+        np.full(grey.shape, np.nan, np.float32),
+        np.zeros(grey.shape, np.float32),
+        np.full(grey.shape, np.nan, np.float32),
+        np.full(grey.shape, Reason.LOW_TEXTURE, np.uint8),
+    )
+
+    keyframe = make_keyframe(0, RectifiedPair(grey, grey, CAMERA), unknown, KeyframeSettings())
+
+    assert keyframe.uvd.shape == (0, 3)
+    assert words_of(keyframe.descriptors, WORDS).size == 0
