@@ -11,6 +11,7 @@ import typer
 
 from recon import __version__
 from recon.cli import evaluate
+from recon.cli.capture import capture
 from recon.cli.demo import demo
 from recon.cli.doctor import doctor
 from recon.cli.map import map_
@@ -28,6 +29,7 @@ app.command()(demo)
 app.command()(pair)
 app.command("map")(map_)
 app.command()(mesh)
+app.command()(capture)
 app.command()(disparity)
 app.command()(paper)
 app.command()(doctor)

@@ -26,6 +26,7 @@ from recon.odometry import OdometrySettings
 from recon.pipeline.paper_settings import PaperSettings
 from recon.rectification import InspectionSettings, RectificationSettings
 from recon.settings import Settings
+from recon.sources.capture import CaptureSettings
 from recon.sources.settings import SourceSettings
 from recon.synthetic import StreetSettings
 
@@ -37,6 +38,7 @@ class ReconConfig(Settings):
     """All that decides a result. Written beside every result as ``config.yaml``."""
 
     source: SourceSettings = SourceSettings()
+    capture: CaptureSettings = CaptureSettings()
     rectification: RectificationSettings = RectificationSettings()
     inspection: InspectionSettings = InspectionSettings()
     matching: MatchingSettings = MatchingSettings()
@@ -118,6 +120,32 @@ def source_overrides(
     return [
         f"source.{key}={json.dumps(value)}" for key, value in given.items() if value is not None
     ]
+
+
+def capture_overrides(
+    size: str | None,
+    rate_hz: float | None,
+    frames: int | None,
+    seconds: float | None,
+    preview_every: int | None,
+) -> list[str]:
+    """Overrides that say what to record; None = as it is.
+
+    Raises:
+        SettingsError: The size is not like 1280x720.
+    """
+    width, cross, height = (size or "").partition("x")
+    if size is not None and not (cross and width.isdigit() and height.isdigit()):
+        raise SettingsError("cannot read this size", got=size, expected="WIDTHxHEIGHT: 1280x720")
+    given = {
+        "width_px": width or None,
+        "height_px": height or None,
+        "rate_hz": rate_hz,
+        "frames": frames,
+        "seconds": seconds,
+        "preview_every": preview_every,
+    }
+    return [f"capture.{key}={value}" for key, value in given.items() if value is not None]
 
 
 def dump_config(config: ReconConfig) -> str:

@@ -1,0 +1,54 @@
+"""`recon capture`: two cameras in, a folder that `recon map` takes out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import Config, Json, Quiet, Set
+from recon.cli.session import print_figures, print_json, session
+
+
+def capture(
+    left: Annotated[
+        str, typer.Argument(help="Left camera: 0, /dev/video0 or a video; or one with both views.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="New folder for the pictures.")],
+    right: Annotated[str | None, typer.Argument(help="Right camera.")] = None,
+    calib: Annotated[
+        Path | None, typer.Option("--calib", help="Calibration file, copied into the folder.")
+    ] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many pairs.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Stop after so long.")] = None,
+    size: Annotated[str | None, typer.Option(help="Frame size to ask for: 1280x720.")] = None,
+    rate: Annotated[float | None, typer.Option(help="Frames per second to ask for.")] = None,
+    preview: Annotated[
+        int | None, typer.Option(min=1, help="Every n-th pair also replaces preview.jpg.")
+    ] = None,
+    config: Config = None,
+    set_: Set = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Record pairs from two cameras, or one that gives both views side by side.
+
+    Ctrl-C stops; what is recorded is whole at any moment, and `recon map` takes it.
+
+    Examples:
+      recon capture 0 2 --out rides/today --calib stereo.yaml --size 1280x720
+      recon capture /dev/video4 --seconds 60 --out rides/today --set capture.suffix=jpg
+    """
+    del quiet  # there is no progress to hide; every command takes the option
+    with session():
+        from recon.cli.interrupt import until_interrupted
+        from recon.pipeline.capture_run import run_capture
+        from recon.pipeline.config import capture_overrides, load_config
+
+        asked = capture_overrides(size, rate, frames, seconds, preview)
+        settings = load_config(config, [*(set_ or ()), *asked]).capture
+        devices = [left] if right is None else [left, right]
+        with until_interrupted() as stopped:
+            summary = run_capture(devices, out, settings, calibration=calib, stopped=stopped)
+    print_json(summary) if json else print_figures("", summary)
