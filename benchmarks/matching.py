@@ -2,7 +2,7 @@
 
 Every round runs all matchers in turn, so that a busy machine is busy for all of them; the
 figures are medians over the rounds. The checks are switched on everywhere: texture, uniqueness,
-left-right and speckles.
+left-right and speckles. The peak memory of a large pair is that of a process of its own.
 
 Example: python benchmarks/matching.py --json --threads 1
 """
@@ -12,6 +12,8 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -23,11 +25,14 @@ import numpy as np
 from recon.formats.middlebury import stand_in_camera
 from recon.matching import SadMatcher, SadSettings
 from recon.matching.sgm import SgmMatcher, SgmSettings
+from recon.pipeline.machine import peak_memory_mb
 from recon.structures import RectifiedPair
 from recon.structures.arrays import UInt8
 
 SIZES = ((480, 640, 64), (375, 1242, 128), (994, 1482, 144))
 GROWTH = ((188, 621, 64), (375, 1242, 64), (375, 1242, 128), (375, 1242, 256), (750, 2484, 128))
+LARGE = (2000, 3000, 300)
+LARGE_RUNS = ("none", "sad", "sgm")
 WINDOW_PX = 11
 RATIOS = (
     ("sad", "opencv-bm"),
@@ -41,6 +46,9 @@ Run = Callable[[], object]
 def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(arguments)
     cv2.setNumThreads(options.threads)
+    if options.peak:
+        print(peak_mb(options.peak, options.threads))
+        return
     sizes = [tuple(map(int, size.split("x"))) for size in options.size] or SIZES
     result = {
         "opencv": cv2.__version__,
@@ -48,6 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "rounds": options.rounds,
         "sizes": [compare(*size, options.threads, options.rounds) for size in sizes],
         "growth": [] if options.size else growth(options.threads, options.rounds),
+        "memory": [] if options.size else [memory(name, options.threads) for name in LARGE_RUNS],
     }
     print(json.dumps(result, indent=2) if options.json else table(result))
 
@@ -60,6 +69,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--size", action="append", default=[], metavar="HxWxD", help="only this size; repeatable"
     )
+    parser.add_argument("--peak", choices=LARGE_RUNS, help="only print the peak memory, MB")
     return parser.parse_args(arguments)
 
 
@@ -80,6 +90,22 @@ def growth(threads: int, rounds: int) -> list[dict[str, Any]]:
         ns = {name: round(1e6 * value / volume, 3) for name, value in ms.items()}
         rows.append({"height": height, "width": width, "ndisp": ndisp, "ns_per_candidate": ns})
     return rows
+
+
+def memory(name: str, threads: int) -> dict[str, Any]:
+    """Peak memory of a process that matches one large pair; "none" only makes the pair."""
+    command = [sys.executable, __file__, "--peak", name, "--threads", str(threads)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    height, width, ndisp = LARGE
+    size = {"height": height, "width": width, "ndisp": ndisp}
+    return {"matcher": name, **size, "peak_mb": float(done.stdout)}
+
+
+def peak_mb(name: str, threads: int) -> float:
+    pair = make_pair(*LARGE)
+    if name != "none":
+        ours(pair, threads)[name]()
+    return round(peak_memory_mb(), 1)
 
 
 def make_pair(height: int, width: int, ndisp: int) -> RectifiedPair:
@@ -150,6 +176,9 @@ def table(result: dict[str, Any]) -> str:
         lines.append(
             f"  {size:15s}" + "".join(f" {k} {v}" for k, v in row["ns_per_candidate"].items())
         )
+    if result["memory"]:
+        lines.append(f"\npeak memory at {'x'.join(map(str, LARGE))}, MB")
+        lines += [f"  {row['matcher']:18s}{row['peak_mb']:9.0f}" for row in result["memory"]]
     return "\n".join(lines)
 
 

@@ -17,7 +17,7 @@ from recon.reports.html import Block, FigureBlock, ReportContent, Section, Table
 from recon.reports.middlebury_tables import report_tables
 from recon.structures.arrays import UInt8
 
-_WIDTH_PX: Final = 400
+_WIDTH_PX: Final = 300
 """Pictures in the report are at most as wide."""
 
 _GAP_PX: Final = 6
