@@ -22,7 +22,7 @@ _POLICY: Final = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
     "script-src 'unsafe-inline' 'unsafe-eval'"
 )
-_WEBP_QUALITY: Final = 85
+_WEBP_QUALITY: Final = 80
 # plotly.js travels compressed: a third of its size, and no address in it is ever text here.
 _DRAW_SCENES: Final = """
 const views = document.querySelectorAll(".view");
