@@ -1,0 +1,230 @@
+"""Calibration boards seen through lenses with known distortion: exact truth for calibration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+from recon.adapters.opencv_boards import dark_rectangles
+from recon.adapters.opencv_lens import project, unproject
+from recon.errors import CalibrationError
+from recon.geometry.se3 import apply, exp_so3, make_transform
+from recon.structures import CameraIntrinsics, LensModel, StereoCalibration
+from recon.structures.arrays import Float64, UInt8
+from recon.structures.board import CalibrationBoard
+
+Lens = Literal["radtan", "rational", "fisheye"]
+
+_TEXELS: Final = 48  # per square: corners fall on borders between them
+_WHITE, _DARK, _WALL = 225.0, 28.0, 120.0
+_MARGIN_PX: Final = 6.0
+_MAX_TILT_RAD: Final = math.radians(50)
+_LENSES: Final[dict[Lens, tuple[LensModel, float, tuple[float, ...]]]] = {
+    "radtan": ("pinhole", 0.8, (-0.28, 0.09, 8e-4, -6e-4)),
+    "rational": ("pinhole", 0.7, (0.12, -0.04, 4e-4, -3e-4, 0.002, 0.42, 0.05, 0.004)),
+    "fisheye": ("fisheye", 0.38, (0.03, -0.012, 0.004, -6e-4)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """One position of the board.
+
+    Attributes:
+        T_left_board: float64 (4, 4).
+        left_px: float64 (N, 2), true pixels of the board's corners in the left picture.
+        right_px: The same in the right picture.
+    """
+
+    T_left_board: Float64
+    left_px: Float64
+    right_px: Float64
+
+    def noisy(self, sigma_px: float, rng: np.random.Generator) -> BoardView:
+        """The view with Gaussian noise on every pixel coordinate."""
+        left, right = (p + rng.normal(0, sigma_px, p.shape) for p in (self.left_px, self.right_px))
+        return BoardView(self.T_left_board, left, right)
+
+
+def board_rig(
+    lens: Lens = "radtan", width_px: int = 640, height_px: int = 480, baseline_m: float = 0.12
+) -> StereoCalibration:
+    """A rig of two cameras that are not quite alike and not quite parallel."""
+    model, focal, coefficients = _LENSES[lens]
+    distortion = np.array(coefficients)
+
+    def camera(scale: float, cx: float, cy: float, bend: float) -> CameraIntrinsics:
+        f = scale * focal * width_px
+        matrix = np.array([[f, 0, cx * width_px], [0, 1.002 * f, cy * height_px], [0, 0, 1]])
+        return CameraIntrinsics(matrix, bend * distortion, width_px, height_px, model)
+
+    T = make_transform(
+        exp_so3(np.array([0.008, -0.02, 0.012])), baseline_m * np.array([-1.0, 0.02, 0.015])
+    )
+    return StereoCalibration(camera(1.0, 0.507, 0.489, 1.0), camera(1.006, 0.494, 0.508, 0.95), T)
+
+
+def place_boards(
+    rig: StereoCalibration, board: CalibrationBoard, count: int, seed: int = 0
+) -> list[BoardView]:
+    """Positions of a board that fill both pictures, at many tilts and distances.
+
+    Args:
+        rig: The true rig.
+        board: The board.
+        count: How many.
+        seed: Another seed, other positions.
+
+    Raises:
+        CalibrationError: The board does not fit into both pictures.
+    """
+    rng = np.random.default_rng(seed)
+    views: list[BoardView] = []
+    for _ in range(400 * count):
+        view = _try_place(rig, board, rng)
+        if view is not None:
+            views.append(view)
+        if len(views) == count:
+            return views
+    raise CalibrationError("board does not fit into both pictures", got=str(board))
+
+
+class BoardRenderer:
+    """Pictures of a board as one camera sees it.
+
+    Args:
+        camera: The raw camera.
+        board: The board, printed on white paper with a margin of one square.
+        samples: Samples along each side of a pixel, averaged.
+    """
+
+    def __init__(self, camera: CameraIntrinsics, board: CalibrationBoard, samples: int = 4) -> None:
+        self._camera, self._board, self._samples = camera, board, samples
+        v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px]
+        pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+        rays = unproject(camera, pixels)[:, :2]
+        self._rays = rays.reshape(camera.height_px, camera.width_px, 2)
+        # Rays are smooth: within a pixel they are straight lines to far below what can be seen.
+        self._by_v, self._by_u = np.gradient(self._rays, axis=(0, 1))
+        self._texture = _texture(board)
+
+    def render(self, T_camera_board: Float64, sigma_grey: float = 0.0, seed: int = 0) -> UInt8:
+        """uint8 (H, W), the board at a place before a grey wall, with noise of that size."""
+        offsets = (np.arange(self._samples) + 0.5) / self._samples - 0.5
+        grey = np.full(self._rays.shape[:2], _WALL)
+        box = self._box(T_camera_board)
+        total = np.zeros(grey[box].shape)
+        rays, by_u, by_v = self._rays[box], self._by_u[box], self._by_v[box]
+        for dv in offsets:
+            for du in offsets:
+                total += self._sample(T_camera_board, rays + du * by_u + dv * by_v)
+        grey[box] = total / self._samples**2
+        if sigma_grey:
+            grey += np.random.default_rng(seed).normal(0, sigma_grey, grey.shape)
+        return np.asarray(np.clip(np.rint(grey), 0, 255), dtype=np.uint8)
+
+    def _box(self, T_camera_board: Float64) -> tuple[slice, slice]:
+        """Rows and columns that the paper may reach; all where a part of it is behind."""
+        pixels = project(self._camera, apply(T_camera_board, _outline(self._board, margin=1.0)))
+        if not np.isfinite(pixels).all():
+            return slice(None), slice(None)
+        low = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 2, 0)
+        high = np.maximum(np.ceil(pixels.max(axis=0)).astype(int) + 3, 0)
+        return slice(low[1], high[1]), slice(low[0], high[0])
+
+    def _sample(self, T_camera_board: Float64, rays: Float64) -> Float64:
+        """Grey of the board where rays (H, W, 2) meet it, of the wall elsewhere."""
+        # A point of the board is R[:, 0] x + R[:, 1] y + t; the ray's own scale cancels.
+        H = np.linalg.inv(
+            np.stack([T_camera_board[:3, 0], T_camera_board[:3, 1], T_camera_board[:3, 3]], axis=1)
+        )
+        with np.errstate(invalid="ignore", divide="ignore"):
+            w = rays @ H[2, :2] + H[2, 2]
+            x = (rays @ H[0, :2] + H[0, 2]) / w / self._board.square_m
+            y = (rays @ H[1, :2] + H[1, 2]) / w / self._board.square_m
+            # Two squares before the first inner corner begins the paper.
+            column, row = np.floor((x + 2) * _TEXELS), np.floor((y + 2) * _TEXELS)
+        rows, columns = self._texture.shape
+        hit = (w > 0) & (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+        picked = np.where(hit, row * columns + column, 0).astype(np.int64)
+        return np.where(hit, self._texture.ravel()[picked], _WALL)
+
+
+def render_views(
+    rig: StereoCalibration,
+    board: CalibrationBoard,
+    views: Sequence[BoardView],
+    *,
+    sigma_grey: float = 2.0,
+) -> list[tuple[UInt8, UInt8]]:
+    """Left and right picture, uint8 (H, W), of each view."""
+    left, right = (BoardRenderer(camera, board) for camera in (rig.left, rig.right))
+    return [
+        (
+            left.render(view.T_left_board, sigma_grey, 2 * number),
+            right.render(rig.T_right_left @ view.T_left_board, sigma_grey, 2 * number + 1),
+        )
+        for number, view in enumerate(views)
+    ]
+
+
+def _texture(board: CalibrationBoard) -> Float64:
+    """The board with a margin of one square on each side."""
+    columns, rows = board.squares
+    texture = np.full(((rows + 2) * _TEXELS, (columns + 2) * _TEXELS), _WHITE)
+    texels = np.rint((dark_rectangles(board) / board.square_m + 2) * _TEXELS).astype(int)
+    for x0, y0, x1, y1 in texels:
+        texture[y0:y1, x0:x1] = _DARK
+    return texture
+
+
+def _try_place(
+    rig: StereoCalibration, board: CalibrationBoard, rng: np.random.Generator
+) -> BoardView | None:
+    """One random position, or None where a corner is out of a picture."""
+    left = rig.left
+    aim = rng.uniform((0.05, 0.05), (0.95, 0.95)) * (left.width_px, left.height_px)
+    ray = unproject(left, aim[None])[0]
+    if not np.isfinite(ray).all():
+        return None
+    reach = max(board.size_m) * left.matrix[0, 0] / left.width_px
+    centre = ray / np.linalg.norm(ray) * reach * rng.uniform(0.8, 2.0)
+    axis, tilt = rng.uniform(0, 2 * math.pi), _MAX_TILT_RAD * math.sqrt(rng.uniform())
+    turn = exp_so3(tilt * np.array([math.cos(axis), math.sin(axis), 0.0]))
+    roll = exp_so3(np.array([0.0, 0.0, rng.uniform(-0.25, 0.25)]))
+    R = _facing(ray) @ turn @ roll
+    T = make_transform(R, centre - R @ board.corners_m.mean(axis=0))
+    xyz = apply(T, np.concatenate([board.corners_m, _outline(board)]))
+    seen = project(left, xyz), project(rig.right, apply(rig.T_right_left, xyz))
+    corners = len(board.corners_m)
+    if not all(_inside(left, px) for px in seen):
+        return None
+    return BoardView(T, seen[0][:corners], seen[1][:corners])
+
+
+def _facing(ray: Float64) -> Float64:
+    """float64 (3, 3), turns the axis z along a ray by the shortest way."""
+    towards = ray / np.linalg.norm(ray)
+    axis = np.cross([0.0, 0.0, 1.0], towards)
+    sine = float(np.linalg.norm(axis))
+    return exp_so3(axis / max(sine, 1e-12) * math.atan2(sine, towards[2]))
+
+
+def _outline(board: CalibrationBoard, margin: float = 0.0) -> Float64:
+    """float64 (N, 3), the border of the pattern, or of its paper, in steps of a quarter square."""
+    columns, rows = board.squares
+    x = np.linspace(-1 - margin, columns - 1 + margin, 4 * columns + 1)
+    y = np.linspace(-1 - margin, rows - 1 + margin, 4 * rows + 1)
+    level = [np.stack([x, np.full_like(x, end)], axis=1) for end in (y[0], y[-1])]
+    upright = [np.stack([np.full_like(y, end), y], axis=1) for end in (x[0], x[-1])]
+    flat = np.concatenate([*level, *upright]) * board.square_m
+    return np.hstack([flat, np.zeros((len(flat), 1))])
+
+
+def _inside(camera: CameraIntrinsics, pixels: Float64) -> bool:
+    limit = np.array([camera.width_px, camera.height_px]) - 1 - _MARGIN_PX
+    return bool(np.all((pixels >= _MARGIN_PX) & (pixels <= limit)))
