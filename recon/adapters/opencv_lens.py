@@ -50,6 +50,21 @@ def project_with_jacobian(
     return pixels, by_point.reshape(-1, 2, 3), by_lens.reshape(len(pixels), 2, -1)
 
 
+def project_into_picture(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
+    """float64 (N, 2), pixels of points (N, 3) that lie in the picture; NaN for all others.
+
+    Far outside the picture the polynomials of a lens fold back into it: such a pixel's ray does
+    not lead to the point, and it is NaN too.
+    """
+    pixels = project(camera, xyz)
+    limit = np.array([camera.width_px - 1, camera.height_px - 1])
+    inside = np.asarray(((pixels >= 0) & (pixels <= limit)).all(axis=1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        apart = np.abs(unproject(camera, np.where(inside[:, None], pixels, 0.0)) * xyz[:, 2:] - xyz)
+        true = np.asarray((apart < 1e-3 * np.abs(xyz[:, 2:])).all(axis=1))
+    return np.where((inside & true)[:, None], pixels, np.nan)
+
+
 def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
     """float64 (N, 3), the rays of pixels (N, 2) in the camera's axes, with z = 1.
 

@@ -1,0 +1,29 @@
+"""From pictures of a board to the cameras that took them."""
+
+from recon.calibration.board_size import check_charuco, check_chessboard
+from recon.calibration.bootstrap import DepthError, Spread, measure_depth, measure_spread
+from recon.calibration.bundle import Sighting, View
+from recon.calibration.detect import find_board, orient_like
+from recon.calibration.quality import coverage, shared_pixels, tilt_deg
+from recon.calibration.settings import CalibrationSettings, LensKind
+from recon.calibration.stereo import StereoFit, calibrate_stereo
+
+__all__ = [
+    "CalibrationSettings",
+    "DepthError",
+    "LensKind",
+    "Sighting",
+    "Spread",
+    "StereoFit",
+    "View",
+    "calibrate_stereo",
+    "check_charuco",
+    "check_chessboard",
+    "coverage",
+    "find_board",
+    "measure_depth",
+    "measure_spread",
+    "orient_like",
+    "shared_pixels",
+    "tilt_deg",
+]

@@ -23,6 +23,8 @@ _CORNER_CONTRAST: Final = 0.5
 _LARGEST: Final = 60
 # Pictures that are asked for the true size when the claimed one is found in none.
 _PROBED: Final = 8
+# … and for the markers of all of OpenCV's dictionaries, of which there are twenty.
+_PROBED_MARKERS: Final = 2
 
 
 def check_chessboard(
@@ -63,7 +65,7 @@ def check_charuco(pictures: Sequence[UInt8], board: CalibrationBoard) -> None:
     Raises:
         CalibrationError: The markers are of another dictionary, or of a larger board.
     """
-    probed = spread(pictures, _PROBED)
+    probed = spread(pictures, _PROBED_MARKERS)
     votes = Counter({name: _marker_votes(probed, name) for name in dictionary_names()})
     best, most = votes.most_common(1)[0]
     if most and votes[board.dictionary] < most / 2:

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.adapters.opencv_lens import project, unproject
+from recon.adapters.opencv_lens import project_into_picture, unproject
 from recon.calibration.bundle import RigState, moved, solve_scaled
 from recon.calibration.settings import CalibrationSettings
 from recon.calibration.stereo import StereoFit, stereo_of
@@ -141,7 +141,7 @@ def _try_rig(state: RigState, step: Float64) -> StereoCalibration | None:
 
 def _interval(values: list[float], settings: CalibrationSettings) -> tuple[float, float]:
     aside = (1 - settings.confidence) / 2
-    low, high = np.quantile(values, (aside, 1 - aside))
+    low, high = np.nanquantile(values, (aside, 1 - aside))
     return float(low), float(high)
 
 
@@ -152,9 +152,10 @@ def _depth_error(
     width, height = rig.left.width_px, rig.left.height_px
     places = np.array([[x * width, y * height] for y in _PLACES for x in _PLACES])
     xyz = unproject(rig.left, places) * depth_m
-    right_px = project(rig.right, apply(rig.T_right_left, xyz))
-    shared = ((right_px >= 0) & (right_px <= (width - 1, height - 1))).all(axis=1)
-    matching_m = depth_m**2 * settings.match_sigma_px / (rig.left.matrix[0, 0] * rig.baseline_m)
+    right_px = project_into_picture(rig.right, apply(rig.T_right_left, xyz))
+    shared = np.asarray(np.isfinite(right_px).all(axis=1))
+    focal_px = float(rig.left.matrix[0, 0])
+    matching_m = depth_m**2 * settings.match_sigma_px / (focal_px * rig.baseline_m)
     if not shared[_MIDDLE]:
         return DepthError(depth_m, np.nan, np.nan, np.nan, matching_m)
     errors = np.array(
@@ -162,5 +163,6 @@ def _depth_error(
     )
     middle = errors[:, int(shared[:_MIDDLE].sum())]
     low_m, high_m = _interval(list(middle), settings)
-    rms_m = float(np.sqrt(np.mean(errors**2)))
+    # A draw that bends a lens beyond its inverse at the border has no depth there.
+    rms_m = float(np.sqrt(np.nanmean(errors**2)))
     return DepthError(depth_m, rms_m, low_m, high_m, matching_m)

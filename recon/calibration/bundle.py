@@ -211,8 +211,8 @@ def _view_blocks(view: View, state: RigState, number: int) -> _Blocks:
         J_own.append((by_point @ T[:3, :3] @ _by_motion(xyz_rig)).reshape(count, _POSE))
         errors.append((seen.pixels - pixels).ravel())
         at += _camera_size(camera)
-    S, O, r = np.concatenate(J_shared), np.concatenate(J_own), np.concatenate(errors)
-    return _Blocks(S.T @ S, S.T @ O, O.T @ O, S.T @ r, O.T @ r, float(r @ r))
+    S, P, r = np.concatenate(J_shared), np.concatenate(J_own), np.concatenate(errors)
+    return _Blocks(S.T @ S, S.T @ P, P.T @ P, S.T @ r, P.T @ r, float(r @ r))
 
 
 def _by_motion(xyz: Float64) -> Float64:

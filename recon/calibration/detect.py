@@ -48,7 +48,10 @@ def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
         numbers = np.arange(len(pixels), dtype=np.int32)
     if not _enough(numbers, board):
         return None
-    pixels = refine_corners(grey, pixels, _spacing(numbers, pixels, board))
+    # A marker's own edges must stay out of the window.
+    free = (board.square_m - board.marker_m) / (2 * board.square_m)
+    window = min(_WINDOW, 0.8 * free)
+    pixels = refine_corners(grey, pixels, _spacing(numbers, pixels, board), window)
     return Sighting(numbers, board.corners_m[numbers], pixels)
 
 
@@ -68,12 +71,21 @@ def find_chessboard(grey: UInt8, inner: tuple[int, int]) -> Float64 | None:
         )
     if not found:
         return None
-    return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
+    return np.asarray((np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5)
 
 
-def refine_corners(grey: UInt8, pixels: Float64, spacing_px: float) -> Float64:
-    """float64 (N, 2), corners at the crossing of the edges around them."""
-    half = int(np.clip(round(_WINDOW * spacing_px), _SMALLEST_WINDOW_PX, _LARGEST_WINDOW_PX))
+def refine_corners(
+    grey: UInt8, pixels: Float64, spacing_px: float, window: float = _WINDOW
+) -> Float64:
+    """float64 (N, 2), corners at the crossing of the edges around them.
+
+    Args:
+        grey: uint8 (H, W).
+        pixels: float64 (N, 2), where they are but for a few pixels.
+        spacing_px: Distance between neighbours.
+        window: Half of the window looked at, in such distances.
+    """
+    half = int(np.clip(round(window * spacing_px), _SMALLEST_WINDOW_PX, _LARGEST_WINDOW_PX))
     start = pixels.astype(np.float32).reshape(-1, 1, 2)
     refined = cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), _SUB_PIXEL)
     lost = np.linalg.norm(refined - start, axis=2) > _LOST * spacing_px

@@ -124,7 +124,7 @@ def _guess_pinhole(sightings: Sequence[Sighting], size: Size) -> CameraIntrinsic
 def _guess_fisheye(sightings: Sequence[Sighting], size: Size) -> RigState:
     """The plain fisheye, among some fields of view, that fits the board best."""
     radius = math.hypot(*size) / 2
-    guesses = []
+    guesses: list[tuple[float, int, RigState]] = []
     for angle in _HALF_ANGLES:
         matrix = np.array(
             [

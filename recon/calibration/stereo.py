@@ -20,7 +20,7 @@ from recon.calibration.initial import (
 from recon.calibration.settings import CalibrationSettings
 from recon.errors import CalibrationError
 from recon.structures import StereoCalibration
-from recon.structures.arrays import Float64
+from recon.structures.arrays import Bool, Float64
 
 _DROPPING_ROUNDS: Final = 4
 # Both cameras fit alone, together they do not: the pictures were not taken together.
@@ -121,7 +121,7 @@ def _finish(
     )
 
 
-def _keep(views: list[View], state: RigState, good: Float64) -> tuple[list[View], RigState]:
+def _keep(views: list[View], state: RigState, good: Bool) -> tuple[list[View], RigState]:
     chosen = np.flatnonzero(good)
     poses = tuple(state.T_rig_board[number] for number in chosen)
     return [views[number] for number in chosen], replace(state, T_rig_board=poses)

@@ -12,6 +12,7 @@ import typer
 from recon import __version__
 from recon.cli import evaluate
 from recon.cli.capture import capture
+from recon.cli.calibrate import calibrate
 from recon.cli.demo import demo
 from recon.cli.doctor import doctor
 from recon.cli.map import map_
@@ -32,6 +33,7 @@ app.command()(mesh)
 app.command()(capture)
 app.command()(disparity)
 app.command()(paper)
+app.command()(calibrate)
 app.command()(doctor)
 app.add_typer(evaluate.app, name="evaluate")
 

@@ -10,6 +10,7 @@ from typing import Any, Final
 import yaml
 from pydantic import Field
 
+from recon.calibration import CalibrationSettings
 from recon.cloud import ANY_SCALE, CloudSettings, EdgeSettings, FilterSettings
 from recon.errors import SettingsError
 from recon.mapping import (
@@ -39,6 +40,7 @@ class ReconConfig(Settings):
 
     source: SourceSettings = SourceSettings()
     capture: CaptureSettings = CaptureSettings()
+    calibration: CalibrationSettings = CalibrationSettings()
     rectification: RectificationSettings = RectificationSettings()
     inspection: InspectionSettings = InspectionSettings()
     matching: MatchingSettings = MatchingSettings()

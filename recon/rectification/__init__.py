@@ -1,5 +1,6 @@
 """From recorded pictures to rows that correspond, and from colour to grey."""
 
+from recon.rectification.epipolar import epipolar_curves, epipolar_lines
 from recon.rectification.grey import GreyMode, to_grey
 from recon.rectification.inspect import (
     InspectionSettings,
@@ -26,6 +27,8 @@ __all__ = [
     "Rectifier",
     "RectifyingTurns",
     "check_inspection",
+    "epipolar_curves",
+    "epipolar_lines",
     "inspect_features",
     "inspect_pair",
     "match_features",

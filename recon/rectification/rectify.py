@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from recon.adapters.opencv_lens import rectifying_maps
+from recon.adapters.opencv_lens import rectifying_maps, unproject
 from recon.errors import CalibrationError
 from recon.geometry.se3 import angle_rad
 from recon.rectification.grey import GreyMode, to_grey
@@ -177,6 +177,15 @@ class RectifyingTurns:
         right = self.camera.matrix
         right[0, 2] = self.camera.cx_right_px
         return self.camera.matrix, right
+
+    def place(
+        self, calibration: StereoCalibration, pixels: Float64, *, right: bool = False
+    ) -> Float64:
+        """float64 (N, 2), where raw pixels (N, 2) of a side come to lie; NaN = nowhere."""
+        camera = calibration.right if right else calibration.left
+        rays = unproject(camera, pixels) @ (self.R_right if right else self.R_left).T
+        flat = (rays / rays[:, 2:]) @ self.matrices[int(right)].T
+        return np.asarray(np.where(rays[:, 2:] > 0, flat[:, :2], np.nan))
 
 
 def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) -> RectifyingTurns:

@@ -1,5 +1,6 @@
 """What a run looks like: figures, tables and one HTML file that needs no network."""
 
+from recon.reports.calibration_report import present_calibration
 from recon.reports.html import ReportContent, render_html
 from recon.reports.map_report import MapReportInputs, map_report
 from recon.reports.pair_report import PairReportInputs, pair_report
@@ -13,6 +14,7 @@ __all__ = [
     "map_report",
     "pair_report",
     "paper_report",
+    "present_calibration",
     "present_disparity",
     "present_map",
     "present_pair",

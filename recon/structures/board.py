@@ -15,11 +15,12 @@ BoardKind = Literal["chess", "charuco"]
 
 _FORMS: Final = (
     "chess:COLUMNSxROWS:SQUARE (inner corners, such as chess:9x6:25mm) or "
-    "charuco:COLUMNSxROWS:SQUARE[:MARKER[:DICTIONARY]] (squares, such as charuco:8x6:30mm:22mm:5x5_100)"
+    "charuco:COLUMNSxROWS:SQUARE[:MARKER[:DICTIONARY]] "
+    "(squares, such as charuco:8x6:30mm:22mm:5x5_100)"
 )
 _UNITS_M: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "": 1.0}
 _LENGTH: Final = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*(mm|cm|m|in|)", re.IGNORECASE)
-_SIZE: Final = re.compile(r"(\d+)\s*[x×]\s*(\d+)", re.IGNORECASE)  # noqa: RUF001
+_SIZE: Final = re.compile(r"(\d+)\s*[x×]\s*(\d+)", re.IGNORECASE)
 _DICTIONARY: Final = re.compile(r"(?:DICT_)?(\w+)", re.IGNORECASE)
 _LARGEST_SQUARE_M: Final = 5.0
 _DEFAULT_MARKER: Final = 0.75  # of a square
@@ -99,10 +100,10 @@ class CalibrationBoard:
 def parse_board(text: str) -> CalibrationBoard:
     """Read a board from text.
 
-    ``chess:9x6:25mm`` has 9 by 6 inner corners and squares of 25 mm; ``charuco:8x6:30mm:22mm:5x5_100``
-    has 8 by 6 squares and markers of 22 mm from that dictionary (three quarters of a square and
-    ``5x5_100`` if left out). Lengths are in mm, cm, m or in; a bare number is metres. Without any,
-    a square counts as 1 m, and `CalibrationBoard.metric` says so.
+    ``chess:9x6:25mm`` has 9 by 6 inner corners and squares of 25 mm.
+    ``charuco:8x6:30mm:22mm:5x5_100`` has 8 by 6 squares and markers of 22 mm from that dictionary
+    (three quarters of a square and ``5x5_100`` if left out). Lengths are in mm, cm, m or in; a
+    bare number is metres. Without any, a square counts as 1 m: see `CalibrationBoard.metric`.
 
     Raises:
         SettingsError: The text is none of these, or the board cannot be.

@@ -109,16 +109,17 @@ class BoardRenderer:
         rays = unproject(camera, pixels)[:, :2]
         self._rays = rays.reshape(camera.height_px, camera.width_px, 2)
         # Rays are smooth: within a pixel they are straight lines to far below what can be seen.
-        self._by_v, self._by_u = np.gradient(self._rays, axis=(0, 1))
+        self._by_v = np.asarray(np.gradient(self._rays, axis=0))
+        self._by_u = np.asarray(np.gradient(self._rays, axis=1))
         self._texture = _texture(board)
 
     def render(self, T_camera_board: Float64, sigma_grey: float = 0.0, seed: int = 0) -> UInt8:
         """uint8 (H, W), the board at a place before a grey wall, with noise of that size."""
         offsets = (np.arange(self._samples) + 0.5) / self._samples - 0.5
-        grey = np.full(self._rays.shape[:2], _WALL)
+        grey = np.full((self._camera.height_px, self._camera.width_px), _WALL)
         box = self._box(T_camera_board)
         total = np.zeros(grey[box].shape)
-        rays, by_u, by_v = self._rays[box], self._by_u[box], self._by_v[box]
+        rays, by_u, by_v = (each[box] for each in (self._rays, self._by_u, self._by_v))
         for dv in offsets:
             for du in offsets:
                 total += self._sample(T_camera_board, rays + du * by_u + dv * by_v)
@@ -192,7 +193,7 @@ def _try_place(
     if not np.isfinite(ray).all():
         return None
     reach = max(board.size_m) * left.matrix[0, 0] / left.width_px
-    centre = ray / np.linalg.norm(ray) * reach * rng.uniform(0.8, 2.0)
+    centre = ray / np.linalg.norm(ray) * reach * (0.8 + 2.2 * rng.uniform() ** 2)
     axis, tilt = rng.uniform(0, 2 * math.pi), _MAX_TILT_RAD * math.sqrt(rng.uniform())
     turn = exp_so3(tilt * np.array([math.cos(axis), math.sin(axis), 0.0]))
     roll = exp_so3(np.array([0.0, 0.0, rng.uniform(-0.25, 0.25)]))

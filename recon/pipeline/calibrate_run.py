@@ -1,0 +1,202 @@
+"""`recon calibrate` without its command line: pictures of a board in, a calibration file out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from recon.calibration import (
+    Spread,
+    StereoFit,
+    View,
+    calibrate_stereo,
+    measure_spread,
+    shared_pixels,
+)
+from recon.errors import OutputError
+from recon.formats.atomic import write_text
+from recon.formats.camera_info import write_camera_info
+from recon.formats.kalibr import write_kalibr
+from recon.formats.opencv_yaml import write_opencv_calibration
+from recon.formats.recon_yaml import write_recon_calibration
+from recon.pipeline.board_views import BoardViews, find_views
+from recon.pipeline.calibrate_summary import advise, summarise
+from recon.pipeline.config import ReconConfig, dump_config
+from recon.pipeline.machine import serial_algebra, use_threads
+from recon.pipeline.record import fingerprint, write_record
+from recon.pipeline.run_directory import RunDirectory
+from recon.pipeline.stopwatch import Stopwatch
+from recon.pipeline.summary import cost
+from recon.rectification import RectifyingTurns, plan_turns
+from recon.sources.picture_pairs import pair_pictures
+from recon.structures.arrays import Float64
+from recon.structures.board import CalibrationBoard
+
+CalibrationForm = Literal["recon", "opencv", "ros", "kalibr"]
+
+# Figures that the calibration file keeps.
+_KEPT: Final = (
+    "board", "stereo_rms_px", "epipolar_px", "baseline_interval_m", "focal_interval_px",
+    "views_used", "views_dropped", "depth_error_cm",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationRun:
+    """All that a run knows when its results are made.
+
+    Attributes:
+        board: The board.
+        config: The configuration.
+        seen: What the pictures show.
+        fit: The calibrated rig.
+        spread: How sure it is.
+        turns: How the rig is rectified.
+        rows_px: float64 (N,), row errors of all corners after rectification.
+        summary: The figures of ``summary.json``.
+    """
+
+    board: CalibrationBoard
+    config: ReconConfig
+    seen: BoardViews
+    fit: StereoFit
+    spread: Spread
+    turns: RectifyingTurns
+    rows_px: Float64
+    summary: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """How a run is made, apart from the configuration.
+
+    Attributes:
+        file: The calibration file; None = ``calibration.yaml`` in the run's folder alone.
+        form: Its format.
+        folder: Where report, pictures and figures go; None = a new folder below ``outputs/``.
+        threads: Threads to use; None = all cores. Changes no result.
+        present: Writes pictures and the report of the run into its folder.
+    """
+
+    file: Path | None = None
+    form: CalibrationForm = "recon"
+    folder: Path | None = None
+    threads: int | None = None
+    present: Callable[[CalibrationRun, RunDirectory], None] | None = None
+
+
+def run_calibration(
+    left: str,
+    right: str,
+    board: CalibrationBoard,
+    config: ReconConfig,
+    options: CalibrateOptions,
+) -> CalibrationRun:
+    """Calibrate a rig from pictures of a board.
+
+    Args:
+        left: Folder or pattern of the left pictures.
+        right: Folder or pattern of the right pictures.
+        board: What they show.
+        config: The configuration.
+        options: Where results go.
+
+    Raises:
+        ReconError: Pictures do not pair up, do not show the board, or fit no rig, or a file
+            cannot be written; then nothing is left behind.
+    """
+    start = time.perf_counter()
+    threads, watch = use_threads(options.threads), Stopwatch()
+    _check_file(options.file)
+    pictures = pair_pictures(left, right)
+    with RunDirectory.for_command("calibrate", options.folder) as directory:
+        with watch.stage("find"):
+            seen = find_views(pictures, board, threads)
+        with watch.stage("solve"), serial_algebra():
+            fit = calibrate_stereo(seen.views, seen.size_px, config.calibration)
+        with watch.stage("bootstrap"), serial_algebra():
+            spread = measure_spread(fit, config.calibration)
+        run = _run(board, config, seen, fit, spread)
+        warnings = advise(board, pictures, run.summary)
+        run.summary["warnings"] = warnings
+        _write(run, options, directory)
+        run.summary.update(cost(watch, time.perf_counter() - start))
+        if options.present is not None:
+            with watch.stage("report"):
+                options.present(run, directory)
+        run.summary.update(cost(watch, time.perf_counter() - start))
+        run.summary["out"] = str(directory.folder)
+        directory.write_json("summary.json", run.summary)
+        record = {
+            "source": f"{left} {right}",
+            "board": str(board),
+            "inputs": fingerprint(path for pair in pictures.pairs for path in pair),
+            "timings": watch.seconds,
+            "warnings": warnings,
+        }
+        write_record(directory, "calibrate", record)
+    return run
+
+
+def _run(
+    board: CalibrationBoard, config: ReconConfig, seen: BoardViews, fit: StereoFit, spread: Spread
+) -> CalibrationRun:
+    turns = plan_turns(fit.calibration, config.rectification)
+    rows_px = np.concatenate([_rows_apart(turns, fit, view) for view in fit.views])
+    summary = summarise(board, seen, fit, spread, rows_px)
+    summary["rectified_focal_px"] = turns.camera.focal_px
+    summary["model"] = config.calibration.model
+    return CalibrationRun(board, config, seen, fit, spread, turns, rows_px, summary)
+
+
+def _rows_apart(turns: RectifyingTurns, fit: StereoFit, view: View) -> Float64:
+    """float64 (N,), row of each corner in the rectified left picture less that in the right."""
+    left_px, right_px = shared_pixels(view)
+    left = turns.place(fit.calibration, left_px)
+    right = turns.place(fit.calibration, right_px, right=True)
+    return np.asarray(left[:, 1] - right[:, 1])
+
+
+def _write(run: CalibrationRun, options: CalibrateOptions, directory: RunDirectory) -> None:
+    write_calibration(directory.path("calibration.yaml"), run, "recon")
+    write_text(directory.path("config.yaml"), dump_config(run.config))
+    if options.file is not None:
+        files = write_calibration(options.file, run, options.form)
+        run.summary["files"] = [str(path) for path in files]
+
+
+def write_calibration(path: Path, run: CalibrationRun, form: CalibrationForm) -> tuple[Path, ...]:
+    """Write the rig of a run in a format.
+
+    Returns:
+        The files: two of ROS, else one.
+
+    Raises:
+        CalibrationError: The format cannot hold the lens.
+        OutputError: A file cannot be written.
+    """
+    rig = run.fit.calibration
+    if form == "ros":
+        rotations = (run.turns.R_left, run.turns.R_right)
+        return write_camera_info(path, rig, rotations, run.turns.camera)
+    if form == "opencv":
+        write_opencv_calibration(path, rig)
+    elif form == "kalibr":
+        write_kalibr(path, rig)
+    else:
+        write_recon_calibration(path, rig, {key: run.summary[key] for key in _KEPT})
+    return (path,)
+
+
+def _check_file(path: Path | None) -> None:
+    if path is not None and path.is_dir():
+        raise OutputError(
+            "the calibration file is a folder",
+            where=path,
+            hint=f"--out {path / 'calibration.yaml'}; pictures and report go to --report",
+        )

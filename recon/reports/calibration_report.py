@@ -1,0 +1,131 @@
+"""The report of a calibration, and its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from recon.calibration import shared_pixels
+from recon.formats.atomic import write_bytes, write_text
+from recon.formats.image import read_image
+from recon.pipeline.calibrate_run import CalibrationRun
+from recon.pipeline.config import dump_config
+from recon.pipeline.machine import versions
+from recon.pipeline.run_directory import RunDirectory
+from recon.rectification import Rectifier, epipolar_curves
+from recon.reports.blocks import run_blocks
+from recon.reports.calibration_figures import (
+    coverage_figure,
+    depth_error_figure,
+    errors_figure,
+    rows_figure,
+)
+from recon.reports.epipolar_figures import (
+    EpipolarPicture,
+    epipolar_figure,
+    level_lines,
+    spread_points,
+)
+from recon.reports.html import FigureBlock, ReportContent, Section, TableBlock, render_html
+from recon.reports.present import command_line
+from recon.structures import StereoPair
+
+
+def present_calibration(run: CalibrationRun, directory: RunDirectory) -> None:
+    """Write ``report.html`` of a calibration, and its pictures beside it.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    before, after = epipolar_pictures(run)
+    figures = {
+        "coverage": coverage_figure(run),
+        "view_errors": errors_figure(run),
+        "epipolar_raw": before,
+        "epipolar_rectified": after,
+        "row_errors": rows_figure(run),
+        "depth_error": depth_error_figure(run),
+    }
+    for name, png in figures.items():
+        write_bytes(directory.path(f"pictures/{name}.png"), png)
+    write_text(directory.path("report.html"), render_html(_content(run, figures)))
+
+
+def epipolar_pictures(run: CalibrationRun) -> tuple[bytes, bytes]:
+    """PNG of the view of median error: raw with its epipolar curves, rectified with its rows."""
+    view = run.fit.views[int(np.argsort(run.fit.errors_px.sum(axis=1))[len(run.fit.views) // 2])]
+    left_px, right_px = shared_pixels(view)
+    chosen = spread_points(left_px)
+    pixels = (left_px[chosen], right_px[chosen])
+    left, right = run.seen.pairs[view.name]
+    pair = StereoPair(read_image(left), read_image(right), name=view.name)
+    curves = epipolar_curves(run.fit.calibration, *pixels)
+    raw = epipolar_figure(
+        EpipolarPicture(pair.left, pixels[0], curves[0], f"Left, as recorded: {view.name}"),
+        EpipolarPicture(pair.right, pixels[1], curves[1], "Right, as recorded"),
+    )
+    rectified = Rectifier(run.fit.calibration, run.config.rectification).rectify(pair)
+    width = run.turns.camera.width_px
+    rig, turns = run.fit.calibration, run.turns
+    placed = [turns.place(rig, pixels[0]), turns.place(rig, pixels[1], right=True)]
+    rows = level_lines(placed[0], width)
+    level = epipolar_figure(
+        EpipolarPicture(rectified.left, placed[0], rows, "Left, rectified"),
+        EpipolarPicture(rectified.right, placed[1], rows, "Right, rectified: rows of the left"),
+    )
+    return raw, level
+
+
+def _content(run: CalibrationRun, figures: Mapping[str, bytes]) -> ReportContent:
+    s = run.summary
+    depth = "How depth in the middle of the picture may be off, in 95 of 100 such calibrations."
+    sections = (
+        Section("Fit", [
+            FigureBlock("Each view", figures["view_errors"],
+                        "Dashed: all corners of both pictures together."),
+            FigureBlock("Where the board was", figures["coverage"],
+                        "One colour for each view. Where no corner was, the lens is guessed."),
+        ]),
+        Section("Rectified", [
+            FigureBlock("Epipolar lines, as recorded", figures["epipolar_raw"],
+                        "A point of one picture lies on the line of its colour in the other."),
+            FigureBlock("Epipolar lines, rectified", figures["epipolar_rectified"],
+                        "Rows of the left picture, drawn through both."),
+            FigureBlock("Row errors", figures["row_errors"],
+                        "Over all corners of all views; a matcher wants less than half a pixel.",
+                        wide=False),
+        ]),
+        Section("What it is worth", [
+            FigureBlock("Depth error", figures["depth_error"],
+                        "The larger of the two lines decides.", wide=False),
+            TableBlock("Depth error in cm", ("depth", "calibration", "interval", "matching"),
+                       _depth_rows(s), depth),
+        ]),
+        Section("Run", run_blocks(s)),
+    )  # fmt: skip
+    return ReportContent(
+        title="Stereo calibration",
+        subtitle=f"{s['board']}, {s['views_used']} of {s['views']} views, lens {s['model']}",
+        command=command_line(),
+        warnings=s["warnings"],
+        figures=[
+            ("Error of corners", f"{s['stereo_rms_px']:.3f} px"),
+            ("Row error, rectified", f"{s['epipolar_px']:.3f} px"),
+            ("Baseline", f"{s['baseline_m']:.5g} m"),
+            ("Focal length", f"{s['focal_px']:.2f} px"),
+        ],
+        sections=sections,
+        config=dump_config(run.config),
+        versions=versions(),
+    )
+
+
+def _depth_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
+    rows = []
+    for depth, error in summary["depth_error_cm"].items():
+        texts = {k: "–" if v is None else f"{v:.3g}" for k, v in error.items()}
+        interval = f"{texts['low']} … {texts['high']}"
+        rows.append((f"{depth} m", texts["calibration"], interval, texts["matching"]))
+    return rows

@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.errors import CalibrationError, OutputError, ReconError, SourceError
+from recon.formats.calibration import read_calibration
+from recon.formats.image import write_image
+from recon.pipeline.calibrate_run import CalibrateOptions, run_calibration
+from recon.pipeline.config import load_config
+from recon.rectification import Rectifier
+from recon.reports import present_calibration
+from recon.structures import StereoCalibration
+from recon.structures.board import parse_board
+from recon.synthetic.boards import board_rig, place_boards, render_views
+
+BOARD = parse_board("chess:9x6:25mm")
+QUICK = ["calibration.bootstrap=60"]
+
+
+@pytest.fixture(scope="session")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Nine views of a board through a true rig; the right picture of one is without the board."""
+    folder, rig = tmp_path_factory.mktemp("board"), board_rig()
+    pictures = render_views(rig, BOARD, place_boards(rig, BOARD, 9, seed=2))
+    for number, (left, right) in enumerate(pictures):
+        write_image(folder / f"left{number:02d}.png", left)
+        write_image(folder / f"right{number:02d}.png", right if number != 4 else left[:] * 0 + 99)
+    return folder
+
+
+def calibrate(folder: Path, out: Path, form: str = "recon", board: str = "chess:9x6:25mm"):
+    options = CalibrateOptions(out / "rig.yaml", form, out / "report", 1, None)  # type: ignore[arg-type]
+    terms = ["calibration.radial_terms=2"] if form == "kalibr" else []
+    sides = (str(folder / "left*.png"), str(folder / "right*.png"))
+    return run_calibration(*sides, parse_board(board), load_config(None, QUICK + terms), options)
+
+
+@pytest.mark.parametrize("form", ["recon", "opencv", "ros", "kalibr"])
+def test_pictures_give_the_true_rig_in_every_format(drawn: Path, tmp_path: Path, form: str) -> None:
+    run, rig = calibrate(drawn, tmp_path, form), board_rig()
+    summary = json.loads((tmp_path / "report" / "summary.json").read_text())
+    assert summary["stereo_rms_px"] < 0.15
+    assert summary["epipolar_px"] < 0.1
+    # Corners of rendered pictures are good to about 0.1 px, and eight views are few.
+    assert summary["focal_px"] == pytest.approx(rig.left.matrix[0, 0], rel=0.01)
+    assert summary["baseline_m"] == pytest.approx(rig.baseline_m, rel=0.005)
+    assert (summary["views"], summary["views_used"]) == (9, 8)
+    assert summary["pictures_without_board"] == ["right04.png"]
+    assert any("right04.png" in line for line in summary["warnings"])
+    read = read_calibration(run.summary["files"][0], 640, 480)
+    assert isinstance(read, StereoCalibration)
+    assert read.baseline_m == pytest.approx(run.fit.calibration.baseline_m, rel=1e-9)
+    assert Rectifier(read).camera.focal_px == pytest.approx(summary["rectified_focal_px"], rel=1e-6)
+
+
+def test_report_and_pictures_are_written(drawn: Path, tmp_path: Path) -> None:
+    options = CalibrateOptions(None, "recon", tmp_path / "out", 1, present_calibration)
+    run = run_calibration(
+        str(drawn / "left*.png"),
+        str(drawn / "right*.png"),
+        BOARD,
+        load_config(None, QUICK),
+        options,
+    )
+    names = {path.name for path in (tmp_path / "out").rglob("*.png")}
+    assert {"coverage.png", "epipolar_raw.png", "epipolar_rectified.png"} <= names
+    html = (tmp_path / "out" / "report.html").read_text()
+    assert "Stereo calibration" in html
+    assert f"{run.summary['stereo_rms_px']:.3f} px" in html
+    assert (tmp_path / "out" / "calibration.yaml").is_file()
+
+
+def shrink(folder: Path) -> None:
+    write_image(folder / "right01.png", np.full((240, 320), 90, np.uint8))
+
+
+def lose(folder: Path) -> None:
+    (folder / "right01.png").unlink()
+
+
+def blank(folder: Path) -> None:
+    for path in folder.iterdir():
+        write_image(path, np.full((480, 640), 90, np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "message"),
+    [
+        (shrink, SourceError, r"right01\.png: pictures differ in size \(got 320x240"),
+        (lose, SourceError, r"no partner \(got left01\.png\)"),
+        (blank, CalibrationError, r"the board is seen in no picture \(got 18 pictures"),
+    ],
+)
+def test_what_is_wrong_is_one_clear_line_and_nothing_is_left(
+    drawn: Path, tmp_path: Path, spoil, error: type[ReconError], message: str
+) -> None:
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for path in drawn.iterdir():
+        (copy / path.name).write_bytes(path.read_bytes())
+    spoil(copy)
+    with pytest.raises(error, match=message) as caught:
+        calibrate(copy, tmp_path / "out")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_wrong_board_is_told_with_the_true_size(drawn: Path, tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"does not have 8x6 inner corners \(got 9x6"):
+        calibrate(drawn, tmp_path / "out", board="chess:8x6:25mm")
+
+
+def test_a_board_without_a_size_gives_squares_and_says_so(drawn: Path, tmp_path: Path) -> None:
+    run = calibrate(drawn, tmp_path, board="chess:9x6")
+    assert run.summary["baseline_squares"] == pytest.approx(0.12 / 0.025, rel=0.01)
+    assert run.summary["baseline_m"] == pytest.approx(run.summary["baseline_squares"])
+    assert any("in squares" in line for line in run.summary["warnings"])
+
+
+def test_a_folder_for_a_calibration_file_is_refused(drawn: Path, tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").mkdir()
+    with pytest.raises(OutputError, match="calibration file is a folder"):
+        calibrate(drawn, tmp_path)
+
+
+@pytest.mark.real
+def test_the_published_chessboard_pairs_calibrate_as_they_should(
+    recon_data: Path, tmp_path: Path
+) -> None:
+    folder = recon_data / "calibration" / "opencv_chessboard"
+    options = CalibrateOptions(None, "recon", tmp_path / "out", 1, None)
+    sides = (str(folder / "left*.jpg"), str(folder / "right*.jpg"))
+    summary = run_calibration(*sides, BOARD, load_config(None, QUICK), options).summary
+    assert summary["stereo_rms_px"] <= 0.45
+    assert summary["baseline_squares"] == pytest.approx(3.34, abs=0.02)
+    assert summary["epipolar_px"] <= 0.3
+    assert summary["views_used"] == 13

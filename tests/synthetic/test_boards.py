@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.adapters.opencv_lens import project
+from recon.errors import CalibrationError
+from recon.geometry.se3 import apply
+from recon.structures.board import parse_board
+from recon.synthetic.boards import BoardRenderer, board_rig, place_boards, render_views
+
+BOARD = parse_board("chess:6x4:30mm")
+
+
+@pytest.mark.parametrize("lens", ["radtan", "rational", "fisheye"])
+def test_truth_of_a_view_is_the_projection_of_the_board(lens: str) -> None:
+    rig = board_rig(lens)  # type: ignore[arg-type]
+    for view in place_boards(rig, BOARD, 5):
+        xyz = apply(view.T_left_board, BOARD.corners_m)
+        np.testing.assert_array_equal(view.left_px, project(rig.left, xyz))
+        right = project(rig.right, apply(rig.T_right_left, xyz))
+        np.testing.assert_array_equal(view.right_px, right)
+        assert (view.left_px > 0).all()
+        assert (view.left_px < (640, 480)).all()
+
+
+def test_squares_between_true_corners_are_dark_and_light_by_turns() -> None:
+    rig = board_rig("fisheye")
+    (view,) = place_boards(rig, BOARD, 1)
+    picture = BoardRenderer(rig.left, BOARD).render(view.T_left_board)
+    centres = BOARD.corners_m.reshape(4, 6, 3)[:3, :5] + [0.015, 0.015, 0]
+    xyz = apply(view.T_left_board, centres.reshape(-1, 3))
+    u, v = np.rint(project(rig.left, xyz)).astype(int).T
+    grey = picture[v, u].reshape(3, 5)
+    dark = (np.add.outer(np.arange(3), np.arange(5)) % 2) == 0
+    assert (grey[dark] < 60).all()
+    assert (grey[~dark] > 190).all()
+
+
+def test_positions_fill_the_picture_and_lean_both_ways() -> None:
+    rig = board_rig()
+    views = place_boards(rig, BOARD, 30)
+    pixels = np.concatenate([view.left_px for view in views])
+    assert np.ptp(pixels, axis=0).min() > 0.7 * 480
+    normals = np.array([view.T_left_board[:3, 2] for view in views])
+    assert normals[:, :2].min() < -0.2 < 0.2 < normals[:, :2].max()
+
+
+def test_one_seed_gives_one_set_of_pictures() -> None:
+    rig = board_rig()
+    one, two = (render_views(rig, BOARD, place_boards(rig, BOARD, 1, seed=3)) for _ in range(2))
+    np.testing.assert_array_equal(one[0], two[0])
+
+
+def test_a_rig_whose_cameras_share_no_view_is_refused() -> None:
+    with pytest.raises(CalibrationError, match="does not fit into both pictures"):
+        place_boards(board_rig(baseline_m=50.0), BOARD, 2)
