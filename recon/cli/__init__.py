@@ -11,8 +11,8 @@ import typer
 
 from recon import __version__
 from recon.cli import evaluate
-from recon.cli.capture import capture
 from recon.cli.calibrate import calibrate
+from recon.cli.capture import capture
 from recon.cli.demo import demo
 from recon.cli.doctor import doctor
 from recon.cli.map import map_

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from recon.errors import SourceError
+from recon.sources.pairing import natural_key
 
 _PICTURES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 _NUMBER: Final = re.compile(r"\d+")
@@ -86,13 +87,7 @@ def list_pictures(where: str | Path) -> list[Path]:
             expected=", ".join(sorted(_PICTURES)),
             hint='put patterns in quotes: "left*.png"',
         )
-    return sorted(pictures, key=natural)
-
-
-def natural(path: Path) -> Key:
-    """Key of the natural order: numbers in names count as numbers."""
-    parts = re.split(r"(\d+)", path.name)
-    return tuple(int(part) if number % 2 else part for number, part in enumerate(parts))
+    return sorted(pictures, key=lambda path: natural_key(path.name))
 
 
 def _by_name(side: Sequence[Path]) -> dict[Key, Path]:
