@@ -37,7 +37,7 @@ class OdometryName(str, Enum):
 
 
 def map_(
-    source: SourceArgument,
+    source: SourceArgument = None,
     out: Out = None,
     kind: SourceKind = None,
     calib: Calib = None,
@@ -53,6 +53,9 @@ def map_(
     ] = None,
     matcher: Matcher = None,
     mesh: Mesh = True,
+    resume: Annotated[
+        Path | None, typer.Option(help="Go on with the killed run in this folder; no SOURCE.")
+    ] = None,
     config: Config = None,
     set_: Set = None,
     json: Json = False,
@@ -65,27 +68,33 @@ def map_(
     Examples:
       recon map ~/kitti/sequences/06 --out outputs/kitti06
       recon map drive.bag --calib camchain.yaml --left /cam0/image_raw --right /cam1/image_raw
+      recon map --resume outputs/kitti06
       recon map left.mp4 --right right.mp4 --calib stereo.yaml
     """
+    if source is None and resume is None:
+        raise typer.BadParameter("give SOURCE, or --resume FOLDER")
     with session():
         from recon.formats.trajectory import read_trajectory
-        from recon.pipeline.config import load_config, matching_overrides, source_overrides
+        from recon.pipeline.config import matching_overrides, source_overrides
         from recon.pipeline.map_run import MapOptions, run_map
+        from recon.pipeline.resume import MapRequest, open_requested, plan_map
         from recon.reports import present_map
-        from recon.sources import open_source
         from recon.viewers import announce, choose_viewer
 
         method = [] if odometry is None else [f"odometry.method={odometry.value}"]
-        asked = source_overrides(calib, left, right, tolerance)
-        overrides = [*(set_ or ()), *method, *matching_overrides(matcher), *asked]
-        settings = load_config(config, overrides)
-        drive = open_source(source, kind, settings.source)
+        views = source_overrides(calib, left, right, tolerance)
+        overrides = [*(set_ or ()), *method, *matching_overrides(matcher), *views]
+        asked = MapRequest(source, kind, poses, mesh, out, resume)
+        request, settings = plan_map(asked, config, overrides)
+        drive = open_requested(request, settings)
         announce(drive, quiet=quiet)
         options = MapOptions(
-            out=out,
+            out=request.out,
             threads=threads,
-            known_poses=None if poses is None else read_trajectory(poses),
-            mesh=mesh,
+            known_poses=None if request.poses is None else read_trajectory(request.poses),
+            mesh=request.mesh,
+            resume=resume is not None,
+            arguments=request.arguments(),
             observers=(choose_viewer(quiet=quiet),),
             present=present_map,
         )

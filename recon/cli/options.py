@@ -35,7 +35,7 @@ Threads = Annotated[
     typer.Option("--threads", min=1, help="Threads to use (all cores)."),
 ]
 SourceArgument = Annotated[
-    Path,
+    Path | None,
     typer.Argument(
         help="KITTI drive (odometry or raw), EuRoC or TUM folder, left and right folders, video, "
         "ROS bag or MCAP file, Middlebury scene."

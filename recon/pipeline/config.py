@@ -24,6 +24,7 @@ from recon.mapping import (
 from recon.matching import MatchingSettings
 from recon.meshing import MeshSettings
 from recon.odometry import OdometrySettings
+from recon.pipeline.checkpoint import CheckpointSettings
 from recon.pipeline.paper_settings import PaperSettings
 from recon.rectification import InspectionSettings, RectificationSettings
 from recon.settings import Settings
@@ -57,6 +58,7 @@ class ReconConfig(Settings):
     fusion: FusionSettings = FusionSettings()
     occupancy: OccupancySettings = OccupancySettings()
     submaps: SubmapSettings = SubmapSettings()
+    checkpoints: CheckpointSettings = CheckpointSettings()
     ground: GroundSettings = GroundSettings()
     grid: GridSettings = GridSettings()
     mesh: MeshSettings = MeshSettings()

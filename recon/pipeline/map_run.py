@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,6 +25,7 @@ from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.machine import use_threads
 from recon.pipeline.observer import Observer
 from recon.pipeline.record import fingerprint, write_record
+from recon.pipeline.resume import begin_or_resume, identity_of, tell_how_to_resume
 from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.sequence import MappedSequence, map_sequence
 from recon.pipeline.stopwatch import Stopwatch
@@ -88,6 +89,8 @@ class MapOptions:
         mesh: Whether to reconstruct a surface.
         observers: Told of the progress.
         present: Writes pictures and the report of the run into its folder.
+        resume: Go on with the unfinished run in ``out``.
+        arguments: What a command line needs to resume the run without being told again.
     """
 
     command: str = "map"
@@ -97,26 +100,31 @@ class MapOptions:
     mesh: bool = True
     observers: tuple[Observer, ...] = ()
     present: Callable[[MapRun, RunDirectory], None] | None = None
+    resume: bool = False
+    arguments: Mapping[str, Any] = field(default_factory=dict)
 
 
 def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> MapRun:
     """Map a source; write trajectory, clouds, grids, mesh, report, summary and record.
 
     Raises:
-        ReconError: The source cannot be read or registered, or the folder not be written; then
-            nothing is left behind.
+        ReconError: The source cannot be read or registered; then nothing is left behind. Or the
+            folder cannot be written; then the run can be resumed.
     """
     start = time.perf_counter()
     threads = use_threads(options.threads)
     watch = Stopwatch()
-    with RunDirectory.for_command(options.command, options.out) as directory:
+    identity = identity_of(source, config, options.known_poses)
+    target = RunDirectory.for_command(options.command, options.out, resume=options.resume)
+    with target as directory, tell_how_to_resume(directory):
+        begin_or_resume(directory, identity, options.arguments)
         mapped = map_sequence(
             source,
             config,
             known_poses=options.known_poses,
             observers=options.observers,
             threads=threads,
-            workspace=Workspace(watch, directory.state("submaps")),
+            workspace=Workspace(watch, directory.state(""), resume=options.resume),
         )
         run = _finish(source, config, mapped, options, watch)
         with watch.stage("write"):

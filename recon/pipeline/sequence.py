@@ -10,16 +10,14 @@ from functools import cached_property
 import numpy as np
 
 from recon.errors import RegistrationError
-from recon.geometry.transform import transform_cloud
-from recon.mapping import SubmapBuilder, estimate_ground, fusion_range_m, map_axes
-from recon.odometry import KnownPoses, Odometry, OdometryFrame, OdometryHealth, make_odometry
+from recon.odometry import KnownPoses, Odometry, OdometryHealth, make_odometry
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.drive_map import DriveMap
 from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
 from recon.pipeline.lookahead import look_ahead
 from recon.pipeline.machine import serial_algebra
+from recon.pipeline.mapper import Mapper
 from recon.pipeline.observer import FrameResult, Observer
-from recon.pipeline.stopwatch import Stopwatch
 from recon.pipeline.submap_store import SubmapStore
 from recon.pipeline.workspace import Workspace
 from recon.sources import StereoSource
@@ -110,110 +108,89 @@ def map_sequence(
         ReconError: A frame cannot be read, matched or registered.
     """
     work = workspace or Workspace()
-    watch = work.stopwatch
     audience = tuple(observers)
-    reconstructor = FrameReconstructor(source.calibration, config, threads=threads, stopwatch=watch)
-    odometry = _odometry(config, known_poses, frames=len(source))
-    store = SubmapStore(work.folder)
-    mapper = _Mapper(
-        config, reconstructor.camera, odometry, watch, store, sample_at=len(source) // 2
+    reconstructor = FrameReconstructor(
+        source.calibration, config, threads=threads, stopwatch=work.stopwatch
     )
+    odometry = _odometry(config, known_poses, frames=len(source))
+    drive = _Drive(Mapper(config, reconstructor.camera, odometry, work), config, work)
     for observer in audience:
         observer.on_start(source.name, len(source))
-    start = last = time.perf_counter()
     try:
         with serial_algebra():
-            for frame in look_ahead(reconstructor.reconstruct, source):
-                result = mapper.add(frame, total=len(source))
-                now = time.perf_counter()
-                _tell(audience, replace(result, seconds=now - last))
-                last = now
+            pairs = source.frames(len(drive.mapper))
+            for frame in look_ahead(reconstructor.reconstruct, pairs):
+                result = drive.add(frame, total=len(source))
+                for observer in audience:
+                    observer.on_frame(result)
     finally:
         for observer in audience:
             observer.on_finish()
-    return mapper.finish(seconds=last - start)
+    return drive.finish(source, reconstructor)
 
 
-def _tell(audience: Iterable[Observer], result: FrameResult) -> None:
-    for observer in audience:
-        observer.on_frame(result)
+class _Drive:
+    """A mapper, its checkpoints, and its clock.
 
+    Where there is a checkpoint to go on from, it does; the time up to there counts as spent.
+    """
 
-class _Mapper:
-    """The part of the flow that holds state: odometry and the two maps."""
-
-    def __init__(
-        self,
-        config: ReconConfig,
-        camera: RectifiedCamera,
-        odometry: Odometry,
-        stopwatch: Stopwatch,
-        store: SubmapStore,
-        *,
-        sample_at: int,
-    ) -> None:
+    def __init__(self, mapper: Mapper, config: ReconConfig, workspace: Workspace) -> None:
+        self.mapper = mapper
         self._config = config
-        self._odometry = odometry
-        self._stopwatch = stopwatch
-        self._sample_at = sample_at
-        self._camera = camera
-        self._fusion_range_m = fusion_range_m(camera, config.fusion)
-        self._store = store
-        self._builder: SubmapBuilder | None = None
-        self._T_map_world = np.eye(4)
-        self._poses: list[Float64] = []
-        self._times_s: list[float] = []
-        self._health: list[OdometryHealth] = []
+        self._checkpoint = workspace.checkpoint
+        self._stage = workspace.stopwatch.stage
         self._sample: ReconstructedFrame | None = None
+        self._saved = 0
+        spent_s = 0.0
+        if workspace.resume and self._checkpoint is not None and self._checkpoint.exists():
+            state = self._checkpoint.load()
+            mapper.restore(state["mapper"])
+            spent_s, self._saved = state["seconds"], len(mapper)
+        self._last = time.perf_counter()
+        self._start = self._last - spent_s
 
     def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
-        index, stage = len(self._poses), self._stopwatch.stage
-        with stage("odometry"):
-            registered = self._odometry.register(OdometryFrame(frame.pair, frame.disparity))
-        T_world_camera = registered.T_world_camera
-        health = replace(registered.health, warnings=(*frame.warnings, *registered.health.warnings))
-        with stage("map"):
-            near = frame.cloud.select(frame.cloud.xyz[:, 2] <= self._fusion_range_m)
-            cloud_world = transform_cloud(near, T_world_camera, frame="world")
-            builder = self._builder_from(frame)
-            builder.integrate(cloud_world, frame.cloud, T_world_camera)
-        with stage("store"):
-            if builder.full:
-                self._store.add(builder.close())
-        self._poses.append(T_world_camera)
-        self._times_s.append(frame.pair.timestamp_s)
-        self._health.append(health)
-        if index <= self._sample_at:
+        result = self.mapper.add(frame, total=total)
+        if result.index <= total // 2:
             self._sample = frame
-        valid_share = float(np.mean(frame.disparity.valid))
-        return FrameResult(index, total, 0.0, valid_share, len(frame.cloud), T_world_camera, health)
+        if len(self.mapper) - self._saved >= self._config.checkpoints.every_frames:
+            self._save()
+        now = time.perf_counter()
+        seconds, self._last = now - self._last, now
+        return replace(result, seconds=seconds)
 
-    def finish(self, *, seconds: float) -> MappedSequence:
-        if self._sample is None or self._builder is None:
+    def finish(self, source: StereoSource, reconstructor: FrameReconstructor) -> MappedSequence:
+        if not len(self.mapper):
             raise RegistrationError("the source has no frame")
-        if self._builder.frames:
-            self._store.add(self._builder.close())
+        if len(self.mapper) > self._saved:
+            self._save()
+        self.mapper.close()
         return MappedSequence(
-            trajectory=Trajectory(np.stack(self._poses), np.array(self._times_s)),
-            health=tuple(self._health),
-            submaps=self._store,
+            trajectory=self.mapper.trajectory,
+            health=self.mapper.health,
+            submaps=self.mapper.submaps,
             config=self._config,
-            T_map_world=self._T_map_world,
-            camera=self._camera,
-            sample=self._sample,
-            seconds=seconds,
+            T_map_world=self.mapper.T_map_world,
+            camera=reconstructor.camera,
+            sample=self._sample or self._sample_again(source, reconstructor),
+            seconds=self._last - self._start,
         )
 
-    def _builder_from(self, frame: ReconstructedFrame) -> SubmapBuilder:
-        """The maps that are being built; the first frame fixes their axes."""
-        if self._builder is None:
-            config = self._config
-            ground = estimate_ground(frame.cloud, config.axes)
-            self._T_map_world = map_axes(ground, config.axes)
-            self._builder = SubmapBuilder(
-                config.submaps, config.fusion, config.occupancy, self._T_map_world
-            )
-        return self._builder
+    def _save(self) -> None:
+        if self._checkpoint is None:
+            return
+        with self._stage("checkpoint"):
+            seconds = time.perf_counter() - self._start
+            self._checkpoint.save({"mapper": self.mapper.state(), "seconds": seconds})
+        self._saved = len(self.mapper)
+
+    def _sample_again(
+        self, source: StereoSource, reconstructor: FrameReconstructor
+    ) -> ReconstructedFrame:
+        """The frame to look at, which was mapped before this process began."""
+        index = min(len(source) // 2, len(self.mapper) - 1)
+        return reconstructor.reconstruct(next(source.frames(index)))
 
 
 def _odometry(config: ReconConfig, known_poses: Trajectory | None, *, frames: int) -> Odometry:

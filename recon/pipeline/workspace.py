@@ -1,10 +1,11 @@
-"""Where a run works: what it may keep on the disk, and who times it."""
+"""Where a run works: what it keeps on the disk while it lasts, and who times it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from recon.pipeline.checkpoint import Checkpoint
 from recon.pipeline.stopwatch import Stopwatch
 
 
@@ -14,9 +15,22 @@ class Workspace:
 
     Attributes:
         stopwatch: Told the seconds per stage.
-        folder: Where closed submaps are written, so that memory does not grow with the drive; it
-            must stay as long as the result is used. None = they stay in memory.
+        folder: Where closed submaps and the checkpoint are written, so that memory does not grow
+            with the drive and a killed run can go on; it must stay as long as the result is
+            used. None = all stays in memory.
+        resume: Go on from the checkpoint in the folder, where there is one.
     """
 
     stopwatch: Stopwatch = field(default_factory=Stopwatch)
     folder: Path | None = None
+    resume: bool = False
+
+    @property
+    def submaps(self) -> Path | None:
+        """Folder of the submaps."""
+        return None if self.folder is None else self.folder / "submaps"
+
+    @property
+    def checkpoint(self) -> Checkpoint | None:
+        """What the run goes on from."""
+        return None if self.folder is None else Checkpoint(self.folder / "checkpoint.zip")

@@ -1,0 +1,105 @@
+"""What a killed run goes on from: its state after a frame, written atomically now and then."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from pydantic import Field
+
+from recon.errors import FormatError
+from recon.formats.tree_file import read_tree, write_tree
+from recon.settings import Settings
+from recon.structures.arrays import UInt8
+
+_HEAD_BYTES: Final = 4096
+#: What a saved odometry may consist of. Loading anything else would run what others wrote.
+_SAFE: Final = ("recon.", "numpy")
+
+
+class CheckpointSettings(Settings):
+    """How often a run writes down what it goes on from; changes no result."""
+
+    every_frames: int = Field(
+        50, ge=1, le=1_000_000, description="Frames after which the state is written."
+    )
+
+
+class Checkpoint:
+    """The newest state of a run, in one file.
+
+    Args:
+        path: The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def exists(self) -> bool:
+        """Whether there is a state to go on from."""
+        return self._path.is_file()
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Replace the state; a kill at any moment leaves the old or the new one.
+
+        Raises:
+            OutputError: It cannot be written; the old one stays.
+        """
+        write_tree(self._path, state)
+
+    def load(self) -> dict[str, Any]:
+        """The state.
+
+        Raises:
+            FormatError: The file is damaged.
+        """
+        return read_tree(self._path)
+
+
+def pack_object(value: object) -> UInt8:
+    """uint8 (N,), one of our stateful objects as bytes; `unpack_object` gives it back."""
+    return np.frombuffer(pickle.dumps(value, protocol=5), np.uint8)
+
+
+def unpack_object(content: UInt8) -> Any:
+    """The object that `pack_object` was given.
+
+    Raises:
+        FormatError: The bytes are damaged, or hold what is not ours.
+    """
+    try:
+        return _OurUnpickler(io.BytesIO(content.tobytes())).load()
+    except (pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError) as error:
+        raise FormatError("the state of the odometry cannot be read", got=error) from error
+
+
+class _OurUnpickler(pickle.Unpickler):
+    """Makes objects of this project and numpy's arrays, and nothing else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """The class or function of a name that may be used."""
+        found = super().find_class(module, name)
+        ours = module.startswith(_SAFE) and (isinstance(found, type) or module.startswith("numpy"))
+        if not ours:
+            raise pickle.UnpicklingError(f"{module}.{name} is not part of a state")
+        return found
+
+
+def quick_fingerprint(files: Iterable[Path]) -> dict[str, Any]:
+    """Number, sizes and a hash of the names and beginnings of files, to tell sources apart.
+
+    Whole files are hashed when a run is done; here a drive of many gigabytes must open at once.
+    """
+    digest, count, size = hashlib.sha256(), 0, 0
+    for path in files:
+        length = path.stat().st_size
+        digest.update(path.name.encode() + b"\0" + length.to_bytes(8, "little"))
+        with path.open("rb") as content:
+            digest.update(content.read(_HEAD_BYTES))
+        count, size = count + 1, size + length
+    return {"files": count, "bytes": size, "sha256": digest.hexdigest()}

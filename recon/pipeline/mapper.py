@@ -1,0 +1,133 @@
+"""The part of the flow that holds state: odometry, and the maps that are being built."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from recon.geometry.transform import transform_cloud
+from recon.mapping import SubmapBuilder, estimate_ground, fusion_range_m, map_axes
+from recon.odometry import Odometry, OdometryFrame, OdometryHealth
+from recon.pipeline.checkpoint import pack_object, unpack_object
+from recon.pipeline.config import ReconConfig
+from recon.pipeline.frame import ReconstructedFrame
+from recon.pipeline.observer import FrameResult
+from recon.pipeline.submap_store import SubmapStore
+from recon.pipeline.workspace import Workspace
+from recon.structures import RectifiedCamera, Trajectory
+from recon.structures.arrays import Float64
+
+
+class Mapper:
+    """Registers frames and adds them to the submap of the moment.
+
+    Args:
+        config: The configuration.
+        camera: The rectified camera.
+        odometry: Finds the poses.
+        workspace: Where closed submaps go, and who times it.
+    """
+
+    def __init__(
+        self,
+        config: ReconConfig,
+        camera: RectifiedCamera,
+        odometry: Odometry,
+        workspace: Workspace,
+    ) -> None:
+        self._config = config
+        self._odometry = odometry
+        self._workspace = workspace
+        self._fusion_range_m = fusion_range_m(camera, config.fusion)
+        self._builder: SubmapBuilder | None = None
+        self._poses: list[Float64] = []
+        self._times_s: list[float] = []
+        self._health: list[OdometryHealth] = []
+        self.submaps = SubmapStore(workspace.submaps)
+        self.T_map_world: Float64 = np.eye(4)
+
+    def __len__(self) -> int:
+        """Number of frames so far."""
+        return len(self._poses)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses so far; there must be one."""
+        return Trajectory(np.stack(self._poses), np.array(self._times_s))
+
+    @property
+    def health(self) -> tuple[OdometryHealth, ...]:
+        """How far each pose can be trusted."""
+        return tuple(self._health)
+
+    def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
+        """Take the next frame."""
+        stage = self._workspace.stopwatch.stage
+        with stage("odometry"):
+            registered = self._odometry.register(OdometryFrame(frame.pair, frame.disparity))
+        T_world_camera = registered.T_world_camera
+        health = replace(registered.health, warnings=(*frame.warnings, *registered.health.warnings))
+        with stage("map"):
+            near = frame.cloud.select(frame.cloud.xyz[:, 2] <= self._fusion_range_m)
+            cloud_world = transform_cloud(near, T_world_camera, frame="world")
+            builder = self._builder_from(frame)
+            builder.integrate(cloud_world, frame.cloud, T_world_camera)
+        with stage("store"):
+            if builder.full:
+                self.submaps.add(builder.close())
+        self._poses.append(T_world_camera)
+        self._times_s.append(frame.pair.timestamp_s)
+        self._health.append(health)
+        valid_share = float(np.mean(frame.disparity.valid))
+        return FrameResult(
+            len(self) - 1, total, 0.0, valid_share, len(frame.cloud), T_world_camera, health
+        )
+
+    def close(self) -> None:
+        """Close the submap of the moment, after the last frame."""
+        if self._builder is not None and self._builder.frames:
+            self.submaps.add(self._builder.close())
+
+    def state(self) -> dict[str, Any]:
+        """All that decides what comes later, as a tree of arrays and plain values."""
+        return {
+            "odometry": pack_object(self._odometry),
+            "builder": None if self._builder is None else self._builder.state(),
+            "submaps": self.submaps.state(),
+            "T_map_world": self.T_map_world,
+            "poses": np.array(self._poses).reshape(-1, 4, 4),
+            "times_s": np.array(self._times_s),
+            "health": [asdict(record) for record in self._health],
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a `state`."""
+        self._odometry = unpack_object(state["odometry"])
+        self.submaps.restore(state["submaps"])
+        self.T_map_world = state["T_map_world"]
+        self._poses = list(state["poses"])
+        self._times_s = state["times_s"].tolist()
+        self._health = [_health(record) for record in state["health"]]
+        if state["builder"] is not None:
+            self._builder = self._new_builder()
+            self._builder.restore(state["builder"])
+
+    def _builder_from(self, frame: ReconstructedFrame) -> SubmapBuilder:
+        """The maps that are being built; the first frame fixes their axes."""
+        if self._builder is None:
+            ground = estimate_ground(frame.cloud, self._config.axes)
+            self.T_map_world = map_axes(ground, self._config.axes)
+            self._builder = self._new_builder()
+        return self._builder
+
+    def _new_builder(self) -> SubmapBuilder:
+        config = self._config
+        return SubmapBuilder(config.submaps, config.fusion, config.occupancy, self.T_map_world)
+
+
+def _health(record: dict[str, Any]) -> OdometryHealth:
+    """A health record as a checkpoint holds it: lists were tuples."""
+    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in record.items()}
+    return OdometryHealth(**fields)

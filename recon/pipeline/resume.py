@@ -1,0 +1,212 @@
+"""Going on with a run that was killed: what it was started with, and whether that is the same."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from recon.errors import OutputError, SettingsError
+from recon.formats.atomic import write_text
+from recon.pipeline.checkpoint import quick_fingerprint
+from recon.pipeline.config import ReconConfig, load_config
+from recon.pipeline.machine import versions
+from recon.pipeline.run_directory import STARTED, RunDirectory, state_folder
+from recon.sources import StereoSource, open_source
+from recon.structures import Trajectory
+
+_OTHER: Final = {
+    "config": "other settings",
+    "source": "another source",
+    "poses": "other poses",
+    "versions": "other versions",
+}
+_NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_NOTHING: Final = "there is no unfinished run to resume"
+
+
+@dataclass(frozen=True)
+class MapRequest:
+    """What the command line asked for, apart from settings.
+
+    Attributes:
+        source: Path of the source; None = that of the run that is resumed.
+        kind: What the source is; None = told by its files.
+        poses: Known poses.
+        mesh: Whether to reconstruct a surface.
+        out: Result folder; None = a new one.
+        resume: Folder of an unfinished run to go on with.
+    """
+
+    source: Path | None
+    kind: str | None = None
+    poses: Path | None = None
+    mesh: bool = True
+    out: Path | None = None
+    resume: Path | None = None
+
+    def arguments(self) -> dict[str, Any]:
+        """What has to be known to open the same source again."""
+        return {
+            "source": None if self.source is None else str(self.source.resolve()),
+            "kind": self.kind,
+            "poses": None if self.poses is None else str(self.poses.resolve()),
+            "mesh": self.mesh,
+        }
+
+
+def plan_map(
+    request: MapRequest, config: Path | None, overrides: Sequence[str]
+) -> tuple[MapRequest, ReconConfig]:
+    """Complete a request and its configuration by those of the run that is resumed.
+
+    Raises:
+        SettingsError: A setting is wrong, or the resumed run was started with others; there is
+            no source.
+        OutputError: There is no run to resume.
+    """
+    if request.resume is not None:
+        return _plan_resumed(request, request.resume, config, overrides)
+    return request, load_config(config, overrides)
+
+
+def _plan_resumed(
+    request: MapRequest, folder: Path, config: Path | None, overrides: Sequence[str]
+) -> tuple[MapRequest, ReconConfig]:
+    started = read_started(folder)
+    known = started["arguments"]
+    settings = ReconConfig.parse(started["identity"]["config"], where=str(folder))
+    if config is not None or overrides:
+        asked = load_config(config, overrides)
+        _refuse_others({"config": asked.model_dump(mode="json")}, started["identity"], folder)
+    if request.out is not None and request.out.resolve() != folder.resolve():
+        raise SettingsError("--out and --resume name two folders", got=request.out, expected=folder)
+    if not request.mesh and known.get("mesh"):
+        raise SettingsError("the run was started with a mesh", where=folder, hint="drop --no-mesh")
+    request = replace(
+        request,
+        source=request.source or _path(known.get("source")),
+        kind=request.kind or known.get("kind"),
+        poses=request.poses or _path(known.get("poses")),
+        mesh=bool(known.get("mesh")),
+        out=folder,
+    )
+    return request, settings
+
+
+def _path(text: str | None) -> Path | None:
+    return None if text is None else Path(text)
+
+
+def open_requested(request: MapRequest, config: ReconConfig) -> StereoSource:
+    """Open the source of a planned request.
+
+    Raises:
+        SettingsError: It names none.
+        ReconError: The source cannot give pairs.
+    """
+    if request.source is None:
+        raise SettingsError("it is not known what to map", hint="name SOURCE")
+    return open_source(request.source, request.kind, config.source)
+
+
+def identity_of(
+    source: StereoSource, config: ReconConfig, known_poses: Trajectory | None
+) -> dict[str, Any]:
+    """All that has to be the same for a run to go on to the same result."""
+    poses = None
+    if known_poses is not None:
+        poses = hashlib.sha256(known_poses.T_world_camera.tobytes()).hexdigest()
+    return {
+        "config": config.model_dump(mode="json"),
+        "source": {"frames": len(source), **quick_fingerprint(source.files)},
+        "poses": poses,
+        "versions": versions(),
+    }
+
+
+def begin_or_resume(
+    directory: RunDirectory, identity: Mapping[str, Any], arguments: Mapping[str, Any]
+) -> None:
+    """Write down what a run is started with; of a resumed one, check that it is the same.
+
+    Raises:
+        SettingsError: The run was started with something else.
+        OutputError: It cannot be written, or there is no run to resume.
+    """
+    if directory.resumes:
+        _refuse_others(identity, read_started(directory.folder)["identity"], directory.folder)
+        return
+    content = {"identity": dict(identity), "arguments": dict(arguments)}
+    write_text(directory.state(STARTED), json.dumps(content, ensure_ascii=False))
+
+
+@contextmanager
+def tell_how_to_resume(directory: RunDirectory) -> Iterator[None]:
+    """Let an error that leaves a state to go on from say how.
+
+    Raises:
+        OutputError: The disk is full, or the folder cannot be written any more.
+    """
+    try:
+        yield
+    except (OutputError, OSError, KeyboardInterrupt) as error:
+        if not directory.resumable:
+            raise
+        hint = f"recon map --resume {shlex.quote(str(directory.folder))} goes on from there"
+        if isinstance(error, KeyboardInterrupt):
+            raise KeyboardInterrupt(hint) from error
+        if isinstance(error, OutputError):
+            told = OutputError(error.what, where=error.where, got=error.got, hint=hint)
+            raise told from error
+        if error.errno not in _NO_ROOM:
+            raise
+        full = OutputError("the disk is full", where=error.filename, got=error.strerror, hint=hint)
+        raise full from error
+
+
+def read_started(folder: Path) -> dict[str, Any]:
+    """What an unfinished run was started with.
+
+    Raises:
+        OutputError: There is none in the folder.
+    """
+    path = state_folder(folder) / STARTED
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise OutputError(_NOTHING, where=folder, hint="start it without --resume") from error
+    if not isinstance(content, dict):
+        raise OutputError(_NOTHING, where=folder, hint="start it without --resume")
+    return content
+
+
+def _refuse_others(now: Mapping[str, Any], then: Mapping[str, Any], folder: Path) -> None:
+    """Refuse to go on with anything but the same."""
+    # Through JSON, as what was read came: tuples and lists are the same.
+    for part, value in json.loads(json.dumps(dict(now))).items():
+        if value == then.get(part):
+            continue
+        key, got, expected = _first_difference(value, then.get(part), part)
+        raise SettingsError(
+            f"the run was started with {_OTHER[part]}",
+            where=folder,
+            got=f"{key} = {got}",
+            expected=expected,
+            hint="resume with what it was started with, or start anew without --resume",
+        )
+
+
+def _first_difference(now: Any, then: Any, key: str) -> tuple[str, Any, Any]:
+    """Dotted key and the two values of the first leaf that differs."""
+    if isinstance(now, dict) and isinstance(then, dict):
+        for name in [*now, *(then.keys() - now.keys())]:
+            if now.get(name) != then.get(name):
+                return _first_difference(now.get(name), then.get(name), f"{key}.{name}")
+    return key, now, then

@@ -1,0 +1,232 @@
+"""A run that was broken off goes on to the files that an unbroken one writes."""
+
+from __future__ import annotations
+
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.errors import FormatError, OutputError, SettingsError
+from recon.pipeline.config import ReconConfig, load_config
+from recon.pipeline.map_run import MapOptions, MapRun, run_map
+from recon.pipeline.observer import FrameResult
+from recon.sources import open_source
+from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.synthetic import StreetSettings
+
+STREET = StreetSettings(frames=24, width_px=192, height_px=72, focal_px=110.0)
+SETTINGS = ["checkpoints.every_frames=5", "submaps.length_m=4", "submaps.tile_m=12.8"]
+FILES = [
+    "trajectory_kitti.txt",
+    "trajectory_tum.txt",
+    "map/cloud.ply",
+    "map/grid.pgm",
+    "map/grid.yaml",
+    "map/octomap.ot",
+    "map/octomap.bt",
+    "config.yaml",
+]
+
+
+class _Breaks:
+    """An observer that breaks a run off before a frame is reported."""
+
+    def __init__(self, frame: int, error: BaseException) -> None:
+        self.frame, self.error = frame, error
+
+    def on_start(self, name: str, total: int) -> None: ...
+
+    def on_frame(self, result: FrameResult) -> None:
+        if result.index == self.frame:
+            raise self.error
+
+    def on_stage(self, name: str) -> None: ...
+
+    def on_finish(self) -> None: ...
+
+
+def _config(*more: str) -> ReconConfig:
+    return load_config(None, [*SETTINGS, *more])
+
+
+def _run(
+    drive: Path, out: Path, observer: _Breaks | None = None, *, resume: bool = False
+) -> MapRun:
+    observers = () if observer is None else (observer,)
+    options = MapOptions(out=out, mesh=False, observers=observers, resume=resume)
+    return run_map(open_source(drive), _config(), options)
+
+
+def _content(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in FILES}
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("drive")
+    write_kitti(SyntheticSource(STREET), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def unbroken(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    folder = tmp_path_factory.mktemp("unbroken")
+    _run(drive, folder)
+    return _content(folder)
+
+
+@pytest.mark.parametrize("frame", [0, 4, 13, 23])
+def test_an_interrupted_run_goes_on_to_the_same_files(
+    drive: Path, unbroken: dict[str, bytes], tmp_path: Path, frame: int
+) -> None:
+    with pytest.raises(KeyboardInterrupt, match="--resume"):
+        _run(drive, tmp_path, _Breaks(frame, KeyboardInterrupt()))
+    assert [path.name for path in tmp_path.iterdir()] == [".partial"]
+    run = _run(drive, tmp_path, resume=True)
+    assert _content(tmp_path) == unbroken
+    assert run.summary["frames"] == STREET.frames
+    assert not (tmp_path / ".partial").exists()
+
+
+def test_a_run_that_is_broken_off_again_and_again_goes_on(
+    drive: Path, unbroken: dict[str, bytes], tmp_path: Path
+) -> None:
+    for frame in (6, 7, 16):
+        with pytest.raises(KeyboardInterrupt):
+            _run(drive, tmp_path, _Breaks(frame, KeyboardInterrupt()), resume=frame != 6)
+    _run(drive, tmp_path, resume=True)
+    assert _content(tmp_path) == unbroken
+
+
+def test_bad_input_leaves_nothing_to_resume(drive: Path, tmp_path: Path) -> None:
+    with pytest.raises(FormatError):
+        _run(drive, tmp_path / "run", _Breaks(12, FormatError("picture is truncated")))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_settings_another_source_and_other_poses_are_refused(
+    drive: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        _run(drive, tmp_path / "run", _Breaks(12, KeyboardInterrupt()))
+    source = open_source(drive)
+    options = MapOptions(out=tmp_path / "run", mesh=False, resume=True)
+    with pytest.raises(SettingsError, match=r"other settings.*fusion.voxel_m = 0.2, expected 0.1"):
+        run_map(source, _config("fusion.voxel_m=0.2"), options)
+    other = shutil.copytree(drive, tmp_path / "other")
+    (other / "image_0" / "000007.png").write_bytes((drive / "image_0" / "000008.png").read_bytes())
+    with pytest.raises(SettingsError, match="another source"):
+        run_map(open_source(other), _config(), options)
+    assert source.truth is not None
+    known = MapOptions(
+        out=tmp_path / "run", mesh=False, resume=True, known_poses=source.truth.trajectory
+    )
+    with pytest.raises(SettingsError, match="other poses"):
+        run_map(source, _config(), known)
+    assert (tmp_path / "run" / ".partial").is_dir()
+
+
+def test_without_an_unfinished_run_there_is_nothing_to_resume(drive: Path, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="no unfinished run"):
+        _run(drive, tmp_path / "run", resume=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_second_run_in_the_same_folder_is_refused_and_the_first_goes_on(
+    drive: Path, unbroken: dict[str, bytes], tmp_path: Path
+) -> None:
+    refused = []
+
+    class Meddles(_Breaks):
+        def on_frame(self, result: FrameResult) -> None:
+            if result.index == 9:
+                for resume in (False, True):
+                    with pytest.raises(OutputError, match="another run") as told:
+                        _run(drive, tmp_path, resume=resume)
+                    refused.append(told.value)
+
+    _run(drive, tmp_path, Meddles(0, KeyError()))
+    assert len(refused) == 2
+    assert _content(tmp_path) == unbroken
+
+
+def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
+    drive: Path, unbroken: dict[str, bytes], tmp_path: Path
+) -> None:
+    with (
+        _largest_file(150_000),
+        pytest.raises(OutputError, match=r"cannot write.*--resume") as told,
+    ):
+        _run(drive, tmp_path)
+    assert "\n" not in str(told.value)
+    _run(drive, tmp_path, resume=True)
+    assert _content(tmp_path) == unbroken
+
+
+@contextmanager
+def _largest_file(size: int) -> Iterator[None]:
+    """A disk that takes no more of a file than this; Python is told so by an error."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.slow
+def test_a_run_killed_at_ten_random_moments_gives_the_same_files(
+    drive: Path, unbroken: dict[str, bytes], tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(0)
+    whole_s = _finish(drive, tmp_path / "whole")
+    assert _content(tmp_path / "whole") == unbroken
+    kills = 0
+    for number in range(20):
+        out = tmp_path / f"run{number}"
+        for _ in range(3):
+            kills += _kill(_command(drive, out), after_s=rng.uniform(0.2, 1.1) * whole_s)
+            if (out / "run.json").exists():
+                break
+        if not (out / "run.json").exists():
+            _finish(drive, out)
+        assert _content(out) == unbroken
+        if kills >= 10:
+            return
+    pytest.fail(f"only {kills} runs were killed before they were done")
+
+
+def _command(drive: Path, out: Path) -> list[str]:
+    """Start the run, or go on with it where it has begun."""
+    recon = [sys.executable, "-m", "recon", "map", "--quiet"]
+    if (out / ".partial" / ".state" / "started.json").exists():
+        return [*recon, "--resume", str(out)]
+    settings = [part for text in SETTINGS for part in ("--set", text)]
+    return [*recon, str(drive), "--out", str(out), "--no-mesh", *settings]
+
+
+def _finish(drive: Path, out: Path) -> float:
+    """Run to the end; the seconds that took."""
+    begun = time.monotonic()
+    subprocess.run(_command(drive, out), check=True, capture_output=True)
+    return time.monotonic() - begun
+
+
+def _kill(command: list[str], after_s: float) -> bool:
+    """Whether a command still ran when it was killed."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        process.wait(after_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        return True
+    return False
