@@ -8,14 +8,25 @@ correspondence", ECCV 1994.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from numba import njit
+from numba import njit, types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 PLANES: Final = 3
-"""Planes come in threes, because three are counted at the price of two."""
+"""Planes come in threes: 5 by 5 has three, and fewer loops are faster ones."""
+
+
+@intrinsic
+def count_bits(_: Any, bits: Any) -> Any:
+    """Number of bits of a uint8 that are set, by the instruction of the processor if it has one."""
+
+    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        return builder.ctpop(arguments[0])
+
+    return (types.uint8(types.uint8), generate) if bits == types.uint8 else None
 
 
 def census_planes(grey: NDArray[np.uint8], rows_radius: int, radius: int) -> NDArray[np.uint8]:

@@ -1,24 +1,34 @@
 """Costs of all candidates of a row: gradients and census over a window, in uint8.
 
-The costs of single pixels are kept for as many rows as the window is high, so that each is
-computed once. As in `recon.kernels.sad`, the right view is mirrored and every intermediate cast
-back; arrays are indexed whole, because a slice costs more than the 128 candidates behind it.
+One row is an array (candidates, W): the pixels of a candidate lie side by side, in the left view
+as in the right, so that vector registers are filled along the row and need no padding but at its
+end. The sums over a window's width are kept for as many rows as the window is high. Every
+intermediate is cast back to its width, and where a row starts at a variable column it is sliced
+first (an index that might be negative is looked at for every pixel), or the loops lose their
+vector instructions.
 
 The twin in plain numpy is `recon.kernels.semi_global_reference.path_costs_reference`.
 """
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.kernels.census import PLANES
+from recon.kernels.census import PLANES, count_bits
 
 LANES: Final = 64
-"""Candidates are padded to a multiple of this: the bytes of a vector register."""
+"""Columns are padded to a multiple of this: the bytes of a vector register."""
+
+BLOCK: Final = 16
+"""Candidates whose rows are kept at a time."""
+
+TOGETHER: Final = 4
+"""Candidates are padded to a multiple of this: so many are done in one loop."""
 
 
 class Views(NamedTuple):
@@ -26,164 +36,287 @@ class Views(NamedTuple):
 
     Attributes:
         grey: uint8 (H, W), the left picture.
-        left: uint8 (H, W), its gradients.
-        right: uint8 (H, W + P - 1), those of the right picture, from `mirror_views`.
-        left_census: uint8 (B, H, W), from `census_planes`.
-        right_census: uint8 (B, H, W + P - 1), mirrored.
+        left: uint8 (H, 1 + B, R), its gradients and census, from `left_planes`.
+        right: uint8 (H, 1 + B, R + P - 1), those of the right picture, from `right_planes`.
     """
 
     grey: NDArray[np.uint8]
     left: NDArray[np.uint8]
     right: NDArray[np.uint8]
-    left_census: NDArray[np.uint8]
-    right_census: NDArray[np.uint8]
 
 
 class Window(NamedTuple):
-    """What a cost sums up.
+    """What a cost sums up: `scaled_window` makes one.
 
     Attributes:
         radius: Half width of the window, pixels: it is ``2·radius + 1`` wide.
         rows_radius: Half height of the window, pixels.
         gradient_cap: Largest difference of gradients that counts.
-        factor: 65536 × path cost per window sum.
-        top: Cost of the candidates that only pad, not below any other; at most 255.
+        row_shift: Bits that the sum over the window's width loses, to fit into uint8.
+        factor: The sum over its height, times this, fits into uint16 ...
+        shift: ... and loses so many bits.
+        top: Cost of the candidates that only pad, not below any other; at most 253.
     """
 
     radius: int
     rows_radius: int
     gradient_cap: int
+    row_shift: int
     factor: int
+    shift: int
     top: int
+
+    @property
+    def levels(self) -> float:
+        """Steps of a path cost for one step of a pixel's cost."""
+        pixels = (2 * self.radius + 1) * (2 * self.rows_radius + 1)
+        return pixels * self.factor * 2.0 ** -(self.row_shift + self.shift)
 
 
 class CostRows(NamedTuple):
     """Room for the rows around the present one.
 
     Attributes:
-        pixels: uint8 (2·rows_radius + 2, W, P), costs of single pixels, and one row of room.
-        columns: uint16 (W, P), their sums over the rows of the window.
-        sums: uint16 (1, P), the sums over the window at one pixel.
+        pixels: uint8 (R + LANES), costs of single pixels of one candidate.
+        wide: uint16 (C), sums over the window's width, before they lose bits.
+        across: uint8 (C), the same afterwards.
+        rows: uint8 (2·rows_radius + 1, BLOCK, C), the same for the rows of the window.
+        sums: uint16 (BLOCK, C), their sums.
     """
 
     pixels: NDArray[np.uint8]
-    columns: NDArray[np.uint16]
+    wide: NDArray[np.uint16]
+    across: NDArray[np.uint8]
+    rows: NDArray[np.uint8]
     sums: NDArray[np.uint16]
 
 
-def padded_candidates(ndisp: int) -> int:
-    """Number of candidates with the padding."""
-    return -(-ndisp // LANES) * LANES
+def padded(number: int, multiple: int = LANES) -> int:
+    """The next multiple."""
+    return -(-number // multiple) * multiple
 
 
-def mirror_view(right: NDArray[np.uint8], ndisp: int, minimum: int) -> NDArray[np.uint8]:
-    """A right view (…, H, W) from right to left, its borders repeated: (…, H, W + P - 1).
+def aligned(shape: tuple[int, ...], kind: type[np.uint8 | np.uint16] = np.uint8) -> NDArray[Any]:
+    """Zeros that start where a vector register's load crosses no cache line."""
+    size = int(np.prod(shape)) * np.dtype(kind).itemsize
+    room = np.zeros(size + LANES, np.uint8)
+    start = -room.ctypes.data % LANES
+    return room[start : start + size].view(kind).reshape(shape)
 
-    Column ``j`` is right column ``W - 1 - minimum - j``, clamped to the picture.
+
+def scaled_window(
+    radius: int, rows_radius: int, gradient_cap: int, largest: int, levels: float
+) -> Window:
+    """The window whose costs are about ``levels`` times the mean cost of a pixel.
+
+    Args:
+        radius: As in `Window`.
+        rows_radius: As in `Window`.
+        gradient_cap: As in `Window`.
+        largest: Largest cost of one pixel.
+        levels: Steps of a path cost for one step of a pixel's cost.
     """
-    width = right.shape[-1]
-    places = np.arange(width + padded_candidates(ndisp) - 1)
-    columns = np.clip(width - 1 - minimum - places, 0, width - 1)
-    return np.ascontiguousarray(right[..., columns])
+    width, height = 2 * radius + 1, 2 * rows_radius + 1
+    row_shift = max(0, (width * largest).bit_length() - 8)
+    most = (width * largest >> row_shift) * height
+    top = largest * levels
+    # The largest scale that 16 bits hold.
+    shift = max(0, int(np.log2(65535 / top)))
+    factor = max(1, int(top * 2**shift / most))
+    return Window(
+        radius, rows_radius, gradient_cap, row_shift, factor, shift, most * factor >> shift
+    )
 
 
-def empty_cost_rows(width: int, candidates: int, window: Window) -> CostRows:
-    """Room for `next_cost_row`, as before the first row."""
+def left_planes(planes: Sequence[NDArray[np.uint8]], radius: int) -> NDArray[np.uint8]:
+    """Planes (H, W) with their borders repeated: (H, B, R), from column ``-radius`` on."""
+    width = planes[0].shape[1]
+    return _placed(planes, padded(width + 2 * radius), radius)
+
+
+def right_planes(
+    planes: Sequence[NDArray[np.uint8]], radius: int, ndisp: int, minimum: int
+) -> NDArray[np.uint8]:
+    """Planes (H, W) of the right view for all candidates: (H, B, R + P - 1).
+
+    What column ``x`` of `left_planes` is compared with as candidate ``k`` stands at
+    ``x - k + P - 1``; where the right picture ends, its borders are repeated.
+    """
+    width, candidates = planes[0].shape[1], padded(ndisp, TOGETHER)
+    size = padded(width + 2 * radius) + candidates - 1
+    return _placed(planes, size, candidates - 1 + radius + minimum)
+
+
+def _placed(planes: Sequence[NDArray[np.uint8]], size: int, start: int) -> NDArray[np.uint8]:
+    """Rows of that size with the planes from ``start`` on, which may be outside."""
+    height, width = planes[0].shape
+    placed = np.empty((height, len(planes), size), np.uint8)
+    first, end = min(max(start, 0), size), min(max(start + width, 0), size)
+    for n, plane in enumerate(planes):
+        placed[:, n, :first] = plane[:, :1]
+        placed[:, n, first:end] = plane[:, first - start : end - start]
+        placed[:, n, end:] = plane[:, -1:]
+    return placed
+
+
+def empty_cost_rows(width: int, window: Window) -> CostRows:
+    """Room for `write_costs`."""
+    columns = padded(width)
     return CostRows(
-        np.zeros((2 * window.rows_radius + 2, width, candidates), np.uint8),
-        np.zeros((width, candidates), np.uint16),
-        np.zeros((1, candidates), np.uint16),
+        aligned((padded(width + 2 * window.radius) + LANES,)),
+        aligned((columns,), np.uint16),
+        aligned((columns,)),
+        aligned((2 * window.rows_radius + 1, BLOCK, columns)),
+        aligned((BLOCK, columns), np.uint16),
     )
 
 
 @njit(cache=True, nogil=True)
-def enter_row(views: Views, window: Window, y: int, rows: CostRows) -> None:
-    """Take row ``y`` (clamped to the picture) into the sums, and the oldest row out."""
+def write_costs(
+    views: Views,
+    window: Window,
+    ndisp: int,
+    top: int,
+    bottom: int,
+    rows: CostRows,
+    costs: NDArray[np.uint8],
+) -> None:
+    """Write the costs (N, P, C) of the rows from ``top`` until before ``bottom``.
+
+    Row ``y`` goes to place ``y % N``. A block of candidates is done at a time, so that the rows of
+    a window stay in the cache.
+    """
+    if top >= bottom:
+        return
+    block = rows.sums.shape[0]
+    for first in range(0, ndisp, block):
+        rows.rows[:] = np.uint8(0)
+        rows.sums[:] = np.uint16(0)
+        end = min(first + block, ndisp)
+        for y in range(top - window.rows_radius, bottom + window.rows_radius):
+            # The first rows are written over.
+            middle = max(y - window.rows_radius, top) % costs.shape[0]
+            _write_block(views, window, first, end, y, rows, costs[middle])
+    for y in range(top, bottom):
+        costs[y % costs.shape[0], ndisp:] = np.uint8(window.top)
+
+
+@njit(cache=True, nogil=True)
+def _write_block(
+    views: Views,
+    window: Window,
+    first: int,
+    end: int,
+    y: int,
+    rows: CostRows,
+    costs: NDArray[np.uint8],
+) -> None:
+    """Take row ``y`` (clamped to the picture) into the sums, the oldest out, and write costs.
+
+    After ``2·rows_radius + 1`` calls for successive rows, the costs (P, C) are those of the row in
+    their middle.
+    """
     height = 2 * window.rows_radius + 1
-    oldest = rows.pixels[(y + height * (window.rows_radius + 1)) % height]
-    fresh = rows.pixels[height]
+    oldest = rows.rows[(y + height * (window.rows_radius + 1)) % height]
     line = min(max(y, 0), views.grey.shape[0] - 1)
-    _compare_gradients(views.left[line], views.right[line], window.gradient_cap, fresh)
-    for plane in range(0, len(views.left_census), PLANES):
-        left = views.left_census[plane : plane + PLANES, line]
-        _add_bits(left, views.right_census[plane : plane + PLANES, line], fresh)
-    _exchange(rows.columns, fresh, oldest)
-    oldest[:] = fresh
+    left, right = views.left[line], views.right[line]
+    for k in range(first, end):
+        start = costs.shape[0] - 1 - k
+        _compare_gradients(left, right, start, window.gradient_cap, rows.pixels)
+        for plane in range(1, left.shape[0], PLANES):
+            _add_bits(left, right, plane, start, rows.pixels)
+        if window.row_shift == 0:
+            _sum_across(rows.pixels, window.radius, rows.across)
+        else:
+            _sum_far_across(rows.pixels, window, rows.wide, rows.across)
+        _exchange(rows.across, oldest[k - first], window, rows.sums[k - first], costs[k])
 
 
 @njit(cache=True, nogil=True)
 def _compare_gradients(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], gradient_cap: int, pixels: NDArray[np.uint8]
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    start: int,
+    gradient_cap: int,
+    pixels: NDArray[np.uint8],
 ) -> None:
     """Write how far the gradients of a row are apart."""
-    width, candidates = pixels.shape
-    cap = np.uint8(gradient_cap)
-    for x in range(width):
-        a, start = left[x], width - 1 - x
-        others = right[start : start + candidates]
-        for k in range(candidates):
-            b = others[k]
-            pixels[x, k] = min(np.uint8(max(a, b) - min(a, b)), cap)
+    cap, others = np.uint8(gradient_cap), right[0, start:]
+    for x in range(left.shape[1]):
+        a, b = left[0, x], others[x]
+        pixels[x] = min(np.uint8(max(a, b) - min(a, b)), cap)
 
 
 @njit(cache=True, nogil=True)
-def _add_bits(left: NDArray[np.uint8], right: NDArray[np.uint8], pixels: NDArray[np.uint8]) -> None:
-    """Add the number of bits of three planes that differ: full adders make two planes of them."""
-    width, candidates = pixels.shape
-    for x in range(width):
-        first, end = width - 1 - x, width - 1 - x + candidates
-        a, b, c = left[0, x], left[1, x], left[2, x]
-        right_a, right_b, right_c = right[0, first:end], right[1, first:end], right[2, first:end]
-        for k in range(candidates):
-            p, q, r = np.uint8(a ^ right_a[k]), np.uint8(b ^ right_b[k]), np.uint8(c ^ right_c[k])
-            either = np.uint8(p ^ q)
-            ones, twos = np.uint8(either ^ r), np.uint8(np.uint8(p & q) | np.uint8(either & r))
-            bits = np.uint8(_count_bits(ones) + np.uint8(_count_bits(twos) << np.uint8(1)))
-            pixels[x, k] = np.uint8(pixels[x, k] + bits)
+def _add_bits(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    plane: int,
+    start: int,
+    pixels: NDArray[np.uint8],
+) -> None:
+    """Add the number of bits of three planes that differ."""
+    first, second, third = (
+        right[plane, start:],
+        right[plane + 1, start:],
+        right[plane + 2, start:],
+    )
+    for x in range(left.shape[1]):
+        a = count_bits(np.uint8(left[plane, x] ^ first[x]))
+        b = count_bits(np.uint8(left[plane + 1, x] ^ second[x]))
+        c = count_bits(np.uint8(left[plane + 2, x] ^ third[x]))
+        pixels[x] = np.uint8(np.uint8(pixels[x] + a) + np.uint8(b + c))
 
 
 @njit(cache=True, nogil=True)
-def _count_bits(bits: np.uint8) -> np.uint8:
-    """Number of bits that are set, counted in pairs, then in fours, then in all."""
-    pairs, fours, all_bits = np.uint8(0x55), np.uint8(0x33), np.uint8(0x0F)
-    bits = np.uint8(bits - np.uint8(np.uint8(bits >> np.uint8(1)) & pairs))
-    upper = np.uint8(np.uint8(bits >> np.uint8(2)) & fours)
-    bits = np.uint8(np.uint8(bits & fours) + upper)
-    count: np.uint8 = np.uint8(np.uint8(bits + np.uint8(bits >> np.uint8(4))) & all_bits)
-    return count
+def _sum_across(pixels: NDArray[np.uint8], radius: int, across: NDArray[np.uint8]) -> None:
+    """Sum the costs over the window's width."""
+    if radius == 2:
+        for x in range(across.size):
+            outer, inner = (
+                np.uint8(pixels[x] + pixels[x + 4]),
+                np.uint8(pixels[x + 1] + pixels[x + 3]),
+            )
+            across[x] = np.uint8(np.uint8(outer + inner) + pixels[x + 2])
+        return
+    for x in range(across.size):
+        across[x] = pixels[x + radius]
+    for d in range(radius):
+        end = 2 * radius - d
+        for x in range(across.size):
+            across[x] = np.uint8(across[x] + np.uint8(pixels[x + d] + pixels[x + end]))
+
+
+@njit(cache=True, nogil=True)
+def _sum_far_across(
+    pixels: NDArray[np.uint8],
+    window: Window,
+    wide: NDArray[np.uint16],
+    across: NDArray[np.uint8],
+) -> None:
+    """The same for windows whose sums need their lowest bits cut."""
+    wide[:] = np.uint16(0)
+    for d in range(2 * window.radius + 1):
+        for x in range(wide.size):
+            wide[x] = np.uint16(wide[x] + np.uint16(pixels[x + d]))
+    shift = np.uint16(window.row_shift)
+    for x in range(wide.size):
+        across[x] = np.uint8(np.uint16(wide[x] >> shift))
 
 
 @njit(cache=True, nogil=True)
 def _exchange(
-    columns: NDArray[np.uint16], come: NDArray[np.uint8], gone: NDArray[np.uint8]
+    across: NDArray[np.uint8],
+    oldest: NDArray[np.uint8],
+    window: Window,
+    sums: NDArray[np.uint16],
+    costs: NDArray[np.uint8],
 ) -> None:
-    """Take one row of costs out of the column sums and add another."""
-    for x in range(columns.shape[0]):
-        for k in range(columns.shape[1]):
-            rest = np.uint16(columns[x, k] - np.uint16(gone[x, k]))
-            columns[x, k] = np.uint16(rest + np.uint16(come[x, k]))
-
-
-@njit(cache=True, nogil=True)
-def write_costs(
-    rows: CostRows, window: Window, ndisp: int, y: int, costs: NDArray[np.uint8]
-) -> None:
-    """Write row ``y`` of ``costs`` (rows, W, P): the scaled window sums, the padding at the top."""
-    columns, sums, radius = rows.columns, rows.sums, window.radius
-    last = columns.shape[0] - 1
-    sums[:] = np.uint16(0)
-    for x in range(-radius - 1, radius):
-        column = min(max(x, 0), last)
-        for k in range(sums.shape[1]):
-            sums[0, k] = np.uint16(sums[0, k] + columns[column, k])
-    factor = np.uint32(window.factor)
-    for x in range(last + 1):
-        come, gone = min(x + radius, last), max(x - radius - 1, 0)
-        for k in range(sums.shape[1]):
-            rest = np.uint16(sums[0, k] - columns[gone, k])
-            sums[0, k] = np.uint16(rest + columns[come, k])
-        for k in range(sums.shape[1]):
-            scaled = np.uint32(np.uint32(sums[0, k]) * factor)
-            costs[y, x, k] = np.uint8(scaled >> np.uint32(16))
-        for k in range(ndisp, sums.shape[1]):
-            costs[y, x, k] = np.uint8(window.top)
+    """Take the oldest row out of the sums of a candidate and another in; write the scaled sums."""
+    factor, shift = np.uint16(window.factor), np.uint16(window.shift)
+    for x in range(across.size):
+        rest = np.uint16(sums[x] - np.uint16(oldest[x]))
+        total = np.uint16(rest + np.uint16(across[x]))
+        sums[x] = total
+        oldest[x] = across[x]
+        costs[x] = np.uint8(np.uint16(np.uint16(total * factor) >> shift))

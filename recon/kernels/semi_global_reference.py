@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from recon.kernels.minima import Minima
 from recon.kernels.path_costs import Views, Window
+from recon.kernels.plane_minima import PARTS
 from recon.kernels.sad_reference import minima_reference
 from recon.kernels.semi_global import Paths
 
@@ -14,32 +15,36 @@ Int64 = NDArray[np.int64]
 
 
 def semi_global_minima_reference(views: Views, window: Window, paths: Paths) -> Minima:
-    """All rows of `recon.kernels.semi_global.semi_global_minima`, as one strip."""
+    """All rows of `recon.kernels.semi_global.semi_global_minima`, as one block."""
     costs = path_costs_reference(views, window, paths.ndisp)
-    steps = [(1, 0), (0, 1), (1, 1), (1, -1)] if paths.diagonal else [(1, 0), (0, 1)]
-    down = sum(path_reference(views.grey, costs, paths, dy, dx) for dy, dx in steps)
-    up = sum(path_reference(views.grey, costs, paths, -dy, -dx) for dy, dx in steps)
-    mean_down = (np.asarray(down) + len(steps) // 2) // len(steps)
-    sums = np.asarray(up) + len(steps) * mean_down
-    return minima_reference(sums[:, :, : paths.ndisp], paths.minimum)
+    sweeps = []
+    for dy in (1, -1):
+        straight, left, right = (
+            path_reference(views.grey, costs, paths, dy, dx) for dx in (0, 1, -1)
+        )
+        sweeps.append(_mean(straight, _mean(left, right)))
+    return minima_reference(PARTS * _mean(*sweeps)[:, :, : paths.ndisp], paths.minimum)
+
+
+def _mean(a: Int64, b: Int64) -> Int64:
+    return (a + b + 1) >> 1
 
 
 def path_costs_reference(views: Views, window: Window, ndisp: int) -> Int64:
     """int64 (H, W, P), the cost of each candidate at each pixel; the padding at the top."""
     height, width = views.grey.shape
-    candidates = views.right.shape[1] - width + 1
-    x, k = np.arange(width)[:, None], np.arange(candidates)
-    right = views.right[:, width - 1 - x + k].astype(np.int64)
-    pixels = np.minimum(np.abs(views.left[:, :, None] - right), window.gradient_cap)
-    differ = views.left_census[:, :, :, None] ^ views.right_census[:, :, width - 1 - x + k]
-    pixels = pixels + np.unpackbits(differ[..., None], axis=-1).sum(axis=(0, -1), dtype=np.int64)
-    sums = np.zeros(pixels.shape, np.int64)
-    rows, columns = np.arange(height)[:, None], np.arange(width)
+    candidates = views.right.shape[2] - views.left.shape[2] + 1
+    x, k = np.arange(views.left.shape[2])[:, None], np.arange(candidates)
+    left, right = views.left[..., None], views.right[:, :, x - k + candidates - 1]
+    pixels = np.minimum(abs(left[:, 0].astype(np.int64) - right[:, 0]), window.gradient_cap)
+    differ = left[:, 1:] ^ right[:, 1:]
+    pixels = pixels + np.unpackbits(differ[..., None], axis=-1).sum(axis=(1, -1), dtype=np.int64)
+    across = sum(pixels[:, dx : dx + width] for dx in range(2 * window.radius + 1))
+    across = np.asarray(across) >> window.row_shift
+    sums, rows = np.zeros(across.shape, np.int64), np.arange(height)
     for dy in range(-window.rows_radius, window.rows_radius + 1):
-        for dx in range(-window.radius, window.radius + 1):
-            line, column = np.clip(rows + dy, 0, height - 1), np.clip(columns + dx, 0, width - 1)
-            sums += pixels[line, column]
-    return np.where(k < ndisp, sums * window.factor >> 16, window.top)
+        sums += across[np.clip(rows + dy, 0, height - 1)]
+    return np.where(k < ndisp, sums * window.factor >> window.shift, window.top)
 
 
 def path_reference(grey: NDArray[np.uint8], costs: Int64, paths: Paths, dy: int, dx: int) -> Int64:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final, Literal
+from typing import Final
 
 import cv2
 import numpy as np
@@ -14,13 +14,22 @@ from typing_extensions import Self
 
 from recon.kernels.census import census_planes
 from recon.kernels.minima import empty_minima
-from recon.kernels.path_costs import Views, Window, mirror_view, padded_candidates
+from recon.kernels.path_costs import (
+    TOGETHER,
+    Views,
+    Window,
+    left_planes,
+    padded,
+    right_planes,
+    scaled_window,
+)
+from recon.kernels.plane_minima import PARTS
 from recon.kernels.refine import (
     Rules,
     empty_refined,
     refine_minima,
 )
-from recon.kernels.semi_global import Paths, Room, empty_room, semi_global_minima
+from recon.kernels.semi_global import ROWS, Paths, Room, empty_room, semi_global_minima
 from recon.matching.search import FITS, MeasuredSettings, OddInt, without_speckles
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import Float32, UInt8
@@ -28,15 +37,13 @@ from recon.structures.arrays import Float32, UInt8
 _GAIN_OF_SOBEL: Final = 8.0
 """A 3×3 Sobel filter answers a slope of one grey level per pixel with 8."""
 
-_LEVELS: Final = 253
+_LEVELS: Final = 250
 """Of the 255 that a path cost has; rounding needs the others."""
 
-_ODDS: Final = 4.0
-"""`Rules.odds` of sums over paths, fitted on MiddEval3; 2005 and 2006 were held out."""
+_ODDS: Final = 2.0
+"""`Rules.odds` of means over paths, fitted on MiddEval3; 2003, 2005 and 2006 were held out."""
 
-_STRIP_BYTES: Final = 512 << 20
 _STRIP_ROWS: Final = 192
-_LEAST_STRIP_ROWS: Final = 32
 
 
 class SgmSettings(MeasuredSettings):
@@ -67,9 +74,6 @@ class SgmSettings(MeasuredSettings):
     )
     census_height_px: OddInt = Field(
         default=5, ge=1, le=9, description="Height of the census; odd."
-    )
-    paths: Literal[4, 8] = Field(
-        default=8, description="Along rows and columns, or along the diagonals too."
     )
     small_penalty: float = Field(
         default=16.0,
@@ -144,14 +148,14 @@ class SgmMatcher:
         """
         s = self._settings
         ndisp = s.ndisp_within(pair.camera)
-        levels = _LEVELS / (s.largest_cost + s.small_penalty + s.large_penalty)
-        views, window = _views(pair, ndisp, s), _window(s, levels)
+        views, window = _views(pair, ndisp, s), _window(s)
+        levels = window.levels
         paths, rules = _paths(s, ndisp, levels), _rules(s, ndisp, levels)
         texture = _texture(pair, s)
         minima, refined = empty_minima(*texture.shape), empty_refined(*texture.shape)
 
         def work(strip: range) -> None:
-            room = self._take_room(strip_rows, pair.camera.width_px, paths)
+            room = self._take_room(pair.camera.width_px, paths)
             semi_global_minima(views, window, paths, strip, room, minima)
             self._rooms.append(room)
             refine_minima(minima, texture, rules, strip.start, strip.stop, refined)
@@ -165,35 +169,36 @@ class SgmMatcher:
 
     def _strips(self, camera: RectifiedCamera, ndisp: int) -> tuple[int, int]:
         """Rows of a strip, and how many strips may be worked on at once."""
-        height, width = camera.height_px, camera.width_px
-        costs_row, means_row = width * padded_candidates(ndisp), width * ndisp
-        fitting = _STRIP_BYTES // (costs_row + means_row)
-        most = min(max(fitting, _LEAST_STRIP_ROWS), _STRIP_ROWS)
+        height = camera.height_px
         # An even number of strips, so that two cores end together.
-        rows = -(-height // (2 * -(-height // (2 * most))))
-        strip_bytes = rows * (costs_row + means_row) + 2 * self._settings.overlap_rows * costs_row
-        at_once = min(self._threads, (self._settings.memory_mb << 20) // strip_bytes)
+        rows = -(-height // (2 * -(-height // (2 * _STRIP_ROWS))))
+        room_bytes = _room_bytes(camera.width_px, ndisp, self._settings.overlap_rows)
+        at_once = min(self._threads, (self._settings.memory_mb << 20) // room_bytes)
         return rows, max(1, at_once)
 
-    def _take_room(self, rows: int, width: int, paths: Paths) -> Room:
+    def _take_room(self, width: int, paths: Paths) -> Room:
         """Room for a strip: that of an earlier one where it fits."""
-        fresh = empty_room(rows, width, paths)
+        fresh = empty_room(width, paths)
         try:
             room = self._rooms.pop()
         except IndexError:
             return fresh
-        fits = room.costs.shape == fresh.costs.shape and room.means.shape == fresh.means.shape
-        return room if fits else fresh
+        return room if room.costs.shape == fresh.costs.shape else fresh
 
 
-def _window(settings: SgmSettings, levels: float) -> Window:
+def _room_bytes(width: int, ndisp: int, overlap: int) -> int:
+    """What a `Room` takes: its costs, its means, and nine rows of paths."""
+    return padded(width) * padded(ndisp, TOGETHER) * (2 * ROWS + overlap + 9)
+
+
+def _window(settings: SgmSettings) -> Window:
     s = settings
-    return Window(
+    return scaled_window(
         radius=s.window_px // 2,
         rows_radius=s.window_height_px // 2,
         gradient_cap=s.cost_cap,
-        factor=int(65536 * levels / (s.window_px * s.window_height_px)),
-        top=int(s.largest_cost * levels),
+        largest=s.largest_cost,
+        levels=_LEVELS / (s.largest_cost + s.small_penalty + s.large_penalty),
     )
 
 
@@ -208,7 +213,6 @@ def _paths(settings: SgmSettings, ndisp: int, levels: float) -> Paths:
         large=large,
         large_at_edge=max(small, round(large * s.edge_penalty_share)),
         edge=s.edge_grey_levels,
-        diagonal=s.paths == 8,
         overlap=s.overlap_rows,
     )
 
@@ -222,23 +226,26 @@ def _rules(settings: SgmSettings, ndisp: int, levels: float) -> Rules:
         texture=s.min_texture,
         uniqueness=s.uniqueness_percent,
         left_right=s.left_right_or_none,
-        window_pixels=max(1, round(s.paths * levels)),
+        window_pixels=max(1, round(PARTS * levels)),
         sigma_floor_px=s.sigma_floor_px,
         odds=_ODDS,
     )
 
 
 def _views(pair: RectifiedPair, ndisp: int, settings: SgmSettings) -> Views:
-    rows_radius, radius = settings.census_height_px // 2, settings.census_px // 2
-    first = settings.min_disparity_px
-    right_census = census_planes(pair.right, rows_radius, radius)
+    radius = settings.window_px // 2
+    right = _planes(pair.right, settings)
     return Views(
         grey=pair.left,
-        left=_gradients(pair.left, settings.prefilter_cap),
-        right=mirror_view(_gradients(pair.right, settings.prefilter_cap), ndisp, first),
-        left_census=census_planes(pair.left, rows_radius, radius),
-        right_census=mirror_view(right_census, ndisp, first),
+        left=left_planes(_planes(pair.left, settings), radius),
+        right=right_planes(right, radius, ndisp, settings.min_disparity_px),
     )
+
+
+def _planes(image: UInt8, settings: SgmSettings) -> list[UInt8]:
+    """Gradients and census, uint8 (H, W) each."""
+    census = census_planes(image, settings.census_height_px // 2, settings.census_px // 2)
+    return [_gradients(image, settings.prefilter_cap), *census]
 
 
 def _gradients(image: UInt8, cap: int) -> UInt8:

@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 
 from recon.kernels.census import census_planes
 from recon.kernels.minima import Minima, empty_minima
-from recon.kernels.path_costs import Views, Window, mirror_view
-from recon.kernels.semi_global import Paths, empty_room, semi_global_minima
+from recon.kernels.path_costs import Views, Window, left_planes, right_planes, scaled_window
+from recon.kernels.semi_global import ROWS, Paths, empty_room, semi_global_minima
 from recon.kernels.semi_global_reference import semi_global_minima_reference
 
 Image = NDArray[np.uint8]
 
 
-def make_views(left: Image, right: Image, paths: Paths) -> Views:
+def make_views(left: Image, right: Image, window: Window, paths: Paths) -> Views:
     return Views(
         grey=left,
-        left=left,
-        right=mirror_view(right, paths.ndisp, paths.minimum),
-        left_census=census_planes(left, 1, 2),
-        right_census=mirror_view(census_planes(right, 1, 2), paths.ndisp, paths.minimum),
+        left=left_planes([left, *census_planes(left, 1, 2)], window.radius),
+        right=right_planes(
+            [right, *census_planes(right, 1, 2)], window.radius, paths.ndisp, paths.minimum
+        ),
     )
 
 
@@ -34,7 +34,7 @@ def search(views: Views, window: Window, paths: Paths, strips: int = 1) -> Minim
     minima = empty_minima(*views.grey.shape)
     edges = np.linspace(0, len(views.grey), strips + 1).astype(int).tolist()
     for first, end in itertools.pairwise(edges):
-        room = empty_room(end - first, views.grey.shape[1], paths)
+        room = empty_room(views.grey.shape[1], paths)
         semi_global_minima(views, window, paths, range(first, end), room, minima)
     return minima
 
@@ -56,21 +56,19 @@ def pairs(draw: st.DrawFn) -> tuple[Image, Image]:
 @st.composite
 def windows(draw: st.DrawFn) -> tuple[Window, Paths]:
     radius, rows_radius, cap = draw(
-        st.tuples(st.integers(0, 3), st.integers(0, 3), st.sampled_from([0, 16, 60]))
+        st.tuples(st.integers(0, 3), st.integers(0, 3), st.sampled_from([0, 16, 120]))
     )
     small, more = draw(st.tuples(st.integers(1, 40), st.integers(0, 80)))
-    # The largest that a path cost leaves: cost + small + large <= 255.
-    top = 255 - 2 * small - more
-    pixels = (2 * radius + 1) * (2 * rows_radius + 1)
-    window = Window(radius, rows_radius, cap, 65536 * top // (pixels * (cap + 14)), top)
+    # The largest that a path cost leaves: cost + small + large <= 254.
+    top = 254 - 2 * small - more
+    window = scaled_window(radius, rows_radius, cap, cap + 14, top / (cap + 14))
     paths = Paths(
-        ndisp=draw(st.integers(1, 70)),
+        ndisp=draw(st.sampled_from([1, 2, 3, 4, 5, 17, 70, 260])),
         minimum=draw(st.integers(-6, 6)),
         small=small,
         large=small + more,
         large_at_edge=small,
         edge=draw(st.sampled_from([0, 12, 255])),
-        diagonal=draw(st.booleans()),
         overlap=100,
     )
     return window, paths
@@ -80,7 +78,7 @@ def windows(draw: st.DrawFn) -> tuple[Window, Paths]:
 @given(pairs(), windows())
 def test_search_equals_its_twin(pair: tuple[Image, Image], rules: tuple[Window, Paths]) -> None:
     window, paths = rules
-    views = make_views(*pair, paths)
+    views = make_views(*pair, window, paths)
     expected = semi_global_minima_reference(views, window, paths)
     assert_equal(search(views, window, paths), expected)
 
@@ -91,15 +89,15 @@ def test_strips_that_overlap_wholly_do_not_change_the_result(
     pair: tuple[Image, Image], rules: tuple[Window, Paths], strips: int
 ) -> None:
     window, paths = rules
-    views = make_views(*pair, paths)
+    views = make_views(*pair, window, paths)
     assert_equal(search(views, window, paths, strips), search(views, window, paths))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
 def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
     grey = np.zeros(shape, np.uint8)
-    paths = Paths(4, 0, 10, 50, 20, 12, diagonal=True, overlap=4)
-    minima = search(make_views(grey, grey, paths), Window(2, 2, 16, 8000, 90), paths)
+    paths, window = Paths(4, 0, 10, 50, 20, 12, overlap=4), scaled_window(2, 2, 16, 30, 3.0)
+    minima = search(make_views(grey, grey, window, paths), window, paths)
     assert (minima.winner == 0).all()
     assert (minima.right_winner == 0).all()
 
@@ -108,7 +106,35 @@ def test_few_rows_of_overlap_change_little() -> None:
     rng = np.random.default_rng(0)
     left = rng.integers(0, 256, (80, 60), dtype=np.uint8)
     right = np.roll(left, -5, axis=1)
-    paths = Paths(16, 0, 10, 50, 20, 12, diagonal=True, overlap=8)
-    views, window = make_views(left, right, paths), Window(1, 1, 16, 18000, 90)
+    paths, window = Paths(16, 0, 10, 50, 20, 12, overlap=8), scaled_window(1, 1, 16, 30, 3.0)
+    views = make_views(left, right, window, paths)
     whole, strips = search(views, window, paths), search(views, window, paths, strips=4)
     assert (whole.winner == strips.winner).mean() > 0.99
+
+
+@pytest.mark.parametrize("shape", [(3 * ROWS + 5, 70), (2 * ROWS, 64)])
+@pytest.mark.parametrize("overlap", [4 * ROWS, 2 * ROWS + 1])
+def test_a_picture_of_several_blocks_equals_the_twin(shape: tuple[int, int], overlap: int) -> None:
+    """Paths from above go on from block to block; those from below reach through all below."""
+    rng = np.random.default_rng(1)
+    left, right = rng.integers(0, 256, (2, *shape), dtype=np.uint8)
+    paths = Paths(9, -2, 10, 50, 20, 12, overlap=max(overlap, shape[0]))
+    window = scaled_window(1, 2, 16, 30, 3.0)
+    views = make_views(left, right, window, paths)
+    expected = semi_global_minima_reference(views, window, paths)
+    assert_equal(search(views, window, paths, strips=2), expected)
+
+
+@given(st.integers(0, 15), st.integers(0, 15), st.integers(1, 207), st.floats(0.05, 6.0))
+def test_a_scaled_window_stays_within_its_widths(
+    radius: int, rows_radius: int, largest: int, levels: float
+) -> None:
+    levels = min(levels, 250 / largest)
+    window = scaled_window(radius, rows_radius, 14, largest, levels)
+    across = ((2 * radius + 1) * largest) >> window.row_shift
+    most = across * (2 * rows_radius + 1)
+    assert across <= 255
+    assert most * window.factor <= 65535
+    assert most * window.factor >> window.shift == window.top <= 250
+    # What is said of the scale is what the largest cost becomes, but for bits that were cut.
+    assert window.levels * largest == pytest.approx(window.top, rel=0.1, abs=1.5)
