@@ -52,8 +52,10 @@ class PointCloud:
 
     def select(self, which: NDArray[Any]) -> PointCloud:
         """The points of a boolean mask (N,) or of an index array, in that order."""
+        # Taking by index is several times as fast as by mask.
+        index = np.flatnonzero(which) if which.dtype == np.bool_ else which
         arrays = {
-            field.name: getattr(self, field.name)[which]
+            field.name: getattr(self, field.name).take(index, axis=0)
             for field in fields(self)
             if isinstance(getattr(self, field.name), np.ndarray)
         }
