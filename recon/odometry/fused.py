@@ -14,6 +14,7 @@ from recon.odometry.gate import (
     as_step,
     as_transform,
     covariance_of,
+    icp_covariance,
     icp_may_help,
     judge,
     step_covariance,
@@ -74,6 +75,9 @@ class FusedOdometry:
         self._lost = 0
         self._mapped = False
         self._frames = 0
+        # Until ICP was heard, it is taken to be as good as it can be.
+        gate = settings.gate
+        self._icp_covariance = step_covariance(gate.icp_floor_m, gate.icp_floor_deg)
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
         """Register the next frame.
@@ -86,13 +90,17 @@ class FusedOdometry:
         prior = self._prior(self._visual.track(frame))
         due = self._frames % self._settings.icp.every == 0
         self._frames += 1
-        if due or not prior.seen or icp_may_help(prior.covariance, self._settings.gate):
+        if due or not prior.seen or self._icp_may_help(prior):
             result = self._asked(prior, frame)
         else:
             result = OdometryResult(prior.T_world_camera, prior.visual.result.health)
         self._T_visual = prior.visual.result.T_world_camera
         self._T_world_camera = result.T_world_camera
         return result
+
+    def _icp_may_help(self, prior: _Prior) -> bool:
+        """Whether ICP, as sure as it was when it was last heard, would change an unsure prior."""
+        return icp_may_help(prior.covariance, self._icp_covariance, self._settings.gate)
 
     def _asked(self, prior: _Prior, frame: OdometryFrame) -> OdometryResult:
         """The prior after ICP was heard; its map has the frame afterwards."""
@@ -110,7 +118,7 @@ class FusedOdometry:
         if visual.information is None:
             sigmas = self._lost * np.array([gate.lost_sigma_m, gate.lost_sigma_deg])
             return _Prior(orthonormalise(T), step_covariance(*sigmas.tolist()), visual)
-        covariance = covariance_of(gate.visual_independence * visual.information)
+        covariance = covariance_of(visual.information)
         return _Prior(orthonormalise(T), covariance, visual)
 
     def _corrected(self, prior: _Prior, points: PointCloud) -> OdometryResult:
@@ -120,14 +128,20 @@ class FusedOdometry:
             note = "no map for ICP yet" if not self._mapped else "too few points for ICP"
             health = replace(health, icp_points=len(points), notes=(*health.notes, note))
             return OdometryResult(prior.T_world_camera, health)
-        icp = self._settings.icp
-        threshold_m = icp.threshold_m if prior.seen else icp.lost_threshold_m
-        alignment = self._icp.align(points.xyz, prior.T_world_camera, threshold_m)
+        alignment = self._align(prior, points)
         correction = self._measure(prior, alignment)
         verdict = judge(correction, self._offset, prior.covariance, self._settings.gate)
         self._learn_offset(prior, correction)
+        self._icp_covariance = icp_covariance(correction.after, self._settings.gate)
         T = orthonormalise(prior.T_world_camera @ as_transform(verdict.step))
         return OdometryResult(T, _health(health, alignment, correction, verdict))
+
+    def _align(self, prior: _Prior, points: PointCloud) -> IcpAlignment:
+        """ICP from the prior; where that was not seen, from farther away first."""
+        icp, T = self._settings.icp, prior.T_world_camera
+        if not prior.seen:
+            T = self._icp.align(points.xyz, T, icp.lost_threshold_m).T_world_camera
+        return self._icp.align(points.xyz, T, icp.threshold_m)
 
     def _measure(self, prior: _Prior, alignment: IcpAlignment) -> Correction:
         """What ICP would change, and how the frame fits the map on both sides of it."""

@@ -74,10 +74,9 @@ def judge(
     return Verdict(step, accepted=True)
 
 
-def icp_may_help(prior_covariance: Float64, settings: GateSettings) -> bool:
-    """Whether ICP at its best, at its floor in every direction, would know better than a prior."""
-    floor = step_covariance(settings.icp_floor_m, settings.icp_floor_deg)
-    share, _ = _shares(prior_covariance, prior_covariance + floor)
+def icp_may_help(prior: Float64, icp: Float64, settings: GateSettings) -> bool:
+    """Whether an ICP of some covariance would know better than a prior in any direction."""
+    share, _ = _shares(prior, prior + icp)
     return bool(share.max() >= settings.min_share)
 
 

@@ -33,6 +33,8 @@ class OdometryHealth:
         tracks: Features followed from the last frame.
         inliers: Features that agree with the visual motion.
         reprojection_px: Their median reprojection error.
+        sigma_m: Standard deviation of the visual translation from the frames before.
+        sigma_deg: The same for the rotation.
         icp_points: Points given to ICP.
         overlap: Share of ICP source points with a neighbour in the map.
         residual_m: Median distance of those to the map.
@@ -47,6 +49,8 @@ class OdometryHealth:
     tracks: int = 0
     inliers: int = 0
     reprojection_px: float = float("nan")
+    sigma_m: float = float("nan")
+    sigma_deg: float = float("nan")
     icp_points: int = 0
     overlap: float = float("nan")
     residual_m: float = float("nan")

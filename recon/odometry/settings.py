@@ -34,6 +34,12 @@ class TrackSettings(Settings):
         description="The same for the way back, which begins where it should end: it only has to "
         "tell whether it stays there",
     )
+    max_exposure_change: float = Field(
+        0.05,
+        ge=0.0,
+        description="Relative change of brightness or contrast from which a picture is brought to "
+        "the exposure of the last one before features are followed",
+    )
     max_return_px: float = Field(
         0.5, gt=0.0, le=10.0, description="Largest distance of forward plus backward tracking"
     )
@@ -55,6 +61,9 @@ class WindowSettings(Settings):
     iterations: int = Field(6, ge=1, le=100, description="Levenberg-Marquardt steps at most")
     min_gain: float = Field(
         1e-3, gt=0.0, lt=1.0, description="Relative gain of a step below which it is the last"
+    )
+    independence: float = Field(
+        0.25, gt=0.0, le=1.0, description="Share of tracks whose errors count as independent"
     )
     sigma_uv_px: float = Field(0.3, gt=0.0, description="Standard deviation of a track")
     sigma_d_px: float = Field(
@@ -92,6 +101,12 @@ class VisualSettings(Settings):
     tracks: TrackSettings = TrackSettings()
     pose: PoseSettings = PoseSettings()
     window: WindowSettings = WindowSettings()
+    relocate_features: int = Field(
+        2000,
+        ge=100,
+        le=20000,
+        description="Features looked for in the whole picture where tracks are lost",
+    )
 
 
 class PointSettings(Settings):
@@ -173,9 +188,6 @@ class GateSettings(Settings):
     )
     icp_independence: float = Field(
         0.05, gt=0.0, le=1.0, description="Share of points whose errors count as independent"
-    )
-    visual_independence: float = Field(
-        0.25, gt=0.0, le=1.0, description="Share of tracks whose errors count as independent"
     )
     icp_floor_m: float = Field(
         0.02, gt=0.0, description="Standard deviation of ICP that more points do not improve"

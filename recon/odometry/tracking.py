@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from recon.adapters.opencv_features import exposed_as
 from recon.odometry.settings import TrackSettings
 from recon.structures import Disparity
 from recon.structures.arrays import Bool, Float32, UInt8
@@ -32,12 +33,20 @@ def follow(
     """
     if not len(uv):
         return uv.copy(), np.zeros(0, np.bool_)
+    target = _comparable(source, target, settings.max_exposure_change)
     there, found = _lucas_kanade(source, target, uv, guess_uv, settings, settings.levels)
     back, found_back = _lucas_kanade(target, source, there, uv, settings, settings.return_levels)
     returned = np.abs(back - uv).max(axis=1) <= settings.max_return_px
     height, width = target.shape
     inside = (there >= 0).all(axis=1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
     return there, np.asarray(found & found_back & returned & inside)
+
+
+def _comparable(source: UInt8, target: UInt8, max_change: float) -> UInt8:
+    """The target, at the exposure of the source where the two differ."""
+    ours, theirs = (np.ravel(cv2.meanStdDev(image)) for image in (source, target))
+    same = np.abs(theirs - ours) <= max_change * ours
+    return target if same.all() else exposed_as(source, target)
 
 
 def sample_disparity(disparity: Disparity, uv: Float32, settings: TrackSettings) -> Float32:

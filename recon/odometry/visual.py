@@ -6,16 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from recon.adapters.opencv_features import match_features
 from recon.geometry.projection import project, unproject
 from recon.geometry.se3 import apply, invert
 from recon.geometry.triangulation import depth_from_disparity
 from recon.odometry.corners import find_corners
+from recon.odometry.motion import Motion
 from recon.odometry.pose import enough_agree, locate_camera
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
 from recon.odometry.settings import VisualSettings
 from recon.odometry.tracking import follow, sample_disparity
 from recon.odometry.window import TrackWindow, adjust, misfits, pose_information, reprojection
-from recon.structures import RectifiedCamera
+from recon.structures import Disparity, RectifiedCamera
 from recon.structures.arrays import Float32, Float64, UInt8
 
 
@@ -24,14 +26,16 @@ class VisualState:
     """What is kept from frame to frame.
 
     Attributes:
-        window: The last frames and the points seen in them.
-        left: uint8 (H, W), the last left picture.
-        motion: float64 (4, 4), the last motion, ``T_previous_camera``.
+        window: The last frames that were seen, and the points in them.
+        left: uint8 (H, W), the left picture of the newest of them.
+        disparity: Its disparity.
+        motion: Where the camera is by now, which may be some frames later.
     """
 
     window: TrackWindow
     left: UInt8
-    motion: Float64
+    disparity: Disparity
+    motion: Motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,15 @@ class VisualEstimate:
 
     result: OdometryResult
     information: Float64 | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A frame that was registered."""
+
+    window: TrackWindow
+    tracks: int
+    note: str = ""
 
 
 class VisualOdometry:
@@ -64,38 +77,91 @@ class VisualOdometry:
         return self.track(frame).result
 
     def track(self, frame: OdometryFrame) -> VisualEstimate:
-        """The same, with what is known about the pose."""
-        if self._state is None:
-            window, motion = _empty(np.eye(4)), np.eye(4)
-            health, information = OdometryHealth(), None
-        else:
-            window, health, information = self._advance(self._state, frame)
-            motion = invert(self._state.window.T_world_camera[-1]) @ window.T_world_camera[-1]
-        T_world_camera = window.T_world_camera[-1].copy()
-        window = self._replenish(window.trimmed(self._settings.window.frames), frame)
-        self._state = VisualState(window, frame.pair.left, motion)
-        return VisualEstimate(OdometryResult(T_world_camera, health), information)
+        """The same, with what is known about the pose.
 
-    def _advance(
-        self, state: VisualState, frame: OdometryFrame
-    ) -> tuple[TrackWindow, OdometryHealth, Float64 | None]:
-        """The window with the new frame in it, or a new one where the old is lost."""
-        predicted = state.window.T_world_camera[-1] @ state.motion
+        Where features cannot be followed, they are looked for in the whole picture: after a gap,
+        or once the sight is back. Where that fails too, a frame with features of its own is a
+        new beginning at the pose where the last motion leads; one without leaves the last frame
+        that was seen waiting for the next.
+        """
+        state = self._state
+        if state is None:
+            motion = Motion(np.eye(4), frame.pair.timestamp_s)
+            self._state = self._begin(frame, motion)
+            return VisualEstimate(OdometryResult(np.eye(4), OdometryHealth()), None)
+        predicted = state.motion.predict(frame.pair.timestamp_s)
+        seen = self._followed(state, frame, predicted) or self._found_again(state, frame, predicted)
+        if seen is None:
+            return self._lost(state, frame)
+        T_world_camera = seen.window.T_world_camera[-1].copy()
+        window = self._replenish(seen.window.trimmed(self._settings.window.frames), frame)
+        motion = state.motion.moved(T_world_camera, frame.pair.timestamp_s)
+        self._state = VisualState(window, frame.pair.left, frame.disparity, motion)
+        return self._estimate(seen, frame.pair.camera)
+
+    def _begin(self, frame: OdometryFrame, motion: Motion) -> VisualState:
+        """A new window at the pose where the camera is by now."""
+        window = self._replenish(_empty(motion.T_world_camera), frame)
+        return VisualState(window, frame.pair.left, frame.disparity, motion)
+
+    def _followed(
+        self, state: VisualState, frame: OdometryFrame, predicted: Float64
+    ) -> _Seen | None:
+        """The frame by the features that were followed into it."""
+        return self._register(
+            state.window, self._observe(state, frame, predicted), frame, predicted
+        )
+
+    def _found_again(
+        self, state: VisualState, frame: OdometryFrame, predicted: Float64
+    ) -> _Seen | None:
+        """The frame by features that look alike, wherever they are now."""
+        count = self._settings.relocate_features
+        uv, uv_now = match_features(state.left, frame.pair.left, count, any_scale=True)
+        camera, T_world_then = frame.pair.camera, state.window.T_world_camera[-1]
+        then = np.column_stack([uv, self._disparity(state.disparity, camera, uv)])
+        now = np.column_stack([uv_now, self._disparity(frame.disparity, camera, uv_now)])
+        known = np.isfinite(then[:, 2])
+        then, now = then[known].astype(np.float64), now[known].astype(np.float64)
+        window = _empty(T_world_then).with_points(then, _points(then, T_world_then, camera))
+        seen = self._register(window, now, frame, predicted)
+        if seen is None:
+            return None
+        note = "features were looked for in the whole picture"
+        # The matches are scattered over both pictures; what is followed next begins anew.
+        return _Seen(seen.window, seen.tracks, note)
+
+    def _register(
+        self, window: TrackWindow, uvd: Float64, frame: OdometryFrame, predicted: Float64
+    ) -> _Seen | None:
+        """The window with the new frame in it, where enough features agree on one motion."""
         camera, settings = frame.pair.camera, self._settings
-        uvd = self._observe(state, frame, predicted)
         tracks = np.flatnonzero(np.isfinite(uvd[:, 0]))
         found = locate_camera(
-            state.window.xyz_world[tracks], uvd[tracks, :2], camera, predicted, settings.pose
+            window.xyz_world[tracks], uvd[tracks, :2], camera, predicted, settings.pose
         )
         if found is None:
-            return _lost(predicted, len(tracks))
+            return None
         uvd[tracks[~found.agree]] = np.nan
-        window = adjust(state.window.with_frame(found.T_world_camera, uvd), camera, settings.window)
+        window = adjust(window.with_frame(found.T_world_camera, uvd), camera, settings.window)
         window = window.without_newest(misfits(window, camera, settings.window))
         if not enough_agree(int(window.seen[-1].sum()), len(tracks), settings.pose):
-            return _lost(predicted, len(tracks))
-        health = _health(window, len(tracks), camera)
-        return window, health, pose_information(window, camera, settings.window)
+            return None
+        return _Seen(window, len(tracks))
+
+    def _lost(self, state: VisualState, frame: OdometryFrame) -> VisualEstimate:
+        """The last motion goes on; what is seen of it decides from where it is followed next."""
+        motion = state.motion.drifted(frame.pair.timestamp_s)
+        begun = self._begin(frame, motion)
+        points = len(begun.window.xyz_world)
+        sees = points >= self._settings.pose.min_inliers
+        self._state = (
+            begun if sees else VisualState(state.window, state.left, state.disparity, motion)
+        )
+        what = "no motion fits" if sees else "nothing to follow in the picture"
+        note = f"lost: {what} ({points} features); the last motion goes on"
+        health = OdometryHealth(False, notes=(note,))
+        return VisualEstimate(OdometryResult(motion.T_world_camera, health), None)
 
     def _observe(self, state: VisualState, frame: OdometryFrame, predicted: Float64) -> Float64:
         """Column, row and disparity (N, 3) in the new frame of the points of the window."""
@@ -108,42 +174,47 @@ class VisualOdometry:
         guess = np.where(np.isfinite(guess), guess, uv).astype(np.float32)
         there, found = follow(state.left, frame.pair.left, uv, guess, self._settings.tracks)
         uvd[alive[found], :2] = there[found]
-        uvd[alive[found], 2] = self._disparity(frame, there[found])
+        uvd[alive[found], 2] = self._disparity(frame.disparity, frame.pair.camera, there[found])
         return uvd
 
-    def _disparity(self, frame: OdometryFrame, uv: Float32) -> Float64:
+    def _disparity(self, disparity: Disparity, camera: RectifiedCamera, uv: Float32) -> Float64:
         """Disparity (N,) of features; NaN = unknown, or too small to tell a depth."""
-        d = sample_disparity(frame.disparity, uv, self._settings.tracks).astype(np.float64)
-        far = d + frame.pair.camera.doffs_px < self._settings.pose.min_disparity_px
-        return np.where(far, np.nan, d)
+        d = sample_disparity(disparity, uv, self._settings.tracks).astype(np.float64)
+        return np.where(d + camera.doffs_px < self._settings.pose.min_disparity_px, np.nan, d)
 
     def _replenish(self, window: TrackWindow, frame: OdometryFrame) -> TrackWindow:
         """The window with new points where the newest frame has room for them."""
         taken = window.uvd[-1, window.seen[-1], :2].astype(np.float32)
         uv = find_corners(frame.pair.left, taken, self._settings.corners)
-        d = self._disparity(frame, uv)
+        d = self._disparity(frame.disparity, frame.pair.camera, uv)
         uvd = np.column_stack([uv, d])[np.isfinite(d)]
-        depth = depth_from_disparity(uvd[:, 2], frame.pair.camera).astype(np.float64)
-        xyz_camera = unproject(uvd[:, 0], uvd[:, 1], depth, frame.pair.camera)
-        return window.with_points(uvd, apply(window.T_world_camera[-1], xyz_camera))
+        return window.with_points(uvd, _points(uvd, window.T_world_camera[-1], frame.pair.camera))
+
+    def _estimate(self, seen: _Seen, camera: RectifiedCamera) -> VisualEstimate:
+        """What a registered frame says, and how sure it is."""
+        settings, window = self._settings.window, seen.window
+        information = settings.independence * pose_information(window, camera, settings)
+        newest = window.seen[-1]
+        error = reprojection(window, camera)[newest, :2]
+        sigma = np.sqrt(np.diag(np.linalg.inv(information + 1e-4 * np.eye(6))))
+        health = OdometryHealth(
+            tracks=seen.tracks,
+            inliers=int(newest.sum()),
+            reprojection_px=float(np.median(np.linalg.norm(error, axis=1))),
+            sigma_m=float(np.linalg.norm(sigma[:3])),
+            sigma_deg=float(np.rad2deg(np.linalg.norm(sigma[3:]))),
+            notes=(seen.note,) if seen.note else (),
+        )
+        T_world_camera = window.T_world_camera[-1].copy()
+        return VisualEstimate(OdometryResult(T_world_camera, health), information)
 
 
-def _lost(predicted: Float64, tracks: int) -> tuple[TrackWindow, OdometryHealth, None]:
-    """A new window where the last motion would have led."""
-    note = f"lost: {tracks} tracks, too few agree on a motion; the last one goes on"
-    return _empty(predicted), OdometryHealth(False, tracks, notes=(note,)), None
+def _points(uvd: Float64, T_world_camera: Float64, camera: RectifiedCamera) -> Float64:
+    """World points (N, 3) of features with a disparity."""
+    depth = depth_from_disparity(uvd[:, 2], camera).astype(np.float64)
+    return apply(T_world_camera, unproject(uvd[:, 0], uvd[:, 1], depth, camera))
 
 
 def _empty(T_world_camera: Float64) -> TrackWindow:
     """A window of one frame without points."""
     return TrackWindow(T_world_camera[None], np.zeros((1, 0, 3)), np.zeros((0, 3)))
-
-
-def _health(window: TrackWindow, tracks: int, camera: RectifiedCamera) -> OdometryHealth:
-    newest = window.seen[-1]
-    error = reprojection(window, camera)[newest, :2]
-    return OdometryHealth(
-        tracks=tracks,
-        inliers=int(newest.sum()),
-        reprojection_px=float(np.median(np.linalg.norm(error, axis=1))),
-    )

@@ -6,21 +6,17 @@ without a word, or worse, finds something. Features that are matched over the wh
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 from pydantic import Field
 
+from recon.adapters import opencv_features
 from recon.errors import CalibrationError
 from recon.settings import Settings
 from recon.structures import RectifiedPair
 from recon.structures.arrays import Bool, Float32, UInt8, freeze
-
-_RATIO: Final = 0.8
-"""Lowe's ratio: the best match must be so much nearer than the second best."""
 
 _NEAR_PX: Final = 1.0
 """Features that shift by less between the eyes are too far away to tell the eyes apart."""
@@ -104,26 +100,14 @@ def inspect_pair(pair: RectifiedPair, settings: InspectionSettings | None = None
 
 
 def match_features(left: UInt8, right: UInt8, count: int) -> PairFeatures:
-    """Features that both pictures show, wherever they are: mutual best matches that stand out.
+    """Features that both pictures show, wherever they are.
 
     Args:
         left: uint8 (H, W).
         right: uint8 (H, W).
         count: Features per picture at most.
-
-    Ref:
-        Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011.
     """
-    orb = cv2.ORB.create(nfeatures=count, fastThreshold=10)
-    (left_uv, left_bits), (right_uv, right_bits) = (_describe(orb, side) for side in (left, right))
-    if len(left_uv) < 2 or len(right_uv) < 2:
-        return PairFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
-    there = _distinct(matcher.knnMatch(left_bits, right_bits, k=2))
-    back = _distinct(matcher.knnMatch(right_bits, left_bits, k=2))
-    mutual = [(i, j) for i, j in there.items() if back.get(j) == i]
-    at = np.array(mutual, dtype=np.int64).reshape(-1, 2)
-    return PairFeatures(*_refined(left, right, left_uv[at[:, 0]], right_uv[at[:, 1]]))
+    return PairFeatures(*opencv_features.match_features(left, right, count))
 
 
 def inspect_features(
@@ -183,51 +167,6 @@ def check_inspection(
 
 def _side(row_error_px: float) -> str:
     return "low" if row_error_px > 0 else "high"
-
-
-def _describe(orb: cv2.ORB, image: UInt8) -> tuple[Float32, UInt8]:
-    """Places (N, 2) and descriptors (N, 32) of the features of a picture."""
-    keypoints, bits = orb.detectAndCompute(image, None)
-    uv = np.array([point.pt for point in keypoints], dtype=np.float32).reshape(-1, 2)
-    return uv, np.zeros((0, 32), np.uint8) if bits is None else bits
-
-
-def _distinct(candidates: Sequence[Sequence[cv2.DMatch]]) -> dict[int, int]:
-    """Best matches that are much better than the second best."""
-    return {
-        best.queryIdx: best.trainIdx
-        for best, second in candidates
-        if best.distance < _RATIO * second.distance
-    }
-
-
-def _refined(
-    left: UInt8, right: UInt8, left_uv: Float32, right_uv: Float32
-) -> tuple[Float32, Float32]:
-    """Matches whose place in the right picture is known to a fraction of a pixel."""
-    if not len(left_uv):
-        return left_uv, right_uv
-    there, status, _ = cv2.calcOpticalFlowPyrLK(
-        left,
-        _exposed_as(left, right),
-        left_uv[:, None],
-        right_uv[:, None].copy(),
-        winSize=(15, 15),
-        maxLevel=0,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-    )
-    there = there.reshape(-1, 2)
-    # The features of coarse pyramid levels are a few pixels off; farther is another thing.
-    kept = (status.ravel() > 0) & (np.abs(there - right_uv).max(axis=1) <= _OUTLIER_PX)
-    return left_uv[kept], there[kept].astype(np.float32)
-
-
-def _exposed_as(model: UInt8, image: UInt8) -> UInt8:
-    """A picture at the brightness and contrast of another: tracking takes both for motion."""
-    gain = model.std() / max(float(image.std()), 1.0)
-    return np.asarray(
-        cv2.convertScaleAbs(image, alpha=gain, beta=model.mean() - gain * image.mean())
-    )
 
 
 def _agreeing(row_shift: Float32) -> Bool:
