@@ -65,6 +65,9 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
     shown = {key: value for key, value in summary.items() if key != "out"}
     for group in ("trajectory", "map", "disparity"):
         shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
+    for part in ("voxels", "grid"):
+        figures = summary.get("occupancy", {}).get(part, {})
+        shown |= {f"occupancy.{part}.{key}": value for key, value in figures.items()}
     if stages:
         shown |= {f"seconds.{key}": value for key, value in summary["stages"].items()}
     print_figures("", shown)

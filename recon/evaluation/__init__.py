@@ -10,6 +10,7 @@ from recon.evaluation.confidence import (
 from recon.evaluation.disparity import evaluate_depth, evaluate_disparity
 from recon.evaluation.map import evaluate_map
 from recon.evaluation.middlebury import MiddleburyRules, evaluate_middlebury
+from recon.evaluation.occupancy import evaluate_occupancy
 from recon.evaluation.trajectory import evaluate_trajectory
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "evaluate_disparity",
     "evaluate_map",
     "evaluate_middlebury",
+    "evaluate_occupancy",
     "evaluate_trajectory",
     "measure_reliability",
     "measure_sparsification",

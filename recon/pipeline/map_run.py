@@ -24,6 +24,7 @@ from recon.meshing import reconstruct_mesh
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.machine import use_threads
 from recon.pipeline.observer import Observer
+from recon.pipeline.occupancy_truth import compare_with_source
 from recon.pipeline.record import fingerprint, write_record
 from recon.pipeline.resume import begin_or_resume, identity_of, tell_how_to_resume
 from recon.pipeline.run_directory import RunDirectory
@@ -35,6 +36,7 @@ from recon.sources import StereoSource
 from recon.structures import (
     MapMetrics,
     OccupancyGrid,
+    OccupancyMetrics,
     PointCloud,
     SequenceTruth,
     Trajectory,
@@ -60,6 +62,7 @@ class MapRun:
         truth: What is known of the true path and surface.
         metrics: Distance to the true path, or None without one.
         map_metrics: Distance to the true surface, or None without one.
+        occupancy_metrics: Distance to the true occupancy, or None without one.
         summary: The figures of ``summary.json``.
         warnings: What went less than well.
     """
@@ -73,6 +76,7 @@ class MapRun:
     truth: SequenceTruth | None
     metrics: TrajectoryMetrics | None
     map_metrics: MapMetrics | None
+    occupancy_metrics: OccupancyMetrics | None
     summary: dict[str, Any]
     warnings: tuple[str, ...]
 
@@ -183,6 +187,7 @@ def _finish(
         given = options.known_poses is not None
         metrics = None if given else _compare_paths(mapped.trajectory, truth, warnings)
         map_metrics = _compare_surfaces(mapped.cloud, truth, warnings)
+        occupancy_metrics = compare_with_source(source, config, mapped, grid, warnings)
     run = MapRun(
         name=source.name,
         config=config,
@@ -193,6 +198,7 @@ def _finish(
         truth=truth,
         metrics=metrics,
         map_metrics=map_metrics,
+        occupancy_metrics=occupancy_metrics,
         summary={},
         warnings=tuple(warnings),
     )
@@ -252,6 +258,8 @@ def _summary(run: MapRun) -> dict[str, Any]:
         figures["trajectory"] = plain(run.metrics)
     if run.map_metrics is not None:
         figures["map"] = plain(run.map_metrics)
+    if run.occupancy_metrics is not None:
+        figures["occupancy"] = plain(run.occupancy_metrics)
     return figures
 
 

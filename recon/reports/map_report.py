@@ -43,6 +43,14 @@ _FIGURES: Final[FigureFormats] = MappingProxyType(
     }
 )
 
+_OCCUPANCY_ROWS: Final = (
+    ("occupied voxels, precision", "voxels", "precision"),
+    ("occupied voxels, recall", "voxels", "recall"),
+    ("occupied cells of the grid, intersection over union", "grid", "iou_occupied"),
+    ("free cells of the grid, intersection over union", "grid", "iou_free"),
+    ("occupied cells that the grid calls free", "grid", "occupied_called_free"),
+)
+
 
 @dataclass(frozen=True, eq=False)
 class MapReportInputs:
@@ -131,7 +139,27 @@ def _map_blocks(inputs: MapReportInputs) -> list[Block]:
         )
         figure = grid_figure(inputs.grid, inputs.trajectory, inputs.T_map_world)
         blocks.append(FigureBlock("Occupancy grid", figure, caption))
-    return blocks
+    return blocks + _occupancy_table(inputs.summary.get("occupancy"))
+
+
+def _occupancy_table(found: Mapping[str, Any] | None) -> list[Block]:
+    """Voxels and grid against the truth, where it is known."""
+    if not found:
+        return []
+    rows = [
+        (label, *(_share(found[part + end].get(key)) for end in ("", "_exact")))
+        for label, part, key in _OCCUPANCY_ROWS
+    ]
+    caption = (
+        f"Of what at least {found['least_frames']} frames saw, in cells of "
+        f"{found['resolution_m']:g} m."
+    )
+    head = ("figure", "within one cell", "the very cell")
+    return [TableBlock("Occupancy against truth", head, rows, caption)]
+
+
+def _share(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"
 
 
 def _in_map_axes(path: Trajectory, T_map_world: Float64) -> Float64:

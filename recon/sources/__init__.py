@@ -1,7 +1,14 @@
 """Where stereo pairs come from: one module per kind of input."""
 
-from recon.sources.protocol import StereoSource
+from recon.sources.protocol import KnowsOccupancy, StereoSource
 from recon.sources.registry import SOURCES, open_source, recognise_source
 from recon.sources.settings import SourceSettings
 
-__all__ = ["SOURCES", "SourceSettings", "StereoSource", "open_source", "recognise_source"]
+__all__ = [
+    "SOURCES",
+    "KnowsOccupancy",
+    "SourceSettings",
+    "StereoSource",
+    "open_source",
+    "recognise_source",
+]

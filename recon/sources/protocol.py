@@ -6,7 +6,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from recon.structures import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
+from recon.structures import (
+    OccupancyTruth,
+    RectifiedCamera,
+    SequenceTruth,
+    StereoCalibration,
+    StereoPair,
+)
+from recon.structures.arrays import Float64
 
 
 @runtime_checkable
@@ -55,4 +62,21 @@ class StereoSource(Protocol):
         Raises:
             FormatError: A picture is missing, truncated or of another size.
         """
+        ...
+
+
+@runtime_checkable
+class KnowsOccupancy(Protocol):
+    """A source that knows what is really occupied."""
+
+    def occupancy_truth(
+        self,
+        *,
+        resolution_m: float,
+        band_m: tuple[float, float],
+        range_m: float,
+        least_frames: int,
+        T_map_world: Float64 | None,
+    ) -> OccupancyTruth:
+        """Where obstacles stand, and what of it the drive saw, in the cells and axes of a map."""
         ...

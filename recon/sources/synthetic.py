@@ -14,16 +14,17 @@ from recon.formats.image import write_image
 from recon.formats.trajectory import write_kitti_poses
 from recon.structures import (
     DisparityTruth,
+    OccupancyTruth,
     RectifiedCamera,
     SequenceTruth,
     StereoPair,
     Trajectory,
 )
-from recon.structures.arrays import UInt8
+from recon.structures.arrays import Float64, UInt8
 from recon.synthetic.render import StreetCamera, SyntheticFrame
 from recon.synthetic.settings import StreetSettings
 from recon.synthetic.street import StreetWorld, build_street
-from recon.synthetic.truth import OccupancyTruth, true_occupancy, true_surface
+from recon.synthetic.truth import true_occupancy, true_surface
 
 _BT601 = np.array([0.299, 0.587, 0.114])
 
@@ -112,11 +113,23 @@ class SyntheticSource:
         return self.camera.disparity_truth(index)
 
     def occupancy_truth(
-        self, *, resolution_m: float = 0.2, band_m: tuple[float, float] = (0.3, 2.0)
+        self,
+        *,
+        resolution_m: float = 0.2,
+        band_m: tuple[float, float] = (0.3, 2.0),
+        range_m: float = 25.0,
+        least_frames: int = 3,
+        T_map_world: Float64 | None = None,
     ) -> OccupancyTruth:
-        """Where obstacles stand, in exact map axes; see `true_occupancy`."""
-        surface = true_surface(self.camera, range_m=self._surface_range_m)
-        return true_occupancy(self.world, surface, resolution_m=resolution_m, band_m=band_m)
+        """Where obstacles stand, and what of it was seen; see `true_occupancy`."""
+        return true_occupancy(
+            self.camera,
+            resolution_m=resolution_m,
+            band_m=band_m,
+            range_m=range_m,
+            least_frames=least_frames,
+            T_map_world=T_map_world,
+        )
 
 
 def write_kitti(source: SyntheticSource, folder: StrPath, *, grey: bool = True) -> None:

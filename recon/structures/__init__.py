@@ -9,11 +9,14 @@ from recon.structures.mesh import TriangleMesh
 from recon.structures.metrics import (
     DepthMetrics,
     DisparityMetrics,
+    GridMetrics,
     MapMetrics,
+    OccupancyMetrics,
     TrajectoryMetrics,
+    VoxelMetrics,
 )
 from recon.structures.trajectory import Trajectory
-from recon.structures.truth import DisparityTruth, SequenceTruth
+from recon.structures.truth import DisparityTruth, OccupancyTruth, SequenceTruth
 
 __all__ = [
     "FREE",
@@ -25,9 +28,12 @@ __all__ = [
     "DisparityMetrics",
     "DisparityTruth",
     "Frame",
+    "GridMetrics",
     "LensModel",
     "MapMetrics",
     "OccupancyGrid",
+    "OccupancyMetrics",
+    "OccupancyTruth",
     "OccupancyVoxels",
     "PointCloud",
     "Reason",
@@ -39,4 +45,5 @@ __all__ = [
     "Trajectory",
     "TrajectoryMetrics",
     "TriangleMesh",
+    "VoxelMetrics",
 ]

@@ -58,6 +58,65 @@ class MapMetrics:
 
 
 @dataclass(frozen=True)
+class VoxelMetrics:
+    """How right and how complete occupied voxels are.
+
+    Attributes:
+        precision: Share of the occupied voxels with a true surface within the tolerance.
+        recall: Share of the true surface voxels with an occupied one within the tolerance.
+        voxels: Occupied voxels compared.
+        true_voxels: True voxels compared.
+    """
+
+    precision: float
+    recall: float
+    voxels: int
+    true_voxels: int
+
+
+@dataclass(frozen=True)
+class GridMetrics:
+    """How well a flat grid covers the true one, over the cells that were seen.
+
+    Attributes:
+        iou_occupied: Intersection over union of the occupied cells.
+        iou_free: The same of the free cells.
+        occupied_called_free: Share of the truly occupied cells that the grid calls free.
+        unknown: Share of the cells compared that the grid does not know.
+        cells: Cells compared.
+        true_occupied: Truly occupied ones among them.
+    """
+
+    iou_occupied: float
+    iou_free: float
+    occupied_called_free: float
+    unknown: float
+    cells: int
+    true_occupied: int
+
+
+@dataclass(frozen=True)
+class OccupancyMetrics:
+    """How far an occupancy map is from the truth, with and without a tolerance of one cell.
+
+    Attributes:
+        resolution_m: Edge of a cell.
+        least_frames: Frames that must have seen what is counted.
+        voxels: In space, within one cell.
+        voxels_exact: In space, the very cell.
+        grid: On the ground, within one cell.
+        grid_exact: On the ground, the very cell.
+    """
+
+    resolution_m: float
+    least_frames: int
+    voxels: VoxelMetrics
+    voxels_exact: VoxelMetrics
+    grid: GridMetrics
+    grid_exact: GridMetrics
+
+
+@dataclass(frozen=True)
 class DisparityMetrics:
     """How far a disparity map is from the truth, over the pixels whose truth is known.
 

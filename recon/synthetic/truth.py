@@ -2,39 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from recon.adapters.open3d_raycasting import RayScene
+from recon.errors import EvaluationError
 from recon.geometry import se3
-from recon.structures import FREE, OCCUPIED, OccupancyGrid, PointCloud
-from recon.structures.arrays import Bool, Float32, Float64, freeze
+from recon.structures import OccupancyTruth, PointCloud
+from recon.structures.arrays import Bool, Float32, Float64
+from recon.synthetic.footprint import footprint
 from recon.synthetic.render import StreetCamera
-from recon.synthetic.street import StreetWorld
 
-_SLICE_M: Final = 0.05
+_BEYOND_M: Final = 2.0
+"""Surfaces this far beyond the range are true too: a map may find them a little nearer."""
 _KEY_BITS: Final = 21
 _COMPACT_AT: Final = 4_000_000
-
-
-@dataclass(frozen=True, eq=False)
-class OccupancyTruth:
-    """Where obstacles really stand, and which cells a camera could know about.
-
-    Attributes:
-        grid: OCCUPIED where an obstacle reaches into the height band, else FREE; what is taller
-            than the band, such as a house, is hollow. Map axes.
-        seen: bool, the shape of the grid: some pixel of the drive looked at a surface in this
-            cell, at or below the top of the band.
-    """
-
-    grid: OccupancyGrid
-    seen: Bool
-
-    def __post_init__(self) -> None:
-        freeze(self, "seen", np.bool_, self.grid.cells.shape)
 
 
 def true_surface(
@@ -64,46 +47,67 @@ def true_surface(
 
 
 def true_occupancy(
-    world: StreetWorld,
-    surface: PointCloud,
+    camera: StreetCamera,
     *,
     resolution_m: float = 0.2,
     band_m: tuple[float, float] = (0.3, 2.0),
+    range_m: float = 25.0,
+    least_frames: int = 1,
     T_map_world: Float64 | None = None,
 ) -> OccupancyTruth:
-    """Where obstacles stand on the part of the street that was seen.
+    """Where surfaces and obstacles are on the part of the street that was seen.
 
     Args:
-        world: The street.
-        surface: What was seen of it, as `true_surface` gives; its extent is the grid's.
+        camera: The rig in its street.
         resolution_m: Edge of a cell; cell borders are at multiples of it.
         band_m: Heights above the road between which something is an obstacle. The pavement is
             0.12 m high, so a band that begins lower makes it one.
+        range_m: Distance from the camera up to which a frame sees.
+        least_frames: Frames that must have seen a cell of the grid.
         T_map_world: The map axes to draw in; the world's own by default.
+
+    Raises:
+        EvaluationError: No surface is in view and in range.
     """
+    world = camera.world
     T = world.T_map_world if T_map_world is None else T_map_world
-    T_map_street = T @ world.T_world_street
-    in_map = se3.apply(T, surface.xyz.astype(np.float64))
-    height = se3.apply(se3.invert(world.T_world_street), surface.xyz.astype(np.float64))[:, 2]
-    low = np.floor(in_map[:, :2].min(axis=0) / resolution_m).astype(int)
-    high = np.floor(in_map[:, :2].max(axis=0) / resolution_m).astype(int) + 1
-    columns, rows = (int(n) for n in high - low)
-    origin = (float(low[0] * resolution_m), float(low[1] * resolution_m))
+    T_map_camera = T @ world.trajectory.T_world_camera
+    seen, columns = _Counter(), _Counter()
+    for index in range(len(camera)):
+        xyz = _visible_points(camera, index, range_m + _BEYOND_M)
+        away = np.linalg.norm(xyz, axis=1)
+        near = away <= range_m
+        cells = np.floor(se3.apply(T_map_camera[index], xyz) / resolution_m).astype(np.int64)
+        low = xyz @ world.ground_plane(index)[:3] + world.ground_plane(index)[3] <= band_m[1]
+        seen.add(cells[near])
+        seen.know(cells[away <= range_m + _BEYOND_M])
+        columns.add(cells[near & low] * [1, 1, 0])
+    keys, frames = seen.counts()
+    raster, known = _raster(*columns.counts(), least_frames)
+    return OccupancyTruth(
+        grid=footprint(world, T @ world.T_world_street, band_m, (*raster, resolution_m)),
+        seen=known,
+        keys=keys.astype(np.int32),
+        frames=frames.astype(np.int32),
+        camera=world.camera,
+        T_map_camera=T_map_camera,
+        range_m=range_m,
+        least_frames=least_frames,
+    )
 
-    def mark(xy_map: Float64) -> Bool:
-        cells = np.floor(xy_map / resolution_m).astype(int) - low
-        inside = ((cells >= 0) & (cells < (columns, rows))).all(axis=1)
-        marked = np.zeros((rows, columns), dtype=np.bool_)
-        marked[cells[inside, 1], cells[inside, 0]] = True
-        return marked
 
-    outlines = _outlines(world.soup.vertices, band_m, resolution_m / 4.0)
-    occupied = mark(se3.apply(T_map_street, outlines)[:, :2])
-    centres = _quarter_centres((rows, columns), origin, resolution_m)
-    occupied |= _covered(world, T_map_street, centres, band_m).reshape(rows, columns, 4).any(axis=2)
-    cells = np.where(occupied, OCCUPIED, FREE).astype(np.int8)
-    seen = mark(in_map[height <= band_m[1], :2])
-    return OccupancyTruth(OccupancyGrid(cells, resolution_m, origin), seen)
+def _raster(
+    columns: NDArray[np.int64], frames: NDArray[np.int64], least: int
+) -> tuple[tuple[NDArray[np.int64], tuple[int, int]], Bool]:
+    """The smallest raster (corner, shape) around columns (N, 3), and which were seen enough."""
+    if len(columns) == 0:
+        raise EvaluationError("no surface of the street is in view and in range")
+    corner = columns[:, :2].min(axis=0)
+    width, height = (columns[:, :2].max(axis=0) - corner + 1).tolist()
+    known = np.zeros((height, width), dtype=np.bool_)
+    enough = columns[frames >= least, :2] - corner
+    known[enough[:, 1], enough[:, 0]] = True
+    return (corner, (height, width)), known
 
 
 def _visible_points(camera: StreetCamera, index: int, range_m: float) -> Float64:
@@ -118,63 +122,39 @@ def _visible_points(camera: StreetCamera, index: int, range_m: float) -> Float64
 
 def _thin(xyz: Float32, voxel_m: float) -> Float32:
     """The first point in each voxel, in the order given."""
-    cells = np.floor(xyz / voxel_m).astype(np.int64) + (1 << (_KEY_BITS - 1))
-    keys = (cells[:, 0] << (2 * _KEY_BITS)) | (cells[:, 1] << _KEY_BITS) | cells[:, 2]
+    keys = _pack(np.floor(xyz / voxel_m).astype(np.int64))
     first = np.unique(keys, return_index=True)[1]
     return np.asarray(xyz[np.sort(first)])
 
 
-def _outlines(vertices: Float64, band_m: tuple[float, float], step_m: float) -> Float64:
-    """Points (N, 3) every ``step_m`` along the level cuts through triangles in a height band."""
-    levels = np.arange(band_m[0], band_m[1] + 1e-9, _SLICE_M)
-    lowest, highest = vertices[..., 2].min(axis=1), vertices[..., 2].max(axis=1)
-    cuts = [
-        _sample_segments(*_level_cut(vertices[(lowest < z) & (highest > z)], z), step_m)
-        for z in levels
-    ]
-    return np.concatenate(cuts)
+class _Counter:
+    """Counts the frames that each cell appears in."""
+
+    def __init__(self) -> None:
+        self._keys = np.zeros(0, np.int64)
+        self._frames = np.zeros(0, np.int64)
+
+    def add(self, cells: NDArray[np.int64]) -> None:
+        """Count the cells (N, 3) of one frame, each once or many times."""
+        self._merge(np.unique(_pack(cells)), 1)
+
+    def know(self, cells: NDArray[np.int64]) -> None:
+        """Take cells (N, 3) that count for no frame."""
+        self._merge(np.unique(_pack(cells)), 0)
+
+    def _merge(self, keys: NDArray[np.int64], count: int) -> None:
+        self._keys, place = np.unique(np.concatenate([self._keys, keys]), return_inverse=True)
+        frames = np.concatenate([self._frames, np.full(len(keys), count)])
+        self._frames = np.bincount(place, weights=frames).astype(np.int64)
+
+    def counts(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Cells (N, 3) in order, and in how many frames each appeared."""
+        mask = (1 << _KEY_BITS) - 1
+        parts = [(self._keys >> shift) & mask for shift in (2 * _KEY_BITS, _KEY_BITS, 0)]
+        return np.stack(parts, axis=1) - (1 << (_KEY_BITS - 1)), self._frames
 
 
-def _level_cut(triangles: Float64, z: float) -> tuple[Float64, Float64]:
-    """Ends (N, 3) of the segments in which triangles cross the plane at height ``z``."""
-    above = triangles[..., 2] > z
-    # The corner that is alone on its side; both edges from it cross the plane.
-    lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
-    row = np.arange(len(triangles))
-    apex = triangles[row, lone]
-    ends = []
-    for step in (1, 2):
-        other = triangles[row, (lone + step) % 3]
-        share = (z - apex[:, 2]) / (other[:, 2] - apex[:, 2])
-        ends.append(apex + share[:, None] * (other - apex))
-    return ends[0], ends[1]
-
-
-def _sample_segments(start: Float64, end: Float64, step_m: float) -> Float64:
-    """Points (M, 3) on segments, at most ``step_m`` apart, ends included."""
-    pieces = np.ceil(np.linalg.norm(end - start, axis=1) / step_m).astype(int) + 1
-    segment = np.repeat(np.arange(len(start)), pieces + 1)
-    first = np.cumsum(pieces + 1) - (pieces + 1)
-    share = (np.arange(len(segment)) - first[segment]) / pieces[segment]
-    return np.asarray(start[segment] + share[:, None] * (end - start)[segment])
-
-
-def _quarter_centres(
-    shape: tuple[int, int], origin_m: tuple[float, float], resolution_m: float
-) -> Float64:
-    """Centres (rows·columns·4, 2) of the quarters of each cell, map axes, cell by cell."""
-    row, column = np.indices(shape)
-    corner = np.stack([column, row], axis=-1).reshape(-1, 1, 2)
-    quarters = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
-    return np.asarray(((corner + quarters) * resolution_m + origin_m).reshape(-1, 2))
-
-
-def _covered(
-    world: StreetWorld, T_map_street: Float64, xy_map: Float64, band_m: tuple[float, float]
-) -> Bool:
-    """Whether a plumb line between the two heights meets a surface, for points (N, 2)."""
-    level = np.column_stack([xy_map, np.full(len(xy_map), T_map_street[2, 3])])
-    feet = se3.apply(se3.invert(T_map_street), level)
-    feet[:, 2] = band_m[1]
-    down = np.broadcast_to([0.0, 0.0, band_m[0] - band_m[1]], feet.shape)
-    return RayScene(world.soup.vertices, world.settings.threads).blocked(feet, down)
+def _pack(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One number for each cell (N, 3)."""
+    wide = cells + (1 << (_KEY_BITS - 1))
+    return np.asarray((wide[:, 0] << (2 * _KEY_BITS)) | (wide[:, 1] << _KEY_BITS) | wide[:, 2])

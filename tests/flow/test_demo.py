@@ -67,6 +67,17 @@ def test_the_map_lies_on_the_true_surface(demo: tuple[Path, dict[str, Any]]) -> 
     assert 0.0 < summary["map"]["median_m"] < 0.1
 
 
+def test_occupied_and_free_are_where_they_really_are(demo: tuple[Path, dict[str, Any]]) -> None:
+    # A short drive; longer ones of several streets stand in test_occupancy_truth.py.
+    _, summary = demo
+    found = summary["occupancy"]
+    assert found["least_frames"] == 3
+    assert 0.9 < found["voxels"]["precision"] < 1
+    assert 0.9 < found["voxels"]["recall"] < 1
+    assert 0.8 < found["grid"]["iou_occupied"] < 1
+    assert 0.95 < found["grid_exact"]["iou_free"] < 1
+
+
 def test_the_record_turns_camera_axes_into_map_axes(demo: tuple[Path, dict[str, Any]]) -> None:
     out, _ = demo
     T = np.array(json.loads((out / "run.json").read_text())["T_map_world"])

@@ -51,8 +51,8 @@ def test_the_surface_stays_within_its_range(street, surface):
 
 
 def test_the_ground_plan_of_a_box_is_that_on_paper(box_world):
-    surface = true_surface(StreetCamera(box_world), range_m=30.0)
-    truth = true_occupancy(box_world, surface, resolution_m=0.25, band_m=(0.3, 2.0))
+    camera = StreetCamera(box_world)
+    truth = true_occupancy(camera, resolution_m=0.25, band_m=(0.3, 2.0), range_m=30.0)
     grid = truth.grid
     rows, columns = np.indices(grid.cells.shape)
     x = grid.origin_m[0] + (columns + 0.5) * 0.25
@@ -70,16 +70,15 @@ def test_the_ground_plan_of_a_box_is_that_on_paper(box_world):
 
 
 def test_what_is_above_or_below_the_band_is_no_obstacle(box_world):
-    surface = true_surface(StreetCamera(box_world), range_m=15.0)
-    above = true_occupancy(box_world, surface, band_m=(1.9, 2.5))
+    above = true_occupancy(StreetCamera(box_world), range_m=15.0, band_m=(1.9, 2.5))
     assert not (above.grid.cells == OCCUPIED).any()
 
 
 def test_the_grid_turns_with_the_map_axes(box_world):
-    surface = true_surface(StreetCamera(box_world), range_m=15.0)
+    camera = StreetCamera(box_world)
     turn = se3.make_transform(se3.exp_so3(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
-    plain = true_occupancy(box_world, surface)
-    turned = true_occupancy(box_world, surface, T_map_world=turn @ box_world.T_map_world)
+    plain = true_occupancy(camera, range_m=15.0)
+    turned = true_occupancy(camera, range_m=15.0, T_map_world=turn @ box_world.T_map_world)
     one, two = ((t.grid.cells == OCCUPIED).sum() for t in (plain, turned))
     # A quarter turn maps cells to cells, but for rounding at their borders.
     assert abs(int(one) - int(two)) <= 0.2 * one
@@ -87,7 +86,7 @@ def test_the_grid_turns_with_the_map_axes(box_world):
 
 
 def test_seen_obstacles_of_the_street_are_where_surface_points_are(street, surface):
-    truth = true_occupancy(street.world, surface)
+    truth = true_occupancy(street, range_m=60.0)
     world = street.world
     xyz = surface.xyz.astype(np.float64)
     height = se3.apply(se3.invert(world.T_world_street), xyz)[:, 2]
@@ -97,3 +96,20 @@ def test_seen_obstacles_of_the_street_are_where_surface_points_are(street, surfa
     hit = truth.grid.cells[cells[:, 1], cells[:, 0]] == OCCUPIED
     assert hit.mean() > 0.97
     assert 0.02 < (truth.grid.cells == OCCUPIED).mean() < 0.4
+
+
+def test_frames_count_how_often_a_cell_was_seen(street):
+    T = street.world.T_map_world
+    truth = true_occupancy(street, range_m=15.0, least_frames=3)
+    assert 0 <= truth.frames.min() < truth.frames.max() == len(street)
+    once = true_occupancy(street, range_m=15.0, least_frames=1)
+    assert 0 < truth.seen.sum() < once.seen.sum()
+    # What is only seen from beyond the range is true, and counts for no frame.
+    centres = (truth.keys + 0.5) * 0.2
+    cameras = (T @ street.world.trajectory.T_world_camera)[:, :3, 3]
+    nearest = np.linalg.norm(centres[:, None] - cameras, axis=2).min(axis=1)
+    # Half the diagonal of a cell more or less.
+    assert nearest[truth.frames > 0].max() < 15.0 + 0.18
+    assert (truth.frames == 0).any()
+    assert len(np.unique(truth.keys, axis=0)) == len(truth.keys)
+    assert nearest.max() < 17.0 + 0.18

@@ -1,0 +1,171 @@
+"""How right and how complete an occupancy map is, against the exact truth.
+
+Only what the drive could know counts. A true voxel holds a surface that enough frames saw within
+the map's range. An occupied voxel counts where enough frames had its place in the picture and in
+range, hidden or not: what is invented inside a wall is wrong too. A cell of the grid counts where
+enough frames saw a surface in it, not higher than the band.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.errors import EvaluationError
+from recon.geometry import se3
+from recon.geometry.projection import project
+from recon.structures import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    GridMetrics,
+    OccupancyGrid,
+    OccupancyMetrics,
+    OccupancyTruth,
+    OccupancyVoxels,
+    VoxelMetrics,
+)
+from recon.structures.arrays import Bool, Int32
+
+_TOLERANCE: Final = 1
+_BITS: Final = 21
+
+
+def evaluate_occupancy(
+    voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth
+) -> OccupancyMetrics:
+    """Compare voxels and flat grid of a map with the truth.
+
+    Args:
+        voxels: The map; log-odds above 0 are occupied.
+        grid: The flat grid of the same map.
+        truth: In the axes and cells of the map.
+
+    Returns:
+        Figures for a tolerance of one cell (26 neighbours in space, 8 on the ground), and for
+        none. With the tolerance, a true cell is found when an estimated one of its kind lies
+        within it, and an estimated cell is wrong when no true one does: found / (true + wrong).
+
+    Raises:
+        EvaluationError: The resolutions differ, or there is nothing to compare.
+    """
+    _check(voxels, grid, truth)
+    occupied = voxels.keys[voxels.log_odds > 0]
+    counted = occupied[_looked_at(occupied, truth)]
+    pictures = _rasters(grid, truth)
+    return OccupancyMetrics(
+        resolution_m=voxels.resolution_m,
+        least_frames=truth.least_frames,
+        voxels=_compare_voxels(occupied, counted, truth, _TOLERANCE),
+        voxels_exact=_compare_voxels(occupied, counted, truth, 0),
+        grid=_compare_grids(*pictures, truth.seen, _TOLERANCE),
+        grid_exact=_compare_grids(*pictures, truth.seen, 0),
+    )
+
+
+def _check(voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth) -> None:
+    """Raise where a comparison would mean nothing."""
+    sizes = {voxels.resolution_m, grid.resolution_m, truth.grid.resolution_m}
+    if max(sizes) - min(sizes) > 1e-9:
+        raise EvaluationError(
+            "map and truth have different resolutions",
+            got=", ".join(f"{size:g} m" for size in sorted(sizes)),
+        )
+    if not (truth.frames >= truth.least_frames).any() or not truth.seen.any():
+        raise EvaluationError(
+            "the drive saw nothing often enough to compare",
+            expected=f"surfaces in {truth.least_frames} frames",
+            hint="a drive of more frames",
+        )
+
+
+def _looked_at(keys: Int32, truth: OccupancyTruth) -> Bool:
+    """Which cells lay in the picture and in range in enough frames, whatever hid them."""
+    centres = (keys.astype(np.float64) + 0.5) * truth.grid.resolution_m
+    frames = np.zeros(len(keys), np.int64)
+    width, height = truth.camera.width_px, truth.camera.height_px
+    for T_map_camera in truth.T_map_camera:
+        xyz = se3.apply(se3.invert(T_map_camera), centres)
+        place = np.flatnonzero((xyz[:, 2] > 0) & (np.linalg.norm(xyz, axis=1) <= truth.range_m))
+        u, v, _ = project(xyz[place], truth.camera)
+        inside = (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
+        frames[place[inside]] += 1
+    return np.asarray(frames >= truth.least_frames)
+
+
+def _compare_voxels(
+    occupied: Int32, counted: Int32, truth: OccupancyTruth, tolerance: int
+) -> VoxelMetrics:
+    wanted = truth.keys[truth.frames >= truth.least_frames]
+    return VoxelMetrics(
+        precision=_share(_near(counted, truth.keys, tolerance)),
+        recall=_share(_near(wanted, occupied, tolerance)),
+        voxels=len(counted),
+        true_voxels=len(wanted),
+    )
+
+
+def _near(keys: Int32, others: Int32, tolerance: int) -> Bool:
+    """Which cells have one of the others at most so many cells away on every axis."""
+    steps = np.arange(-tolerance, tolerance + 1)
+    known = np.unique(_pack(others))
+    found = np.zeros(len(keys), dtype=np.bool_)
+    for offset in np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3):
+        found |= np.isin(_pack(keys + offset), known)
+    return found
+
+
+def _pack(keys: NDArray[Any]) -> NDArray[np.int64]:
+    """One number for each cell (N, 3)."""
+    wide = keys.astype(np.int64) + (1 << (_BITS - 1))
+    return np.asarray((wide[:, 0] << (2 * _BITS)) | (wide[:, 1] << _BITS) | wide[:, 2])
+
+
+def _rasters(
+    grid: OccupancyGrid, truth: OccupancyTruth
+) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+    """The grid and the true grid, both of the extent of the true one; UNKNOWN outside."""
+    offset_m = np.array(truth.grid.origin_m) - np.array(grid.origin_m)
+    right, down = np.rint(offset_m / grid.resolution_m).astype(int).tolist()
+    rows, columns = (np.arange(n) for n in truth.seen.shape)
+    rows = rows[(rows + down >= 0) & (rows + down < grid.cells.shape[0])]
+    columns = columns[(columns + right >= 0) & (columns + right < grid.cells.shape[1])]
+    cells = np.full(truth.seen.shape, UNKNOWN, np.int8)
+    cells[np.ix_(rows, columns)] = grid.cells[np.ix_(rows + down, columns + right)]
+    return cells, truth.grid.cells
+
+
+def _compare_grids(
+    cells: NDArray[np.int8], true: NDArray[np.int8], seen: Bool, tolerance: int
+) -> GridMetrics:
+    occupied = seen & (true == OCCUPIED)
+    return GridMetrics(
+        iou_occupied=_iou(cells == OCCUPIED, true == OCCUPIED, seen, tolerance),
+        iou_free=_iou(cells == FREE, true == FREE, seen, tolerance),
+        occupied_called_free=_share(cells[occupied] == FREE),
+        unknown=_share(cells[seen] == UNKNOWN),
+        cells=int(seen.sum()),
+        true_occupied=int(occupied.sum()),
+    )
+
+
+def _iou(estimate: Bool, true: Bool, seen: Bool, tolerance: int) -> float:
+    """Found / (true + wrong) over the seen cells; at no tolerance, intersection over union."""
+    found = seen & true & _grown(estimate, tolerance)
+    wrong = seen & estimate & ~_grown(true, tolerance)
+    union = int((seen & true).sum() + wrong.sum())
+    return float(found.sum() / union) if union else float("nan")
+
+
+def _grown(cells: Bool, tolerance: int) -> Bool:
+    """The cells and their neighbours up to so many cells away."""
+    kernel = np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
+    return np.asarray(cv2.dilate(cells.astype(np.uint8), kernel) > 0)
+
+
+def _share(which: Bool) -> float:
+    """Share of True; NaN of nothing."""
+    return float(which.mean()) if which.size else float("nan")

@@ -1,0 +1,55 @@
+"""A run's occupancy beside that of a source that knows it."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from recon.errors import EvaluationError
+from recon.evaluation import evaluate_occupancy
+from recon.mapping import drop_undecided
+from recon.pipeline.config import ReconConfig
+from recon.pipeline.sequence import MappedSequence
+from recon.sources import KnowsOccupancy, StereoSource
+from recon.structures import OccupancyGrid, OccupancyMetrics, OccupancyTruth, OccupancyVoxels
+from recon.structures.arrays import Float64
+
+LEAST_FRAMES: Final = 3
+"""Frames that must have seen what is compared."""
+
+
+def compare_with_source(
+    source: StereoSource,
+    config: ReconConfig,
+    mapped: MappedSequence,
+    grid: OccupancyGrid,
+    warnings: list[str],
+) -> OccupancyMetrics | None:
+    """Figures of a run whose source knows its occupancy, else None."""
+    if not isinstance(source, KnowsOccupancy):
+        return None
+    truth = known_occupancy(source, config, mapped.T_map_world)
+    return compare(drop_undecided(mapped.voxels, config.grid), grid, truth, warnings)
+
+
+def known_occupancy(
+    source: KnowsOccupancy, config: ReconConfig, T_map_world: Float64
+) -> OccupancyTruth:
+    """What a source knows, in the cells, axes and height band of a map."""
+    return source.occupancy_truth(
+        resolution_m=config.occupancy.resolution_m,
+        band_m=(config.grid.min_height_m, config.grid.max_height_m),
+        range_m=config.occupancy.max_range_m,
+        least_frames=LEAST_FRAMES,
+        T_map_world=T_map_world,
+    )
+
+
+def compare(
+    voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth, warnings: list[str]
+) -> OccupancyMetrics | None:
+    """The figures, or a warning that says why there are none."""
+    try:
+        return evaluate_occupancy(voxels, grid, truth)
+    except EvaluationError as error:
+        warnings.append(f"not compared with the true occupancy: {error}")
+        return None
