@@ -1,0 +1,181 @@
+"""How fast clouds become maps: our ray casting beside OctoMap's, on the same rays.
+
+Both start from an empty map, and every round runs both in turn, so that a busy machine is busy for
+both; the figures are medians over the rounds. ``agreement`` compares the cells that both call
+occupied or free: their share among the cells that either names.
+
+Example: python benchmarks/mapping.py --json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pyoctomap
+from numpy.typing import NDArray
+
+from recon.geometry.se3 import make_transform
+from recon.mapping import OccupancyBuilder, OccupancySettings
+from recon.structures import PointCloud
+from recon.structures.arrays import Float64
+
+Int64 = NDArray[np.int64]
+RAYS = 100_000
+RANGE_M = 20.0
+RESOLUTIONS_M = (0.2, 0.1)
+ORIGIN_M = np.array([0.33, -0.21, 0.47])
+HEIGHT_M = 1.65
+HALF_WIDTH_M = 8.0
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    options = parse(arguments)
+    result = {
+        "octomap": pyoctomap.__version__,
+        "rays": options.rays,
+        "rounds": options.rounds,
+        "ray_casting": ray_casting(options.rays, options.rounds),
+    }
+    print(json.dumps(result, indent=2) if options.json else table(result))
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument("--rounds", type=int, default=7, help="runs that a median is taken of")
+    parser.add_argument("--rays", type=int, default=RAYS, help="rays of one frame")
+    return parser.parse_args(arguments)
+
+
+def ray_casting(rays: int, rounds: int) -> list[dict[str, Any]]:
+    """One row for each scene and resolution."""
+    rows = []
+    for name, scene in (("street", street), ("scattered", scattered)):
+        for resolution_m in RESOLUTIONS_M:
+            ends = to_centres(scene(rays), resolution_m)
+            ms = medians_ms(
+                {
+                    "recon": lambda e=ends, r=resolution_m: ours(e, r),
+                    "octomap": lambda e=ends, r=resolution_m: octomap(e, r),
+                },
+                rounds,
+            )
+            same = agreement(ours_cells(ends, resolution_m), octomap_cells(ends, resolution_m))
+            ratio = round(ms["octomap"] / ms["recon"], 2)
+            row = {"scene": name, "resolution_m": resolution_m, "ms": ms, "octomap / recon": ratio}
+            rows.append({**row, "agreement": same})
+    return rows
+
+
+def street(rays: int) -> Float64:
+    """Ends of rays of a camera on a road between two walls, up to the range."""
+    rng = np.random.default_rng(0)
+    directions = pinhole(rng.uniform(-1, 1, rays), rng.uniform(-0.4, 0.4, rays))
+    with np.errstate(divide="ignore"):
+        to_road = np.where(directions[:, 1] > 0, HEIGHT_M / directions[:, 1], np.inf)
+        to_wall = HALF_WIDTH_M / np.abs(directions[:, 0])
+    return np.asarray(directions * np.minimum(np.minimum(to_road, to_wall), RANGE_M)[:, None])
+
+
+def scattered(rays: int) -> Float64:
+    """Ends of rays of a camera, at random lengths up to the range: nearly each in its own cell."""
+    rng = np.random.default_rng(1)
+    directions = pinhole(rng.uniform(-1, 1, rays), rng.uniform(-0.4, 0.4, rays))
+    return np.asarray(directions * rng.uniform(2.0, RANGE_M, (rays, 1)))
+
+
+def pinhole(x: Float64, y: Float64) -> Float64:
+    """Unit vectors (N, 3) through points of the plane at depth 1."""
+    directions = np.stack([x, y, np.ones_like(x)], axis=1)
+    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+
+def to_centres(xyz: Float64, resolution_m: float) -> Float64:
+    """Ends moved to the centres of their cells, in map axes.
+
+    OctoMap aims there; we aim at the mean of the points of a cell, which is the same then.
+    """
+    return np.asarray((np.floor((xyz + ORIGIN_M) / resolution_m) + 0.5) * resolution_m)
+
+
+def ours(ends_m: Float64, resolution_m: float) -> OccupancyBuilder:
+    """A map of one frame, without errors, which OctoMap does not know."""
+    settings = OccupancySettings(resolution_m=resolution_m, max_range_m=RANGE_M + 1.0, min_points=1)
+    builder = OccupancyBuilder(settings, np.eye(4))
+    cloud = PointCloud((ends_m - ORIGIN_M).astype(np.float32))
+    builder.integrate(cloud, make_transform(np.eye(3), ORIGIN_M))
+    return builder
+
+
+def octomap(ends_m: Float64, resolution_m: float) -> pyoctomap.OcTree:
+    """The same by OctoMap: each end cell once (discretised), inner nodes not updated (lazy)."""
+    tree = pyoctomap.OcTree(resolution_m)
+    tree.insertPointCloud(ends_m, ORIGIN_M, -1.0, True, True)
+    return tree
+
+
+def medians_ms(runs: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Median milliseconds of each; the first round compiles and is not counted."""
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(rounds + 1):
+        for name, run in runs.items():
+            start = time.perf_counter()
+            run()
+            seconds[name].append(time.perf_counter() - start)
+    return {name: round(1e3 * statistics.median(s[1:]), 2) for name, s in seconds.items()}
+
+
+def ours_cells(ends_m: Float64, resolution_m: float) -> dict[str, Int64]:
+    """Occupied and free cells, one sorted number each."""
+    voxels = ours(ends_m, resolution_m).voxels()
+    return split(voxels.keys.astype(np.int64), voxels.log_odds > 0)
+
+
+def octomap_cells(ends_m: Float64, resolution_m: float) -> dict[str, Int64]:
+    """The same of OctoMap."""
+    leaves = [
+        (*leaf.getCoordinate(), leaf.current_node.getLogOdds())
+        for leaf in octomap(ends_m, resolution_m).begin_leafs()
+    ]
+    values = np.array(leaves)
+    keys = np.floor(values[:, :3] / resolution_m).astype(np.int64)
+    return split(keys, values[:, 3] > 0)
+
+
+def split(keys: Int64, occupied: Any) -> dict[str, Int64]:
+    """Cells (N, 3) as one number each, by kind."""
+    packed = ((keys[:, 0] + (1 << 20)) << 42) + ((keys[:, 1] + (1 << 20)) << 21) + keys[:, 2]
+    return {"occupied": np.unique(packed[occupied]), "free": np.unique(packed[~occupied])}
+
+
+def agreement(one: dict[str, Int64], other: dict[str, Int64]) -> dict[str, float]:
+    """Cells in both over cells in either, by kind, and how many there are."""
+    shares: dict[str, float] = {}
+    for kind, cells in one.items():
+        both = len(np.intersect1d(cells, other[kind], assume_unique=True))
+        either = len(cells) + len(other[kind]) - both
+        shares[kind] = round(both / either, 5)
+        shares[f"{kind}_cells"] = len(cells)
+    return shares
+
+
+def table(result: dict[str, Any]) -> str:
+    lines = [f"{result['rays']} rays to {RANGE_M:g} m, median ms (OctoMap {result['octomap']})"]
+    for row in result["ray_casting"]:
+        ms, same = row["ms"], row["agreement"]
+        lines.append(
+            f"  {row['scene']:10s}{row['resolution_m']:5g} m  recon {ms['recon']:8.1f}"
+            f"  octomap {ms['octomap']:8.1f}  {row['octomap / recon']:6.1f}x"
+            f"  same cells: occupied {same['occupied']:.4f}, free {same['free']:.4f}"
+        )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
