@@ -19,6 +19,7 @@ from recon.cli.map import map_
 from recon.cli.mesh import mesh
 from recon.cli.pair import disparity, pair
 from recon.cli.paper import paper
+from recon.cli.rectify import rectify
 
 app = typer.Typer(
     name="recon",
@@ -34,6 +35,7 @@ app.command()(capture)
 app.command()(disparity)
 app.command()(paper)
 app.command()(calibrate)
+app.command()(rectify)
 app.command()(doctor)
 app.add_typer(evaluate.app, name="evaluate")
 

@@ -26,7 +26,7 @@ from recon.meshing import MeshSettings
 from recon.odometry import OdometrySettings
 from recon.pipeline.checkpoint import CheckpointSettings
 from recon.pipeline.paper_settings import PaperSettings
-from recon.rectification import InspectionSettings, RectificationSettings
+from recon.rectification import InspectionSettings, RectificationSettings, UncalibratedSettings
 from recon.settings import Settings
 from recon.sources.capture import CaptureSettings
 from recon.sources.settings import SourceSettings
@@ -43,6 +43,7 @@ class ReconConfig(Settings):
     capture: CaptureSettings = CaptureSettings()
     calibration: CalibrationSettings = CalibrationSettings()
     rectification: RectificationSettings = RectificationSettings()
+    uncalibrated: UncalibratedSettings = UncalibratedSettings()
     inspection: InspectionSettings = InspectionSettings()
     matching: MatchingSettings = MatchingSettings()
     edges: EdgeSettings = EdgeSettings()

@@ -1,6 +1,7 @@
 """From recorded pictures to rows that correspond, and from colour to grey."""
 
 from recon.rectification.epipolar import epipolar_curves, epipolar_lines
+from recon.rectification.features import match_exactly
 from recon.rectification.grey import GreyMode, to_grey
 from recon.rectification.inspect import (
     InspectionSettings,
@@ -17,6 +18,12 @@ from recon.rectification.rectify import (
     RectifyingTurns,
     plan_turns,
 )
+from recon.rectification.shaping import map_pixels
+from recon.rectification.uncalibrated import (
+    UncalibratedRectification,
+    UncalibratedSettings,
+    rectify_uncalibrated,
+)
 
 __all__ = [
     "GreyMode",
@@ -26,12 +33,17 @@ __all__ = [
     "RectificationSettings",
     "Rectifier",
     "RectifyingTurns",
+    "UncalibratedRectification",
+    "UncalibratedSettings",
     "check_inspection",
     "epipolar_curves",
     "epipolar_lines",
     "inspect_features",
     "inspect_pair",
+    "map_pixels",
+    "match_exactly",
     "match_features",
     "plan_turns",
+    "rectify_uncalibrated",
     "to_grey",
 ]

@@ -128,14 +128,7 @@ class Rectifier:
         Raises:
             CalibrationError: The pictures have another size than the calibration.
         """
-        self._check_size(pair)
-        left, right = pair.left, pair.right
-        if self._views is not None:
-            how = _INTERPOLATIONS[self.settings.interpolation]
-            left, right = (
-                view.warp(image, how)
-                for view, image in zip(self._views, (left, right), strict=True)
-            )
+        left, right = self.warp(pair)
         return RectifiedPair(
             left=to_grey(left, self.settings.grey),
             right=to_grey(right, self.settings.grey),
@@ -145,6 +138,19 @@ class Rectifier:
             timestamp_s=pair.timestamp_s,
             index=pair.index,
         )
+
+    def warp(self, pair: StereoPair) -> tuple[UInt8, UInt8]:
+        """Both pictures of a pair rectified, in the colours that they have.
+
+        Raises:
+            CalibrationError: The pictures have another size than the calibration.
+        """
+        self._check_size(pair)
+        if self._views is None:
+            return pair.left, pair.right
+        how = _INTERPOLATIONS[self.settings.interpolation]
+        left, right = self._views
+        return left.warp(pair.left, how), right.warp(pair.right, how)
 
     def _check_size(self, pair: StereoPair) -> None:
         height_px, width_px = pair.left.shape[:2]

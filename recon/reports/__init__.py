@@ -6,6 +6,7 @@ from recon.reports.map_report import MapReportInputs, map_report
 from recon.reports.pair_report import PairReportInputs, pair_report
 from recon.reports.paper_report import paper_report
 from recon.reports.present import present_disparity, present_map, present_pair, present_paper
+from recon.reports.rectify_pictures import present_rectify
 
 __all__ = [
     "MapReportInputs",
@@ -19,5 +20,6 @@ __all__ = [
     "present_map",
     "present_pair",
     "present_paper",
+    "present_rectify",
     "render_html",
 ]

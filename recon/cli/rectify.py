@@ -1,0 +1,49 @@
+"""`recon rectify`: pictures whose rows correspond."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli.session import print_json, print_run, session
+
+
+def rectify(
+    left: Annotated[
+        str, typer.Argument(help='Left picture, folder, or pattern in quotes: "left*.png".')
+    ],
+    right: Annotated[str, typer.Argument(help="Right picture, folder or pattern.")],
+    calib: Annotated[
+        Path | None,
+        typer.Option(
+            help="Calibration of the raw cameras. Without it: homographies from features, and "
+            "depth has no scale."
+        ),
+    ] = None,
+    unit_m: Annotated[
+        float, typer.Option(min=1e-6, help="Metres per unit of an OpenCV file: 0.001 for mm.")
+    ] = 1.0,
+    out: Out = None,
+    config: Config = None,
+    set_: Set = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    threads: Threads = None,
+) -> None:
+    """Rectify a pair or two folders, by a calibration or by what the pictures show.
+
+    Example: recon rectify left/ right/ --calib rig.yaml --out rectified
+    """
+    del quiet  # there is no progress to hide; every command takes the option
+    with session():
+        from recon.pipeline.config import load_config
+        from recon.pipeline.rectify_run import RectifyOptions, run_rectify
+        from recon.reports import present_rectify
+
+        options = RectifyOptions(calib, unit_m, out, threads, present_rectify)
+        run = run_rectify(left, right, load_config(config, set_ or ()), options)
+    print_json(run.summary) if json else print_run(run.summary, stages=verbose)

@@ -1,0 +1,281 @@
+"""`recon rectify` without its command line: pictures in, pictures out whose rows correspond."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from recon.errors import CalibrationError
+from recon.formats.atomic import write_text
+from recon.formats.calibration import read_calibration
+from recon.formats.image import write_image
+from recon.formats.recon_yaml import write_recon_calibration
+from recon.formats.yaml_file import write_yaml
+from recon.pipeline.config import ReconConfig, dump_config
+from recon.pipeline.machine import serial_algebra, use_threads
+from recon.pipeline.record import fingerprint, write_record
+from recon.pipeline.run_directory import RunDirectory
+from recon.pipeline.stopwatch import Stopwatch
+from recon.pipeline.summary import cost, plain
+from recon.rectification import (
+    PairFeatures,
+    Rectifier,
+    UncalibratedRectification,
+    epipolar_curves,
+    epipolar_lines,
+    map_pixels,
+    match_exactly,
+    plan_turns,
+    rectify_uncalibrated,
+    to_grey,
+)
+from recon.sources.files import read_pair
+from recon.sources.picture_pairs import PicturePairs, pair_pictures
+from recon.structures import StereoCalibration, StereoPair
+from recon.structures.arrays import Float64, UInt8
+
+_WARN_ROW_PX: Final = 0.5
+# A match so many times farther from its row than the median is wrong, not the calibration.
+_WRONG: Final = 5.0
+_NEVER_WRONG_PX: Final = 0.5
+
+Lines = tuple[list[Float64], list[Float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class RectifyRun:
+    """All that a run knows when its results are made.
+
+    Attributes:
+        pair: The first pair, as recorded.
+        rectified: Its pictures, rectified.
+        raw_px: float64 (N, 2) twice: features of the first pair that agree, as recorded.
+        raw_lines: For each the epipolar lines in the left and in the right picture.
+        rectified_px: The same features, rectified.
+        summary: The figures of ``summary.json``.
+    """
+
+    pair: StereoPair
+    rectified: tuple[UInt8, UInt8]
+    raw_px: tuple[Float64, Float64]
+    raw_lines: Lines
+    rectified_px: tuple[Float64, Float64]
+    summary: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class RectifyOptions:
+    """How a run is made, apart from the configuration.
+
+    Attributes:
+        calibration: Calibration file; None = homographies from features.
+        metres_per_unit: Unit of an OpenCV file.
+        out: Result folder; None = a new one below ``outputs/``.
+        threads: Threads to use; None = all cores.
+        present: Draws the pictures of the run into its folder.
+    """
+
+    calibration: Path | None = None
+    metres_per_unit: float = 1.0
+    out: Path | None = None
+    threads: int | None = None
+    present: Callable[[RectifyRun, RunDirectory], None] | None = None
+
+
+def run_rectify(left: str, right: str, config: ReconConfig, options: RectifyOptions) -> RectifyRun:
+    """Rectify a pair, or all pairs of two folders.
+
+    Args:
+        left: Picture, folder or pattern of the left camera.
+        right: The same of the right camera.
+        config: The configuration.
+        options: With which calibration, and where results go.
+
+    Raises:
+        ReconError: Pictures do not pair up or cannot be rectified, or the folder not be written;
+            then nothing is left behind.
+    """
+    start = time.perf_counter()
+    use_threads(options.threads)
+    watch, pictures = Stopwatch(), pair_pictures(left, right)
+    with RunDirectory.for_command("rectify", options.out) as directory, serial_algebra():
+        with watch.stage("plan"):
+            first = read_pair(*pictures.pairs[0])
+            plan = _by_file(options, config, first) if options.calibration else None
+            plan = plan or _by_features(pictures, config, first)
+        with watch.stage("rectify"):
+            for pair, (left_path, right_path) in _pairs(pictures):
+                warped = plan.warp(pair)
+                write_image(directory.path(f"left/{left_path.stem}.png"), warped[0])
+                write_image(directory.path(f"right/{right_path.stem}.png"), warped[1])
+        run = _measure(plan, first, config)
+        run.summary["pairs"] = len(pictures.pairs)
+        run.summary["warnings"] = _warnings(run.summary, pictures)
+        plan.write(directory)
+        write_text(directory.path("config.yaml"), dump_config(config))
+        if options.present is not None:
+            with watch.stage("report"):
+                options.present(run, directory)
+        run.summary.update(cost(watch, time.perf_counter() - start))
+        run.summary["out"] = str(directory.folder)
+        directory.write_json("summary.json", run.summary)
+        write_record(
+            directory,
+            "rectify",
+            {
+                "source": f"{left} {right}",
+                "inputs": fingerprint(path for pair in pictures.pairs for path in pair),
+                "timings": watch.seconds,
+                "warnings": run.summary["warnings"],
+            },
+        )
+    return run
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """One way to rectify: what becomes of pictures, of pixels, and what is told of it."""
+
+    warp: Callable[[StereoPair], tuple[UInt8, UInt8]]
+    place: Callable[[Float64, Float64], tuple[Float64, Float64]]
+    lines: Callable[[Float64, Float64], Lines]
+    write: Callable[[RunDirectory], None]
+    figures: dict[str, Any]
+
+
+def _by_file(options: RectifyOptions, config: ReconConfig, first: StereoPair) -> _Plan:
+    """By a calibration file: metric."""
+    path = options.calibration
+    height, width = first.left.shape[:2]
+    rig = read_calibration(path or "", width, height, metres_per_unit=options.metres_per_unit)
+    if not isinstance(rig, StereoCalibration):
+        raise CalibrationError(
+            "the calibration is one of pictures that are rectified already", where=path
+        )
+    rectifier = Rectifier(rig, config.rectification)
+    turns, camera = plan_turns(rig, config.rectification), rectifier.camera
+    return _Plan(
+        warp=rectifier.warp,
+        place=lambda a, b: (turns.place(rig, a), turns.place(rig, b, right=True)),
+        lines=lambda a, b: epipolar_curves(rig, a, b),
+        write=lambda run: write_recon_calibration(run.path("calibration.yaml"), camera),
+        figures={
+            "method": "calibration",
+            "up_to_scale": False,
+            "focal_px": camera.focal_px,
+            "baseline_m": camera.baseline_m,
+        },
+    )
+
+
+def _by_features(pictures: PicturePairs, config: ReconConfig, first: StereoPair) -> _Plan:
+    """By homographies from features of some pairs: rows correspond, depth has no scale."""
+    settings = config.uncalibrated
+    height, width = first.left.shape[:2]
+    size = (width, height)
+    step = max(1, len(pictures.pairs) // settings.pairs)
+    some = replace(pictures, pairs=pictures.pairs[::step][: settings.pairs])
+    found = [_features(pair, settings.features) for pair, _ in _pairs(some)]
+    features = PairFeatures(
+        np.concatenate([each.left_uv for each in found]),
+        np.concatenate([each.right_uv for each in found]),
+    )
+    result = rectify_uncalibrated(features, size, settings)
+
+    def warp(pair: StereoPair) -> tuple[UInt8, UInt8]:
+        left, right = (
+            np.asarray(cv2.warpPerspective(image, H, size))
+            for image, H in ((pair.left, result.H_left), (pair.right, result.H_right))
+        )
+        return left, right
+
+    figures = _uncalibrated_figures(result)
+    return _Plan(
+        warp=warp,
+        place=lambda a, b: (map_pixels(result.H_left, a), map_pixels(result.H_right, b)),
+        lines=lambda a, b: epipolar_lines(result.fundamental, a, b, size),
+        write=lambda run: write_yaml(
+            run.path("homographies.yaml"),
+            {
+                "note": "rectified = H * raw, up to scale; depth has no unit",
+                "width_px": width,
+                "height_px": height,
+                **{name: figures[name] for name in ("H_left", "H_right", "fundamental")},
+            },
+        ),
+        figures=figures,
+    )
+
+
+def _uncalibrated_figures(result: UncalibratedRectification) -> dict[str, Any]:
+    return {
+        "method": "features",
+        "up_to_scale": True,
+        "matches": result.matches,
+        "inliers": len(result.features),
+        "row_error_held_out_px": plain(result.held_out_px),
+        "disparity_range_px": list(result.disparity_px),
+        "H_left": result.H_left.tolist(),
+        "H_right": result.H_right.tolist(),
+        "fundamental": result.fundamental.tolist(),
+    }
+
+
+def _pairs(pictures: PicturePairs) -> Iterator[tuple[StereoPair, tuple[Path, Path]]]:
+    """Pictures and their files, one pair in memory at a time, all of one size."""
+    shape: tuple[int, ...] | None = None
+    for files in pictures.pairs:
+        pair = read_pair(*files)
+        shape = shape or pair.left.shape[:2]
+        if pair.left.shape[:2] != shape:
+            raise CalibrationError(
+                "pictures differ in size",
+                where=files[0],
+                got=f"{pair.left.shape[1]}x{pair.left.shape[0]}",
+                expected=f"{shape[1]}x{shape[0]}",
+            )
+        yield pair, files
+
+
+def _features(pair: StereoPair, count: int) -> PairFeatures:
+    return match_exactly(to_grey(pair.left), to_grey(pair.right), count)
+
+
+def _measure(plan: _Plan, first: StereoPair, config: ReconConfig) -> RectifyRun:
+    """How well rows of the first pair correspond, by features."""
+    found = _features(first, config.uncalibrated.features)
+    raw = (found.left_uv.astype(np.float64), found.right_uv.astype(np.float64))
+    left, right = plan.place(*raw)
+    rows = np.abs(left[:, 1] - right[:, 1])
+    limit = _WRONG * float(np.median(rows)) if len(rows) else 0.0
+    good = rows <= max(limit, _NEVER_WRONG_PX)
+    summary = {"pair": first.name, **plan.figures, "features": int(good.sum())}
+    if good.any():
+        summary |= {
+            "row_error_px": float(rows[good].mean()),
+            "row_error_median_px": float(np.median(rows[good])),
+            "row_error_95_px": float(np.quantile(rows[good], 0.95)),
+        }
+    kept = (raw[0][good], raw[1][good])
+    return RectifyRun(
+        first, plan.warp(first), kept, plan.lines(*kept), (left[good], right[good]), summary
+    )
+
+
+def _warnings(summary: dict[str, Any], pictures: PicturePairs) -> list[str]:
+    lines = []
+    if summary["up_to_scale"]:
+        lines.append("without a calibration: rows correspond, but depth is up to scale, no metres")
+    if summary.get("row_error_px", 0.0) > _WARN_ROW_PX:
+        lines.append(f"rows are {summary['row_error_px']:.2f} px apart: a matcher wants 0.5")
+    if "row_error_px" not in summary:
+        lines.append("no features to measure rows by")
+    if pictures.by_order:
+        lines.append("names do not tell which pictures belong together: paired by their order")
+    return lines

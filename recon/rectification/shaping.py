@@ -1,0 +1,122 @@
+"""What rows leave open in a pair of homographies: size, slant, place, least disparity."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.rectification.inspect import PairFeatures
+from recon.structures.arrays import Float64
+
+Size = tuple[int, int]
+
+# Disparity of the smallest of the matches: a matcher searches from 0.
+_SMALLEST_DISPARITY_PX: Final = 4.0
+
+
+def map_pixels(H: Float64, pixels: NDArray[Any]) -> Float64:
+    """float64 (N, 2), where a homography (3, 3) takes pixels (N, 2)."""
+    mapped = pixels.astype(np.float64) @ H[:, :2].T + H[:, 2]
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])
+
+
+def shape_views(
+    H_left: Float64, H_right: Float64, features: PairFeatures, size: Size
+) -> tuple[Float64, Float64]:
+    """Choose what rows leave open; rows stay as they correspond.
+
+    Both pictures stand upright, are slanted as little as may be, have about the size that they
+    had, lie in the middle, and the right one is moved so that disparities are positive.
+
+    Args:
+        H_left: float64 (3, 3).
+        H_right: float64 (3, 3).
+        features: Matches that correspond, raw pixels.
+        size: (width, height) of the pictures.
+
+    Ref: Loop and Zhang 1999, "Computing rectifying homographies for stereo vision", section 6.
+    """
+    upright = np.diag([1.0, np.sign(_upright(H_left, size)) or 1.0, 1.0])
+    views = [_straight(H, size) for H in _levelled(upright @ H_left, upright @ H_right, size)]
+    height = float(np.mean([_extent(H, size)[1] for H in views]))
+    scale = size[1] / height
+    views = [_scaled(H, scale, size) for H in views]
+    middle = np.mean([_middle(H, size)[1] for H in views])
+    left, right = (
+        _shift(size[0] / 2 - 0.5 - _middle(H, size)[0], size[1] / 2 - 0.5 - middle) @ H
+        for H in views
+    )
+    a, b = map_pixels(left, features.left_uv), map_pixels(right, features.right_uv)
+    least = float(np.percentile(a[:, 0] - b[:, 0], 1))
+    return left, _shift(least - _SMALLEST_DISPARITY_PX, 0.0) @ right
+
+
+def _levelled(H_left: Float64, H_right: Float64, size: Size) -> list[Float64]:
+    """Tip both pictures forward or back together, until they are alike large above and below.
+
+    Rows stay together under (x, y) -> (x, y) / (1 + g·y). The size at a pixel goes with the third
+    coordinate there: g makes that as even as can be over the border of both.
+    """
+    points = np.hstack([np.concatenate([_middles(size), _corners(size)]), np.ones((8, 1))])
+    views = [H / (points @ H[2]).mean() for H in (H_left, H_right)]
+    middle = float(np.mean([_middle(H, size)[1] for H in views]))
+    views = [_shift(0.0, -middle) @ H for H in views]
+    y, w = (np.stack([points @ H[row] for H in views]) for row in (1, 2))
+    y, w = y - y.mean(axis=1, keepdims=True), w - w.mean(axis=1, keepdims=True)
+    tip = np.eye(3)
+    tip[2, 1] = -float((y * w).sum() / (y * y).sum())
+    return [tip @ H for H in views]
+
+
+def _corners(size: Size) -> Float64:
+    w, h = size[0] - 1.0, size[1] - 1.0
+    return np.array([[0, 0], [w, 0], [w, h], [0, h]])
+
+
+def _middles(size: Size) -> Float64:
+    """float64 (4, 2), the middles of the left, right, upper and lower border."""
+    w, h = size[0] - 1.0, size[1] - 1.0
+    return np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]])
+
+
+def _upright(H: Float64, size: Size) -> float:
+    """Above 0 where the lower border stays below the upper one."""
+    _, _, top, bottom = map_pixels(H, _middles(size))
+    return float(bottom[1] - top[1])
+
+
+def _straight(H: Float64, size: Size) -> Float64:
+    """Shear and stretch along x so that the middle lines stay at right angles, in proportion."""
+    left, right, top, bottom = map_pixels(H, _middles(size))
+    across, down = right - left, bottom - top
+    w, h = size
+    # x' = s·x + k·y: across' · down' = 0 and |across'| / |down'| = w / h, with y as it is.
+    (ax, ay), (dx, dy) = across, down
+    cross = dx * ay - dy * ax
+    s = (h**2 * ay**2 + w**2 * dy**2) / (h * w * cross)
+    k = (h**2 * ax * ay + w**2 * dx * dy) / (-h * w * cross)
+    if s * ax + k * ay < 0:
+        s, k = -s, -k
+    return np.array([[s, k, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) @ H
+
+
+def _extent(H: Float64, size: Size) -> Float64:
+    """Width and height of the mapped middle lines."""
+    left, right, top, bottom = map_pixels(H, _middles(size))
+    return np.array([np.linalg.norm(right - left), abs(bottom[1] - top[1])])
+
+
+def _scaled(H: Float64, scale: float, size: Size) -> Float64:
+    """Scale rows alike, and columns so that the picture keeps its proportion."""
+    width = _extent(H, size)[0] * scale
+    return np.diag([scale * size[0] / width, scale, 1.0]) @ H
+
+
+def _middle(H: Float64, size: Size) -> Float64:
+    return np.asarray(map_pixels(H, np.array([[(size[0] - 1) / 2, (size[1] - 1) / 2]]))[0])
+
+
+def _shift(x: float, y: float) -> Float64:
+    return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
