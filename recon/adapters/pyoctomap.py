@@ -1,4 +1,4 @@
-"""OctoMap trees through pyoctomap: arrays in, bytes of a file out, and back.
+"""OctoMap trees through pyoctomap: a file in, arrays out.
 
 OctoMap counts cells as we do: cell ``k`` spans ``[k, k + 1) · resolution`` (its own keys are
 shifted by 2^15), so nothing is resampled.
@@ -7,51 +7,14 @@ shifted by 2^15), so nothing is resampled.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pyoctomap
 from numpy.typing import NDArray
 
-from recon.errors import FormatError, MappingError
+from recon.errors import FormatError
 from recon.structures.arrays import Float32, Int32
-
-_DEPTH: Final = 16
-KEY_LIMIT: Final = 1 << (_DEPTH - 1)
-"""An OctoMap holds cells in ``[-KEY_LIMIT, KEY_LIMIT)`` on each axis."""
-
-
-def encode_octomap(
-    keys: NDArray[np.int32], log_odds: NDArray[np.float32], resolution_m: float
-) -> tuple[bytes, bytes]:
-    """The contents of an ``.ot`` file (log-odds) and of a ``.bt`` file (occupied or free).
-
-    Args:
-        keys: int32 (N, 3), cells.
-        log_odds: float32 (N,); above 0 = occupied.
-        resolution_m: Edge of a cell.
-
-    Raises:
-        MappingError: A cell lies outside of what an OctoMap can hold.
-    """
-    if len(keys) and (keys.min() < -KEY_LIMIT or keys.max() >= KEY_LIMIT):
-        raise MappingError(
-            "the map is too large for an OctoMap of this resolution",
-            got=f"{np.abs(keys).max() * resolution_m:.0f} m from the origin",
-            expected=f"at most {KEY_LIMIT * resolution_m:.0f} m",
-        )
-    tree = pyoctomap.OcTree(float(resolution_m))
-    # The values are final: a clamp that is narrower than ours would change them.
-    tree.setClampingThresMin(1e-6)
-    tree.setClampingThresMax(1.0 - 1e-6)
-    centres = (keys.astype(np.float64) + 0.5) * resolution_m
-    update = tree.updateNode
-    for centre, value in zip(centres.tolist(), log_odds.tolist(), strict=True):
-        update(centre, value, True)
-    tree.updateInnerOccupancy()
-    # In this order: writeBinary reduces the live tree to its maximum likelihood and prunes it.
-    full = bytes(tree.write())
-    return full, bytes(tree.writeBinary())
 
 
 def decode_octomap(path: Path) -> tuple[Int32, Float32, float]:

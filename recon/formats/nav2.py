@@ -17,7 +17,7 @@ import yaml
 from numpy.typing import NDArray
 
 from recon.errors import FormatError
-from recon.formats.atomic import write_bytes, write_text
+from recon.formats.atomic import atomic_path, write_text
 from recon.structures import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.structures.arrays import UInt8
 
@@ -25,6 +25,7 @@ _OCCUPIED_THRESH: Final = 0.65
 # 0.25, often seen, would read the grey of unknown (205: 0.196…) back as free.
 _FREE_THRESH: Final = 0.196
 _GREY: Final = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
+_STRIP_ROWS: Final = 256
 _KEYS: Final = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 _PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d+)\s+(\d+)\s+(\d+)\s")
 
@@ -45,11 +46,10 @@ def write_nav2(path: str | PathLike[str], grid: OccupancyGrid) -> tuple[Path, Pa
     stem = Path(path)
     picture, description = (stem.with_name(f"{stem.name}.{end}") for end in ("pgm", "yaml"))
     rows, columns = grid.cells.shape
-    grey = np.full((rows, columns), _GREY[UNKNOWN], np.uint8)
-    for cell, value in _GREY.items():
-        grey[grid.cells == cell] = value
-    header = f"P5\n{columns} {rows}\n255\n".encode()
-    write_bytes(picture, header + np.ascontiguousarray(grey[::-1]).tobytes())
+    with atomic_path(picture) as temporary, temporary.open("wb") as file:
+        file.write(f"P5\n{columns} {rows}\n255\n".encode())
+        for last in range(rows, 0, -_STRIP_ROWS):
+            file.write(_grey(grid.cells[max(0, last - _STRIP_ROWS) : last][::-1]).tobytes())
     write_text(description, yaml.safe_dump(_describe(grid, picture.name), sort_keys=False))
     return picture, description
 
@@ -75,6 +75,13 @@ def read_nav2(path: str | PathLike[str]) -> OccupancyGrid:
     return OccupancyGrid(
         np.ascontiguousarray(cells[::-1]), float(fields["resolution"]), (float(x), float(y))
     )
+
+
+def _grey(cells: NDArray[np.int8]) -> UInt8:
+    grey = np.full(cells.shape, _GREY[UNKNOWN], np.uint8)
+    for cell, value in _GREY.items():
+        grey[cells == cell] = value
+    return grey
 
 
 def _describe(grid: OccupancyGrid, image: str) -> dict[str, Any]:

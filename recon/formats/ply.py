@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from os import PathLike
 from typing import Any, Final
 
@@ -9,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import FormatError
-from recon.formats.ply_tables import PlyHeader, Table, read_tables, write_tables
+from recon.formats.atomic import atomic_path
+from recon.formats.ply_tables import PlyHeader, Table, TableStream, read_tables, write_tables
 from recon.structures import Frame, PointCloud
 from recon.structures.arrays import UInt8
 
@@ -47,6 +49,36 @@ def write_ply(
         OutputError: The file cannot be written.
     """
     write_tables(path, {"vertex": _table(cloud)}, [_FRAME + cloud.frame], ascii=ascii)
+
+
+def write_ply_tiles(
+    path: str | PathLike[str], clouds: Iterable[PointCloud], *, frame: Frame
+) -> int:
+    """Write clouds one after the other into one file, as `write_ply` writes one.
+
+    Args:
+        path: The file to write; it appears whole or not at all.
+        clouds: All in one frame and with the same fields. One at a time is held.
+        frame: Frame of the file where there is no cloud.
+
+    Returns:
+        The number of points.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    stream: TableStream | None = None
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        for cloud in clouds:
+            table = _table(cloud)
+            if stream is None:
+                stream = TableStream(file, "vertex", table.dtype, [_FRAME + cloud.frame])
+            stream.append(table)
+        if stream is None:
+            nothing = _table(PointCloud(np.zeros((0, 3), np.float32), frame=frame))
+            stream = TableStream(file, "vertex", nothing.dtype, [_FRAME + frame])
+        stream.close()
+    return stream.rows
 
 
 def read_ply(path: str | PathLike[str]) -> PointCloud:

@@ -29,6 +29,7 @@ _TYPES: Final[dict[str, str]] = {
 _NAMES: Final = {code: name for name, code in list(_TYPES.items())[:8]}
 _ORDERS: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 _LONGEST_HEADER_LINES: Final = 1000
+_LONGEST_NUMBER: Final = 20
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,47 @@ def write_tables(
                 _write_rows(stream, table)
             else:
                 stream.write(table.tobytes())
+
+
+class TableStream:
+    """Rows of one element, written to a file as they come; the header follows at the end.
+
+    Args:
+        stream: A file that can be written from its begin, and nothing else writes to.
+        name: The element.
+        dtype: Of its rows.
+        comments: Comment lines.
+    """
+
+    def __init__(
+        self, stream: IO[bytes], name: str, dtype: np.dtype[Any], comments: Sequence[str]
+    ) -> None:
+        self._stream, self._name, self._dtype, self._comments = stream, name, dtype, comments
+        self.rows = 0
+        self._stream.write(self._header())
+
+    def append(self, table: Table) -> None:
+        """Write some more rows."""
+        self._stream.write(table.astype(self._dtype, copy=False).tobytes())
+        self.rows += len(table)
+
+    def close(self) -> None:
+        """Write how many rows there are."""
+        self._stream.seek(0)
+        self._stream.write(self._header())
+
+    def _header(self) -> bytes:
+        """Of the same length whatever the number: a comment takes up what that leaves."""
+        number = str(self.rows)
+        lines = [
+            "ply",
+            "format binary_little_endian 1.0",
+            *(f"comment {comment}" for comment in self._comments),
+            f"comment {'.' * (_LONGEST_NUMBER - len(number))}",
+            f"element {self._name} {number}",
+            *_property_lines(self._dtype),
+        ]
+        return "\n".join([*lines, "end_header", ""]).encode()
 
 
 def _property_lines(dtype: np.dtype[Any]) -> list[str]:

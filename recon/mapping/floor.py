@@ -18,20 +18,30 @@ _REACH: Final = 2
 """A floor splits its evidence over two voxels, so the free one may be the second above."""
 
 
-def add_floor(cloud: PointCloud, voxels: OccupancyVoxels, settings: GroundSettings) -> PointCloud:
-    """A cloud to look for ground in: its points, and floors of voxels where it has too few.
+def find_floors(voxels: OccupancyVoxels) -> Float32:
+    """float32 (N, 3), centres of the occupied voxels with free space right above them.
 
-    A floor is an occupied voxel with free space right above it, so walls have none.
+    Walls have none. Voxels on another column do not matter, so tiles can be looked at alone.
+    """
+    return ((_floors(voxels) + 0.5) * voxels.resolution_m).astype(np.float32)
+
+
+def add_floor(cloud: PointCloud, voxels: OccupancyVoxels, settings: GroundSettings) -> PointCloud:
+    """A cloud to look for ground in, as `add_floors` gives it, with the floors of voxels."""
+    return add_floors(cloud, find_floors(voxels), settings)
+
+
+def add_floors(cloud: PointCloud, floors: Float32, settings: GroundSettings) -> PointCloud:
+    """A cloud to look for ground in: its points, and floors of voxels where it has too few.
 
     Args:
         cloud: The fused cloud in map axes.
-        voxels: The observed voxels, map axes.
+        floors: float32 (N, 3), as `find_floors` gives them.
         settings: Cells of the ground, and what makes a measured one.
 
     Returns:
         Points, and normals if the cloud has them (straight up for voxels); frame of the cloud.
     """
-    floors = ((_floors(voxels) + 0.5) * voxels.resolution_m).astype(np.float32)
     known = cloud.xyz
     if cloud.normals is not None:
         known = known[cloud.normals[:, 2] >= math.cos(math.radians(settings.max_tilt_deg))]

@@ -106,7 +106,8 @@ def estimate_ground_surface(
 
     Args:
         cloud: The fused cloud in map axes (z up). With normals, only points that face up count.
-        positions_m: float (N, 3), where the camera was, map axes; N ≥ 1.
+        positions_m: float (N, 3), where the camera was, map axes; N ≥ 1. A row of NaN parts one
+            piece of a path from the next.
         settings: How to follow it.
 
     Returns:
@@ -115,11 +116,7 @@ def estimate_ground_surface(
     Raises:
         MappingError: The cloud is not in map axes, or there is no path.
     """
-    if cloud.frame != "map":
-        raise MappingError("ground is looked for in map axes", got=cloud.frame, expected="map")
-    if len(positions_m) == 0:
-        raise MappingError("ground is looked for below a path, and the path is empty")
-    field = _Field(cloud, np.asarray(positions_m, dtype=np.float64), settings)
+    field = _field(cloud, positions_m, settings)
     camera_height = settings.camera_height_m or field.camera_height()
     if math.isfinite(camera_height):
         field.grow(camera_height)
@@ -131,13 +128,31 @@ def estimate_ground_surface(
     )
 
 
+def estimate_camera_height(
+    cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings
+) -> float:
+    """Height of the camera above the ground along a path; NaN where none was found.
+
+    Takes and raises what `estimate_ground_surface` does.
+    """
+    return _field(cloud, positions_m, settings).camera_height()
+
+
+def _field(cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings) -> _Field:
+    if cloud.frame != "map":
+        raise MappingError("ground is looked for in map axes", got=cloud.frame, expected="map")
+    if not np.isfinite(positions_m).any():
+        raise MappingError("ground is looked for below a path, and the path is empty")
+    return _Field(cloud, np.asarray(positions_m, dtype=np.float64), settings)
+
+
 class _Field:
     """The cells while the surface grows."""
 
     def __init__(self, cloud: PointCloud, path: Float64, settings: GroundSettings) -> None:
         self._settings = settings
         cell, rings = settings.cell_m, math.ceil(settings.reach_m / settings.cell_m)
-        path = _densify(path, cell / 2)
+        path = np.concatenate([_densify(piece, cell / 2) for piece in _pieces(path)])
         low = np.floor(path[:, :2].min(axis=0) / cell) - rings
         columns, rows = (np.floor(path[:, :2].max(axis=0) / cell) - low + rings + 1).astype(int)
         self.origin = (float(low[0] * cell), float(low[1] * cell))
@@ -235,6 +250,13 @@ class _Field:
         inside = np.all((place >= 0) & (place < (columns, rows)), axis=1)
         column, row = np.where(inside, place.T, 0).astype(np.intp)
         return row * columns + column, np.asarray(inside)
+
+
+def _pieces(path: Float64) -> list[Float64]:
+    """The runs of rows between those of NaN."""
+    known = np.isfinite(path).all(axis=1)
+    runs = np.split(path, np.flatnonzero(np.diff(known)) + 1)
+    return [run for run in runs if len(run) and np.isfinite(run[0]).all()]
 
 
 def _densify(path: Float64, step_m: float) -> Float64:

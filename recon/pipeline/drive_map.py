@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, Final
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from recon.cloud import filter_cloud
 from recon.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
 from recon.mapping import Submap, SubmapMotion
-from recon.mapping.fused_part import join_fused
+from recon.mapping.fused_part import KNOWABLE, join_fused
 from recon.mapping.occupancy_part import join_occupancy
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.submap_store import SubmapStore
@@ -33,10 +33,21 @@ _ROW_ZERO: Final = 1 << (_ROW_BITS - 1)
 
 @dataclass(frozen=True)
 class _Reach:
-    """The tiles that a submap has something in."""
+    """Where a submap has something, margins of tiles included, and what it knows of points.
+
+    Attributes:
+        fused: Tiles of the fused cloud.
+        occupancy: Tiles of the occupancy.
+        known: Which fields of a cloud it has.
+        low: Smallest x and y of its cells.
+        high: Largest ones, plus one.
+    """
 
     fused: frozenset[Tile]
     occupancy: frozenset[Tile]
+    known: frozenset[str]
+    low: tuple[int, int]
+    high: tuple[int, int]
 
 
 class DriveMap:
@@ -73,6 +84,9 @@ class DriveMap:
         self._margin_voxels = math.ceil(margin_m / config.fusion.voxel_m)
         self._margin_blocks = math.ceil(config.grid.min_blob_cells / BLOCK_EDGE)
         self._reach = [self._reach_of(self._submap(n)) for n in range(len(store))]
+        shared = frozenset(KNOWABLE).intersection(*(reach.known for reach in self._reach))
+        # What one submap does not know, the map does not know: all tiles have the same fields.
+        self._known = tuple(name for name in KNOWABLE if name in shared)
 
     @property
     def cloud_tile_m(self) -> float:
@@ -84,9 +98,15 @@ class DriveMap:
         """Edge of a tile of the occupancy, in cells; a power of two, at least 8."""
         return self._blocks_per_tile << BLOCK_BITS
 
-    def submaps(self) -> Iterator[Submap]:
-        """The submaps where they have been moved to, in order."""
-        return (self._submap(index) for index in range(len(self._store)))
+    @property
+    def columns(self) -> tuple[Tile, Tile]:
+        """Smallest x and y of the observed voxels, and the largest ones plus one."""
+        seen = [reach for reach in self._reach if reach.low != reach.high]
+        if not seen:
+            return (0, 0), (0, 0)
+        low = np.min([reach.low for reach in seen], axis=0)
+        high = np.max([reach.high for reach in seen], axis=0)
+        return (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))
 
     def cloud_tiles(self) -> Iterator[tuple[Tile, PointCloud]]:
         """The fused and filtered cloud, frame ``world``, tile by tile along the drive.
@@ -121,7 +141,9 @@ class DriveMap:
 
     def cloud(self) -> PointCloud:
         """The whole cloud, frame ``world``: memory in proportion to the map."""
-        return join_clouds([cloud for _, cloud in self.cloud_tiles()], self._nothing())
+        nothing = PointCloud(np.zeros((0, 3), np.float32), frame="world")
+        whole = join_clouds([cloud for _, cloud in self.cloud_tiles()])
+        return nothing if whole is None else whole
 
     def voxels(self) -> OccupancyVoxels:
         """All observed voxels, map axes: memory in proportion to the map."""
@@ -140,11 +162,10 @@ class DriveMap:
         for index in self._near(tile, lambda reach: reach.fused):
             part = self._submap(index).fused
             parts.append(part.select(_inside(part.cells[:, [0, 2]], low, high)))
+        fused = replace(join_fused(parts), known=self._known)
         # A drive of fewer frames than the least count must still give a map.
         least = min(config.fusion.min_count, self._frames)
-        cloud = filter_cloud(
-            join_fused(parts).cloud(config.fusion.voxel_m, least), config.map_filters
-        )
+        cloud = filter_cloud(fused.cloud(config.fusion.voxel_m, least), config.map_filters)
         home = np.floor(cloud.xyz[:, [0, 2]] / np.float32(self.cloud_tile_m))
         return cloud.select((home == tile).all(axis=1))
 
@@ -154,9 +175,16 @@ class DriveMap:
 
     def _reach_of(self, submap: Submap) -> _Reach:
         cells, blocks = submap.fused.cells[:, [0, 2]], submap.occupancy.blocks[:, :2]
+        columns = submap.occupancy.voxels(self._config.occupancy.resolution_m).keys[:, :2]
+        low, high = (
+            (columns.min(axis=0), columns.max(axis=0) + 1) if len(columns) else ((0, 0),) * 2
+        )
         return _Reach(
             _tiles(cells, self._voxels_per_tile, self._margin_voxels),
             _tiles(blocks, self._blocks_per_tile, self._margin_blocks),
+            frozenset(submap.fused.known if len(submap.fused) else KNOWABLE),
+            (int(low[0]), int(low[1])),
+            (int(high[0]), int(high[1])),
         )
 
     def _submap(self, index: int) -> Submap:
@@ -178,14 +206,11 @@ class DriveMap:
         self._moved.move_to_end(index)
         return self._moved[index]
 
-    def _nothing(self) -> PointCloud:
-        return PointCloud(np.zeros((0, 3), np.float32), frame="world")
 
-
-def join_clouds(clouds: list[PointCloud], nothing: PointCloud) -> PointCloud:
-    """Clouds of one frame as one; what one of them does not know, the whole does not know."""
+def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud | None:
+    """Clouds of one frame as one, None of none; what one of them does not know is left out."""
     if not clouds:
-        return nothing
+        return None
     fields: dict[str, Any] = {}
     for name in ("rgb", "normals", "sigma_m", "confidence", "weight", "count"):
         arrays = [getattr(cloud, name) for cloud in clouds]

@@ -13,16 +13,12 @@ from recon.evaluation import evaluate_map, evaluate_trajectory
 from recon.formats.atomic import write_text
 from recon.formats.mesh import write_mesh
 from recon.formats.mlp import write_mlp
-from recon.formats.nav2 import write_nav2
-from recon.formats.octomap import write_octomap
-from recon.formats.ply import write_ply
+from recon.formats.ply import read_ply
 from recon.formats.trajectory import write_kitti_poses, write_tum
-from recon.geometry.se3 import apply
-from recon.geometry.transform import transform_cloud
-from recon.mapping import add_floor, drop_undecided, estimate_ground_surface, flatten
 from recon.meshing import reconstruct_mesh
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.machine import use_threads
+from recon.pipeline.map_files import write_map
 from recon.pipeline.observer import Observer
 from recon.pipeline.occupancy_truth import compare_with_source
 from recon.pipeline.record import fingerprint, write_record
@@ -56,7 +52,7 @@ class MapRun:
         name: What a user calls the source.
         config: The configuration.
         mapped: Trajectory, health, fused cloud, voxels.
-        cloud: The fused cloud, frame ``map``.
+        cloud: Points of the fused cloud, spread evenly; all of a small one. Frame ``map``.
         grid: The flat grid.
         mesh: The surface, map axes, or None where none was asked for or none could be made.
         truth: What is known of the true path and surface.
@@ -130,7 +126,7 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
             threads=threads,
             workspace=Workspace(watch, directory.state(""), resume=options.resume),
         )
-        run = _finish(source, config, mapped, options, watch)
+        run = _finish(source, mapped, options, directory, watch)
         with watch.stage("write"):
             _write(run, directory)
         run.summary.update(cost(watch, time.perf_counter() - start))
@@ -161,39 +157,34 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
 
 def _finish(
     source: StereoSource,
-    config: ReconConfig,
     mapped: MappedSequence,
     options: MapOptions,
+    directory: RunDirectory,
     watch: Stopwatch,
 ) -> MapRun:
-    """Make the products that need the whole drive."""
-    warnings = health_warnings(mapped.health)
-    with watch.stage("export"):
-        cloud = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
-    _tell(options.observers, "grid")
-    with watch.stage("grid"):
-        path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
-        floor = add_floor(cloud, mapped.voxels, config.ground)
-        ground = estimate_ground_surface(floor, path_m, config.ground)
-        grid = flatten(mapped.voxels, ground, config.grid)
+    """Make the products that need the whole drive; those of the map are written at once."""
+    config, warnings = mapped.config, health_warnings(mapped.health)
+    _tell(options.observers, "map")
+    written = write_map(mapped, directory, watch)
+    warnings += written.warnings
     mesh = None
     if options.mesh:
         _tell(options.observers, "mesh")
         with watch.stage("mesh"):
-            mesh = _mesh(cloud, config, warnings)
+            mesh = _mesh(read_ply(directory.path("map/cloud.ply")), config, warnings)
     truth = source.truth
     with watch.stage("compare"):
         # Poses that were given are no estimate; a drift of 0 % would be a lie.
         given = options.known_poses is not None
         metrics = None if given else _compare_paths(mapped.trajectory, truth, warnings)
         map_metrics = _compare_surfaces(mapped.cloud, truth, warnings)
-        occupancy_metrics = compare_with_source(source, config, mapped, grid, warnings)
+        occupancy_metrics = compare_with_source(source, config, mapped, written.grid, warnings)
     run = MapRun(
         name=source.name,
         config=config,
         mapped=mapped,
-        cloud=cloud,
-        grid=grid,
+        cloud=written.cloud,
+        grid=written.grid,
         mesh=mesh,
         truth=truth,
         metrics=metrics,
@@ -203,7 +194,8 @@ def _finish(
         warnings=tuple(warnings),
     )
     odometry = "known poses" if given else config.odometry.method
-    run.summary.update(odometry=odometry, **_summary(run))
+    sizes = {"points": written.points, "voxels": written.voxels}
+    run.summary.update(odometry=odometry, **_summary(run), **sizes)
     return run
 
 
@@ -247,8 +239,6 @@ def _summary(run: MapRun) -> dict[str, Any]:
         "frames": frames,
         "fps": frames / seconds if seconds > 0 else None,
         "path_length_m": run.mapped.trajectory.path_length_m,
-        "points": len(run.cloud),
-        "voxels": len(run.mapped.voxels),
         "faces": 0 if run.mesh is None else len(run.mesh.faces),
         "frames_not_measured": sum(not record.ok for record in run.mapped.health),
         "T_map_world": run.mapped.T_map_world.tolist(),
@@ -267,9 +257,6 @@ def _write(run: MapRun, directory: RunDirectory) -> None:
     path = directory.path
     write_kitti_poses(path("trajectory_kitti.txt"), run.mapped.trajectory)
     write_tum(path("trajectory_tum.txt"), run.mapped.trajectory)
-    write_ply(path("map/cloud.ply"), run.cloud)
-    write_nav2(path("map/grid"), run.grid)
-    write_octomap(path("map/octomap"), drop_undecided(run.mapped.voxels, run.config.grid))
     if run.mesh is not None:
         write_mesh(path("mesh/mesh.ply"), run.mesh)
         layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("map/cloud.ply")}

@@ -8,8 +8,9 @@ import numpy as np
 import pyoctomap
 import pytest
 
-from recon.errors import FormatError, OutputError
-from recon.formats.octomap import read_octomap, write_octomap
+from recon.errors import FormatError, MappingError, OutputError
+from recon.formats.octomap import read_octomap, write_octomap, write_octomap_tiles
+from recon.formats.octree import KEY_LIMIT
 from recon.structures import OccupancyVoxels
 
 
@@ -85,3 +86,56 @@ def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
         read_octomap(tmp_path / "x.bt")
     with pytest.raises(FormatError):
         read_octomap(tmp_path / "missing.bt")
+
+
+def _by_pyoctomap(voxels: OccupancyVoxels) -> tuple[bytes, bytes]:
+    """The contents of the ``.ot`` and the ``.bt`` file that OctoMap itself writes."""
+    tree = pyoctomap.OcTree(voxels.resolution_m)
+    tree.setClampingThresMin(1e-6)
+    tree.setClampingThresMax(1.0 - 1e-6)
+    cells = zip(voxels.centres_m.tolist(), voxels.log_odds.tolist(), strict=True)
+    for centre, value in cells:
+        tree.updateNode(centre, value, True)
+    tree.updateInnerOccupancy()
+    return bytes(tree.write()), bytes(tree.writeBinary())
+
+
+def _random_voxels(seed: int, reach: int, number: int) -> OccupancyVoxels:
+    rng = np.random.default_rng(seed)
+    keys = np.unique(rng.integers(-reach, reach, (number, 3)), axis=0).astype(np.int32)
+    # Mostly free, and dense where the reach is small: many nodes are pruned.
+    log_odds = rng.choice([-1.0, -1.0, -1.0, -1.0, -1.0, -0.3, 2.0], len(keys))
+    return OccupancyVoxels(keys, log_odds.astype(np.float32), 0.2)
+
+
+@pytest.mark.parametrize(
+    ("reach", "number"), [(5, 1), (6, 9000), (30, 20_000), (700, 3000), (KEY_LIMIT, 500)]
+)
+def test_files_are_those_of_octomap_byte_for_byte(tmp_path: Path, reach: int, number: int) -> None:
+    voxels = _random_voxels(reach, reach, number)
+    binary, full = write_octomap(tmp_path / "map", voxels)
+    assert (full.read_bytes(), binary.read_bytes()) == _by_pyoctomap(voxels)
+
+
+@pytest.mark.parametrize("depth", [1, 3, 6, 11])
+def test_a_map_in_tiles_gives_the_same_files(tmp_path: Path, depth: int) -> None:
+    voxels = _random_voxels(2, 40, 6000)
+    write_octomap(tmp_path / "whole", voxels)
+    tile = voxels.keys[:, :2] >> depth
+    tiles = [
+        OccupancyVoxels(voxels.keys[inside], voxels.log_odds[inside], 0.2)
+        for column in np.unique(tile, axis=0)
+        for inside in [(tile == column).all(axis=1)]
+    ]
+    write_octomap_tiles(tmp_path / "tiled", tiles[::-1], depth, 0.2)
+    for end in ("bt", "ot"):
+        tiled, whole = (tmp_path / f"{name}.{end}" for name in ("tiled", "whole"))
+        assert tiled.read_bytes() == whole.read_bytes()
+
+
+@pytest.mark.parametrize("cell", [-KEY_LIMIT - 1, KEY_LIMIT])
+def test_a_map_too_large_for_octomap_is_refused(tmp_path: Path, cell: int) -> None:
+    voxels = OccupancyVoxels(np.array([[0, cell, 0]], np.int32), np.ones(1, np.float32), 0.2)
+    with pytest.raises(MappingError, match="too large"):
+        write_octomap(tmp_path / "map", voxels)
+    assert list(tmp_path.iterdir()) == []
