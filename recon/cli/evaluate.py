@@ -10,12 +10,14 @@ import typer
 
 from recon.cli.evaluate_disparity import disparity
 from recon.cli.evaluate_middlebury import middlebury
+from recon.cli.evaluate_trajectory import trajectory
 from recon.cli.options import Json
 from recon.cli.session import print_figures, print_json, session
 
 app = typer.Typer(no_args_is_help=True, help="Compare results with truth.")
 app.command()(middlebury)
 app.command()(disparity)
+app.command()(trajectory)
 
 
 class ReferenceFrame(str, Enum):
@@ -23,23 +25,6 @@ class ReferenceFrame(str, Enum):
 
     camera = "camera"
     map = "map"
-
-
-@app.command("trajectory")
-def trajectory(
-    estimate: Annotated[Path, typer.Argument(help="KITTI or TUM trajectory of a run.")],
-    truth: Annotated[Path, typer.Argument(help="The true one, in either format.")],
-    json: Json = False,
-) -> None:
-    """Relative errors by KITTI's segment rules, ATE and RPE.
-
-    Example: recon evaluate trajectory outputs/map/latest/trajectory_kitti.txt poses.txt
-    """
-    with session():
-        from recon.pipeline.evaluate_run import compare_trajectories
-
-        figures = compare_trajectories(estimate, truth)
-    print_json(figures) if json else print_figures(f"{estimate} against {truth}", figures)
 
 
 @app.command("map")

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from recon.errors import SettingsError
+
 Out = Annotated[
     Path | None,
     typer.Option("--out", "-o", help="Result folder (outputs/<command>/<UTC stamp>)."),
@@ -63,3 +65,19 @@ Tolerance = Annotated[
     float | None,
     typer.Option("--tolerance", help="Seconds that the stamps of a pair may differ. [0.01]"),
 ]
+
+
+def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:
+    """The numbers of an option that takes several, separated by commas.
+
+    Raises:
+        SettingsError: One of them is no number.
+    """
+    if text is None:
+        return None
+    try:
+        return tuple(float(word) for word in text.split(","))
+    except ValueError as error:
+        raise SettingsError(
+            "not numbers separated by commas", where=option, got=text, expected="0.1,0.2,0.5"
+        ) from error

@@ -60,6 +60,19 @@ def print_figures(title: str, figures: Mapping[str, Any]) -> None:
     Console().print(table)
 
 
+def print_evaluation(title: str, figures: Mapping[str, Any]) -> None:
+    """Print the figures of a comparison, those of each part too, its warnings and its folder."""
+    shown = {key: value for key, value in figures.items() if key != "out"}
+    for part in (*figures.get("by_length", ()), *figures.get("by_threshold", ())):
+        (_, name), *values = part.items()
+        shown |= {f"{key} at {name:g} m": value for key, value in values}
+    print_figures(title, shown)
+    for warning in figures["warnings"]:
+        typer.echo(f"warning: {warning}", err=True)
+    if "out" in figures:
+        typer.echo(f"results: {figures['out']}")
+
+
 def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
     """Print a run's figures, its warnings, and where its results are."""
     shown = {key: value for key, value in summary.items() if key != "out"}

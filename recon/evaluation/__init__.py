@@ -1,5 +1,6 @@
 """From estimates and truth to figures."""
 
+from recon.evaluation.association import associate
 from recon.evaluation.confidence import (
     Reliability,
     Sparsification,
@@ -11,12 +12,21 @@ from recon.evaluation.disparity import evaluate_depth, evaluate_disparity
 from recon.evaluation.map import evaluate_map
 from recon.evaluation.middlebury import MiddleburyRules, evaluate_middlebury
 from recon.evaluation.occupancy import evaluate_occupancy
-from recon.evaluation.trajectory import evaluate_trajectory
+from recon.evaluation.trajectory import (
+    TrajectoryComparison,
+    TrajectoryRules,
+    compare_paths,
+    evaluate_trajectory,
+)
 
 __all__ = [
     "MiddleburyRules",
     "Reliability",
     "Sparsification",
+    "TrajectoryComparison",
+    "TrajectoryRules",
+    "associate",
+    "compare_paths",
     "evaluate_depth",
     "evaluate_disparity",
     "evaluate_map",

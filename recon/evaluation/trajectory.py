@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final, Literal
 
 import numpy as np
+from pydantic import Field
 
 from recon.errors import EvaluationError
+from recon.geometry.alignment import Similarity, fit_points
 from recon.geometry.se3 import angle_rad, invert
-from recon.structures import Trajectory, TrajectoryMetrics
+from recon.settings import Settings
+from recon.structures import LengthErrors, Trajectory, TrajectoryMetrics
 from recon.structures.arrays import Float64, Int32
 
 KITTI_LENGTHS_M: Final = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """The benchmark's segments."""
 
 SHORT_LENGTHS_M: Final = (50.0, 100.0)
-"""Segments of a drive that has no room for the benchmark's longest one."""
+"""Segments of a drive that has no room for two of the benchmark's."""
 
 KITTI_STEP_FRAMES: Final = 10
 """The benchmark starts a segment at every tenth frame (one second)."""
@@ -40,60 +43,155 @@ class Segments:
     length_m: Float64
 
 
-def evaluate_trajectory(estimate: Trajectory, truth: Trajectory) -> TrajectoryMetrics:
+class TrajectoryRules(Settings):
+    """How two paths are compared."""
+
+    alignment: Literal["none", "origin", "se3", "sim3"] = Field(
+        default="se3",
+        description="what is done to the estimate first: nothing, moved to the true first pose, "
+        "moved as a whole to lie closest, or also scaled",
+    )
+    lengths_m: tuple[Annotated[float, Field(gt=0)], ...] | None = Field(
+        default=None, min_length=1, description="lengths of the segments; null = chosen by the path"
+    )
+    step_frames: int | None = Field(
+        default=None, ge=1, description="a segment starts at every such frame; null = by the path"
+    )
+    rpe_frames: int = Field(default=1, ge=1, description="frames apart for the RPE")
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryComparison:
+    """Two paths and how they differ, for figures.
+
+    Attributes:
+        estimate: The estimate, aligned.
+        truth: The truth, pose by pose.
+        segments: The stretches of the relative errors.
+        segment_percent: float64 (N,), translation error of each segment, per cent of its length.
+        segment_deg_per_100m: float64 (N,), rotation error of each.
+        metrics: The figures.
+    """
+
+    estimate: Trajectory
+    truth: Trajectory
+    segments: Segments
+    segment_percent: Float64
+    segment_deg_per_100m: Float64
+    metrics: TrajectoryMetrics
+
+    @property
+    def position_errors_m(self) -> Float64:
+        """float64 (N,): distance of each position from the true one."""
+        away = self.estimate.positions_m - self.truth.positions_m
+        return np.asarray(np.linalg.norm(away, axis=1))
+
+
+def evaluate_trajectory(
+    estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules | None = None
+) -> TrajectoryMetrics:
+    """Figures of an estimated trajectory against the true one: see `compare_paths`."""
+    return compare_paths(estimate, truth, rules).metrics
+
+
+def compare_paths(
+    estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules | None = None
+) -> TrajectoryComparison:
     """Compare an estimated trajectory with the true one, pose by pose.
 
-    Relative errors follow the KITTI development kit: segments of 100 to 800 m of the true path,
-    one at every tenth frame; the error of a segment is the error of the motion over it, divided
-    by its length; the mean is over all segments. A drive under 800 m has segments of 50 and
-    100 m instead, starting at every frame, and one of 50 m or less has segments of half its
-    path: `TrajectoryMetrics.segment_lengths_m` tells which were used.
+    Relative errors follow the KITTI development kit: segments of those lengths from 100 to 800 m
+    that the true path has room for, one at every tenth frame; the error of a segment is the error
+    of the motion over it, divided by its length; the mean is over all segments. A drive with room
+    for fewer than two of these lengths has segments of 50 and 100 m instead, starting at every
+    frame, and one of 50 m or less has segments of half its path:
+    `TrajectoryMetrics.segment_lengths_m` tells which were used.
 
     Args:
-        estimate: One pose for each true pose; its first pose may differ, for relative errors do
-            not see it and the absolute error is measured after alignment.
+        estimate: One pose for each true pose.
         truth: The true poses.
-
-    Returns:
-        The figures; every one is finite.
+        rules: How to align and what to cut; None = the defaults. A change of scale counts for
+            every figure, a rigid motion for ``ate_m`` alone.
 
     Raises:
-        EvaluationError: The lengths differ, there are fewer than two poses, or the true path is
-            shorter than `MIN_PATH_M`.
+        EvaluationError: The lengths differ, there are too few poses, the true path is shorter
+            than `MIN_PATH_M`, or it has no room for a segment asked for.
 
     Ref:
         Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012;
         Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
     """
-    _check(estimate, truth)
-    segments = choose_segments(truth.distances_m)
+    rules = rules or TrajectoryRules()
+    _check(estimate, truth, rules)
+    motion = align(estimate, truth, rules.alignment)
+    estimate = motion.move(estimate)
+    segments = choose_segments(truth.distances_m, rules.lengths_m, rules.step_frames)
     translation_m, rotation_rad = motion_errors(estimate, truth, segments.first, segments.last)
+    percent = 100.0 * translation_m / segments.length_m
+    deg_per_100m = 100.0 * np.rad2deg(rotation_rad) / segments.length_m
     frames = np.arange(len(truth), dtype=np.int32)
-    step_m, step_rad = motion_errors(estimate, truth, frames[:-1], frames[1:])
-    return TrajectoryMetrics(
-        t_rel_percent=100.0 * float(np.mean(translation_m / segments.length_m)),
-        r_rel_deg_per_100m=100.0 * float(np.mean(np.rad2deg(rotation_rad) / segments.length_m)),
-        ate_m=_rms(_aligned_distances_m(estimate.positions_m, truth.positions_m)),
+    apart = rules.rpe_frames
+    step_m, step_rad = motion_errors(estimate, truth, frames[:-apart], frames[apart:])
+    away_m = np.linalg.norm(estimate.positions_m - truth.positions_m, axis=1)
+    metrics = TrajectoryMetrics(
+        t_rel_percent=float(np.mean(percent)),
+        r_rel_deg_per_100m=float(np.mean(deg_per_100m)),
+        ate_m=_rms(away_m),
         rpe_m=_rms(step_m),
         rpe_deg=float(np.rad2deg(_rms(step_rad))),
         path_length_m=truth.path_length_m,
         frames=len(truth),
         segment_lengths_m=tuple(float(length) for length in np.unique(segments.length_m)),
         segments=len(segments.first),
+        alignment=rules.alignment,
+        scale=motion.scale,
+        ate_median_m=float(np.median(away_m)),
+        ate_max_m=float(np.max(away_m)),
+        by_length=_by_length(segments, percent, deg_per_100m),
     )
+    return TrajectoryComparison(estimate, truth, segments, percent, deg_per_100m, metrics)
 
 
-def choose_segments(distances_m: Float64) -> Segments:
+def align(estimate: Trajectory, truth: Trajectory, alignment: str) -> Similarity:
+    """The motion of the estimate that `TrajectoryRules.alignment` asks for."""
+    if alignment == "none":
+        return Similarity(np.eye(4))
+    if alignment == "origin":
+        return Similarity(truth.T_world_camera[0] @ invert(estimate.T_world_camera[0]))
+    scaled = alignment == "sim3"
+    return fit_points(estimate.positions_m, truth.positions_m, scaled=scaled)
+
+
+def choose_segments(
+    distances_m: Float64,
+    lengths_m: tuple[float, ...] | None = None,
+    step_frames: int | None = None,
+) -> Segments:
     """The segments over which a drive is judged.
 
     Args:
         distances_m: float64 (N,), true path length from the first pose to each.
+        lengths_m: Their lengths; None = those of the benchmark that fit, or shorter ones.
+        step_frames: Frames from start to start; None = 10, or 1 for shorter lengths.
+
+    Raises:
+        EvaluationError: Lengths are given, and the path has room for none.
     """
-    path_m = float(distances_m[-1])
-    if path_m >= KITTI_LENGTHS_M[-1]:
-        return segments_of(distances_m, KITTI_LENGTHS_M, KITTI_STEP_FRAMES)
-    segments = segments_of(distances_m, SHORT_LENGTHS_M, 1)
-    return segments if len(segments.first) else segments_of(distances_m, (0.5 * path_m,), 1)
+    if lengths_m is not None:
+        segments = segments_of(distances_m, lengths_m, step_frames or KITTI_STEP_FRAMES)
+        if not len(segments.first):
+            raise EvaluationError(
+                "true path has no room for a segment asked for",
+                got=f"a path of {distances_m[-1]:.1f} m",
+                expected=f"more than {min(lengths_m):g} m",
+            )
+        return segments
+    segments = segments_of(distances_m, KITTI_LENGTHS_M, step_frames or KITTI_STEP_FRAMES)
+    if len(np.unique(segments.length_m)) >= 2:
+        return segments
+    segments = segments_of(distances_m, SHORT_LENGTHS_M, step_frames or 1)
+    if len(segments.first):
+        return segments
+    return segments_of(distances_m, (0.5 * float(distances_m[-1]),), 1)
 
 
 def segments_of(distances_m: Float64, lengths_m: tuple[float, ...], step: int) -> Segments:
@@ -129,31 +227,40 @@ def _motion(trajectory: Trajectory, first: Int32, last: Int32) -> Float64:
     return motion
 
 
-def _aligned_distances_m(estimate_m: Float64, truth_m: Float64) -> Float64:
-    """Distances (N,) of positions after the rigid motion that brings them closest (Umeyama)."""
-    estimate_m = estimate_m - estimate_m.mean(axis=0)
-    truth_m = truth_m - truth_m.mean(axis=0)
-    U, _, Vt = np.linalg.svd(truth_m.T @ estimate_m)
-    U[:, -1] *= np.sign(np.linalg.det(U @ Vt))
-    distances: Float64 = np.linalg.norm(truth_m - estimate_m @ (U @ Vt).T, axis=1)
-    return distances
+def _by_length(
+    segments: Segments, percent: Float64, deg_per_100m: Float64
+) -> tuple[LengthErrors, ...]:
+    """Mean errors of the segments of each length."""
+    found = []
+    for length_m in np.unique(segments.length_m):
+        of_length = segments.length_m == length_m
+        found.append(
+            LengthErrors(
+                length_m=float(length_m),
+                t_rel_percent=float(np.mean(percent[of_length])),
+                r_rel_deg_per_100m=float(np.mean(deg_per_100m[of_length])),
+                segments=int(of_length.sum()),
+            )
+        )
+    return tuple(found)
 
 
 def _rms(values: Float64) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _check(estimate: Trajectory, truth: Trajectory) -> None:
+def _check(estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules) -> None:
     if len(estimate) != len(truth):
         raise EvaluationError(
             "estimated and true trajectory differ in length",
             got=f"{len(estimate)} poses",
             expected=f"{len(truth)} poses",
-            hint="both must list a pose for the same frames",
+            hint="without times (TUM, or --times) both must have a pose for each frame",
         )
-    if len(truth) < 2:
+    least = rules.rpe_frames + 1
+    if len(truth) < least:
         raise EvaluationError(
-            "too few poses to compare", got=f"{len(truth)} poses", expected="2 or more"
+            "too few poses to compare", got=f"{len(truth)} poses", expected=f"{least} or more"
         )
     if truth.path_length_m < MIN_PATH_M:
         raise EvaluationError(

@@ -33,6 +33,15 @@ def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Traje
     return _from_tum(table, lines, path)
 
 
+def holds_times(path: StrPath) -> bool:
+    """Whether a trajectory file has a time for each pose: TUM's has, KITTI's has not.
+
+    Raises:
+        FormatError: The file is missing or neither.
+    """
+    return bool(read_table(path, (12, 8))[0].shape[1] == 8)
+
+
 def read_kitti_poses(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
     """Read poses of the left camera, one row-major 3×4 matrix a line.
 

@@ -9,11 +9,10 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from recon.errors import EvaluationError, FormatError
-from recon.evaluation import evaluate_disparity, evaluate_map, evaluate_trajectory
+from recon.evaluation import evaluate_disparity, evaluate_map
 from recon.formats.image import read_grey_levels
 from recon.formats.pfm import read_pfm
 from recon.formats.ply import read_ply
-from recon.formats.trajectory import read_trajectory
 from recon.geometry.se3 import invert
 from recon.geometry.transform import transform_cloud
 from recon.pipeline.middlebury_confidence import curve_figures
@@ -26,17 +25,6 @@ from recon.structures.arrays import Float32, Float64
 
 ReferenceFrame = Literal["camera", "map"]
 _COUNTED: Final = 255
-
-
-def compare_trajectories(estimate: Path, truth: Path) -> dict[str, Any]:
-    """Figures of one trajectory file (KITTI or TUM) against another.
-
-    Raises:
-        FormatError: A file cannot be read.
-        EvaluationError: The two cannot be compared.
-    """
-    metrics = evaluate_trajectory(read_trajectory(estimate), read_trajectory(truth))
-    return dict(plain(metrics))
 
 
 def compare_disparities(

@@ -18,7 +18,7 @@ from recon.reports.figures import (
 from recon.reports.html import Block, FigureBlock, SceneBlock, TableBlock
 from recon.reports.plots import timing_figure
 from recon.reports.scene3d import Scene, plot_scene
-from recon.structures import Disparity, RectifiedPair
+from recon.structures import Disparity, RectifiedPair, TrajectoryMetrics
 
 # Key of the summary -> label and format of its figure.
 FigureFormats = Mapping[str, tuple[str, str]]
@@ -90,6 +90,24 @@ def run_blocks(summary: Mapping[str, Any]) -> list[Block]:
     if rows:
         blocks.append(TableBlock("All figures", ("figure", "value"), rows))
     return blocks
+
+
+def metrics_table(metrics: TrajectoryMetrics) -> TableBlock:
+    """How far a path is from the true one."""
+    lengths = ", ".join(f"{length:g}" for length in metrics.segment_lengths_m)
+    return TableBlock(
+        "Path against truth",
+        ("figure", "value"),
+        (
+            ("relative translation error (t_rel)", f"{metrics.t_rel_percent:.3f} %"),
+            ("relative rotation error (r_rel)", f"{metrics.r_rel_deg_per_100m:.3f} °/100 m"),
+            ("absolute trajectory error (ATE)", f"{metrics.ate_m:.3f} m"),
+            ("frame to frame, translation (RPE)", f"{metrics.rpe_m:.4f} m"),
+            ("frame to frame, rotation (RPE)", f"{metrics.rpe_deg:.4f} °"),
+            ("length of the true path", f"{metrics.path_length_m:.1f} m"),
+            ("segments", f"{metrics.segments} of {lengths} m"),
+        ),
+    )
 
 
 def is_number(value: Any) -> bool:

@@ -14,6 +14,7 @@ from recon.odometry.protocol import OdometryHealth
 from recon.reports.blocks import (
     FigureFormats,
     known_figures,
+    metrics_table,
     run_blocks,
     scene_blocks,
     stereo_blocks,
@@ -184,7 +185,7 @@ def _path_blocks(inputs: MapReportInputs) -> list[Block]:
 def _tables(inputs: MapReportInputs) -> list[Block]:
     tables: list[Block] = []
     if inputs.metrics is not None:
-        tables.append(_metrics_table(inputs.metrics))
+        tables.append(metrics_table(inputs.metrics))
     notes = [
         (str(frame), "; ".join(record.notes) or "no measurement")
         for frame, record in enumerate(inputs.health)
@@ -195,20 +196,3 @@ def _tables(inputs: MapReportInputs) -> list[Block]:
         caption = f"The first {len(shown)} of {len(notes)}." if len(notes) > len(shown) else ""
         tables.append(TableBlock("Notes of the odometry", ("frame", "note"), shown, caption))
     return tables
-
-
-def _metrics_table(metrics: TrajectoryMetrics) -> TableBlock:
-    lengths = ", ".join(f"{length:g}" for length in metrics.segment_lengths_m)
-    return TableBlock(
-        "Path against truth",
-        ("figure", "value"),
-        (
-            ("relative translation error (t_rel)", f"{metrics.t_rel_percent:.3f} %"),
-            ("relative rotation error (r_rel)", f"{metrics.r_rel_deg_per_100m:.3f} °/100 m"),
-            ("absolute trajectory error, aligned (ATE)", f"{metrics.ate_m:.3f} m"),
-            ("frame to frame, translation (RPE)", f"{metrics.rpe_m:.4f} m"),
-            ("frame to frame, rotation (RPE)", f"{metrics.rpe_deg:.4f} °"),
-            ("length of the true path", f"{metrics.path_length_m:.1f} m"),
-            ("segments", f"{metrics.segments} of {lengths} m"),
-        ),
-    )

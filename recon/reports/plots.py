@@ -53,12 +53,12 @@ def trajectory_figure(
     paths = [_seen_from_above(estimate, T_map_world)]
     if truth is not None:
         paths.append(_seen_from_above(truth, T_map_world))
-    figure = new_figure(WIDE_IN, _height_for(np.concatenate(paths)))
+    figure = new_figure(WIDE_IN, height_for(np.concatenate(paths)))
     axes = figure.subplots()
     if truth is not None:
         axes.plot(*paths[1].T, color=TRUTH, linewidth=3.5, alpha=0.75, label="truth")
     axes.plot(*paths[0].T, color=ESTIMATE, linewidth=1.8, label="estimate")
-    _mark_ends(axes, paths[0])
+    mark_ends(axes, paths[0])
     bad = _bad_frames(health, len(estimate))
     if len(bad):
         label = f"not measured ({len(bad)})"
@@ -115,13 +115,13 @@ def grid_figure(
     if path is not None and len(path):
         corners = np.concatenate([corners, path - _PATH_MARGIN_M, path + _PATH_MARGIN_M])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    figure = new_figure(WIDE_IN, _height_for(corners))
+    figure = new_figure(WIDE_IN, height_for(corners))
     axes = figure.subplots()
     axes.set_facecolor(unit_colour(GRID_UNKNOWN))
     axes.imshow(colour_grid(grid), extent=(x, float(far[0]), y, float(far[1])))
     if path is not None:
         axes.plot(*path.T, color=ESTIMATE, linewidth=1.6)
-        _mark_ends(axes, path)
+        mark_ends(axes, path)
     style_plot(axes, _X_LABEL, _Y_LABEL)
     axes.grid(visible=False)
     axes.set_xlim(low[0], high[0])
@@ -175,14 +175,15 @@ def _seen_from_above(trajectory: Trajectory, T_map_world: NDArray[Any]) -> Float
     return np.asarray(apply(T_map_world, trajectory.positions_m)[:, :2])
 
 
-def _height_for(points: NDArray[Any]) -> float:
+def height_for(points: NDArray[Any]) -> float:
     """Height in inches of a wide figure that shows these (N, 2) points with equal axes."""
     extent = np.ptp(points, axis=0) if len(points) else np.ones(2)
     ratio = float(extent[1]) / max(float(extent[0]), 1e-9)
     return float(np.clip((WIDE_IN - 0.8) * ratio + 1.1, 3.0, 9.0))
 
 
-def _mark_ends(axes: Axes, path: NDArray[Any]) -> None:
+def mark_ends(axes: Axes, path: NDArray[Any]) -> None:
+    """Mark where a path (N, 2) starts and ends."""
     if len(path):
         axes.plot(*path[0], "o", color=ESTIMATE, markersize=9, markeredgecolor="white", zorder=5)
         axes.plot(*path[-1], "s", color=ESTIMATE, markersize=7, markeredgecolor="white", zorder=5)

@@ -6,19 +6,41 @@ from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
+class LengthErrors:
+    """Relative errors of the segments of one length.
+
+    Attributes:
+        length_m: Their length.
+        t_rel_percent: Mean translation error, per cent of the length.
+        r_rel_deg_per_100m: Mean rotation error.
+        segments: How many.
+    """
+
+    length_m: float
+    t_rel_percent: float
+    r_rel_deg_per_100m: float
+    segments: int
+
+
+@dataclass(frozen=True)
 class TrajectoryMetrics:
     """How far an estimated trajectory is from the true one.
 
     Attributes:
         t_rel_percent: Mean relative translation error over all segments, per cent (KITTI).
         r_rel_deg_per_100m: Mean relative rotation error over all segments (KITTI).
-        ate_m: Root mean square distance of positions after a rigid (SE(3)) alignment.
+        ate_m: Root mean square distance of positions after the alignment.
         rpe_m: Root mean square translation error from each frame to the next.
         rpe_deg: Root mean square rotation error from each frame to the next.
         path_length_m: Length of the true path.
         frames: Number of poses compared.
         segment_lengths_m: Lengths of the segments used for the relative errors.
         segments: Number of segments.
+        alignment: What was done to the estimate first: ``none``, ``origin``, ``se3``, ``sim3``.
+        scale: Factor on the estimate's lengths in that.
+        ate_median_m: Median distance of positions after the alignment.
+        ate_max_m: Largest one.
+        by_length: The relative errors for each length of segment.
     """
 
     t_rel_percent: float
@@ -30,6 +52,11 @@ class TrajectoryMetrics:
     frames: int
     segment_lengths_m: tuple[float, ...]
     segments: int
+    alignment: str = "se3"
+    scale: float = 1.0
+    ate_median_m: float = float("nan")
+    ate_max_m: float = float("nan")
+    by_length: tuple[LengthErrors, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from recon.errors import EvaluationError
 from recon.evaluation.trajectory import (
     KITTI_LENGTHS_M,
+    TrajectoryRules,
     choose_segments,
     evaluate_trajectory,
     segments_of,
@@ -98,6 +99,58 @@ def test_a_long_drive_has_the_benchmarks_segments_at_every_tenth_frame() -> None
     segments = choose_segments(np.arange(1000, dtype=np.float64))
     assert set(segments.length_m) == set(KITTI_LENGTHS_M)
     assert set(np.unique(segments.first) % 10) == {0}
+
+
+def test_a_drive_of_a_few_hundred_metres_has_those_of_the_benchmark_that_fit() -> None:
+    metrics = evaluate_trajectory(trajectory(straight(331)), trajectory(straight(331)))
+    assert metrics.segment_lengths_m == (100.0, 200.0, 300.0)
+    # From frame 0, 10, …; a segment ends one frame beyond its length, at frame 330 at the latest.
+    assert [one.segments for one in metrics.by_length] == [23, 13, 3]
+    assert metrics.segments == 39
+
+
+def test_lengths_and_steps_can_be_asked_for() -> None:
+    rules = TrajectoryRules(lengths_m=(20.0, 5.0), step_frames=7)
+    metrics = evaluate_trajectory(trajectory(straight(50)), trajectory(straight(50)), rules)
+    assert [(one.length_m, one.segments) for one in metrics.by_length] == [(5.0, 7), (20.0, 5)]
+    with pytest.raises(EvaluationError, match="no room for a segment"):
+        evaluate_trajectory(
+            trajectory(straight(50)), trajectory(straight(50)), TrajectoryRules(lengths_m=(60.0,))
+        )
+
+
+def test_the_mean_over_lengths_is_weighted_by_their_segments() -> None:
+    truth = trajectory(bend(400, 0.01))
+    metrics = evaluate_trajectory(trajectory(bend(400, 0.0101)), truth)
+    weights = [one.segments for one in metrics.by_length]
+    for name in ("t_rel_percent", "r_rel_deg_per_100m"):
+        mean = np.average([getattr(one, name) for one in metrics.by_length], weights=weights)
+        assert getattr(metrics, name) == pytest.approx(mean, rel=1e-12)
+
+
+def test_a_wrong_scale_vanishes_with_sim3_alone() -> None:
+    poses = bend(201, 0.01)
+    estimate = poses.copy()
+    estimate[:, :3, 3] *= 1.1
+    found = {
+        name: evaluate_trajectory(
+            trajectory(estimate), trajectory(poses), TrajectoryRules(alignment=name)
+        )
+        for name in ("none", "se3", "sim3")
+    }
+    assert found["sim3"].scale == pytest.approx(1 / 1.1)
+    assert found["sim3"].ate_m < 1e-9
+    assert found["sim3"].t_rel_percent < 1e-9
+    assert found["none"].ate_m > found["se3"].ate_m > 1
+    assert found["none"].t_rel_percent == pytest.approx(found["se3"].t_rel_percent)
+
+
+def test_an_estimate_that_starts_elsewhere_is_right_from_its_origin() -> None:
+    poses = bend(120, 0.01)
+    moved = make_transform(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([5.0, -3.0, 2.0])) @ poses
+    pair = (trajectory(moved), trajectory(poses))
+    assert evaluate_trajectory(*pair, TrajectoryRules(alignment="origin")).ate_m < 1e-9
+    assert evaluate_trajectory(*pair, TrajectoryRules(alignment="none")).ate_m > 3
 
 
 def test_a_short_drive_has_segments_of_50_and_100_m_at_every_frame() -> None:

@@ -1,0 +1,55 @@
+"""Which poses of two paths belong together, told by their times."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.errors import EvaluationError
+from recon.structures import Trajectory
+from recon.structures.arrays import Float64, Int32
+
+
+def associate(
+    estimate: Trajectory, truth: Trajectory, tolerance_s: float
+) -> tuple[Trajectory, Trajectory]:
+    """The poses of both that have a partner: each is the nearest in time to the other.
+
+    Args:
+        estimate: Any path.
+        truth: Another, on the same clock; its rate may differ.
+        tolerance_s: How far the times of partners may differ.
+
+    Returns:
+        Two paths of equal length, partner by partner, each with its own times.
+
+    Raises:
+        EvaluationError: No pose has a partner.
+    """
+    there = nearest_times(estimate.timestamps_s, truth.timestamps_s)
+    back = nearest_times(truth.timestamps_s, estimate.timestamps_s)
+    apart_s = np.abs(truth.timestamps_s[there] - estimate.timestamps_s)
+    mutual = (back[there] == np.arange(len(estimate))) & (apart_s <= tolerance_s)
+    if not mutual.any():
+        raise EvaluationError(
+            "no pose of the one path is as old as one of the other",
+            got=f"times {_span(estimate)} and {_span(truth)}",
+            expected=f"times within {tolerance_s:g} s of each other",
+            hint="raise --tolerance, or see that both use the same clock",
+        )
+    return _part(estimate, np.flatnonzero(mutual)), _part(truth, there[mutual])
+
+
+def nearest_times(times_s: Float64, others_s: Float64) -> Int32:
+    """int32 (N,): for each time the index of the nearest of the others (M ≥ 1, not falling)."""
+    after = np.clip(np.searchsorted(others_s, times_s), 0, len(others_s) - 1)
+    before = np.maximum(after - 1, 0)
+    earlier = np.abs(times_s - others_s[before]) <= np.abs(others_s[after] - times_s)
+    return np.where(earlier, before, after).astype(np.int32)
+
+
+def _part(path: Trajectory, index: np.ndarray) -> Trajectory:
+    return Trajectory(path.T_world_camera[index], path.timestamps_s[index])
+
+
+def _span(path: Trajectory) -> str:
+    return f"{path.timestamps_s[0]:.3f} to {path.timestamps_s[-1]:.3f} s"

@@ -1,0 +1,118 @@
+"""`recon evaluate trajectory` without its command line: two files in, figures and a report out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from recon.evaluation import TrajectoryComparison, TrajectoryRules, associate, compare_paths
+from recon.formats.trajectory import holds_times, read_trajectory, write_tum
+from recon.pipeline.record import fingerprint, write_record
+from recon.pipeline.run_directory import RunDirectory
+from recon.pipeline.summary import plain
+from recon.sources.times import read_times
+from recon.structures import Trajectory
+
+TOLERANCE_S: Final = 0.01
+"""How far the times of two poses of the same moment may differ."""
+
+
+@dataclass(frozen=True)
+class TrajectoryFiles:
+    """What is compared.
+
+    Attributes:
+        estimate: KITTI or TUM file.
+        truth: The true one, in either format.
+        times: Seconds of the poses of a KITTI file, one a line; None = unknown.
+        tolerance_s: How far the times of two poses of the same moment may differ.
+    """
+
+    estimate: Path
+    truth: Path
+    times: Path | None = None
+    tolerance_s: float = TOLERANCE_S
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryRun:
+    """All that a comparison knows; its report is made from it.
+
+    Attributes:
+        files: What was compared.
+        comparison: The two paths, aligned, and how they differ.
+        summary: The figures of ``summary.json``.
+    """
+
+    files: TrajectoryFiles
+    comparison: TrajectoryComparison
+    summary: dict[str, Any] = field(default_factory=dict)
+
+
+Present = Callable[[TrajectoryRun, RunDirectory], None]
+
+
+def run_evaluate_trajectory(
+    files: TrajectoryFiles,
+    rules: TrajectoryRules,
+    out: Path | None = None,
+    present: Present | None = None,
+) -> dict[str, Any]:
+    """Compare two trajectory files; with a folder, write figures and report into it.
+
+    Poses belong together by their times where both files tell them, else in their order.
+
+    Raises:
+        ReconError: A file cannot be read, the two cannot be compared, or the folder cannot be
+            written; then nothing is left behind.
+    """
+    estimate, truth, by_time = _read_paths(files)
+    poses = {"estimate_poses": len(estimate), "true_poses": len(truth)}
+    if by_time:
+        estimate, truth = associate(estimate, truth, files.tolerance_s)
+    comparison = compare_paths(estimate, truth, rules)
+    summary = {
+        **plain(comparison.metrics),
+        "associated": "by time" if by_time else "in order",
+        **poses,
+        "warnings": _warnings(len(truth), poses),
+    }
+    if out is not None:
+        _write(TrajectoryRun(files, comparison, summary), out, present)
+    return summary
+
+
+def _read_paths(files: TrajectoryFiles) -> tuple[Trajectory, Trajectory, bool]:
+    """Estimate and truth, and whether the times of both are known."""
+    stamped = [holds_times(path) for path in (files.estimate, files.truth)]
+    paths = [read_trajectory(path) for path in (files.estimate, files.truth)]
+    if files.times is not None:
+        for n, path in enumerate(paths):
+            if not stamped[n]:
+                times_s = read_times(files.times, len(path))
+                paths[n] = Trajectory(path.T_world_camera, times_s)
+        stamped = [True, True]
+    return paths[0], paths[1], all(stamped)
+
+
+def _warnings(compared: int, poses: dict[str, int]) -> list[str]:
+    fewer = min(poses.values())
+    if 2 * compared >= fewer:
+        return []
+    return [f"only {compared} of {fewer} poses have a partner in time; see --tolerance"]
+
+
+def _write(run: TrajectoryRun, out: Path, present: Present | None) -> None:
+    with RunDirectory.for_command("evaluate", out) as directory:
+        write_tum(directory.path("estimate_aligned_tum.txt"), run.comparison.estimate)
+        write_tum(directory.path("truth_tum.txt"), run.comparison.truth)
+        run.summary["out"] = str(directory.folder)
+        if present is not None:
+            present(run, directory)
+        directory.write_json("summary.json", run.summary)
+        read = [run.files.estimate, run.files.truth, run.files.times]
+        inputs = fingerprint([path for path in read if path is not None])
+        content = {"source": str(run.files.estimate), "inputs": inputs}
+        write_record(directory, "evaluate trajectory", content)
