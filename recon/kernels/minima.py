@@ -138,3 +138,27 @@ def right_minima(
         place = width - 1 - minimum - x
         inside = 0 <= place < width + ndisp - 1
         right_winner[y, x] = best[1, place] if inside else np.uint16(ndisp)
+
+
+@njit(cache=True, nogil=True)
+def claim_right(ndisp: int, minimum: int, y: int, minima: Minima) -> None:
+    """Match each pixel of row ``y`` of the right view to the left pixel that chose it at least cost.
+
+    Of left pixels that chose it at equal cost the leftmost gets it. Weaker than a search of the
+    right view among all costs, but it costs a hundredth of that.
+
+    Args:
+        ndisp: Number of candidates.
+        minimum: Disparity of candidate 0, pixels.
+        y: The row.
+        minima: Read: row ``y`` of ``winner`` and the best costs. Written: row ``y`` of
+            ``right_winner``.
+    """
+    best = np.full(minima.winner.shape[1], NO_COST, np.uint16)
+    minima.right_winner[y] = ndisp
+    for x in range(best.size):
+        k = np.int64(minima.winner[y, x])
+        cost = minima.costs[0, y, x]
+        if k < ndisp and cost < best[x - minimum - k]:
+            best[x - minimum - k] = cost
+            minima.right_winner[y, x - minimum - k] = k

@@ -12,19 +12,18 @@ from recon.kernels.sad import Search
 def sad_minima_reference(
     left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search
 ) -> Minima:
-    """All rows of `recon.kernels.sad.sad_minima`, from pictures (H, W) that are not mirrored."""
-    upright = window_costs_reference(left, right, search._replace(slant=0.0))
-    slanted = window_costs_reference(left, right, search)
-    lowest = np.minimum(upright, slanted)
+    """All rows of `recon.kernels.sad.sad_minima`, from pictures (H, W)."""
+    upright = window_costs_reference(left, right, search._replace(lean=0))
+    leaning = window_costs_reference(left, right, search)
+    lowest = np.minimum(upright, leaning)
     minima = minima_reference(lowest, search.minimum)
     k = np.minimum(minima.winner, search.ndisp - 1).astype(np.int64)[:, :, None]
-    slanted_wins = np.take_along_axis(slanted < upright, k, axis=2)
-    own = np.where(slanted_wins, slanted, upright)
+    own = np.where(np.take_along_axis(leaning < upright, k, axis=2), leaning, upright)
     for n, step in ((1, -1), (2, 1)):
         there = np.clip(k + step, 0, search.ndisp - 1)
         cost = np.take_along_axis(own, there, axis=2)[:, :, 0]
         minima.costs[n] = np.where(minima.costs[n] == NO_COST, NO_COST, cost)
-    return minima
+    return minima._replace(right_winner=claim_right_reference(minima, search))
 
 
 def window_costs_reference(
@@ -35,16 +34,31 @@ def window_costs_reference(
     costs = np.zeros((height, width, search.ndisp), np.int64)
     candidates = search.minimum + np.arange(search.ndisp)
     y, x = np.arange(height), np.arange(width)
-    for dy in range(-search.rows_radius, search.rows_radius + 1):
+    reach = search.rows_radius
+    upper = [(dy, -search.lean) for dy in range(-reach, 1)]
+    lower = [(dy, search.lean) for dy in range(reach + 1)]
+    for dy, lean in upper + lower:
         rows = np.clip(y + dy, 0, height - 1)[:, None]
-        disparities = candidates + int(np.floor(dy * search.slant + 0.5))
         for dx in range(-search.radius, search.radius + 1):
             columns = np.clip(x + dx, 0, width - 1)
-            others = np.clip(x[:, None] + dx - disparities, 0, width - 1)
+            others = np.clip(x[:, None] + dx - candidates - lean, 0, width - 1)
             a = left[rows, columns].astype(np.int64)[:, :, None]
             b = right[rows[:, :, None], others[None]].astype(np.int64)
             costs += np.minimum(np.abs(a - b), search.cost_cap)
     return costs
+
+
+def claim_right_reference(minima: Minima, search: Search) -> NDArray[np.uint16]:
+    """uint16 (H, W), the candidate of the left pixel that chose each right pixel at least cost."""
+    claims = np.full(minima.winner.shape, search.ndisp, np.uint16)
+    x_last_first = -np.arange(claims.shape[1])
+    for y, costs in enumerate(minima.costs[0].astype(np.int64)):
+        # The last claim stands: that of the least cost, and of equal ones the leftmost.
+        for x in np.lexsort((x_last_first, -costs)):
+            k = int(minima.winner[y, x])
+            if k < search.ndisp:
+                claims[y, x - search.minimum - k] = k
+    return claims
 
 
 def minima_reference(costs: NDArray[np.int64], minimum: int) -> Minima:

@@ -19,7 +19,7 @@ from recon.kernels.refine import (
     empty_refined,
     refine_minima,
 )
-from recon.kernels.sad import Search, mirror_right, sad_minima
+from recon.kernels.sad import Search, lay_out, make_room, sad_minima
 from recon.matching.fill import fill_holes
 from recon.matching.search import (
     FITS,
@@ -104,12 +104,12 @@ class SadMatcher:
         search, rules = self._plan(pair.camera)
         texture = _texture(pair, self._settings)
         left = _prefiltered(pair.left, self._settings)
-        mirrored = mirror_right(_prefiltered(pair.right, self._settings), search)
+        views = lay_out(left, _prefiltered(pair.right, self._settings), search)
         minima = empty_minima(*left.shape)
         refined = empty_refined(*left.shape)
 
         def strip(first: int, end: int) -> None:
-            sad_minima(left, mirrored, search, first, end, minima)
+            sad_minima(views, search, first, end, make_room(search, views.width), minima)
             refine_minima(minima, texture, rules, first, end, refined)
 
         _in_strips(strip, len(left), self._threads)
@@ -120,7 +120,8 @@ class SadMatcher:
         s = self._settings
         ndisp = s.ndisp_within(camera)
         radius, rows_radius = s.window_px // 2, s.window_height_px // 2
-        search = Search(ndisp, s.min_disparity_px, radius, rows_radius, s.cost_cap, s.window_slant)
+        lean = int(np.floor(s.window_slant * rows_radius / 2 + 0.5))
+        search = Search(ndisp, s.min_disparity_px, radius, rows_radius, s.cost_cap, lean)
         rules = Rules(
             ndisp=ndisp,
             minimum=s.min_disparity_px,

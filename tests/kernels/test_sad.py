@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from recon.kernels.minima import NO_COST, Minima, empty_minima
-from recon.kernels.sad import Search, mirror_right, sad_minima
+from recon.kernels.sad import Search, lay_out, make_room, sad_minima
 from recon.kernels.sad_reference import sad_minima_reference
 
 Image = NDArray[np.uint8]
@@ -20,10 +20,10 @@ Image = NDArray[np.uint8]
 
 def search_all(left: Image, right: Image, search: Search, strips: int = 1) -> Minima:
     minima = empty_minima(*left.shape)
-    mirrored = mirror_right(right, search)
+    views, room = lay_out(left, right, search), make_room(search, left.shape[1])
     edges = np.linspace(0, len(left), strips + 1).astype(int)
     for first, end in itertools.pairwise(edges):
-        sad_minima(left, mirrored, search, int(first), int(end), minima)
+        sad_minima(views, search, int(first), int(end), room, minima)
     return minima
 
 
@@ -48,7 +48,7 @@ searches = st.builds(
     radius=st.integers(0, 4),
     rows_radius=st.integers(0, 4),
     cost_cap=st.sampled_from([1, 20, 255]),
-    slant=st.sampled_from([0.0, 1 / 3, -0.5, 1.0]),
+    lean=st.integers(-2, 2),
 )
 
 
@@ -69,7 +69,7 @@ def test_strips_do_not_change_the_result(
 @pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
 def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
     grey = np.zeros(shape, np.uint8)
-    search = Search(ndisp=4, minimum=0, radius=3, rows_radius=3, cost_cap=31, slant=0.0)
+    search = Search(ndisp=4, minimum=0, radius=3, rows_radius=3, cost_cap=31, lean=0)
     minima = search_all(grey, grey, search)
     assert_equal(minima, sad_minima_reference(grey, grey, search))
     assert (minima.winner == 0).all()
@@ -77,15 +77,15 @@ def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]
 
 def test_largest_costs_do_not_overflow() -> None:
     left, right = np.full((40, 40), 255, np.uint8), np.zeros((40, 40), np.uint8)
-    search = Search(ndisp=3, minimum=0, radius=7, rows_radius=8, cost_cap=255, slant=0.0)
+    search = Search(ndisp=3, minimum=0, radius=7, rows_radius=7, cost_cap=255, lean=0)
     costs = search_all(left, right, search).costs[0]
-    assert (costs == 15 * 17 * 255).all()
+    assert (costs == 15 * 16 * 255).all()
     assert costs.max() < NO_COST
 
 
 def test_pixels_without_a_candidate_have_no_winner() -> None:
     grey = np.zeros((2, 8), np.uint8)
-    search = Search(ndisp=3, minimum=5, radius=1, rows_radius=1, cost_cap=31, slant=0.0)
+    search = Search(ndisp=3, minimum=5, radius=1, rows_radius=1, cost_cap=31, lean=0)
     minima = search_all(grey, grey, search)
     # Disparity 5 needs a right pixel at x - 5.
     assert (minima.winner[:, :5] == 3).all()
