@@ -142,10 +142,10 @@ def right_minima(
 
 @njit(cache=True, nogil=True)
 def claim_right(ndisp: int, minimum: int, y: int, minima: Minima) -> None:
-    """Match each pixel of row ``y`` of the right view to the left pixel that chose it at least cost.
+    """Match each pixel of row ``y`` of the right view to the left pixel that chose it best.
 
-    Of left pixels that chose it at equal cost the leftmost gets it. Weaker than a search of the
-    right view among all costs, but it costs a hundredth of that.
+    The left pixel of the least cost gets it, of equal ones the leftmost. Weaker than a search of
+    the right view among all costs, but it costs a hundredth of that.
 
     Args:
         ndisp: Number of candidates.

@@ -132,14 +132,9 @@ def refine_minima(
     claimed = np.empty(minima.winner.shape[1], np.bool_)
     for y in range(first, end):
         _claim(minima.right_winner[y], rules, claimed)
-        for x in range(minima.winner.shape[1]):
-            reason = _judge(minima, texture[y, x], claimed[x], rules, y, x)
-            refined.reason[y, x] = np.uint8(reason)
-            refined.values[y, x] = np.float32(np.nan)
-            refined.sigma_px[y, x] = np.float32(np.nan)
-            refined.confidence[y, x] = np.float32(0)
-            if reason == VALID:
-                _measure(minima, rules, y, x, refined)
+        for x in range(claimed.size):
+            refined.reason[y, x] = _judge(minima, texture[y, x], claimed[x], rules, y, x)
+        _measure(minima, rules, y, refined)
 
 
 @njit(cache=True, nogil=True)
@@ -178,36 +173,48 @@ def _judge(minima: Minima, texture: float, claimed: bool, rules: Rules, y: int, 
     return VALID
 
 
-@njit(cache=True, nogil=True)
-def _measure(minima: Minima, rules: Rules, y: int, x: int, refined: Refined) -> None:
-    """Write disparity, standard deviation and confidence of one pixel; float64 inside."""
-    best, second = np.float64(minima.costs[0, y, x]), np.float64(minima.costs[3, y, x])
-    before, after = np.float64(minima.costs[1, y, x]), np.float64(minima.costs[2, y, x])
-    offset = _offset(best, before, after, rules.fit)
-    refined.values[y, x] = np.float32(rules.minimum + np.float64(minima.winner[y, x]) + offset)
-    slope = max(before, after) - best
-    vertex = max(best - 0.5 * abs(before - after), 0.0)
-    sigma = SIGMA_LARGEST_PX
-    if slope > 0.0:
-        noise = 0.5 * np.pi * vertex / (slope * np.sqrt(rules.window_pixels))
-        sigma = min(np.sqrt(rules.sigma_floor_px**2 + noise * noise), sigma)
-    confidence = 0.0
-    if second < NO_COST:
-        margin = (second - best) / (rules.window_pixels + best)
-        odds = rules.odds * np.sqrt(margin / (sigma * sigma * sigma))
-        confidence = odds / (odds + 1.0)
-    refined.confidence[y, x] = np.float32(confidence)
-    if_wrong = max(sigma, WRONG_PX)
-    variance = confidence * (sigma * sigma) + (1.0 - confidence) * (if_wrong * if_wrong)
-    refined.sigma_px[y, x] = np.float32(np.sqrt(variance))
+@njit(cache=True, nogil=True, error_model="numpy")
+def _measure(minima: Minima, rules: Rules, y: int, refined: Refined) -> None:
+    """Write disparity, standard deviation and confidence of one row.
 
+    All pixels are measured, and those that do not stand are wiped out: a loop without branches, in
+    float32 alone, becomes vector instructions (and numpy's rules of division: no check for nought).
+    """
+    winner, minimum = minima.winner[y], np.float32(rules.minimum)
+    best_cost, cost_before = minima.costs[0, y], minima.costs[1, y]
+    cost_after, second_cost = minima.costs[2, y], minima.costs[3, y]
+    values, confidences, sigmas = refined.values[y], refined.confidence[y], refined.sigma_px[y]
+    reasons = refined.reason[y]
+    lines, parabola = rules.fit == EQUIANGULAR, rules.fit == PARABOLA
+    nought, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    largest, nan = np.float32(SIGMA_LARGEST_PX), np.float32(np.nan)
+    variance_floor = np.float32(rules.sigma_floor_px) * np.float32(rules.sigma_floor_px)
+    pixels, odds_of_one = np.float32(rules.window_pixels), np.float32(rules.odds)
+    noise_of_one = np.float32(0.5 * np.pi / np.sqrt(rules.window_pixels))
+    for x in range(winner.size):
+        best, second = np.float32(best_cost[x]), np.float32(second_cost[x])
+        before, after = np.float32(cost_before[x]), np.float32(cost_after[x])
+        slope = max(before, after) - best
+        bend = before + after - best - best
+        steepness = bend if parabola else slope
+        fits = (lines or parabola) and steepness > nought
+        offset = half * (before - after) / (steepness if fits else one)
+        offset = offset if fits else nought
 
-@njit(cache=True, nogil=True)
-def _offset(best: float, before: float, after: float, fit: int) -> float:
-    """Where the minimum lies between candidates, in [-0.5, 0.5]."""
-    steepness = max(before, after) - best
-    if fit == PARABOLA:
-        steepness = before + after - 2.0 * best
-    if fit == NO_FIT or steepness <= 0.0:
-        return 0.0
-    return 0.5 * (before - after) / steepness
+        vertex = max(best - half * abs(before - after), nought)
+        sloped = slope > nought
+        noise = noise_of_one * vertex / (slope if sloped else one)
+        sigma = min(np.sqrt(variance_floor + noise * noise), largest)
+        sigma = sigma if sloped else largest
+
+        margin = (second - best) / (pixels + best)
+        odds = odds_of_one * np.sqrt(margin / (sigma * sigma * sigma))
+        confidence = odds / (odds + one)
+        confidence = confidence if second_cost[x] != NO_COST else nought
+        if_wrong = max(sigma, np.float32(WRONG_PX))
+        variance = confidence * (sigma * sigma) + (one - confidence) * (if_wrong * if_wrong)
+
+        valid = reasons[x] == VALID
+        values[x] = minimum + np.float32(winner[x]) + offset if valid else nan
+        confidences[x] = confidence if valid else nought
+        sigmas[x] = min(np.sqrt(variance), largest) if valid else nan

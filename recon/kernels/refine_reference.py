@@ -1,4 +1,4 @@
-"""`recon.kernels.refine` in plain numpy: the definition of its results."""
+"""`recon.kernels.refine` in plain numpy and float64: the definition of its results."""
 
 from __future__ import annotations
 

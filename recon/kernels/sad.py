@@ -64,8 +64,8 @@ class Views(NamedTuple):
 
     Attributes:
         left: uint8 (H, C); column ``c`` is column ``c - radius`` of the picture.
-        right: uint8 (H, C + n - 1), n = ndisp + 2·\\|lean\\|; column ``c`` sees candidate ``k`` at
-            column ``c + n - 1 - \\|lean\\| - k``.
+        right: uint8 (H, C + n - 1), n = ndisp + 2·abs(lean); column ``c`` sees candidate
+            ``k`` at column ``c + n - 1 - abs(lean) - k``.
         width: Columns of the picture.
     """
 
@@ -84,10 +84,10 @@ class Room(NamedTuple):
         no_pairs: As ``pairs``, noughts.
         no_fours: As ``fours``, noughts.
         halves: uint16 (rows_radius + 1, n, S), a ring of rows: sums over a half.
-        found: uint16 (4·_BLOCK,), of each column of a row: the best of the candidates offered so far
-            (ndisp = none), its cost, the least cost of those two or more away from it, and the
-            least cost of all but the last one offered. One array: the compiler checks every one
-            that is written for overlaps.
+        found: uint16 (4·_BLOCK,), of each column of a row: the best of the candidates offered so
+            far (ndisp = none), its cost, the least cost of those two or more away from it, and
+            the least cost of all but the last one offered. One array, because the compiler checks
+            every one that is written for overlaps.
         block: Columns done at a time, at most S - 2·radius.
     """
 
@@ -192,9 +192,7 @@ def sad_minima(
 
 
 @njit(cache=True, nogil=True)
-def _next_half(
-    views: Views, search: Search, first: int, y: int, x0: int, room: Room
-) -> Halves:
+def _next_half(views: Views, search: Search, first: int, y: int, x0: int, room: Room) -> Halves:
     """Sum up the half window below row ``y``; give the halves above and below it."""
     rows, start = search.rows_radius + 1, first - search.rows_radius
     last = views.left.shape[0] - 1
@@ -289,7 +287,13 @@ def _sum_window(values: NDArray[Any], window: int, room: Room, sums: NDArray[np.
 
 @njit(cache=True, nogil=True)
 def _choose(
-    halves: Halves, search: Search, y: int, x0: int, x1: int, found: NDArray[np.uint16], minima: Minima
+    halves: Halves,
+    search: Search,
+    y: int,
+    x0: int,
+    x1: int,
+    found: NDArray[np.uint16],
+    minima: Minima,
 ) -> None:
     """Choose among the candidates of columns ``x0`` to ``x1 - 1`` of row ``y``."""
     width, ahead, block = minima.winner.shape[1], search.minimum - x0, x1 - x0
@@ -404,23 +408,22 @@ def _weigh(
 
 
 @njit(cache=True, nogil=True)
-def _look_beside(
-    halves: Halves, search: Search, y: int, x0: int, x1: int, minima: Minima
-) -> None:
+def _look_beside(halves: Halves, search: Search, y: int, x0: int, x1: int, minima: Minima) -> None:
     """Write the costs before and after each best, from the window that won: a fit mixes no two."""
-    upper, lower = halves
-    width, lean = minima.winner.shape[1], search.lean
+    upper, lower = halves.upper.reshape(-1), halves.lower.reshape(-1)
+    width, stride = minima.winner.shape[1], np.uint64(halves.upper.shape[1])
+    # Unsigned steps through flat arrays need no checks; a lean below nought wraps round twice.
+    lean = np.uint64(search.lean) * stride
     for x in range(x0, x1):
-        minima.costs[1, y, x] = NO_COST
-        minima.costs[2, y, x] = NO_COST
+        before, after = np.uint16(NO_COST), np.uint16(NO_COST)
         k = np.int64(minima.winner[y, x])
-        if k == search.ndisp:
-            continue
-        n, c = k + abs(lean), x - x0
-        leaning = np.uint16(upper[n - lean, c] + lower[n + lean, c])
-        own = lean if leaning < np.uint16(upper[n, c] + lower[n, c]) else 0
-        right = x - search.minimum - k
-        if k > 0 and right + 1 < width:
-            minima.costs[1, y, x] = upper[n - 1 - own, c] + lower[n - 1 + own, c]
-        if k + 1 < search.ndisp and right > 0:
-            minima.costs[2, y, x] = upper[n + 1 - own, c] + lower[n + 1 + own, c]
+        if k < search.ndisp:
+            at = np.uint64(k + abs(search.lean)) * stride + np.uint64(x - x0)
+            leaning = np.uint16(upper[at - lean] + lower[at + lean])
+            own = lean if leaning < np.uint16(upper[at] + lower[at]) else np.uint64(0)
+            right = x - search.minimum - k
+            if k > 0 and right + 1 < width:
+                before = np.uint16(upper[at - stride - own] + lower[at - stride + own])
+            if k + 1 < search.ndisp and right > 0:
+                after = np.uint16(upper[at + stride - own] + lower[at + stride + own])
+        minima.costs[1, y, x], minima.costs[2, y, x] = before, after

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -27,7 +28,7 @@ from recon.matching.search import (
     MinTexture,
     OddInt,
     UniquenessPercent,
-    without_speckles,
+    finish,
 )
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import Float32, UInt8
@@ -48,7 +49,8 @@ class SadSettings(MeasuredSettings):
         ge=-1.0,
         le=1.0,
         description="Disparity per row of a second window, which competes with the upright one "
-        "at each pixel; 0 = none. On level ground it is baseline / camera height.",
+        "at each pixel; 0 = none. On level ground it is baseline / camera height. Its upper and "
+        "its lower half are moved against each other by whole disparities, so it is rounded.",
     )
     prefilter: Literal["sobel", "none"] = Field(
         default="sobel", description="What is compared: horizontal gradients, or grey levels."
@@ -75,8 +77,8 @@ class SadSettings(MeasuredSettings):
 
     @model_validator(mode="after")
     def _costs_fit(self) -> Self:
-        if self.window_px * self.window_height_px * self.cost_cap >= 65535:
-            raise ValueError("window_px x window_height_px x cost_cap must stay below 65535")
+        if self.window_px * (self.window_height_px + 1) * self.cost_cap >= 65535:
+            raise ValueError("window_px x (window_height_px + 1) x cost_cap must stay below 65535")
         return self
 
 
@@ -113,14 +115,15 @@ class SadMatcher:
             refine_minima(minima, texture, rules, first, end, refined)
 
         _in_strips(strip, len(left), self._threads)
-        found = without_speckles(Disparity(*refined), self._settings)
+        found = finish(refined, self._settings)
         return _smoothed(found, self._settings.median_px)
 
     def _plan(self, camera: RectifiedCamera) -> tuple[Search, Rules]:
         s = self._settings
         ndisp = s.ndisp_within(camera)
         radius, rows_radius = s.window_px // 2, s.window_height_px // 2
-        lean = int(np.floor(s.window_slant * rows_radius / 2 + 0.5))
+        # The middles of the two halves lie half a radius above and below the pixel.
+        lean = math.floor(s.window_slant * rows_radius / 2 + 0.5)
         search = Search(ndisp, s.min_disparity_px, radius, rows_radius, s.cost_cap, lean)
         rules = Rules(
             ndisp=ndisp,

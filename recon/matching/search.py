@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from recon.errors import MatchingError
-from recon.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA
+from recon.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA, Refined
 from recon.kernels.speckle import find_speckles
 from recon.settings import Settings
 from recon.structures import Disparity, Reason, RectifiedCamera
@@ -114,12 +115,21 @@ class MeasuredSettings(SearchSettings):
     )
 
 
-def without_speckles(disparity: Disparity, settings: SearchSettings) -> Disparity:
-    """The disparity without its small regions, whose reason becomes SPECKLE."""
-    if settings.speckle_size_px < 2:
-        return disparity
-    small = find_speckles(disparity.values, settings.speckle_range_px, settings.speckle_size_px)
-    return disparity.reject(small, Reason.SPECKLE)
+def finish(refined: Refined, settings: SearchSettings) -> Disparity:
+    """The disparity of what was refined, without its small regions: their reason becomes SPECKLE.
+
+    Args:
+        refined: Overwritten; a copy of each array would cost more than the search for speckles.
+        settings: Says what a speckle is.
+    """
+    if settings.speckle_size_px >= 2:
+        largest_step, size = settings.speckle_range_px, settings.speckle_size_px
+        small = find_speckles(refined.values, largest_step, size)
+        np.putmask(refined.values, small, np.nan)
+        np.putmask(refined.confidence, small, 0)
+        np.putmask(refined.sigma_px, small, np.nan)
+        np.putmask(refined.reason, small, Reason.SPECKLE)
+    return Disparity(*refined)
 
 
 def usual_ndisp(width_px: int) -> int:

@@ -30,7 +30,7 @@ from recon.kernels.refine import (
     refine_minima,
 )
 from recon.kernels.semi_global import ROWS, Paths, Room, empty_room, semi_global_minima
-from recon.matching.search import FITS, MeasuredSettings, OddInt, without_speckles
+from recon.matching.search import FITS, MeasuredSettings, OddInt, finish
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import Float32, UInt8
 
@@ -165,7 +165,7 @@ class SgmMatcher:
         strips = [range(y, min(y + strip_rows, height)) for y in range(0, height, strip_rows)]
         with ThreadPoolExecutor(at_once) as pool:
             list(pool.map(work, strips))
-        return without_speckles(Disparity(*refined), s)
+        return finish(refined, s)
 
     def _strips(self, camera: RectifiedCamera, ndisp: int) -> tuple[int, int]:
         """Rows of a strip, and how many strips may be worked on at once."""

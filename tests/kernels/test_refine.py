@@ -99,8 +99,12 @@ LEFT_RIGHT_OR_OCCLUDED = (
 @example(LEFT_RIGHT_OR_OCCLUDED)
 def test_refinement_equals_its_twin(case: tuple[Minima, np.ndarray, Rules]) -> None:
     found, expected = refine_all(*case), refine_minima_reference(*case)
-    for name in Refined._fields:
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+    np.testing.assert_array_equal(found.reason, expected.reason)
+    for name in ("values", "confidence", "sigma_px"):
+        # The kernel computes in float32 (2e-7 a step), its twin in float64.
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(expected, name), rtol=2e-6, atol=1e-6, err_msg=name
+        )
 
 
 @settings(deadline=None)  # the first call compiles
