@@ -12,21 +12,34 @@ from typing import Any, Final
 
 import numpy as np
 from numba import njit, types
-from numba.extending import intrinsic
+from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
 PLANES: Final = 3
 """Planes come in threes: 5 by 5 has three, and fewer loops are faster ones."""
 
 
-@intrinsic
-def count_bits(_: Any, bits: Any) -> Any:
-    """Number of bits of a uint8 that are set, by the instruction of the processor if it has one."""
+def count_bits(bits: Any) -> Any:
+    """Number of bits of a uint8 that are set."""
+    return np.uint8(int(bits).bit_count())
 
+
+@intrinsic
+def _population_count(_: Any, bits: Any) -> Any:
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
         return builder.ctpop(arguments[0])
 
     return (types.uint8(types.uint8), generate) if bits == types.uint8 else None
+
+
+@overload(count_bits)
+def _count_bits_compiled(bits: Any) -> Any:
+    """Let compiled code count by the instruction of the processor, if it has one."""
+
+    def count(bits: Any) -> Any:
+        return _population_count(bits)
+
+    return count if bits == types.uint8 else None
 
 
 def census_planes(grey: NDArray[np.uint8], rows_radius: int, radius: int) -> NDArray[np.uint8]:

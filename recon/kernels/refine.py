@@ -74,13 +74,8 @@ class Refined(NamedTuple):
 
 def empty_refined(height: int, width: int) -> Refined:
     """Arrays for `refine_minima` to write to."""
-    shape = (height, width)
-    return Refined(
-        values=np.empty(shape, np.float32),
-        confidence=np.empty(shape, np.float32),
-        sigma_px=np.empty(shape, np.float32),
-        reason=np.empty(shape, np.uint8),
-    )
+    values, confidence, sigma_px = np.empty((3, height, width), np.float32)
+    return Refined(values, confidence, sigma_px, np.empty((height, width), np.uint8))
 
 
 @njit(cache=True, nogil=True)

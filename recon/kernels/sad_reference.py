@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.kernels.half_windows import Search
 from recon.kernels.minima import NO_COST, Minima
-from recon.kernels.sad import Search
 
 
 def sad_minima_reference(
@@ -42,15 +42,15 @@ def window_costs_reference(
         for dx in range(-search.radius, search.radius + 1):
             columns = np.clip(x + dx, 0, width - 1)
             others = np.clip(x[:, None] + dx - candidates - lean, 0, width - 1)
-            a = left[rows, columns].astype(np.int64)[:, :, None]
-            b = right[rows[:, :, None], others[None]].astype(np.int64)
+            a = np.expand_dims(left[rows, columns].astype(np.int64), 2)
+            b = right[np.expand_dims(rows, 2), others[None]].astype(np.int64)
             costs += np.minimum(np.abs(a - b), search.cost_cap)
     return costs
 
 
 def claim_right_reference(minima: Minima, search: Search) -> NDArray[np.uint16]:
     """uint16 (H, W), the candidate of the left pixel that chose each right pixel at least cost."""
-    claims = np.full(minima.winner.shape, search.ndisp, np.uint16)
+    claims = np.full_like(minima.winner, search.ndisp)
     x_last_first = -np.arange(claims.shape[1])
     for y, costs in enumerate(minima.costs[0].astype(np.int64)):
         # The last claim stands: that of the least cost, and of equal ones the leftmost.

@@ -14,14 +14,16 @@ import numpy as np
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
+from recon.kernels.half_windows import Search, lay_out, make_room
 from recon.kernels.minima import empty_minima
 from recon.kernels.refine import (
     Rules,
     empty_refined,
     refine_minima,
 )
-from recon.kernels.sad import Search, lay_out, make_room, sad_minima
+from recon.kernels.sad import sad_minima
 from recon.matching.fill import fill_holes
+from recon.matching.rooms import Rooms
 from recon.matching.search import (
     FITS,
     MeasuredSettings,
@@ -96,6 +98,8 @@ class SadMatcher:
     def __init__(self, settings: SadSettings, threads: int | None = None) -> None:
         self._settings = settings
         self._threads = max(1, threads or os.cpu_count() or 1)
+        self._rooms = Rooms(make_room, self._threads)
+        self._minima = Rooms(empty_minima, 1)
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair.
@@ -107,14 +111,15 @@ class SadMatcher:
         texture = _texture(pair, self._settings)
         left = _prefiltered(pair.left, self._settings)
         views = lay_out(left, _prefiltered(pair.right, self._settings), search)
-        minima = empty_minima(*left.shape)
         refined = empty_refined(*left.shape)
 
         def strip(first: int, end: int) -> None:
-            sad_minima(views, search, first, end, make_room(search, views.width), minima)
+            with self._rooms.borrow(search, views.width) as room:
+                sad_minima(views, search, first, end, room, minima)
             refine_minima(minima, texture, rules, first, end, refined)
 
-        _in_strips(strip, len(left), self._threads)
+        with self._minima.borrow(*left.shape) as minima:
+            _in_strips(strip, len(left), self._threads)
         found = finish(refined, self._settings)
         return _smoothed(found, self._settings.median_px)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
@@ -29,7 +28,8 @@ from recon.kernels.refine import (
     empty_refined,
     refine_minima,
 )
-from recon.kernels.semi_global import ROWS, Paths, Room, empty_room, semi_global_minima
+from recon.kernels.semi_global import ROWS, Paths, empty_room, semi_global_minima
+from recon.matching.rooms import Rooms
 from recon.matching.search import FITS, MeasuredSettings, OddInt, finish
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import Float32, UInt8
@@ -138,7 +138,8 @@ class SgmMatcher:
     def __init__(self, settings: SgmSettings, threads: int | None = None) -> None:
         self._settings = settings
         self._threads = max(1, threads or os.cpu_count() or 1)
-        self._rooms: deque[Room] = deque(maxlen=self._threads)
+        self._rooms = Rooms(empty_room, self._threads)
+        self._minima = Rooms(empty_minima, 1)
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair.
@@ -152,18 +153,17 @@ class SgmMatcher:
         levels = window.levels
         paths, rules = _paths(s, ndisp, levels), _rules(s, ndisp, levels)
         texture = _texture(pair, s)
-        minima, refined = empty_minima(*texture.shape), empty_refined(*texture.shape)
+        refined = empty_refined(*texture.shape)
 
         def work(strip: range) -> None:
-            room = self._take_room(pair.camera.width_px, paths)
-            semi_global_minima(views, window, paths, strip, room, minima)
-            self._rooms.append(room)
+            with self._rooms.borrow(pair.camera.width_px, paths) as room:
+                semi_global_minima(views, window, paths, strip, room, minima)
             refine_minima(minima, texture, rules, strip.start, strip.stop, refined)
 
         strip_rows, at_once = self._strips(pair.camera, ndisp)
         height = pair.camera.height_px
         strips = [range(y, min(y + strip_rows, height)) for y in range(0, height, strip_rows)]
-        with ThreadPoolExecutor(at_once) as pool:
+        with self._minima.borrow(*texture.shape) as minima, ThreadPoolExecutor(at_once) as pool:
             list(pool.map(work, strips))
         return finish(refined, s)
 
@@ -175,15 +175,6 @@ class SgmMatcher:
         room_bytes = _room_bytes(camera.width_px, ndisp, self._settings.overlap_rows)
         at_once = min(self._threads, (self._settings.memory_mb << 20) // room_bytes)
         return rows, max(1, at_once)
-
-    def _take_room(self, width: int, paths: Paths) -> Room:
-        """Room for a strip: that of an earlier one where it fits."""
-        fresh = empty_room(width, paths)
-        try:
-            room = self._rooms.pop()
-        except IndexError:
-            return fresh
-        return room if room.costs.shape == fresh.costs.shape else fresh
 
 
 def _room_bytes(width: int, ndisp: int, overlap: int) -> int:

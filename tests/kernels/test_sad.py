@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
+from recon.kernels.half_windows import Search, lay_out, make_room
 from recon.kernels.minima import NO_COST, Minima, empty_minima
-from recon.kernels.sad import Search, lay_out, make_room, sad_minima
+from recon.kernels.sad import sad_minima
 from recon.kernels.sad_reference import sad_minima_reference
 
 Image = NDArray[np.uint8]
