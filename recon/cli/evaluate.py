@@ -10,6 +10,7 @@ import typer
 
 from recon.cli.evaluate_disparity import disparity
 from recon.cli.evaluate_middlebury import middlebury
+from recon.cli.evaluate_occupancy import occupancy
 from recon.cli.evaluate_trajectory import trajectory
 from recon.cli.options import Json
 from recon.cli.session import print_figures, print_json, session
@@ -18,6 +19,7 @@ app = typer.Typer(no_args_is_help=True, help="Compare results with truth.")
 app.command()(middlebury)
 app.command()(disparity)
 app.command()(trajectory)
+app.command()(occupancy)
 
 
 class ReferenceFrame(str, Enum):

@@ -11,7 +11,7 @@ from recon.evaluation.confidence import (
 from recon.evaluation.disparity import evaluate_depth, evaluate_disparity
 from recon.evaluation.map import evaluate_map
 from recon.evaluation.middlebury import MiddleburyRules, evaluate_middlebury
-from recon.evaluation.occupancy import evaluate_occupancy
+from recon.evaluation.occupancy import evaluate_occupancy, grid_on_truth
 from recon.evaluation.trajectory import (
     TrajectoryComparison,
     TrajectoryRules,
@@ -33,6 +33,7 @@ __all__ = [
     "evaluate_middlebury",
     "evaluate_occupancy",
     "evaluate_trajectory",
+    "grid_on_truth",
     "measure_reliability",
     "measure_sparsification",
     "share_within_sigma",

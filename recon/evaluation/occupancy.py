@@ -55,7 +55,7 @@ def evaluate_occupancy(
     _check(voxels, grid, truth)
     occupied = voxels.keys[voxels.log_odds > 0]
     counted = occupied[_looked_at(occupied, truth)]
-    pictures = _rasters(grid, truth)
+    pictures = grid_on_truth(grid, truth), truth.grid.cells
     return OccupancyMetrics(
         resolution_m=voxels.resolution_m,
         least_frames=truth.least_frames,
@@ -124,10 +124,8 @@ def _pack(keys: NDArray[Any]) -> NDArray[np.int64]:
     return np.asarray((wide[:, 0] << (2 * _BITS)) | (wide[:, 1] << _BITS) | wide[:, 2])
 
 
-def _rasters(
-    grid: OccupancyGrid, truth: OccupancyTruth
-) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-    """The grid and the true grid, both of the extent of the true one; UNKNOWN outside."""
+def grid_on_truth(grid: OccupancyGrid, truth: OccupancyTruth) -> NDArray[np.int8]:
+    """The cells of a grid in the raster of the true one; UNKNOWN where it does not reach."""
     offset_m = np.array(truth.grid.origin_m) - np.array(grid.origin_m)
     right, down = np.rint(offset_m / grid.resolution_m).astype(int).tolist()
     rows, columns = (np.arange(n) for n in truth.seen.shape)
@@ -135,7 +133,7 @@ def _rasters(
     columns = columns[(columns + right >= 0) & (columns + right < grid.cells.shape[1])]
     cells = np.full(truth.seen.shape, UNKNOWN, np.int8)
     cells[np.ix_(rows, columns)] = grid.cells[np.ix_(rows + down, columns + right)]
-    return cells, truth.grid.cells
+    return cells
 
 
 def _compare_grids(

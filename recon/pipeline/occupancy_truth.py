@@ -32,14 +32,17 @@ def compare_with_source(
 
 
 def known_occupancy(
-    source: KnowsOccupancy, config: ReconConfig, T_map_world: Float64
+    source: KnowsOccupancy,
+    config: ReconConfig,
+    T_map_world: Float64,
+    least_frames: int = LEAST_FRAMES,
 ) -> OccupancyTruth:
     """What a source knows, in the cells, axes and height band of a map."""
     return source.occupancy_truth(
         resolution_m=config.occupancy.resolution_m,
         band_m=(config.grid.min_height_m, config.grid.max_height_m),
         range_m=config.occupancy.max_range_m,
-        least_frames=LEAST_FRAMES,
+        least_frames=least_frames,
         T_map_world=T_map_world,
     )
 

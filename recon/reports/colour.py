@@ -11,7 +11,8 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from recon.errors import ShapeError
-from recon.structures import FREE, OCCUPIED, OccupancyGrid, Reason
+from recon.evaluation import grid_on_truth
+from recon.structures import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyTruth, Reason
 from recon.structures.arrays import UInt8
 
 Rgb = tuple[int, int, int]
@@ -51,6 +52,18 @@ REASON_LABELS: Final[Mapping[Reason, str]] = MappingProxyType(
 GRID_FREE: Final[Rgb] = (247, 249, 250)
 GRID_OCCUPIED: Final[Rgb] = (24, 28, 34)
 GRID_UNKNOWN: Final[Rgb] = (190, 197, 204)
+# Right cells keep the colours of a grid; what is not counted is darker than what is.
+GRID_ERRORS: Final[Mapping[tuple[int, int], Rgb]] = MappingProxyType(
+    {
+        (FREE, FREE): GRID_FREE,
+        (FREE, OCCUPIED): (230, 159, 0),
+        (FREE, UNKNOWN): (160, 220, 190),
+        (OCCUPIED, FREE): (213, 40, 40),
+        (OCCUPIED, OCCUPIED): GRID_OCCUPIED,
+        (OCCUPIED, UNKNOWN): (0, 114, 178),
+    }
+)
+GRID_NOT_COUNTED: Final[Rgb] = (120, 128, 136)
 
 
 def colour_disparity(
@@ -109,6 +122,21 @@ def colour_grid(grid: OccupancyGrid) -> UInt8:
     picture = np.full((*grid.cells.shape, 3), GRID_UNKNOWN, dtype=np.uint8)
     picture[grid.cells == FREE] = GRID_FREE
     picture[grid.cells == OCCUPIED] = GRID_OCCUPIED
+    return picture[::-1]
+
+
+def colour_grid_errors(grid: OccupancyGrid, truth: OccupancyTruth) -> UInt8:
+    """Colour a grid by what is true, over the cells that are compared.
+
+    Returns:
+        uint8 (rows, columns, 3) RGB, row 0 = the largest y. Right cells are almost white (free)
+        or almost black; an obstacle that is called free is red, one that is not known blue, an
+        invented one orange, free ground that is not known green; what was not seen is grey.
+    """
+    cells = grid_on_truth(grid, truth)
+    picture = np.full((*cells.shape, 3), GRID_NOT_COUNTED, dtype=np.uint8)
+    for (true, found), colour in GRID_ERRORS.items():
+        picture[truth.seen & (truth.grid.cells == true) & (cells == found)] = colour
     return picture[::-1]
 
 

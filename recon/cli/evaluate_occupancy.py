@@ -1,0 +1,49 @@
+"""`recon evaluate occupancy`: voxels and grid of a run against the exact truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import Json
+from recon.cli.session import print_figures, print_json, session
+
+
+def occupancy(
+    run: Annotated[Path, typer.Argument(help="Folder of a run of recon demo.")],
+    least_frames: Annotated[
+        int, typer.Option(min=1, help="Frames that must have seen what is compared.")
+    ] = 3,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG of the grid beside the truth, to look at.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Precision and recall of occupied voxels, intersection over union of the grid.
+
+    The street of the run is rendered again: its truth is exact.
+
+    Example: recon evaluate occupancy outputs/demo/latest --picture compared.png
+    """
+    with session():
+        from recon.formats.image import write_image
+        from recon.pipeline.evaluate_occupancy import compare_occupancy
+        from recon.pipeline.summary import plain
+        from recon.reports.colour import colour_grid_errors
+
+        compared = compare_occupancy(run, least_frames)
+        if picture is not None:
+            write_image(picture, colour_grid_errors(compared.grid, compared.truth))
+        figures = plain(compared.metrics)
+    if json:
+        print_json(figures)
+        return
+    shown = {
+        f"{part} {name}": value
+        for part, values in figures.items()
+        if isinstance(values, dict)
+        for name, value in values.items()
+    }
+    print_figures(f"{run} against the true street", shown)

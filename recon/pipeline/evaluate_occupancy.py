@@ -1,0 +1,61 @@
+"""`recon evaluate occupancy` without its command line: the maps of a run beside the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from recon.errors import EvaluationError
+from recon.evaluation import evaluate_occupancy
+from recon.formats.nav2 import read_nav2
+from recon.formats.octomap import read_octomap
+from recon.pipeline.demo_source import demo_source
+from recon.pipeline.finished_run import GRID, OCTOMAP, FinishedRun, open_run
+from recon.pipeline.occupancy_truth import LEAST_FRAMES, known_occupancy
+from recon.sources import KnowsOccupancy
+from recon.structures import OccupancyGrid, OccupancyMetrics, OccupancyTruth
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyComparison:
+    """A run's occupancy and the truth.
+
+    Attributes:
+        metrics: The figures.
+        grid: The flat grid of the run.
+        truth: What is true, in the cells of the run.
+    """
+
+    metrics: OccupancyMetrics
+    grid: OccupancyGrid
+    truth: OccupancyTruth
+
+
+def compare_occupancy(folder: Path, least_frames: int = LEAST_FRAMES) -> OccupancyComparison:
+    """Compare the files that a run wrote, ``map/octomap.ot`` and ``map/grid.*``, with the truth.
+
+    Args:
+        folder: A run of a rendered street: of ``recon demo``, or of ``recon occupancy`` on one.
+        least_frames: Frames that must have seen what is compared.
+
+    Raises:
+        FormatError: The folder holds no finished run, or a map is missing or damaged.
+        EvaluationError: The truth of the run is not known, or nothing was seen often enough.
+    """
+    run = open_run(folder)
+    source = _source_that_knows(run)
+    voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
+    truth = known_occupancy(source, run.config, run.T_map_world, least_frames)
+    return OccupancyComparison(evaluate_occupancy(voxels, grid, truth), grid, truth)
+
+
+def _source_that_knows(run: FinishedRun) -> KnowsOccupancy:
+    if run.mapped_by != "demo":
+        raise EvaluationError(
+            "the true occupancy of this run is not known",
+            where=run.folder,
+            got=f"a run of recon {run.mapped_by}",
+            expected="a run of recon demo, whose street can be rendered again",
+            hint="recon evaluate map compares a run with a reference cloud",
+        )
+    return demo_source(run.config)

@@ -1,0 +1,79 @@
+"""What the folder of a run that is done tells about it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from recon.errors import FormatError
+from recon.pipeline.config import ReconConfig, load_config
+from recon.pipeline.run_directory import RECORD
+from recon.structures.arrays import Float64, freeze
+
+CONFIG: Final = "config.yaml"
+GRID: Final = "map/grid.yaml"
+OCTOMAP: Final = "map/octomap.ot"
+MAPPED_BY: Final = "mapped_by"
+"""In the record of a run that took its drive from another: the command that mapped the drive."""
+
+
+@dataclass(frozen=True, eq=False)
+class FinishedRun:
+    """A run with maps.
+
+    Attributes:
+        folder: Where it is.
+        mapped_by: The command that mapped the drive, such as ``demo``.
+        config: The configuration that it was made with.
+        T_map_world: float64 (4, 4), from world to map axes.
+    """
+
+    folder: Path
+    mapped_by: str
+    config: ReconConfig
+    T_map_world: Float64
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_map_world", np.float64, (4, 4))
+
+
+def open_run(folder: Path) -> FinishedRun:
+    """Read the record and the configuration of a run with maps.
+
+    Raises:
+        FormatError: The folder holds no finished run, or one without maps.
+        SettingsError: Its configuration is not one of this version.
+    """
+    record = _read_record(folder / RECORD)
+    T_map_world = _matrix(record.get("T_map_world"))
+    if T_map_world is None:
+        raise FormatError("the run made no map: its record has no T_map_world", where=folder)
+    mapped_by = record.get(MAPPED_BY, record.get("command"))
+    return FinishedRun(folder, str(mapped_by), load_config(folder / CONFIG), T_map_world)
+
+
+def _matrix(value: Any) -> Float64 | None:
+    """A finite 4×4 matrix, or None where it is none."""
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    return matrix if matrix.shape == (4, 4) and np.isfinite(matrix).all() else None
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise FormatError(
+            "folder holds no finished run", where=path.parent, expected=f"a {path.name}"
+        )
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise FormatError("record of the run cannot be read", where=path) from error
+    if not isinstance(record, dict):
+        raise FormatError("record of the run cannot be read", where=path)
+    return record

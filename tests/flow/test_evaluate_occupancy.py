@@ -1,0 +1,114 @@
+"""`recon evaluate occupancy`: the files of a run give the figures that the run itself gave."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.errors import EvaluationError, FormatError
+from recon.formats.nav2 import read_nav2
+from recon.pipeline.config import load_config
+from recon.pipeline.demo_source import demo_source
+from recon.pipeline.evaluate_occupancy import compare_occupancy
+from recon.pipeline.map_run import MapOptions, run_map
+from recon.pipeline.summary import plain
+from recon.reports.colour import GRID_ERRORS, GRID_NOT_COUNTED
+
+STREET = {"frames": 12, "width_px": 256, "height_px": 96, "focal_px": 150.0}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    config = load_config(None, [f"street.{key}={value}" for key, value in STREET.items()])
+    out = tmp_path_factory.mktemp("demo") / "run"
+    run_map(demo_source(config), config, MapOptions(command="demo", out=out, mesh=False))
+    return out
+
+
+def test_the_files_of_a_run_give_its_own_figures(run: Path) -> None:
+    told = json.loads((run / "summary.json").read_text())["occupancy"]
+    assert plain(compare_occupancy(run).metrics) == told
+    assert 0 < told["voxels"]["precision"] < 1
+
+
+def test_more_frames_must_have_seen_what_is_compared(run: Path) -> None:
+    few, many = (compare_occupancy(run, least).metrics for least in (1, 6))
+    assert few.voxels.true_voxels > many.voxels.true_voxels > 0
+    assert many.least_frames == 6
+
+
+def test_the_command_prints_json_and_draws_what_is_wrong(run: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "compared.png"
+    arguments = ["evaluate", "occupancy", str(run), "--json", "--picture", str(picture)]
+    command = [sys.executable, "-m", "recon", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    printed = json.loads(done.stdout)
+    assert printed == json.loads((run / "summary.json").read_text())["occupancy"]
+
+    colours = cv2.imread(str(picture))[..., ::-1].reshape(-1, 3)
+    counts = {kind: int((colours == rgb).all(axis=1).sum()) for kind, rgb in GRID_ERRORS.items()}
+    assert sum(counts.values()) == printed["grid"]["cells"]
+    true = sum(n for (kind, _), n in counts.items() if kind == 100)
+    assert true == printed["grid"]["true_occupied"]
+    unknown = sum(n for (_, kind), n in counts.items() if kind == -1)
+    assert unknown / printed["grid"]["cells"] == pytest.approx(printed["grid"]["unknown"])
+    assert (colours == GRID_NOT_COUNTED).all(axis=1).any()
+
+
+def test_a_run_whose_truth_is_not_known_is_refused(run: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(run, tmp_path / "drive")
+    record = json.loads((copy / "run.json").read_text())
+    (copy / "run.json").write_text(json.dumps({**record, "command": "map"}))
+    with pytest.raises(EvaluationError, match=r"not known.*recon map.*evaluate map"):
+        compare_occupancy(copy)
+
+
+@pytest.mark.parametrize(
+    ("lost", "words"),
+    [
+        ("run.json", "no finished run"),
+        ("map/octomap.ot", "OctoMap"),
+        ("map/grid.yaml", "YAML"),
+        ("map/grid.pgm", "picture"),
+    ],
+)
+def test_a_folder_without_its_files_is_refused(
+    run: Path, tmp_path: Path, lost: str, words: str
+) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    (copy / lost).unlink()
+    with pytest.raises(FormatError, match=words):
+        compare_occupancy(copy)
+
+
+@pytest.mark.parametrize("record", ["{}", "no json", "[]", '{"T_map_world": [[1], 2]}'])
+def test_a_broken_record_is_refused(run: Path, tmp_path: Path, record: str) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    (copy / "run.json").write_text(record)
+    with pytest.raises(FormatError, match="record"):
+        compare_occupancy(copy)
+
+
+def test_grids_that_other_programs_drew_larger_are_compared_all_the_same(
+    run: Path, tmp_path: Path
+) -> None:
+    copy = shutil.copytree(run, tmp_path / "copy")
+    grid = read_nav2(copy / "map" / "grid.yaml")
+    rows, columns = grid.cells.shape
+    picture = np.full((rows + 7, columns + 5), 205, np.uint8)
+    original = cv2.imread(str(copy / "map" / "grid.pgm"), cv2.IMREAD_GRAYSCALE)
+    picture[7:, 5:] = original  # row 0 is the top: the origin moves left, and not down
+    cv2.imwrite(str(copy / "map" / "grid.pgm"), picture)
+    text = (copy / "map" / "grid.yaml").read_text()
+    x = grid.origin_m[0]
+    assert f"- {x}" in text
+    (copy / "map" / "grid.yaml").write_text(text.replace(f"- {x}", f"- {x - 5 * 0.2}", 1))
+    assert compare_occupancy(copy).metrics == compare_occupancy(run).metrics
