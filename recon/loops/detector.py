@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -32,12 +31,14 @@ class StoredKeyframe:
         T_world_camera: float64 (4, 4), by odometry.
         path_m: Path up to it, as `doubtful_path` counts it.
         loops: Verified loops that end in it.
+        refused: Why other candidates were refused.
     """
 
     keyframe: Keyframe
     T_world_camera: Float64
     path_m: float
-    loops: tuple[Loop, ...]
+    loops: tuple[Loop, ...] = ()
+    refused: tuple[str, ...] = ()
 
 
 @runtime_checkable
@@ -129,29 +130,25 @@ class LoopDetector:
         if not measured or not self._is_due(T_world_camera):
             return ()
         keyframe = make_keyframe(frame, pair, disparity, self._settings.keyframes)
-        place = self._place(keyframe, T_world_camera, path_m)
-        loops = tuple(islice(self._verified(keyframe, place, pair), 1))
-        self._store.put(StoredKeyframe(keyframe, T_world_camera, path_m, loops))
-        self._remember(place, loops)
-        return loops
+        stored = self._compared(StoredKeyframe(keyframe, T_world_camera, path_m), pair)
+        self._store.put(stored)
+        self.restore(stored)
+        return stored.loops
 
     def restore(self, stored: StoredKeyframe) -> None:
         """Take a keyframe of an interrupted drive, with what was found there."""
-        place = self._place(stored.keyframe, stored.T_world_camera, stored.path_m)
-        self._remember(place, stored.loops)
+        self._places.append(self._place(stored))
+        self.loops.extend(stored.loops)
+        self.refused.update(stored.refused)
 
     def agreeing(self) -> list[Loop]:
         """The loops that enough others of other keyframes confirm."""
         poses = {place.frame: (place.T_world_camera, place.path_m) for place in self._places}
         return agreeing_loops(self.loops, poses, self._settings)
 
-    def _place(self, keyframe: Keyframe, T_world_camera: Float64, path_m: float) -> _Place:
-        words = words_of(keyframe.descriptors, self._settings.candidates)
-        return _Place(keyframe.frame, T_world_camera, path_m, words)
-
-    def _remember(self, place: _Place, loops: tuple[Loop, ...]) -> None:
-        self._places.append(place)
-        self.loops.extend(loops)
+    def _place(self, stored: StoredKeyframe) -> _Place:
+        words = words_of(stored.keyframe.descriptors, self._settings.candidates)
+        return _Place(stored.keyframe.frame, stored.T_world_camera, stored.path_m, words)
 
     def _is_due(self, T_world_camera: Float64) -> bool:
         if not self._places:
@@ -161,18 +158,19 @@ class LoopDetector:
         moved = float(np.linalg.norm(T[:3, 3])) >= settings.distance_m
         return moved or float(np.rad2deg(angle_rad(T))) >= settings.angle_deg
 
-    def _verified(self, keyframe: Keyframe, place: _Place, pair: RectifiedPair) -> Iterator[Loop]:
-        """The candidates that are one place with the keyframe, and where odometry could be."""
+    def _compared(self, new: StoredKeyframe, pair: RectifiedPair) -> StoredKeyframe:
+        """The keyframe with the first candidate that is one place with it, if any is."""
+        place, refused = self._place(new), []
         for old in self._candidates(place):
             known = self._store.get(old.frame).keyframe
-            verdict = verify(known, keyframe, pair.camera, self._settings.verify)
-            refused = verdict.refused
-            if verdict.loop is not None and not self._possible(old, place, verdict.loop):
-                refused = "odometry contradicts"
-            if refused:
-                self.refused[refused] += 1
-            elif verdict.loop is not None:
-                yield verdict.loop
+            verdict = verify(known, new.keyframe, pair.camera, self._settings.verify)
+            if verdict.loop is None:
+                refused.append(verdict.refused)
+            elif self._possible(old, place, verdict.loop):
+                return replace(new, loops=(verdict.loop,), refused=tuple(refused))
+            else:
+                refused.append("odometry contradicts")
+        return replace(new, refused=tuple(refused))
 
     def _candidates(self, place: _Place) -> list[_Place]:
         """Old keyframes that may be near, most alike first."""

@@ -13,6 +13,7 @@ from pydantic import Field
 from recon.calibration import CalibrationSettings
 from recon.cloud import ANY_SCALE, CloudSettings, EdgeSettings, FilterSettings
 from recon.errors import SettingsError
+from recon.loops import LoopSettings
 from recon.mapping import (
     AxesSettings,
     FusionSettings,
@@ -55,6 +56,7 @@ class ReconConfig(Settings):
         default=NO_ISLANDS, description="Of the fused cloud, when it is exported."
     )
     odometry: OdometrySettings = OdometrySettings()
+    loops: LoopSettings = LoopSettings()
     axes: AxesSettings = AxesSettings()
     fusion: FusionSettings = FusionSettings()
     occupancy: OccupancySettings = OccupancySettings()

@@ -164,6 +164,8 @@ def _finish(
 ) -> MapRun:
     """Make the products that need the whole drive; those of the map are written at once."""
     config, warnings = mapped.config, health_warnings(mapped.health)
+    if mapped.loops is not None:
+        warnings += mapped.loops.warnings()
     _tell(options.observers, "map")
     written = write_map(mapped, directory, watch)
     warnings += written.warnings
@@ -244,6 +246,8 @@ def _summary(run: MapRun) -> dict[str, Any]:
         "T_map_world": run.mapped.T_map_world.tolist(),
         "warnings": list(run.warnings),
     }
+    if run.mapped.loops is not None:
+        figures["loops"] = run.mapped.loops.figures()
     if run.metrics is not None:
         figures["trajectory"] = plain(run.metrics)
     if run.map_metrics is not None:
@@ -257,6 +261,9 @@ def _write(run: MapRun, directory: RunDirectory) -> None:
     path = directory.path
     write_kitti_poses(path("trajectory_kitti.txt"), run.mapped.trajectory)
     write_tum(path("trajectory_tum.txt"), run.mapped.trajectory)
+    if run.mapped.loops is not None and run.mapped.loops.closure.closed:
+        write_tum(path("trajectory_odometry_tum.txt"), run.mapped.loops.odometry)
+        directory.write_json("loops.json", run.mapped.loops.edges())
     if run.mesh is not None:
         write_mesh(path("mesh/mesh.ply"), run.mesh)
         layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("map/cloud.ply")}

@@ -12,6 +12,7 @@ import numpy as np
 from recon.errors import RegistrationError
 from recon.odometry import KnownPoses, Odometry, OdometryHealth, make_odometry
 from recon.pipeline.config import ReconConfig
+from recon.pipeline.drive_loops import DriveLoops, LoopWatch
 from recon.pipeline.drive_map import DriveMap
 from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
 from recon.pipeline.lookahead import look_ahead
@@ -40,6 +41,7 @@ class MappedSequence:
         seconds: Wall-clock time from the first frame to the last.
         T_corrected_world: float64 (S, 4, 4), a motion that each submap still has to make; the
             trajectory has made it. None = none.
+        loops: What loop closure did to the trajectory; None = it was not asked.
     """
 
     trajectory: Trajectory
@@ -51,6 +53,7 @@ class MappedSequence:
     sample: ReconstructedFrame
     seconds: float
     T_corrected_world: Float64 | None = None
+    loops: DriveLoops | None = None
 
     @cached_property
     def map(self) -> DriveMap:
@@ -82,6 +85,15 @@ class MappedSequence:
             T_corrected_world=T_corrected_world,
         )
 
+    def closed(self, loops: DriveLoops) -> MappedSequence:
+        """The drive after its loops were closed: the path is bent, submaps move with it."""
+        return replace(
+            self,
+            trajectory=loops.closure.trajectory,
+            T_corrected_world=loops.submap_corrections(self.submaps.entries),
+            loops=loops,
+        )
+
 
 def map_sequence(
     source: StereoSource,
@@ -92,14 +104,15 @@ def map_sequence(
     threads: int | None = None,
     workspace: Workspace | None = None,
 ) -> MappedSequence:
-    """Register and fuse all frames of a source.
+    """Register and fuse all frames of a source, and close the loops of the path.
 
     The next frames are matched while this one is registered; the result does not depend on it.
 
     Args:
         source: Where the pairs come from.
         config: The configuration.
-        known_poses: Poses to use instead of odometry, one per frame of the source.
+        known_poses: Poses to use instead of odometry, one per frame of the source; they are
+            taken as they are, loops or not.
         observers: Told of the progress.
         threads: Threads to use; None = all cores. Changes no result.
         workspace: What the run may keep on the disk, and who times it; None = in memory, nobody.
@@ -113,7 +126,9 @@ def map_sequence(
         source.calibration, config, threads=threads, stopwatch=work.stopwatch
     )
     odometry = _odometry(config, known_poses, frames=len(source))
-    drive = _Drive(Mapper(config, reconstructor.camera, odometry, work), config, work)
+    loops = LoopWatch(config.loops, work.loops) if config.loops.enabled else None
+    mapper = Mapper(config, reconstructor.camera, odometry, work)
+    drive = _Drive(mapper, loops if known_poses is None else None, config, work)
     for observer in audience:
         observer.on_start(source.name, len(source))
     try:
@@ -130,13 +145,16 @@ def map_sequence(
 
 
 class _Drive:
-    """A mapper, its checkpoints, and its clock.
+    """A mapper, who looks for loops beside it, its checkpoints, and its clock.
 
     Where there is a checkpoint to go on from, it does; the time up to there counts as spent.
     """
 
-    def __init__(self, mapper: Mapper, config: ReconConfig, workspace: Workspace) -> None:
+    def __init__(
+        self, mapper: Mapper, loops: LoopWatch | None, config: ReconConfig, workspace: Workspace
+    ) -> None:
         self.mapper = mapper
+        self._loops = loops
         self._config = config
         self._checkpoint = workspace.checkpoint
         self._stage = workspace.stopwatch.stage
@@ -146,12 +164,17 @@ class _Drive:
         if workspace.resume and self._checkpoint is not None and self._checkpoint.exists():
             state = self._checkpoint.load()
             mapper.restore(state["mapper"])
+            if loops is not None:
+                loops.restore(mapper.trajectory.T_world_camera, [h.ok for h in mapper.health])
             spent_s, self._saved = state["seconds"], len(mapper)
         self._last = time.perf_counter()
         self._start = self._last - spent_s
 
     def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
         result = self.mapper.add(frame, total=total)
+        if self._loops is not None:
+            with self._stage("loops"):
+                self._loops.add(frame, result.T_world_camera, measured=result.health.ok)
         if result.index <= total // 2:
             self._sample = frame
         if len(self.mapper) - self._saved >= self._config.checkpoints.every_frames:
@@ -166,7 +189,7 @@ class _Drive:
         if len(self.mapper) > self._saved:
             self._save()
         self.mapper.close()
-        return MappedSequence(
+        mapped = MappedSequence(
             trajectory=self.mapper.trajectory,
             health=self.mapper.health,
             submaps=self.mapper.submaps,
@@ -176,6 +199,10 @@ class _Drive:
             sample=self._sample or self._sample_again(source, reconstructor),
             seconds=self._last - self._start,
         )
+        if self._loops is None:
+            return mapped
+        with self._stage("close_loops"):
+            return mapped.closed(self._loops.close(mapped.trajectory))
 
     def _save(self) -> None:
         if self._checkpoint is None:

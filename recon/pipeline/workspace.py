@@ -15,7 +15,7 @@ class Workspace:
 
     Attributes:
         stopwatch: Told the seconds per stage.
-        folder: Where closed submaps and the checkpoint are written, so that memory does not grow
+        folder: Where closed submaps, keyframes and the checkpoint are written, so that memory does not grow
             with the drive and a killed run can go on; it must stay as long as the result is
             used. None = all stays in memory.
         resume: Go on from the checkpoint in the folder, where there is one.
@@ -29,6 +29,11 @@ class Workspace:
     def submaps(self) -> Path | None:
         """Folder of the submaps."""
         return None if self.folder is None else self.folder / "submaps"
+
+    @property
+    def loops(self) -> Path | None:
+        """Folder of the keyframes."""
+        return None if self.folder is None else self.folder / "loops"
 
     @property
     def checkpoint(self) -> Checkpoint | None:

@@ -1,0 +1,229 @@
+"""The loops of a drive: looked for frame by frame, closed when the drive is over."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from recon.errors import FormatError
+from recon.formats.tree_file import read_tree, write_tree
+from recon.loops import LoopSettings
+from recon.loops.detector import KeyframeMemory, LoopDetector, StoredKeyframe
+from recon.loops.drift import doubtful_path
+from recon.loops.graph import Closure, close_loops
+from recon.loops.keyframe import Keyframe
+from recon.loops.verify import Loop
+from recon.pipeline.frame import ReconstructedFrame
+from recon.pipeline.submap_store import SubmapEntry
+from recon.structures import Trajectory
+from recon.structures.arrays import Float64
+
+_CACHED: Final = 64
+
+
+@dataclass(frozen=True, eq=False)
+class DriveLoops:
+    """What loop closure did to a drive.
+
+    Attributes:
+        odometry: The path before.
+        closure: The path after, and the loops.
+        keyframes: Number of places that were remembered.
+        found: Loops that geometry confirmed, whether neighbours did or not.
+        refused: How many candidates were refused, and why.
+    """
+
+    odometry: Trajectory
+    closure: Closure
+    keyframes: int
+    found: int
+    refused: dict[str, int]
+
+    @property
+    def corrections_m(self) -> Float64:
+        """float64 (N,), how far each pose was moved."""
+        moved = self.closure.trajectory.positions_m - self.odometry.positions_m
+        return np.asarray(np.linalg.norm(moved, axis=1))
+
+    def submap_corrections(self, entries: Sequence[SubmapEntry]) -> Float64 | None:
+        """``T_corrected_world`` (S, 4, 4), the motion of each submap: that of its middle frame.
+
+        None where no loop was closed, so that nothing moves by a rounding error.
+        """
+        if not self.closure.closed:
+            return None
+        middles = (entry.first_frame + entry.frames // 2 for entry in entries)
+        return np.stack([self.closure.correction(self.odometry, frame) for frame in middles])
+
+    def figures(self) -> dict[str, Any]:
+        """The figures for ``summary.json``."""
+        return {
+            "keyframes": self.keyframes,
+            "found": self.found,
+            "closed": len(self.closure.closed),
+            "refused_by_graph": len(self.closure.refused),
+            "refused": dict(sorted(self.refused.items())),
+            "largest_correction_m": float(self.corrections_m.max(initial=0.0)),
+        }
+
+    def edges(self) -> dict[str, Any]:
+        """The loops themselves, for ``loops.json``."""
+        return {
+            name: [
+                {
+                    "first": loop.first,
+                    "last": loop.last,
+                    "inliers": loop.inliers,
+                    "dense_share": round(loop.dense_share, 4),
+                    "T_first_last": loop.T_first_last.tolist(),
+                }
+                for loop in loops
+            ]
+            for name, loops in (("closed", self.closure.closed), ("refused", self.closure.refused))
+        }
+
+    def warnings(self) -> list[str]:
+        """What a user should know about loops that were not closed."""
+        closed, refused = len(self.closure.closed), len(self.closure.refused)
+        if refused and not closed:
+            what = "they contradict the odometry; the map may show a place twice"
+            return [f"{refused} loops were found and none closed: {what}"]
+        if refused:
+            return [f"{refused} of {refused + closed} loops contradict the others; they are left"]
+        return []
+
+
+class LoopWatch:
+    """Looks for loops while a drive is mapped, and closes them at its end.
+
+    Args:
+        settings: What is kept, compared and believed.
+        folder: Where keyframes are written; None = they stay in memory.
+    """
+
+    def __init__(self, settings: LoopSettings, folder: Path | None = None) -> None:
+        self._settings = settings
+        self._store = KeyframeMemory() if folder is None else KeyframeFiles(folder)
+        self._detector = LoopDetector(settings, self._store)
+        self._path_m: list[float] = []
+        self._last: Float64 = np.eye(4)
+
+    def add(self, frame: ReconstructedFrame, T_world_camera: Float64, *, measured: bool) -> None:
+        """Take the next frame.
+
+        Raises:
+            OutputError: A keyframe cannot be written.
+        """
+        path_m = self._advance(T_world_camera, measured=measured)
+        self._detector.add(
+            len(self._path_m) - 1,
+            frame.pair,
+            frame.disparity,
+            T_world_camera,
+            path_m=path_m,
+            measured=measured,
+        )
+
+    def restore(self, T_world_camera: Iterable[Float64], measured: Iterable[bool]) -> None:
+        """Go on after frames with these poses; their keyframes are in the store.
+
+        Raises:
+            FormatError: A keyframe's file is damaged.
+        """
+        for T, good in zip(T_world_camera, measured, strict=True):
+            self._advance(T, measured=good)
+        for stored in self._store:
+            # A killed run may have written keyframes after its last checkpoint.
+            if stored.keyframe.frame < len(self._path_m):
+                self._detector.restore(stored)
+
+    def close(self, trajectory: Trajectory) -> DriveLoops:
+        """Close the loops of a path."""
+        path_m = np.array(self._path_m)
+        loops = self._detector.agreeing()
+        return DriveLoops(
+            odometry=trajectory,
+            closure=close_loops(trajectory, path_m, loops, self._settings),
+            keyframes=len(self._detector),
+            found=len(self._detector.loops),
+            refused=dict(self._detector.refused),
+        )
+
+    def _advance(self, T_world_camera: Float64, *, measured: bool) -> float:
+        """The path up to the next frame, as the detector counts it."""
+        before = self._last if self._path_m else T_world_camera
+        step = doubtful_path(
+            np.stack([before, T_world_camera]), np.array([True, measured]), self._settings.drift
+        )
+        self._path_m.append((self._path_m[-1] if self._path_m else 0.0) + float(step[1]))
+        self._last = T_world_camera
+        return self._path_m[-1]
+
+
+class KeyframeFiles:
+    """Keeps keyframes in files, one each, and the last few that were read in memory.
+
+    Args:
+        folder: Where they are written; made if missing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._held: OrderedDict[int, StoredKeyframe] = OrderedDict()
+
+    def put(self, stored: StoredKeyframe) -> None:
+        """Keep a keyframe.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        write_tree(self._path(stored.keyframe.frame), _to_tree(stored))
+
+    def get(self, frame: int) -> StoredKeyframe:
+        """The keyframe of a frame.
+
+        Raises:
+            FormatError: Its file is missing or damaged.
+        """
+        if frame not in self._held:
+            self._held[frame] = _read(self._path(frame))
+            while len(self._held) > _CACHED:
+                self._held.popitem(last=False)
+        self._held.move_to_end(frame)
+        return self._held[frame]
+
+    def __iter__(self) -> Iterator[StoredKeyframe]:
+        """All that were written, in order of their frames."""
+        return (_read(path) for path in sorted(self._folder.glob("keyframe_*.zip")))
+
+    def _path(self, frame: int) -> Path:
+        return self._folder / f"keyframe_{frame:09d}.zip"
+
+
+def _read(path: Path) -> StoredKeyframe:
+    tree = read_tree(path)
+    try:
+        return StoredKeyframe(
+            Keyframe(**tree["keyframe"]),
+            tree["T_world_camera"],
+            tree["path_m"],
+            tuple(Loop(**loop) for loop in tree["loops"]),
+            tuple(tree["refused"]),
+        )
+    except (KeyError, TypeError) as error:
+        raise FormatError("the file holds no keyframe", where=path) from error
+
+
+def _to_tree(stored: StoredKeyframe) -> dict[str, Any]:
+    return {
+        "keyframe": asdict(stored.keyframe),
+        "T_world_camera": stored.T_world_camera,
+        "path_m": stored.path_m,
+        "loops": [asdict(loop) for loop in stored.loops],
+        "refused": list(stored.refused),
+    }
