@@ -11,6 +11,7 @@ import numpy as np
 
 from recon.geometry.se3 import apply
 from recon.odometry.protocol import OdometryHealth
+from recon.pipeline.drive_loops import DriveLoops
 from recon.reports.blocks import (
     FigureFormats,
     known_figures,
@@ -20,7 +21,13 @@ from recon.reports.blocks import (
     stereo_blocks,
 )
 from recon.reports.html import Block, FigureBlock, ReportContent, Section, TableBlock
-from recon.reports.plots import grid_figure, health_figure, path_error_figure, trajectory_figure
+from recon.reports.plots import (
+    grid_figure,
+    health_figure,
+    loops_figure,
+    path_error_figure,
+    trajectory_figure,
+)
 from recon.reports.scene3d import Scene
 from recon.structures import (
     Disparity,
@@ -71,6 +78,7 @@ class MapReportInputs:
         summary: The figures of ``summary.json``.
         command: The command line, or "".
         config: The effective configuration as text.
+        loops: What loop closure did to the path.
         warnings: What went less than well.
         versions: Versions of the packages that took part.
     """
@@ -88,6 +96,7 @@ class MapReportInputs:
     summary: Mapping[str, Any] = field(default_factory=dict)
     command: str = ""
     config: str = ""
+    loops: DriveLoops | None = None
     warnings: Sequence[str] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -172,6 +181,8 @@ def _path_blocks(inputs: MapReportInputs) -> list[Block]:
     blocks: list[Block] = [
         FigureBlock("Path from above", drawn, "Map axes; both axes have the same scale.")
     ]
+    if inputs.loops is not None and inputs.loops.closure.closed:
+        blocks.append(_loops_block(inputs.loops, inputs.T_map_world))
     if inputs.truth is not None:
         error = path_error_figure(inputs.trajectory, inputs.truth, inputs.health)
         caption = "Both paths start at the same pose, so all drift shows."
@@ -180,6 +191,19 @@ def _path_blocks(inputs: MapReportInputs) -> list[Block]:
         caption = "What each pose rests on; frames that rest on no measurement are shaded red."
         blocks.append(FigureBlock("Health of the odometry", health_figure(inputs.health), caption))
     return blocks + _tables(inputs)
+
+
+def _loops_block(loops: DriveLoops, T_map_world: Float64) -> Block:
+    closed = loops.closure.closed
+    pairs = [(loop.first, loop.last) for loop in closed]
+    drawn = loops_figure(loops.odometry, loops.closure.trajectory, pairs, T_map_world)
+    moved = f"{float(loops.corrections_m.max()):.2f} m"
+    caption = (
+        f"{len(closed)} times the camera came back to a place, out of {loops.keyframes} that were "
+        f"remembered. Closing them moved the path by up to {moved}; each red line is the gap "
+        "between where odometry saw one place."
+    )
+    return FigureBlock("Loops", drawn, caption)
 
 
 def _tables(inputs: MapReportInputs) -> list[Block]:

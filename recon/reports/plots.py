@@ -69,6 +69,36 @@ def trajectory_figure(
     return to_png(figure)
 
 
+def loops_figure(
+    before: Trajectory,
+    after: Trajectory,
+    loops: Sequence[tuple[int, int]],
+    T_map_world: NDArray[Any],
+) -> bytes:
+    """The path before and after its loops were closed, and the gaps that they closed.
+
+    Args:
+        before: By odometry.
+        after: The same frames.
+        loops: The two frames of each loop.
+        T_map_world: (4, 4), turns world to map axes.
+    """
+    paths = [_seen_from_above(path, T_map_world) for path in (before, after)]
+    figure = new_figure(WIDE_IN, _height_for(np.concatenate(paths)))
+    axes = figure.subplots()
+    axes.plot(*paths[0].T, color=FAINT, linewidth=1.4, linestyle="--", label="odometry")
+    axes.plot(*paths[1].T, color=ESTIMATE, linewidth=1.8, label="loops closed")
+    for number, pair in enumerate(loops):
+        ends = paths[0][list(pair)]
+        label = f"loops ({len(loops)})" if number == 0 else None
+        axes.plot(*ends.T, "o-", color=BAD, linewidth=0.8, markersize=2.5, label=label)
+    _mark_ends(axes, paths[1])
+    style_plot(axes, _X_LABEL, _Y_LABEL)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(loc="best", frameon=False)
+    return to_png(figure)
+
+
 def path_error_figure(
     estimate: Trajectory, truth: Trajectory, health: Sequence[OdometryHealth] = ()
 ) -> bytes:

@@ -41,6 +41,7 @@ def present_map(run: MapRun, directory: RunDirectory) -> None:
             cloud=run.cloud,
             mesh=run.mesh,
             summary=run.summary,
+            loops=mapped.loops,
             command=command_line(),
             config=dump_config(run.config),
             warnings=run.warnings,

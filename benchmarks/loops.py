@@ -1,0 +1,257 @@
+"""What loop closure is worth: a drive around a block, with and without it, and one that deceives.
+
+- `block`: the drive as its odometry sees it. How far the end is from the truth before and after
+  closing, and how the fused cloud and the occupied voxels compare with the true surface.
+- `drift`: the same with a drift planted into the odometry.
+- `alike`: a straight street that repeats itself. Every loop would be a false one.
+
+Example: python benchmarks/loops.py --json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from recon.evaluation import evaluate_map
+from recon.geometry import se3
+from recon.geometry.transform import transform_cloud
+from recon.mapping import add_floor, estimate_ground_surface, flatten, fusion_range_m
+from recon.odometry import Odometry, OdometryFrame, OdometryResult, make_odometry
+from recon.pipeline.config import ReconConfig, load_config
+from recon.pipeline.sequence import MappedSequence, map_sequence
+from recon.pipeline.workspace import Workspace
+from recon.sources.synthetic import SyntheticSource
+from recon.structures import OCCUPIED, PointCloud, StereoPair
+from recon.structures.arrays import Float64
+from recon.synthetic.truth import true_surface
+
+THRESHOLDS_M = (0.2, 0.4)
+BAND_M = (0.3, 2.0)
+
+
+class Filmed(SyntheticSource):
+    """A drive whose pictures are rendered once."""
+
+    @cached_property
+    def pairs(self) -> list[StereoPair]:
+        """All pictures."""
+        return [self.camera.pair(index) for index in range(len(self))]
+
+    def frames(self, first: int = 0) -> Iterator[StereoPair]:
+        """The pairs from a frame on."""
+        return iter(self.pairs[first:])
+
+
+@dataclass
+class Drifting:
+    """An odometry whose steps are too long, and turn a little too much.
+
+    Attributes:
+        inner: The odometry.
+        share: By how much each step is too long.
+        turn_deg_per_m: How much it turns too much.
+    """
+
+    inner: Odometry
+    share: float
+    turn_deg_per_m: float
+
+    def __post_init__(self) -> None:
+        self._true, self._drifted = np.eye(4), np.eye(4)
+
+    def register(self, frame: OdometryFrame) -> OdometryResult:
+        """Register the next frame, and drift a little more."""
+        result = self.inner.register(frame)
+        step = se3.invert(self._true) @ result.T_world_camera
+        angle = np.radians(self.turn_deg_per_m) * float(np.linalg.norm(step[:3, 3]))
+        turn = step[:3, :3] @ se3.exp_so3(np.array([0.0, angle, 0.0]))
+        longer = se3.make_transform(turn, (1.0 + self.share) * step[:3, 3])
+        self._true = result.T_world_camera
+        self._drifted = se3.orthonormalise(self._drifted @ longer)
+        return OdometryResult(self._drifted.copy(), result.health)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    options = parse(arguments)
+    result: dict[str, Any] = {"width": options.width, "seed": options.seed}
+    block = Filmed(config_of(options, "block").street)
+    result["block"] = closing(block, config_of(options, "block"), 0.0)
+    result["drift"] = closing(block, config_of(options, "block"), options.drift_percent)
+    result["alike"] = deceiving(Filmed(config_of(options, "alike").street), options)
+    print(json.dumps(result, indent=2) if options.json else table(result))
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument("--width", type=int, default=480, help="width of the pictures")
+    parser.add_argument("--seed", type=int, default=1, help="another seed is another block")
+    parser.add_argument("--frames", type=int, default=280, help="frames; a lap takes 258")
+    parser.add_argument(
+        "--drift-percent", type=float, default=1.0, help="planted drift; it turns as many °/100 m"
+    )
+    return parser.parse_args(arguments)
+
+
+def config_of(options: argparse.Namespace, drive: str) -> ReconConfig:
+    """A street, filmed small."""
+    street = {
+        "seed": options.seed,
+        "width_px": options.width,
+        "height_px": options.width * 3 // 8,
+        "focal_px": options.width * 0.5625,
+        "smooth_edges": False,
+    }
+    if drive == "block":
+        street |= {"path": "block", "block_m": [80, 60], "frames": options.frames}
+    else:
+        street |= {"path": "straight", "repeat_m": 50.0, "frames": 130}
+    texts = [f"street.{name}={json.dumps(value)}" for name, value in street.items()]
+    return load_config(None, texts)
+
+
+def closing(source: Filmed, config: ReconConfig, drift_percent: float) -> dict[str, Any]:
+    """A drive around a block, before and after closing."""
+    mapped, seconds = mapped_with(source, config, drift_percent)
+    if mapped.loops is None:
+        raise SystemExit("loop closure is off")
+    surface = true_surface(source.camera, range_m=fusion_range_m(mapped.camera, config.fusion))
+    before = MappedSequence(
+        mapped.loops.odometry,
+        mapped.health,
+        mapped.submaps,
+        config,
+        mapped.T_map_world,
+        mapped.camera,
+        mapped.sample,
+        mapped.seconds,
+    )
+    frames = len(mapped.trajectory)
+    return {
+        "path_m": round(source.trajectory.path_length_m, 2),
+        "before": quality(before, source, surface),
+        "after": quality(mapped, source, surface),
+        "loops": mapped.loops.figures(),
+        "ms_per_frame": {name: round(1e3 * s / frames, 2) for name, s in seconds.items()},
+    }
+
+
+def deceiving(source: Filmed, options: argparse.Namespace) -> dict[str, Any]:
+    """A street that repeats itself: what is closed, and what would be without the odometry."""
+    config = config_of(options, "alike")
+    blind = load_config_with(config, {"share": 1.0, "turn_deg": 5.0})
+    loops, trusting = (mapped_with(source, c, 0.0)[0].loops for c in (config, blind))
+    if loops is None or trusting is None:
+        raise SystemExit("loop closure is off")
+    return {
+        "path_m": round(source.trajectory.path_length_m, 2),
+        "closed": len(loops.closure.closed),
+        "found": loops.found,
+        "found_if_odometry_were_not_asked": trusting.found,
+        "path_unchanged": loops.closure.trajectory is loops.odometry,
+    }
+
+
+def load_config_with(config: ReconConfig, drift: dict[str, float]) -> ReconConfig:
+    values = config.model_dump()
+    values["loops"]["drift"] |= drift
+    return ReconConfig.parse(values)
+
+
+def mapped_with(
+    source: Filmed, config: ReconConfig, drift_percent: float
+) -> tuple[MappedSequence, dict[str, float]]:
+    """The drive mapped, its odometry drifting; and the seconds of loop closure."""
+
+    def drifting(method: str, settings: Any) -> Odometry:
+        inner = make_odometry(method, settings)
+        return Drifting(inner, drift_percent / 100, drift_percent / 100) if drift_percent else inner
+
+    work = Workspace()
+    start = time.perf_counter()
+    with patch("recon.pipeline.sequence.make_odometry", drifting):
+        mapped = map_sequence(source, config, workspace=work)
+    seconds = {n: s for n, s in work.stopwatch.seconds.items() if "loops" in n}
+    return mapped, seconds | {"all": time.perf_counter() - start}
+
+
+def quality(mapped: MappedSequence, source: Filmed, surface: PointCloud) -> dict[str, Any]:
+    """How far path and maps are from the truth."""
+    truth = source.trajectory
+    off_m = np.linalg.norm(mapped.trajectory.positions_m - truth.positions_m, axis=1)
+    cells, obstacles = footprint(mapped), footprint_of(surface, source, mapped.T_map_world)
+    return {
+        "end_error_m": round(float(off_m[-1]), 4),
+        "end_error_percent": round(100 * float(off_m[-1]) / truth.path_length_m, 4),
+        "rms_error_m": round(float(np.sqrt(np.mean(off_m**2))), 4),
+        "cloud": [scores(mapped.cloud, surface, t) for t in THRESHOLDS_M],
+        "grid": [scores(cells, obstacles, t) for t in THRESHOLDS_M],
+    }
+
+
+def scores(cloud: PointCloud, surface: PointCloud, threshold_m: float) -> dict[str, float]:
+    metrics = evaluate_map(cloud, surface, threshold_m)
+    return {
+        "threshold_m": threshold_m,
+        "precision": round(metrics.precision, 4),
+        "recall": round(metrics.recall, 4),
+        "f_score": round(metrics.f_score, 4),
+        "median_m": round(metrics.median_m, 4),
+    }
+
+
+def footprint(mapped: MappedSequence) -> PointCloud:
+    """Centres of the occupied cells of the flat grid, as `recon map` makes it."""
+    config, T = mapped.config, mapped.T_map_world
+    cloud = transform_cloud(mapped.cloud, T, frame="map")
+    path_m = se3.apply(T, mapped.trajectory.positions_m)
+    floor = add_floor(cloud, mapped.voxels, config.ground)
+    ground = estimate_ground_surface(floor, path_m, config.ground)
+    grid = flatten(mapped.voxels, ground, config.grid)
+    row, column = np.nonzero(grid.cells == OCCUPIED)
+    return on_the_ground((np.column_stack([column, row]) + 0.5) * grid.resolution_m + grid.origin_m)
+
+
+def footprint_of(surface: PointCloud, source: Filmed, T_map_world: Float64) -> PointCloud:
+    """The obstacles that were seen; heights are those above the level road."""
+    level = se3.apply(source.world.T_map_world, surface.xyz)[:, 2]
+    height_m = level + source.settings.camera_height_m
+    standing = (height_m > BAND_M[0]) & (height_m < BAND_M[1])
+    return on_the_ground(se3.apply(T_map_world, surface.xyz[standing])[:, :2])
+
+
+def on_the_ground(xy_m: Float64) -> PointCloud:
+    flat = np.column_stack([xy_m, np.zeros(len(xy_m))]).astype(np.float32)
+    return PointCloud(flat, frame="map")
+
+
+def table(result: dict[str, Any]) -> str:
+    lines = []
+    for name in ("block", "drift"):
+        row = result[name]
+        lines.append(f"{name}: {row['path_m']} m, {row['loops']['closed']} loops closed")
+        for moment in ("before", "after"):
+            q = row[moment]
+            lines.append(
+                f"  {moment:6s} end off by {q['end_error_m']:.3f} m ({q['end_error_percent']:.3f} "
+                f"%), cloud F {q['cloud'][0]['f_score']:.3f}, grid F {q['grid'][0]['f_score']:.3f}"
+            )
+    row = result["alike"]
+    lines.append(
+        f"alike: {row['closed']} closed; {row['found_if_odometry_were_not_asked']} would be found "
+        "if odometry were not asked"
+    )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
