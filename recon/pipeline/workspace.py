@@ -15,9 +15,9 @@ class Workspace:
 
     Attributes:
         stopwatch: Told the seconds per stage.
-        folder: Where closed submaps, keyframes and the checkpoint are written, so that memory does not grow
-            with the drive and a killed run can go on; it must stay as long as the result is
-            used. None = all stays in memory.
+        folder: Where closed submaps, keyframes and the checkpoint are written, so that memory
+            does not grow with the drive and a killed run can go on; it must stay as long as the
+            result is used. None = all stays in memory.
         resume: Go on from the checkpoint in the folder, where there is one.
     """
 

@@ -79,6 +79,7 @@ def test_drive_leaves_its_report(
         T_map_world=T_map_world,
         health=(),
         sample=SimpleNamespace(pair=pair, disparity=disparity),
+        loops=None,
     )
     run = SimpleNamespace(
         name="drives/street",
