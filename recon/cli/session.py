@@ -76,7 +76,7 @@ def print_evaluation(title: str, figures: Mapping[str, Any]) -> None:
 def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
     """Print a run's figures, its warnings, and where its results are."""
     shown = {key: value for key, value in summary.items() if key != "out"}
-    for group in ("trajectory", "map", "disparity"):
+    for group in ("loops", "trajectory", "map", "disparity"):
         shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
     for part in ("voxels", "grid"):
         figures = summary.get("occupancy", {}).get(part, {})

@@ -133,6 +133,10 @@ def _figures(inputs: MapReportInputs) -> list[tuple[str, str]]:
     if inputs.health:
         lost = sum(not record.ok for record in inputs.health)
         figures.append(("Frames not measured", f"{lost} of {len(inputs.health)}"))
+    if inputs.loops is not None and inputs.loops.found:
+        moved = f"{float(inputs.loops.corrections_m.max()):.2f} m"
+        closed = f"{len(inputs.loops.closure.closed)} of {inputs.loops.found}"
+        figures.append(("Loops closed, path moved by", f"{closed}, {moved}"))
     return figures + known_figures(inputs.summary, _FIGURES)
 
 

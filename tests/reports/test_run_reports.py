@@ -1,9 +1,14 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from recon.loops.graph import Closure
+from recon.loops.verify import Loop
 from recon.odometry.protocol import OdometryHealth
+from recon.pipeline.drive_loops import DriveLoops
 from recon.reports.html import FigureBlock, ReportContent, SceneBlock, TableBlock, render_html
 from recon.reports.map_report import MapReportInputs, map_report
 from recon.reports.pair_report import PairReportInputs, pair_report
@@ -86,6 +91,23 @@ def test_report_of_a_drive_puts_the_main_figures_first(drive: MapReportInputs) -
     assert figures["Frames not measured"] == "1 of 11"
     assert figures["Mapping rate"] == "4.2 fps"
     assert figures["Points in the map"] == "2,000"
+
+
+def test_loops_that_were_closed_and_that_were_not_are_in_the_report(
+    drive: MapReportInputs, trajectory: Trajectory
+) -> None:
+    moved = np.array(trajectory.T_world_camera)
+    moved[:, 0, 3] += np.linspace(0.0, 2.5, len(moved))
+    bent = replace(trajectory, T_world_camera=moved)
+    right, wrong = (Loop(0, last, np.eye(4), np.eye(6), 50, 0.9) for last in (9, 10))
+    loops = DriveLoops(trajectory, Closure(bent, (right,), (wrong,), 1.0), 11, 3, {})
+    report = map_report(replace(drive, loops=loops))
+    assert dict(report.figures)["Loops closed, path moved by"] == "1 of 3, 2.50 m"
+    assert isinstance(blocks(report)["Loops"], FigureBlock)
+    unclosed = DriveLoops(trajectory, Closure(trajectory, (), (wrong,), 9.0), 11, 3, {})
+    report = map_report(replace(drive, loops=unclosed))
+    assert dict(report.figures)["Loops closed, path moved by"] == "0 of 3, 0.00 m"
+    assert "Loops" not in blocks(report)
 
 
 def test_notes_of_the_odometry_are_listed_by_frame(drive: MapReportInputs) -> None:
