@@ -84,7 +84,7 @@ def loops_figure(
         T_map_world: (4, 4), turns world to map axes.
     """
     paths = [_seen_from_above(path, T_map_world) for path in (before, after)]
-    figure = new_figure(WIDE_IN, _height_for(np.concatenate(paths)))
+    figure = new_figure(WIDE_IN, height_for(np.concatenate(paths)))
     axes = figure.subplots()
     axes.plot(*paths[0].T, color=FAINT, linewidth=1.4, linestyle="--", label="odometry")
     axes.plot(*paths[1].T, color=ESTIMATE, linewidth=1.8, label="loops closed")
@@ -92,7 +92,7 @@ def loops_figure(
         ends = paths[0][list(pair)]
         label = f"loops ({len(loops)})" if number == 0 else None
         axes.plot(*ends.T, "o-", color=BAD, linewidth=0.8, markersize=2.5, label=label)
-    _mark_ends(axes, paths[1])
+    mark_ends(axes, paths[1])
     style_plot(axes, _X_LABEL, _Y_LABEL)
     axes.set_aspect("equal", adjustable="datalim")
     axes.legend(loc="best", frameon=False)
