@@ -11,6 +11,7 @@ import typer
 
 from recon import __version__
 from recon.cli import evaluate
+from recon.cli.audit import audit
 from recon.cli.calibrate import calibrate
 from recon.cli.capture import capture
 from recon.cli.demo import demo
@@ -32,6 +33,7 @@ app.command()(pair)
 app.command("map")(map_)
 app.command()(mesh)
 app.command()(capture)
+app.command()(audit)
 app.command()(disparity)
 app.command()(paper)
 app.command()(calibrate)

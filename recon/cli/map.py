@@ -75,6 +75,7 @@ def map_(
         raise typer.BadParameter("give SOURCE, or --resume FOLDER")
     with session():
         from recon.formats.trajectory import read_trajectory
+        from recon.pipeline.audit_run import quick_warnings
         from recon.pipeline.config import matching_overrides, source_overrides
         from recon.pipeline.map_run import MapOptions, run_map
         from recon.pipeline.resume import MapRequest, open_requested, plan_map
@@ -97,6 +98,7 @@ def map_(
             arguments=request.arguments(),
             observers=(choose_viewer(quiet=quiet),),
             present=present_map,
+            warnings=quick_warnings(drive, settings),
         )
         run = run_map(drive, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

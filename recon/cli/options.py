@@ -36,13 +36,11 @@ Threads = Annotated[
     int | None,
     typer.Option("--threads", min=1, help="Threads to use (all cores)."),
 ]
-SourceArgument = Annotated[
-    Path | None,
-    typer.Argument(
-        help="KITTI drive (odometry or raw), EuRoC or TUM folder, left and right folders, video, "
-        "ROS bag or MCAP file, Middlebury scene."
-    ),
-]
+SOURCES_HELP = (
+    "KITTI drive (odometry or raw), EuRoC or TUM folder, left and right folders, video, "
+    "ROS bag or MCAP file, Middlebury scene."
+)
+SourceArgument = Annotated[Path | None, typer.Argument(help=SOURCES_HELP)]
 SourceKind = Annotated[
     str | None,
     typer.Option(

@@ -10,6 +10,7 @@ from typing import Any, Final
 import yaml
 from pydantic import Field
 
+from recon.audit import AuditSettings
 from recon.calibration import CalibrationSettings
 from recon.cloud import ANY_SCALE, CloudSettings, EdgeSettings, FilterSettings
 from recon.errors import SettingsError
@@ -43,6 +44,7 @@ class ReconConfig(Settings):
     source: SourceSettings = SourceSettings()
     capture: CaptureSettings = CaptureSettings()
     calibration: CalibrationSettings = CalibrationSettings()
+    audit: AuditSettings = AuditSettings()
     rectification: RectificationSettings = RectificationSettings()
     uncalibrated: UncalibratedSettings = UncalibratedSettings()
     inspection: InspectionSettings = InspectionSettings()

@@ -91,6 +91,7 @@ class MapOptions:
         present: Writes pictures and the report of the run into its folder.
         resume: Go on with the unfinished run in ``out``.
         arguments: What a command line needs to resume the run without being told again.
+        warnings: What was found out about the source beforehand.
     """
 
     command: str = "map"
@@ -102,6 +103,7 @@ class MapOptions:
     present: Callable[[MapRun, RunDirectory], None] | None = None
     resume: bool = False
     arguments: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
 
 def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> MapRun:
@@ -163,7 +165,8 @@ def _finish(
     watch: Stopwatch,
 ) -> MapRun:
     """Make the products that need the whole drive; those of the map are written at once."""
-    config, warnings = mapped.config, health_warnings(mapped.health)
+    config = mapped.config
+    warnings = [*options.warnings, *health_warnings(mapped.health)]
     if mapped.loops is not None:
         warnings += mapped.loops.warnings()
     _tell(options.observers, "map")

@@ -1,6 +1,6 @@
 """Where stereo pairs come from: one module per kind of input."""
 
-from recon.sources.protocol import KnowsOccupancy, StereoSource
+from recon.sources.protocol import KnowsOccupancy, StampedSource, StereoSource
 from recon.sources.registry import SOURCES, open_source, recognise_source
 from recon.sources.settings import SourceSettings
 
@@ -8,6 +8,7 @@ __all__ = [
     "SOURCES",
     "KnowsOccupancy",
     "SourceSettings",
+    "StampedSource",
     "StereoSource",
     "open_source",
     "recognise_source",

@@ -40,8 +40,8 @@ class BagSource:
         bag: The recording.
         topics: Left and right image topic.
         pairs: Which messages belong together.
-        stamps_s: float64 (N,), stamps of the left messages, all of them.
-        recorded_ns: int64 (N,) and (M,), when left and right messages were recorded.
+        left_s: float64 (M,), stamps of the left messages, all of them.
+        recorded_ns: int64 (M,) and (K,), when left and right messages were recorded.
         texts: The calibration file, where one was given.
     """
 
@@ -51,7 +51,7 @@ class BagSource:
     bag: Bag
     topics: tuple[str, str]
     pairs: StampPairs
-    stamps_s: Float64
+    left_s: Float64
     recorded_ns: tuple[NDArray[np.int64], NDArray[np.int64]]
     texts: tuple[Path, ...]
 
@@ -68,6 +68,11 @@ class BagSource:
             for path in self.bag.paths
         )
         return [*self.texts, *(file for files in inside for file in files)]
+
+    @property
+    def stamps_s(self) -> Float64:
+        """float64 (N,), times of the left pictures of the pairs."""
+        return self.left_s[list(self.pairs.left)]
 
     def __len__(self) -> int:
         return len(self.pairs.left)
@@ -91,7 +96,7 @@ class BagSource:
             strict=True,
         )
         for index, (left, right) in enumerate(views, start=start):
-            stamp_s = float(self.stamps_s[self.pairs.left[index]])
+            stamp_s = float(self.left_s[self.pairs.left[index]])
             yield join_pair(left, right, stamp_s, index, f"{self.topics[0]}, pair {index}")
 
     def _pictures(self, side: int, wanted: Sequence[int]) -> Iterator[UInt8]:
@@ -136,7 +141,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
         bag=bag,
         topics=topics,
         pairs=pairs,
-        stamps_s=stamps[0],
+        left_s=stamps[0],
         recorded_ns=(times[topics[0]][:, 0], times[topics[1]][:, 0]),
         texts=texts,
     )

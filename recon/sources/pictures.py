@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from recon.errors import FormatError, SourceError
 from recon.formats.image import read_image
 from recon.sources.files import join_pair
 from recon.sources.pairing import natural_key
 from recon.structures import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
-from recon.structures.arrays import UInt8
+from recon.structures.arrays import Float64, UInt8
 
 PICTURES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff"})
 
@@ -57,6 +59,11 @@ class PictureSource:
         """Calibration and the like, then the pictures."""
         pictures = (path for frame in self.pictures for path in (frame.left, frame.right))
         return [*self.texts, *pictures]
+
+    @property
+    def stamps_s(self) -> Float64:
+        """float64 (N,), times of the left pictures."""
+        return np.array([frame.timestamp_s for frame in self.pictures])
 
     def __len__(self) -> int:
         return len(self.pictures)

@@ -80,3 +80,13 @@ class KnowsOccupancy(Protocol):
     ) -> OccupancyTruth:
         """Where obstacles stand, and what of it the drive saw, in the cells and axes of a map."""
         ...
+
+
+@runtime_checkable
+class StampedSource(Protocol):
+    """A source that knows the times of all pairs without reading one."""
+
+    @property
+    def stamps_s(self) -> Float64:
+        """float64 (N,), seconds, one for each pair."""
+        ...

@@ -1,0 +1,70 @@
+"""`recon audit`: is an input good enough, before a long run?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import (
+    SOURCES_HELP,
+    Calib,
+    Config,
+    Json,
+    LeftView,
+    Quiet,
+    RightView,
+    Set,
+    SourceKind,
+    Tolerance,
+)
+from recon.cli.session import print_figures, print_json, session
+
+
+def audit(
+    source: Annotated[Path, typer.Argument(help=SOURCES_HELP)],
+    mend: Annotated[
+        Path | None, typer.Option(help="Write the calibration whose rows correspond to this file.")
+    ] = None,
+    kind: SourceKind = None,
+    calib: Calib = None,
+    left: LeftView = None,
+    right: RightView = None,
+    tolerance: Tolerance = None,
+    config: Config = None,
+    set_: Set = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Look at a drive before a long run: good, usable or not usable, and why.
+
+    Rows, swapped eyes, late, frozen and repeating cameras, brightness, focus, baseline; and the
+    depth error to expect.
+
+    Examples:
+      recon audit drive.bag --calib camchain.yaml
+      recon audit rides/today --mend mended.yaml && recon map rides/today --calib mended.yaml
+    """
+    with session():
+        from recon.pipeline.audit_run import mend_calibration, run_audit
+        from recon.pipeline.config import load_config, source_overrides
+        from recon.reports.audit_table import audit_lines
+        from recon.sources import open_source
+        from recon.viewers import announce
+
+        asked = source_overrides(calib, left, right, tolerance)
+        settings = load_config(config, [*(set_ or ()), *asked])
+        drive = open_source(source, kind, settings.source)
+        announce(drive, quiet=quiet)
+        found = run_audit(drive, settings)
+        summary = found.summary
+        if mend is not None:
+            summary["mended"] = mend_calibration(drive, settings, found, mend)
+    if json:
+        print_json(summary)
+        return
+    print_figures("", audit_lines(summary))
+    for finding in found.findings:
+        typer.echo(f"{'fatal' if finding.fatal else 'warning'}: {finding.text}")
+    typer.echo(f"verdict: {found.verdict}")

@@ -1,0 +1,143 @@
+"""`recon audit` without its command line: is a source good enough for a long run?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon.audit import Finding, RowAlignment, Verdict, mend_rig, verdict_of
+from recon.errors import CalibrationError
+from recon.formats.recon_yaml import write_recon_calibration
+from recon.matching import MatchingSettings, field_of
+from recon.matching.search import SearchSettings
+from recon.pipeline.audit_figures import audit_figures
+from recon.pipeline.audit_findings import (
+    find_calibration_faults,
+    find_gaps,
+    find_geometry_faults,
+    find_picture_faults,
+    find_range_faults,
+    find_series_faults,
+)
+from recon.pipeline.audit_geometry import measure_geometry
+from recon.pipeline.audit_sample import take_sample
+from recon.pipeline.config import ReconConfig
+from recon.rectification import Rectifier, plan_turns
+from recon.sources import StereoSource
+from recon.structures import RectifiedCamera
+
+
+@dataclass(frozen=True, eq=False)
+class Audit:
+    """What was found.
+
+    Attributes:
+        verdict: good, usable or not usable.
+        findings: What is wrong, worst first.
+        figures: All that was measured, as JSON can hold it.
+        alignment: Row errors of all pairs together; None where too few features tell.
+    """
+
+    verdict: Verdict
+    findings: tuple[Finding, ...]
+    figures: dict[str, Any]
+    alignment: RowAlignment | None
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What ``--json`` prints."""
+        findings = [
+            {"code": f.code, "severity": "fatal" if f.fatal else "warning", "text": f.text}
+            for f in self.findings
+        ]
+        return {"verdict": self.verdict, "findings": findings, **self.figures}
+
+
+def run_audit(source: StereoSource, config: ReconConfig, *, quick: bool = False) -> Audit:
+    """Look at a drive before a long run.
+
+    Args:
+        source: The drive.
+        config: Its ``audit`` and ``rectification`` count.
+        quick: A short look of a second or two, as `recon map` takes.
+
+    Raises:
+        CalibrationError: The calibration cannot rectify anything.
+    """
+    settings = config.audit.for_quick_look() if quick else config.audit
+    rectifier = Rectifier(source.calibration, config.rectification)
+    camera = rectifier.camera
+    sample = take_sample(source, rectifier, settings, quick=quick)
+    geometry = measure_geometry(sample, camera, settings)
+    gaps = find_gaps(source, settings)
+    reach_px = _reach_px(camera, config.matching)
+    findings = [
+        *find_picture_faults(sample, settings),
+        *find_series_faults(sample, gaps, settings),
+        *find_geometry_faults(geometry, settings),
+        *find_range_faults(geometry, reach_px, camera, settings),
+        *find_calibration_faults(sample, source.calibration, camera, settings),
+    ]
+    findings.sort(key=lambda finding: not finding.fatal)
+    figures = audit_figures(source, sample, geometry, gaps, camera)
+    return Audit(verdict_of(findings), tuple(findings), figures, geometry.alignment)
+
+
+def quick_warnings(source: StereoSource, config: ReconConfig) -> tuple[str, ...]:
+    """What a quick look finds, one line each; nothing where it is switched off.
+
+    An input that cannot be read says so itself when the run gets there.
+    """
+    if not config.audit.quick:
+        return ()
+    try:
+        audit = run_audit(source, config, quick=True)
+    except CalibrationError:
+        return ()
+    return tuple(f"{finding.text} [recon audit]" for finding in audit.findings)
+
+
+def mend_calibration(
+    source: StereoSource, config: ReconConfig, audit: Audit, path: Path
+) -> dict[str, Any]:
+    """Write the calibration with the right camera turned so that rows correspond.
+
+    Returns:
+        The turn in degrees, and the row error that it leaves.
+
+    Raises:
+        CalibrationError: Too few features tell the row error.
+        OutputError: The file cannot be written.
+    """
+    alignment = audit.alignment
+    if alignment is None:
+        raise CalibrationError(
+            "too few features to mend a calibration",
+            where=source.name,
+            hint="give pictures that show more, or calibrate the cameras anew",
+        )
+    rig = source.calibration
+    if isinstance(rig, RectifiedCamera):
+        left = np.eye(3)
+    else:
+        left = plan_turns(rig, config.rectification).R_left
+    figures = {
+        "pitch_deg": float(np.degrees(alignment.pitch_rad)),
+        "roll_deg": float(np.degrees(alignment.roll_rad)),
+        "row_error_before_px": alignment.rms_px,
+    }
+    write_recon_calibration(path, mend_rig(rig, alignment, left), figures)
+    return {**figures, "calibration": str(path)}
+
+
+def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None:
+    """The largest disparity that is searched; None where the range widens to what pairs need."""
+    own = getattr(matching, field_of(matching.matcher), None)
+    if not isinstance(own, SearchSettings):
+        return None
+    if matching.range == "auto" and own.ndisp is None and camera.ndisp is None:
+        return None
+    return own.min_disparity_px + own.ndisp_for(camera)

@@ -1,0 +1,183 @@
+"""What an audit looks at: stretches of a drive, and pairs in them whose features are matched."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+
+import numpy as np
+
+from recon.audit import (
+    AuditSettings,
+    RepeatCounter,
+    count_aligned,
+    measure_gain,
+    measure_sharpness,
+    measure_speed,
+    track,
+)
+from recon.errors import ReconError
+from recon.rectification import PairFeatures, Rectifier, match_features
+from recon.sources import StereoSource
+from recon.structures import RectifiedPair
+from recon.structures.arrays import Float64
+
+# A quick look: two stretches, as many frames each as tell a camera that is late.
+_QUICK_RUNS = 2
+_LAG_PAIRS = 4
+
+
+@dataclass(eq=False)
+class Sample:
+    """What was measured on the pictures that were looked at.
+
+    Attributes:
+        frames: Pairs that were read.
+        repeats: Repeated and frozen pictures.
+        contrast_dn: (left, right) standard deviation of each picture.
+        brightness_dn: Mean of each.
+        sharpness: Share of the finest detail, of each.
+        gains: Ratios of brightness around features.
+        features: Of each pair whose features were matched.
+        by_lag: Features that agree on one rotation, summed over pairs, by frames that the right
+            picture is taken later in the series.
+        lagged: Features of pairs at each lag.
+        speeds_m_per_s: Of each of those pairs.
+        flows: float64 (N,) rows that each feature of a pair moves to the next frame, NaN unknown.
+        broken: What a pair could not be read for.
+    """
+
+    frames: int = 0
+    repeats: RepeatCounter = field(default_factory=RepeatCounter)
+    contrast_dn: list[tuple[float, float]] = field(default_factory=list)
+    brightness_dn: list[tuple[float, float]] = field(default_factory=list)
+    sharpness: list[tuple[float, float]] = field(default_factory=list)
+    gains: list[Float64] = field(default_factory=list)
+    features: list[PairFeatures] = field(default_factory=list)
+    by_lag: dict[int, int] = field(default_factory=dict)
+    lagged: dict[int, list[PairFeatures]] = field(default_factory=dict)
+    speeds_m_per_s: list[float] = field(default_factory=list)
+    flows: list[Float64] = field(default_factory=list)
+    broken: ReconError | None = None
+
+
+def take_sample(
+    source: StereoSource, rectifier: Rectifier, settings: AuditSettings, *, quick: bool
+) -> Sample:
+    """Look at a drive. What cannot be read ends the look, and is noted."""
+    stretches = plan_stretches(len(source), settings, quick=quick)
+    centres = plan_centres(stretches, settings, quick=quick)
+    sampler = _Sampler(source, rectifier, settings, centres)
+    try:
+        for start, stop in stretches:
+            sampler.look(start, stop)
+    except ReconError as error:
+        sampler.sample.broken = error
+    return sampler.sample
+
+
+def plan_stretches(frames: int, settings: AuditSettings, *, quick: bool) -> list[tuple[int, int]]:
+    """First frame and end of each stretch: the whole drive, or runs spread over it evenly."""
+    runs = _QUICK_RUNS if quick else settings.runs
+    length = 2 * settings.max_lag + 1 if quick else max(2, settings.frames // runs)
+    if frames <= runs * length:
+        return [(0, frames)]
+    # In the middle of equal parts: a drive may begin and end at rest.
+    starts = [int((k + 0.5) * frames / runs - length / 2) for k in range(runs)]
+    return [(start, start + length) for start in starts]
+
+
+def plan_centres(
+    stretches: list[tuple[int, int]], settings: AuditSettings, *, quick: bool
+) -> list[int]:
+    """Frames whose features are matched, spread evenly, with room for lags around each."""
+    pairs = _QUICK_RUNS if quick else settings.pairs
+    each = max(1, pairs // len(stretches))
+    chosen: list[int] = []
+    for start, stop in stretches:
+        # Of a short drive, several pairs with a few lags tell more than one with all.
+        margin = min(settings.max_lag, (stop - start - 1) // (2 if quick else 3))
+        places = np.linspace(start + margin, stop - 1 - margin, each)
+        chosen += sorted({int(place) for place in np.rint(places)})
+    return chosen
+
+
+class _Sampler:
+    """Walks through stretches with the pairs around the current one at hand."""
+
+    def __init__(
+        self,
+        source: StereoSource,
+        rectifier: Rectifier,
+        settings: AuditSettings,
+        centres: list[int],
+    ) -> None:
+        self.sample = Sample()
+        self._source, self._rectifier, self._settings = source, rectifier, settings
+        self._centres = centres
+        self._with_lag = set(centres[:: max(1, len(centres) // _LAG_PAIRS)])
+        self._recent: dict[int, RectifiedPair] = {}
+
+    def look(self, start: int, stop: int) -> None:
+        """Read one stretch; a pair is measured when all that it is compared with is there."""
+        self.sample.repeats.restart()
+        self._recent.clear()
+        reach = self._settings.max_lag
+        waiting = [centre for centre in self._centres if start <= centre < stop]
+        for pair in self._pairs(start, stop):
+            self._recent[pair.index] = pair
+            self._recent.pop(pair.index - 2 * reach - 1, None)
+            while waiting and pair.index >= min(waiting[0] + reach, stop - 1):
+                self._measure(waiting.pop(0))
+
+    def _pairs(self, start: int, stop: int) -> Iterator[RectifiedPair]:
+        for recorded in islice(self._source.frames(start), stop - start):
+            self.sample.frames += 1
+            self.sample.repeats.add(recorded.left, recorded.right)
+            yield self._rectifier.rectify(recorded)
+
+    def _measure(self, centre: int) -> None:
+        """Everything about one pair and its neighbours."""
+        pair, sample, settings = self._recent[centre], self.sample, self._settings
+        sample.contrast_dn.append((float(pair.left.std()), float(pair.right.std())))
+        sample.brightness_dn.append((float(pair.left.mean()), float(pair.right.mean())))
+        if min(sample.contrast_dn[-1]) < settings.contrast_dn:
+            return
+        sample.sharpness.append((measure_sharpness(pair.left), measure_sharpness(pair.right)))
+        features = match_features(pair.left, pair.right, settings.features)
+        sample.features.append(features)
+        gains = measure_gain(pair.left, pair.right, features.left_uv, features.right_uv)
+        sample.gains.append(gains)
+        if centre in self._with_lag:
+            self._compare_lags(centre, features)
+        self._follow(centre, features)
+
+    def _compare_lags(self, centre: int, features: PairFeatures) -> None:
+        """How well the left picture fits right ones before and after."""
+        ends = (min(self._recent), max(self._recent))
+        span = min(self._settings.max_lag, *(abs(end - centre) for end in ends))
+        pair, sample = self._recent[centre], self.sample
+        for lag in range(-span, span + 1):
+            found = features
+            if lag:
+                right = self._recent[centre + lag].right
+                found = match_features(pair.left, right, self._settings.features)
+            agreeing = count_aligned(found.left_uv, found.right_uv, pair.camera)
+            sample.by_lag[lag] = sample.by_lag.get(lag, 0) + agreeing
+            sample.lagged.setdefault(lag, []).append(found)
+
+    def _follow(self, centre: int, features: PairFeatures) -> None:
+        """Speed and row flow, from the left picture of the next frame."""
+        flow = np.full(len(features), np.nan)
+        later = self._recent.get(centre + 1)
+        if later is not None:
+            pair = self._recent[centre]
+            there, found = track(pair.left, later.left, features.left_uv)
+            flow[found] = there[found, 1] - features.left_uv[found, 1]
+            seen = (features.left_uv[found], features.right_uv[found], there[found])
+            moved_m = measure_speed(*seen, pair.camera)
+            step_s = later.timestamp_s - pair.timestamp_s
+            if moved_m is not None and step_s > 0:
+                self.sample.speeds_m_per_s.append(moved_m / step_s)
+        self.sample.flows.append(flow)

@@ -1,0 +1,102 @@
+"""An audit as a person reads it: one line for each thing that was looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+_UNKNOWN = "not known"
+
+
+def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
+    """What was measured, in words.
+
+    Args:
+        summary: What `recon audit --json` prints.
+
+    Returns:
+        Subject and text, in the order in which they are read.
+    """
+    lines = {
+        "frames": _frames(summary),
+        "rows": _rows(summary),
+        "eyes": _eyes(summary),
+        "time": _time(summary),
+        "brightness": _known("right / left {:.2f}", summary["gain"]),
+        "sharpness": _known(
+            "left {:.2f}, right {:.2f} (0 to 1)",
+            summary["sharpness_left"],
+            summary["sharpness_right"],
+        ),
+        "disparities": _known(
+            "{0:.1f} to {2:.1f} px in use, half of them under {1:.1f} px",
+            *summary.get("disparity_5_50_95_px", [None]),
+        ),
+        "rig": _rig(summary),
+        "depth error": ", ".join(
+            f"{_length(error)} at {at} m" for at, error in summary.get("depth_error_m", {}).items()
+        )
+        or _UNKNOWN,
+    }
+    mended = summary.get("mended")
+    if mended is not None:
+        turn = f"{mended['pitch_deg']:+.3f} deg pitch, {mended['roll_deg']:+.3f} deg roll"
+        lines["mended"] = f"{mended['calibration']}: right camera turned by {turn}"
+    return lines
+
+
+def _frames(summary: Mapping[str, Any]) -> str:
+    frozen = max(summary["frozen_left_frames"], summary["frozen_right_frames"])
+    step_s = summary["usual_step_s"]
+    rate = "" if step_s is None else f" at {1 / step_s:.3g} Hz, {summary['gaps']} gaps"
+    return (
+        f"{summary['frames']}{rate}; of {summary['frames_read']} looked at, "
+        f"{summary['repeated_frames']} repeat the one before"
+        + (f", one camera stands still for {frozen}" if frozen else "")
+    )
+
+
+def _rows(summary: Mapping[str, Any]) -> str:
+    if "row_error_rms_px" not in summary:
+        return _UNKNOWN
+    return (
+        f"{summary['row_error_rms_px']:.2f} px rms (mean {summary['row_error_mean_px']:+.2f}, "
+        f"spread {summary['row_error_spread_px']:.2f}, of which the features' noise is "
+        f"{summary['row_noise_px']:.2f}); mended by pitch {summary['mend_pitch_deg']:+.3f}, "
+        f"roll {summary['mend_roll_deg']:+.3f} deg"
+    )
+
+
+def _eyes(summary: Mapping[str, Any]) -> str:
+    return _known("{:.0f} % of near features as if left and right were swapped", _percent(summary))
+
+
+def _percent(summary: Mapping[str, Any]) -> float | None:
+    share = summary["swapped_share"]
+    return None if share is None else 100 * float(share)
+
+
+def _time(summary: Mapping[str, Any]) -> str:
+    if summary["lag_frames"]:
+        return f"right camera {summary['lag_frames']:+d} frames late"
+    skew = summary["time_skew_frames"]
+    # No minus before a zero.
+    return _known("right camera {:+.2f} frames late", skew and round(skew, 2) + 0.0)
+
+
+def _rig(summary: Mapping[str, Any]) -> str:
+    speed = summary["speed_m_per_s"]
+    moving = "" if speed is None else f", moving at {speed:.1f} m/s"
+    return f"baseline {_length(summary['baseline_m'])}, f {summary['focal_px']:.0f} px{moving}"
+
+
+def _known(text: str, *values: float | None) -> str:
+    return _UNKNOWN if None in values else text.format(*values)
+
+
+def _length(metres: float) -> str:
+    """Three digits, in the unit that a person would take."""
+    for unit, factor, under in (("mm", 1000.0, 0.01), ("cm", 100.0, 1.0)):
+        if metres < under:
+            return f"{metres * factor:.2g} {unit}"
+    return f"{metres:.3g} m"

@@ -1,0 +1,147 @@
+"""The audit finds each planted fault, and nothing where nothing was planted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.formats.calibration import read_calibration
+from recon.pipeline.audit_run import mend_calibration, run_audit
+from recon.pipeline.config import load_config
+from recon.sources import StereoSource, open_source
+from recon.sources.synthetic import SyntheticSource
+from recon.structures import StereoCalibration, StereoPair
+from recon.synthetic import StreetSettings
+from tests.audit import faults
+
+CONFIG = load_config()
+FRAMES = 10
+
+
+@pytest.fixture(scope="module")
+def street() -> faults.Spoiled:
+    """A rendered drive without a fault, kept in memory."""
+    size = StreetSettings(
+        seed=5, frames=FRAMES, width_px=400, height_px=136, focal_px=225.0, threads=1
+    )
+    source = SyntheticSource(size)
+    pairs: list[StereoPair] = list(source)
+    return faults.Spoiled(source.calibration, FRAMES, pairs.__getitem__)
+
+
+def codes(source: StereoSource, *, quick: bool = False) -> set[str]:
+    return {finding.code for finding in run_audit(source, CONFIG, quick=quick).findings}
+
+
+def test_a_clean_drive_is_good_and_its_figures_are_right(street: faults.Spoiled) -> None:
+    audit = run_audit(street, CONFIG)
+    assert (audit.verdict, audit.findings) == ("good", ())
+    assert audit.figures["gain"] == pytest.approx(1, abs=0.02)
+    assert audit.figures["row_error_rms_px"] < 0.1
+    # 1 m a frame, ten frames a second.
+    assert audit.figures["speed_m_per_s"] == pytest.approx(10, rel=0.05)
+    assert audit.figures["frames_read"] == FRAMES
+    assert run_audit(street, CONFIG, quick=True).verdict == "good"
+
+
+@pytest.mark.parametrize("fault", faults.FAULTS)
+def test_each_planted_fault_is_found_and_no_other(street: faults.Spoiled, fault: str) -> None:
+    code, plant = faults.FAULTS[fault]
+    audit = run_audit(plant(street), CONFIG)
+    assert [finding.code for finding in audit.findings] == [code]
+    assert audit.verdict != "good"
+    assert all("\n" not in finding.text for finding in audit.findings)
+
+
+@pytest.mark.parametrize("fault", faults.FAULTS)
+def test_a_quick_look_finds_what_spoils_every_frame(street: faults.Spoiled, fault: str) -> None:
+    code, plant = faults.FAULTS[fault]
+    assert code in codes(plant(street), quick=True)
+
+
+@pytest.mark.parametrize("pitch_deg", [0.3, -0.3])
+def test_mending_brings_a_pitch_back_under_a_third_of_a_pixel(
+    street: faults.Spoiled, tmp_path: Path, pitch_deg: float
+) -> None:
+    assert_mended(faults.turned(street, pitch_deg=pitch_deg, roll_deg=0.2), tmp_path)
+
+
+def assert_mended(spoiled: faults.Spoiled, folder: Path) -> None:
+    before = run_audit(spoiled, CONFIG)
+    assert "rows" in {finding.code for finding in before.findings}
+    path = folder / "mended.yaml"
+    mend_calibration(spoiled, CONFIG, before, path)
+    mended = read_calibration(path, spoiled.camera.width_px, spoiled.camera.height_px)
+    assert isinstance(mended, StereoCalibration)
+    assert mended.baseline_m == pytest.approx(spoiled.camera.baseline_m, rel=1e-9)
+    after = run_audit(replace(spoiled, camera=mended), CONFIG)
+    assert "rows" not in {finding.code for finding in after.findings}
+    assert abs(after.figures["row_error_mean_px"]) < 0.3
+    assert after.figures["row_error_rms_px"] < 0.3
+    assert before.figures["row_error_rms_px"] > 5 * after.figures["row_error_rms_px"]
+    # Mending what is mended changes next to nothing.
+    assert abs(after.figures["mend_pitch_deg"]) < 0.02
+
+
+def test_half_a_frame_of_skew_is_measured(street: faults.Spoiled) -> None:
+    """Pairs of a drive at half speed stand in: every other frame, the right one in between."""
+
+    def take(index: int) -> StereoPair:
+        return replace(street.take(2 * index), right=street.take(2 * index + 1).right)
+
+    audit = run_audit(faults.Spoiled(street.camera, FRAMES // 2, take), CONFIG)
+    assert audit.figures["time_skew_frames"] == pytest.approx(0.5, abs=0.1)
+    assert "skew" in {finding.code for finding in audit.findings}
+
+
+def test_a_frozen_camera_is_found(street: faults.Spoiled) -> None:
+    def take(index: int) -> StereoPair:
+        return replace(street.take(index), right=street.take(min(index, 4)).right)
+
+    findings = run_audit(replace(street, take=take), CONFIG).findings
+    frozen = next(finding for finding in findings if finding.code == "frozen")
+    assert frozen.fatal
+    assert "the right camera stands still for 5 frames" in frozen.text
+
+
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize("drive", ["kitti_raw_0013", "kitti_06_51"])
+def test_nothing_is_found_on_real_drives(recon_data: Path, drive: str) -> None:
+    source = open_source(recon_data / "driven" / drive)
+    assert run_audit(source, CONFIG).findings == ()
+    assert run_audit(source, CONFIG, quick=True).findings == ()
+
+
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", faults.FAULTS)
+@pytest.mark.parametrize("drive", ["kitti_raw_0013", "kitti_06_51"])
+def test_each_planted_fault_is_found_on_real_drives(
+    recon_data: Path, drive: str, fault: str
+) -> None:
+    code, plant = faults.FAULTS[fault]
+    assert code in codes(plant(open_source(recon_data / "driven" / drive)))
+
+
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize("drive", ["kitti_raw_0013", "kitti_06_51"])
+def test_a_real_drive_is_mended(recon_data: Path, tmp_path: Path, drive: str) -> None:
+    source = open_source(recon_data / "driven" / drive)
+    assert_mended(faults.turned(source, pitch_deg=0.3), tmp_path)
+
+
+def test_noise_is_no_frozen_camera() -> None:
+    rng = np.random.default_rng(0)
+    scene = rng.integers(20, 200, (64, 96))
+    pairs = [
+        StereoPair(*(np.uint8(scene + rng.normal(0, 1, (2, 64, 96))).clip(0, 255)), 0.1 * k, k)
+        for k in range(8)
+    ]
+    camera = faults.RectifiedCamera(60.0, 47.5, 31.5, 47.5, 0.1, 96, 64)
+    found = codes(faults.Spoiled(camera, 8, pairs.__getitem__))
+    assert not found & {"frozen", "duplicates"}
