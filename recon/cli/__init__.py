@@ -12,6 +12,7 @@ import typer
 from recon import __version__
 from recon.cli import evaluate
 from recon.cli.audit import audit
+from recon.cli.board import board
 from recon.cli.calibrate import calibrate
 from recon.cli.capture import capture
 from recon.cli.demo import demo
@@ -36,6 +37,7 @@ app.command()(capture)
 app.command()(audit)
 app.command()(disparity)
 app.command()(paper)
+app.command()(board)
 app.command()(calibrate)
 app.command()(rectify)
 app.command()(doctor)

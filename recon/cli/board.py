@@ -1,0 +1,53 @@
+"""`recon board`: a calibration board to print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import Json
+from recon.cli.session import print_figures, print_json, session
+
+
+def board(
+    pattern: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="BOARD",
+            help="chess:9x6:25mm (inner corners, side of a square), or "
+            "charuco:8x6:30mm:22mm:5x5_100 (squares, square, marker, dictionary).",
+        ),
+    ] = None,
+    same: Annotated[
+        str | None, typer.Option("--board", help="The same, spelt as for recon calibrate.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="A .pdf or .png file.")] = Path(
+        "board.pdf"
+    ),
+    paper: Annotated[
+        str | None,
+        typer.Option(
+            help="a4, a3, a2, a1, a0, letter, legal, tabloid or 600x400mm; without it the "
+            "smallest A paper that will do."
+        ),
+    ] = None,
+    dpi: Annotated[
+        float, typer.Option(min=30, max=2400, help="Pixels per inch of a PNG, about.")
+    ] = 300.0,
+    json: Json = False,
+) -> None:
+    """Draw a calibration board to scale, to be printed at 100 %.
+
+    Example: recon board chess:9x6:25mm --out board.pdf --paper a4
+    """
+    wanted = pattern or same
+    if wanted is None or (pattern and same):
+        raise typer.BadParameter("name one board, such as chess:9x6:25mm")
+    with session():
+        from recon.reports.board_sheet import write_board
+        from recon.structures.board import parse_board
+
+        figures = write_board(out, parse_board(wanted), paper, dpi)
+    print_json(figures) if json else print_figures("", figures)
