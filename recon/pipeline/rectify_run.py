@@ -32,7 +32,7 @@ from recon.rectification import (
     map_pixels,
     match_exactly,
     plan_turns,
-    rectify_uncalibrated,
+    rectify_pictures,
     to_grey,
 )
 from recon.sources.files import read_pair
@@ -181,12 +181,8 @@ def _by_features(pictures: PicturePairs, config: ReconConfig, first: StereoPair)
     size = (width, height)
     step = max(1, len(pictures.pairs) // settings.pairs)
     some = replace(pictures, pairs=pictures.pairs[::step][: settings.pairs])
-    found = [_features(pair, settings.features) for pair, _ in _pairs(some)]
-    features = PairFeatures(
-        np.concatenate([each.left_uv for each in found]),
-        np.concatenate([each.right_uv for each in found]),
-    )
-    result = rectify_uncalibrated(features, size, settings)
+    greys = [(to_grey(pair.left), to_grey(pair.right)) for pair, _ in _pairs(some)]
+    result = rectify_pictures(greys, settings)
 
     def warp(pair: StereoPair) -> tuple[UInt8, UInt8]:
         left, right = (

@@ -1,7 +1,7 @@
 """From recorded pictures to rows that correspond, and from colour to grey."""
 
 from recon.rectification.epipolar import epipolar_curves, epipolar_lines
-from recon.rectification.features import match_exactly
+from recon.rectification.features import match_again, match_exactly
 from recon.rectification.grey import GreyMode, to_grey
 from recon.rectification.inspect import (
     InspectionSettings,
@@ -22,6 +22,7 @@ from recon.rectification.shaping import map_pixels
 from recon.rectification.uncalibrated import (
     UncalibratedRectification,
     UncalibratedSettings,
+    rectify_pictures,
     rectify_uncalibrated,
 )
 
@@ -41,9 +42,11 @@ __all__ = [
     "inspect_features",
     "inspect_pair",
     "map_pixels",
+    "match_again",
     "match_exactly",
     "match_features",
     "plan_turns",
+    "rectify_pictures",
     "rectify_uncalibrated",
     "to_grey",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,15 +11,18 @@ import numpy as np
 from pydantic import Field
 
 from recon.errors import CalibrationError
+from recon.rectification.features import match_again, match_exactly
+from recon.rectification.fundamental import epipoles, find_fundamental, level_homographies
 from recon.rectification.inspect import PairFeatures
 from recon.rectification.shaping import map_pixels, shape_views
 from recon.settings import Settings
-from recon.structures.arrays import Bool, Float64
+from recon.structures.arrays import Bool, Float64, UInt8
 
 Size = tuple[int, int]
 
-_ROUNDS: Final = 60
-_STEP: Final = 1e-6
+# Sizes at one corner of a rectified picture, in those at another.
+_MOST_STRETCHED: Final = 20.0
+_FEWEST_AT_FIRST: Final = 12
 _HELD_OUT: Final = 4  # every fourth feature measures, the others fit
 
 
@@ -69,14 +73,38 @@ class UncalibratedRectification:
     disparity_px: tuple[float, float]
 
 
+def rectify_pictures(
+    pairs: Sequence[tuple[UInt8, UInt8]], settings: UncalibratedSettings | None = None
+) -> UncalibratedRectification:
+    """Find homographies that bring the rows of pictures of unknown cameras together.
+
+    Features are matched twice: as recorded, and once these have made the pictures alike.
+
+    Args:
+        pairs: uint8 (H, W) left and right, of one pair or of several pairs of one rig.
+        settings: How.
+
+    Raises:
+        CalibrationError: See `rectify_uncalibrated`.
+    """
+    settings = settings or UncalibratedSettings()
+    height, width = pairs[0][0].shape
+    matched = _joined([match_exactly(left, right, settings.features) for left, right in pairs])
+    # A first guess need not be sure: few matches will do, and it is judged by what it leads to.
+    few = settings.model_copy(update={"min_features": _FEWEST_AT_FIRST})
+    H = _fit(matched, (width, height), few)[:2]
+    again = _joined([match_again(left, right, *H, settings.features) for left, right in pairs])
+    return rectify_uncalibrated(again, (width, height), settings)
+
+
 def rectify_uncalibrated(
     features: PairFeatures, size: Size, settings: UncalibratedSettings | None = None
 ) -> UncalibratedRectification:
     """Find homographies that bring matches of unknown cameras onto common rows.
 
-    The fundamental matrix is found robustly (MAGSAC++), turned into homographies (Hartley), and
-    these are fitted to the matches: seven numbers, by least absolute rows. What rows leave open
-    is chosen so that the pictures are slanted little and disparities are positive.
+    The fundamental matrix is found robustly (MAGSAC++), its seven numbers are fitted to the
+    matches, and it is turned into homographies (Hartley). What rows leave open is chosen so that
+    the pictures are slanted little and disparities are positive.
 
     Args:
         features: Matches of one pair, or of several pairs of one rig.
@@ -87,8 +115,7 @@ def rectify_uncalibrated(
         CalibrationError: Too few matches agree, or the scene is flat, or one camera stands in the
             view of the other.
 
-    Ref: Hartley 1999, "Theory and practice of projective rectification"; OpenCV's
-        ``stereoRectifyUncalibrated``.
+    Ref: Hartley 1999, "Theory and practice of projective rectification".
     """
     settings = settings or UncalibratedSettings()
     used = np.arange(len(features)) % _HELD_OUT != 0
@@ -121,6 +148,13 @@ def rectify_uncalibrated(
     )
 
 
+def _joined(found: list[PairFeatures]) -> PairFeatures:
+    return PairFeatures(
+        np.concatenate([each.left_uv for each in found]),
+        np.concatenate([each.right_uv for each in found]),
+    )
+
+
 def _some(features: PairFeatures, which: Bool) -> PairFeatures:
     return PairFeatures(features.left_uv[which], features.right_uv[which])
 
@@ -132,98 +166,52 @@ def _fit(
     F, agreeing = _fundamental(features, settings)
     _check_depth(agreeing, settings)
     _check_epipoles(F, size)
-    done, H_left, H_right = cv2.stereoRectifyUncalibrated(
-        agreeing.left_uv.astype(np.float64), agreeing.right_uv.astype(np.float64), F, size
-    )
-    if not done or not (np.isfinite(H_left).all() and np.isfinite(H_right).all()):
-        raise CalibrationError("no homographies bring the rows together")
-    # Rows are fitted in pixels of pictures that look as they will.
-    H_left, H_right = shape_views(H_left, H_right, agreeing, size)
-    H_left, H_right = _refine(H_left / H_left[2, 2], H_right / H_right[2, 2], agreeing, size)
-    return *shape_views(H_left, H_right, agreeing, size), F, agreeing
+    H_left, H_right = shape_views(*level_homographies(F, size), agreeing, size)
+    _check_torn(H_left, H_right, size)
+    return H_left, H_right, F, agreeing
 
 
 def _fundamental(
     features: PairFeatures, settings: UncalibratedSettings
 ) -> tuple[Float64, PairFeatures]:
-    F, mask = None, np.zeros(0, bool)
-    if len(features) >= settings.min_features:
-        F, inliers = cv2.findFundamentalMat(
-            features.left_uv,
-            features.right_uv,
-            cv2.USAC_MAGSAC,
-            settings.inlier_px,
-            0.9999,
-            10000,
-        )
-        mask = np.zeros(0, bool) if inliers is None else np.asarray(inliers).ravel() > 0
-    if F is None or F.shape != (3, 3) or mask.sum() < settings.min_features:
+    left, right = features.left_uv.astype(np.float64), features.right_uv.astype(np.float64)
+    F, agreeing = find_fundamental(left, right, settings.inlier_px)
+    if F is None or agreeing.sum() < settings.min_features:
         raise CalibrationError(
             "too few features of both pictures agree on one geometry",
-            got=f"{int(mask.sum())} of {len(features)} matches",
+            got=f"{int(agreeing.sum())} of {len(features)} matches",
             expected=f"at least {settings.min_features}",
             hint="are these two views of one scene, with texture?",
         )
-    return np.asarray(F, dtype=np.float64), _some(features, mask)
+    return F, _some(features, agreeing)
 
 
 def _check_epipoles(F: Float64, size: Size) -> None:
     """A homography tears a picture apart that sees the other camera."""
-    U, _, Vt = np.linalg.svd(F)
-    for side, epipole in (("left", Vt[2]), ("right", U[:, 2])):
+    for side, epipole in zip(("left", "right"), epipoles(F), strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = epipole[:2] / epipole[2]
         if 0 <= x < size[0] and 0 <= y < size[1]:
-            raise CalibrationError(
-                f"the {side} picture sees the other camera: one stands before the other",
-                got=f"epipole at ({x:.0f}, {y:.0f}) px",
-                expected="outside the picture",
-                hint="put the cameras side by side",
-            )
+            raise _seen(side, f"epipole at ({x:.0f}, {y:.0f}) px")
 
 
-def _refine(
-    H_left: Float64, H_right: Float64, features: PairFeatures, size: Size
-) -> tuple[Float64, Float64]:
-    """Fit rows to the matches by the seven numbers that a fundamental matrix has.
-
-    Five are rows 2 and 3 of the left homography, two the direction of row 3 of the right one.
-    """
-    # Row 3 is in 1/px: scaled so that a unit of each number moves a border by about a pixel.
-    unit = np.array([1 / size[0], 1 / size[1], 1, 1 / size[0] ** 2, 1 / size[1] ** 2] * 2)[:7]
-    unit[5:] = [1 / size[0] ** 2, 1 / size[1] ** 2]
-
-    def rows(step: Float64) -> Float64:
-        left, right = _moved(H_left, H_right, step * unit)
-        a, b = map_pixels(left, features.left_uv), map_pixels(right, features.right_uv)
-        return np.asarray(a[:, 1] - b[:, 1])
-
-    step, damping = np.zeros(7), 1e-3
-    apart = rows(step)
-    for _ in range(_ROUNDS):
-        weights = 1.0 / np.maximum(np.abs(apart), 0.1 + np.median(np.abs(apart)))
-        J = np.stack([(rows(step + _STEP * e) - apart) / _STEP for e in np.eye(7)], axis=1)
-        A = J.T @ (J * weights[:, None])
-        move = np.linalg.lstsq(
-            A + damping * np.diag(np.diag(A)), -J.T @ (weights * apart), rcond=1e-12
-        )[0]
-        trial = rows(step + move)
-        if np.isfinite(trial).all() and weights @ trial**2 < weights @ apart**2:
-            gain = 1 - (weights @ trial**2) / (weights @ apart**2)
-            step, apart, damping = step + move, trial, damping / 5
-            if gain < 1e-8:
-                break
-        else:
-            damping *= 10
-    return _moved(H_left, H_right, step * unit)
+def _check_torn(H_left: Float64, H_right: Float64, size: Size) -> None:
+    """Close to the other camera pixels would be stretched without end."""
+    w, h = size[0] - 1.0, size[1] - 1.0
+    corners = np.array([[0, 0, 1], [w, 0, 1], [w, h, 1], [0, h, 1]])
+    for side, H in (("left", H_left), ("right", H_right)):
+        last = corners @ H[2]
+        if last.min() < last.max() / _MOST_STRETCHED:
+            raise _seen(side, "epipole next to it")
 
 
-def _moved(H_left: Float64, H_right: Float64, step: Float64) -> tuple[Float64, Float64]:
-    left, right = H_left.copy(), H_right.copy()
-    left[1] += step[:3]
-    left[2, :2] += step[3:5]
-    right[2, :2] += step[5:]
-    return left, right
+def _seen(side: str, got: str) -> CalibrationError:
+    return CalibrationError(
+        f"the {side} picture sees the other camera: one stands before the other",
+        got=got,
+        expected="outside the picture",
+        hint="put the cameras side by side",
+    )
 
 
 def _held_out(

@@ -213,6 +213,6 @@ def _note(axes: Axes, board: CalibrationBoard, sheet: Sheet, margin_mm: float) -
     axes.add_patch(Rectangle((left, y), ruler_mm, 0.3, facecolor=FAINT, linewidth=0))
     for end in (left, left + ruler_mm - 0.3):
         axes.add_patch(Rectangle((end, y - 1.0), 0.3, 2.3, facecolor=FAINT, linewidth=0))
-    font = {"fontsize": size_mm / _POINT_MM, "color": FAINT, "va": "bottom"}
+    font: dict[str, Any] = {"fontsize": size_mm / _POINT_MM, "color": FAINT, "va": "bottom"}
     axes.text(_SMALLEST_MARGIN_MM, y, f"{board}   print at 100 %", **font)
     axes.text(left + ruler_mm / 2, y - 0.5, f"{ruler_mm:g} mm", ha="center", **font)

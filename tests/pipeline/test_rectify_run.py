@@ -19,6 +19,7 @@ from recon.structures import RectifiedCamera
 from recon.synthetic import StreetSettings
 from recon.synthetic.boards import board_rig
 
+SMALL = StreetSettings(frames=2, width_px=480, height_px=240, focal_px=280.0)
 WARP = np.array([[1.0, 0.04, -12], [-0.05, 1.02, 9], [4e-5, -3e-5, 1]])
 
 
@@ -26,7 +27,7 @@ WARP = np.array([[1.0, 0.04, -12], [-0.05, 1.02, 9], [4e-5, -3e-5, 1]])
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two pairs of the street; the right camera's are warped by one homography."""
     folder = tmp_path_factory.mktemp("street")
-    source = SyntheticSource(StreetSettings(frames=2))
+    source = SyntheticSource(SMALL)
     for pair in source:
         height, width = pair.left.shape[:2]
         write_image(folder / "left" / f"{pair.index}.png", pair.left)
@@ -51,7 +52,7 @@ def test_a_folder_is_rectified_by_its_features_and_says_up_to_scale(
     }
     assert {"left/0.png", "left/1.png", "right/0.png", "right/1.png"} <= names
     assert {"homographies.yaml", "pictures/epipolar_raw.png"} <= names
-    source = SyntheticSource(StreetSettings(frames=2))
+    source = SyntheticSource(SMALL)
     truth = source.disparity_truth(0).values
     v, u = np.nonzero(np.isfinite(truth))
     ones = np.ones(len(u))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,9 @@ from recon.rectification import (
     UncalibratedSettings,
     epipolar_lines,
     map_pixels,
+    match_again,
     match_exactly,
+    rectify_pictures,
     rectify_uncalibrated,
     to_grey,
 )
@@ -161,24 +164,86 @@ def test_blank_pictures_have_no_features() -> None:
     assert len(match_exactly(blank, blank)) == 0
 
 
+def picture_of(seed: int, size: tuple[int, int]) -> np.ndarray:
+    """A texture with detail of many sizes."""
+    rng, total = np.random.default_rng(seed), np.zeros(size[::-1])
+    for sigma in (1.0, 2.0, 4.0):
+        noise = cv2.GaussianBlur(rng.normal(size=size[::-1]), (0, 0), sigma)
+        total += noise / noise.std()
+    return np.clip(128 + 30 * total, 0, 255).astype(np.uint8)
+
+
+def planes_pair(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A rectified pair: three upright planes at different depths; and its disparity."""
+    width, height = size
+    disparity = np.zeros((height, width))
+    for n, values in enumerate(((30.0, 10.0), (14.0, 14.0), (6.0, 24.0))):
+        rows = slice(n * height // 3, (n + 1) * height // 3)
+        disparity[rows] = np.linspace(*values, width)[None]
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    right = picture_of(0, (width + 80, height))[:, 40:-40]
+    at = (u - disparity).astype(np.float32)
+    return cv2.remap(right, at, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), right, disparity
+
+
+def true_rows(found, A: np.ndarray, B: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+    """Row of each pixel less that of its true partner, after both warps and the rectification."""
+    v, u = np.nonzero(np.isfinite(disparity))
+    left = map_pixels(found.H_left @ A, np.stack([u, v], axis=1))
+    right = map_pixels(found.H_right @ B, np.stack([u - disparity[v, u], v], axis=1))
+    return np.asarray(left[:, 1] - right[:, 1])
+
+
+def shaken(size: tuple[int, int], reach: float, rng: np.random.Generator) -> np.ndarray:
+    """A homography that moves each corner by up to a share of the width."""
+    width, height = size
+    border = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    moved = border + rng.uniform(-reach, reach, (4, 2)) * width
+    return np.asarray(cv2.getPerspectiveTransform(border, moved.astype(np.float32)))
+
+
+@pytest.mark.parametrize("warp", ["none", "turned", "shifted", "weak", "strong"])
+def test_a_pair_under_known_homographies_comes_back_onto_rows(warp: str) -> None:
+    size, rng = (400, 300), np.random.default_rng(7)
+    left, right, disparity = planes_pair(size)
+    turn = np.vstack([cv2.getRotationMatrix2D((200, 150), 2.0, 1.0), [0, 0, 1]])
+    A, B = {
+        "none": (np.eye(3), np.eye(3)),
+        "turned": (np.eye(3), turn),
+        "shifted": (np.eye(3), np.array([[1.0, 0, 3], [0, 1, 9], [0, 0, 1]])),
+        "weak": (shaken(size, 0.02, rng), shaken(size, 0.02, rng)),
+        "strong": (shaken(size, 0.1, rng), shaken(size, 0.1, rng)),
+    }[warp]
+    seen = tuple(cv2.warpPerspective(p, H, size) for p, H in ((left, A), (right, B)))
+    found = rectify_pictures([seen], UncalibratedSettings(features=1500))
+    rows = true_rows(found, A, B, disparity)
+    assert np.abs(rows).mean() < 0.3
+
+
+def test_matches_of_pictures_made_alike_are_places_in_those_recorded() -> None:
+    size, rng = (320, 240), np.random.default_rng(7)
+    picture = picture_of(1, size)
+    A, B = shaken(size, 0.08, rng), shaken(size, 0.08, rng)
+    seen = [cv2.warpPerspective(picture, H, size) for H in (A, B)]
+    found = match_again(*seen, np.linalg.inv(A), np.linalg.inv(B), 800)
+    back = [map_pixels(np.linalg.inv(H), uv) for H, uv in ((A, found.left_uv), (B, found.right_uv))]
+    assert len(found) > 100
+    assert np.median(np.linalg.norm(back[0] - back[1], axis=1)) < 0.2
+
+
 @pytest.mark.real
-@pytest.mark.parametrize("name", ["Jadeplant", "Motorcycle", "Pipes"])
+@pytest.mark.parametrize("reach", [0.0, 0.06, 0.12])
+@pytest.mark.parametrize("name", ["Jadeplant", "Motorcycle", "Pipes", "Teddy"])
 def test_warped_middlebury_pairs_come_back_onto_rows_by_their_truth(
-    recon_data: Path, name: str
+    recon_data: Path, name: str, reach: float
 ) -> None:
     found = read_middlebury_scene(recon_data / "middlebury" / "MiddEval3" / "trainingQ" / name)
     left, right = to_grey(found.pair.left), to_grey(found.pair.right)
-    height, width = left.shape
-    border = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
-    rng = np.random.default_rng(3)
-    shaken = [border + rng.uniform(-0.06, 0.06, (4, 2)) * width for _ in range(2)]
-    A, B = (cv2.getPerspectiveTransform(border, s.astype(np.float32)) for s in shaken)
-    warped = [cv2.warpPerspective(p, H, (width, height)) for p, H in ((left, A), (right, B))]
-    result = rectify_uncalibrated(match_exactly(*warped), (width, height))
+    size, rng = left.shape[::-1], np.random.default_rng(3)
+    A, B = shaken(size, reach, rng), shaken(size, reach, rng)
+    seen = tuple(cv2.warpPerspective(p, H, size) for p, H in ((left, A), (right, B)))
     assert found.truth is not None
-    disparity = found.truth.values
-    v, u = np.nonzero(np.isfinite(disparity))
-    placed_left = map_pixels(result.H_left @ A, np.stack([u, v], axis=1))
-    partner = np.stack([u - disparity[v, u], v], axis=1)
-    rows = placed_left[:, 1] - map_pixels(result.H_right @ B, partner)[:, 1]
+    rows = true_rows(rectify_pictures([seen]), A, B, found.truth.values)
+    sys.stdout.write(f"{name} by {reach}: mean row error {np.abs(rows).mean():.3f} px\n")
+    # Motorcycle and Pipes are 0.3 px off as they are published.
     assert np.abs(rows).mean() <= 0.7
