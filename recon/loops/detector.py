@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.geometry.se3 import angle_rad, invert
 from recon.loops.drift import Drift, drift_over, is_possible
 from recon.loops.keyframe import Keyframe, make_keyframe, words_of
+from recon.loops.places import Place, Places
 from recon.loops.settings import LoopSettings
 from recon.loops.verify import Loop, verify
 from recon.structures import Disparity, RectifiedPair
@@ -75,16 +75,6 @@ class KeyframeMemory:
         return self._kept[frame]
 
 
-@dataclass(frozen=True, eq=False)
-class _Place:
-    """What stays in memory of a keyframe."""
-
-    frame: int
-    T_world_camera: Float64
-    path_m: float
-    words: NDArray[np.uint32]
-
-
 class LoopDetector:
     """Looks for earlier places in each keyframe of a drive.
 
@@ -99,7 +89,7 @@ class LoopDetector:
     def __init__(self, settings: LoopSettings, store: KeyframeStore) -> None:
         self._settings = settings
         self._store = store
-        self._places: list[_Place] = []
+        self._places = Places()
         self.loops: list[Loop] = []
         self.refused: Counter[str] = Counter()
 
@@ -137,23 +127,25 @@ class LoopDetector:
 
     def restore(self, stored: StoredKeyframe) -> None:
         """Take a keyframe of an interrupted drive, with what was found there."""
-        self._places.append(self._place(stored))
+        self._places.add(self._place(stored))
         self.loops.extend(stored.loops)
         self.refused.update(stored.refused)
 
     def agreeing(self) -> list[Loop]:
         """The loops that enough others of other keyframes confirm."""
-        poses = {place.frame: (place.T_world_camera, place.path_m) for place in self._places}
+        places = self._places
+        known = zip(places.frames, places.T_world_camera, places.path_m.tolist(), strict=True)
+        poses = {frame: (T, path_m) for frame, T, path_m in known}
         return agreeing_loops(self.loops, poses, self._settings)
 
-    def _place(self, stored: StoredKeyframe) -> _Place:
+    def _place(self, stored: StoredKeyframe) -> Place:
         words = words_of(stored.keyframe.descriptors, self._settings.candidates)
-        return _Place(stored.keyframe.frame, stored.T_world_camera, stored.path_m, words)
+        return Place(stored.keyframe.frame, stored.T_world_camera, stored.path_m, words)
 
     def _is_due(self, T_world_camera: Float64) -> bool:
-        if not self._places:
+        if not len(self._places):
             return True
-        T = invert(self._places[-1].T_world_camera) @ T_world_camera
+        T = invert(self._places.T_world_camera[-1]) @ T_world_camera
         settings = self._settings.keyframes
         moved = float(np.linalg.norm(T[:3, 3])) >= settings.distance_m
         return moved or float(np.rad2deg(angle_rad(T))) >= settings.angle_deg
@@ -162,7 +154,7 @@ class LoopDetector:
         """The keyframe with the first candidate that is one place with it, if any is."""
         place, refused = self._place(new), []
         for old in self._candidates(place):
-            known = self._store.get(old.frame).keyframe
+            known = self._store.get(self._places.frames[old]).keyframe
             verdict = verify(known, new.keyframe, pair.camera, self._settings.verify)
             if verdict.loop is None:
                 refused.append(verdict.refused)
@@ -172,48 +164,29 @@ class LoopDetector:
                 refused.append("odometry contradicts")
         return replace(new, refused=tuple(refused))
 
-    def _candidates(self, place: _Place) -> list[_Place]:
-        """Old keyframes that may be near, most alike first."""
-        near = [old for old in self._places if self._may_be_near(old, place)]
-        if not near:
+    def _candidates(self, place: Place) -> list[int]:
+        """Numbers of old keyframes that may be near, most alike first."""
+        candidates = self._settings.candidates
+        near = self._places.near(place, self._settings)
+        if not near.any():
             return []
-        expected = likeness(place.words, self._places[-1].words)
-        least = self._settings.candidates.min_likeness * expected
-        ranked = sorted((-likeness(place.words, old.words), old.frame, old) for old in near)
-        chosen: list[_Place] = []
-        for negative, _, old in ranked:
-            if -negative < least or len(chosen) == self._settings.candidates.verified:
+        alike = self._places.likeness(place)
+        worth = np.flatnonzero(near & (alike >= candidates.min_likeness * alike[-1]))
+        chosen: list[int] = []
+        path_m = self._places.path_m
+        for number in worth[np.argsort(-alike[worth], kind="stable")].tolist():
+            gaps_m = np.abs(path_m[chosen] - path_m[number])
+            if gaps_m.min(initial=np.inf) >= candidates.apart_m:
+                chosen.append(number)
+            if len(chosen) == candidates.verified:
                 break
-            gaps = (abs(old.path_m - other.path_m) for other in chosen)
-            if min(gaps, default=np.inf) >= self._settings.candidates.apart_m:
-                chosen.append(old)
         return chosen
 
-    def _may_be_near(self, old: _Place, new: _Place) -> bool:
-        """Whether odometry could be so wrong that the two look at the same."""
-        settings = self._settings.candidates
-        path_m = new.path_m - old.path_m
-        if path_m < settings.min_path_m:
-            return False
-        drift = drift_over(path_m, self._settings.drift)
-        sigmas = self._settings.drift.sigmas
-        T = invert(old.T_world_camera) @ new.T_world_camera
-        far_m = float(np.linalg.norm(T[:3, 3])) - sigmas * drift.position_m
-        turned = float(angle_rad(T)) - sigmas * drift.angle_rad
-        return far_m <= settings.view_m and turned <= np.deg2rad(settings.view_deg)
-
-    def _possible(self, old: _Place, new: _Place, loop: Loop) -> bool:
-        T = invert(old.T_world_camera) @ new.T_world_camera
-        drift = drift_over(new.path_m - old.path_m, self._settings.drift)
+    def _possible(self, old: int, new: Place, loop: Loop) -> bool:
+        """Whether odometry can be as wrong as a loop says."""
+        T = invert(self._places.T_world_camera[old]) @ new.T_world_camera
+        drift = drift_over(new.path_m - float(self._places.path_m[old]), self._settings.drift)
         return is_possible(invert(T) @ loop.T_first_last, drift, ALIKE, self._settings.drift)
-
-
-def likeness(words: NDArray[np.uint32], others: NDArray[np.uint32]) -> float:
-    """Share of words that two pictures have in common, in [0, 1]."""
-    if not len(words) or not len(others):
-        return 0.0
-    shared = np.intersect1d(words, others, assume_unique=True).size
-    return float(shared / np.sqrt(len(words) * len(others)))
 
 
 def agreeing_loops(

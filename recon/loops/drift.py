@@ -49,9 +49,15 @@ def drift_over(path_m: float, settings: DriftSettings) -> Drift:
     The scale error is taken as constant, the heading as a random walk, whose position error
     is that of a straight drive, the worst there is: ``turn·√(path³/3)``.
     """
+    position_m, turn_rad = spread_over(np.array(path_m), settings)
+    return Drift(float(position_m), float(turn_rad))
+
+
+def spread_over(path_m: Float64, settings: DriftSettings) -> tuple[Float64, Float64]:
+    """The standard deviations of `drift_over` for many paths: of positions and of rotations."""
     turn = math.radians(settings.turn_deg)
-    position_m = math.hypot(settings.share * path_m, turn * math.sqrt(path_m**3 / 3.0))
-    return Drift(position_m, turn * math.sqrt(path_m))
+    position_m = np.hypot(settings.share * path_m, turn * np.sqrt(path_m**3 / 3.0))
+    return position_m, turn * np.sqrt(path_m)
 
 
 def is_possible(

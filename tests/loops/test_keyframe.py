@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.loops.detector import likeness
 from recon.loops.keyframe import make_keyframe, words_of
+from recon.loops.places import WordIndex
 from recon.loops.settings import CandidateSettings, KeyframeSettings
 from recon.structures import Disparity, Reason, RectifiedPair
 from tests.loops.conftest import LAP
@@ -21,16 +21,11 @@ def _words(block, frame: int) -> np.ndarray:
 def test_the_same_place_is_more_alike_than_any_other(block):
     here = _words(block, 3)
 
-    again = likeness(here, _words(block, LAP + 3))
-    elsewhere = [likeness(here, _words(block, frame)) for frame in (60, 100)]
+    index = WordIndex()
+    for frame in (LAP + 3, 60, 100):
+        index.add(_words(block, frame))
+    again, *elsewhere = index.likeness(here)
     assert again > 2 * max(elsewhere)
-
-
-def test_likeness_of_a_picture_with_itself_is_one(block):
-    words = _words(block, 3)
-
-    assert likeness(words, words) == 1.0
-    assert likeness(words, np.zeros(0, np.uint32)) == 0.0
 
 
 def test_features_are_spread_and_have_the_disparity_of_their_place(block):

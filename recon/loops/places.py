@@ -1,0 +1,131 @@
+"""The places that a drive has passed: which may be near, and which look alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.geometry.se3 import angle_rad, invert
+from recon.loops.drift import spread_over
+from recon.loops.settings import LoopSettings
+from recon.structures.arrays import Bool, Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """What stays in memory of a keyframe.
+
+    Attributes:
+        frame: Its frame.
+        T_world_camera: float64 (4, 4), by odometry.
+        path_m: Path up to it, as `doubtful_path` counts it.
+        words: uint32 (W,), sorted, each once.
+    """
+
+    frame: int
+    T_world_camera: Float64
+    path_m: float
+    words: NDArray[np.uint32]
+
+
+class Places:
+    """All places so far, in order; a question to thousands of them takes a millisecond or two."""
+
+    def __init__(self) -> None:
+        self._frames: list[int] = []
+        self._poses = np.empty((64, 4, 4))
+        self._path_m = np.empty(64)
+        self._words = WordIndex()
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def add(self, place: Place) -> None:
+        """Remember a place."""
+        count = len(self)
+        if count == len(self._path_m):
+            self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
+            self._path_m = np.concatenate([self._path_m, np.empty_like(self._path_m)])
+        self._poses[count], self._path_m[count] = place.T_world_camera, place.path_m
+        self._frames.append(place.frame)
+        self._words.add(place.words)
+
+    @property
+    def frames(self) -> list[int]:
+        """The frame of each place."""
+        return self._frames
+
+    @property
+    def T_world_camera(self) -> Float64:
+        """float64 (N, 4, 4)."""
+        return self._poses[: len(self)]
+
+    @property
+    def path_m(self) -> Float64:
+        """float64 (N,)."""
+        return self._path_m[: len(self)]
+
+    def near(self, place: Place, settings: LoopSettings) -> Bool:
+        """Whether odometry could be so wrong (N,) that each sees the same as a later place."""
+        way_m = place.path_m - self.path_m
+        sigma_m, sigma_rad = spread_over(np.maximum(way_m, 0.0), settings.drift)
+        T = invert(self.T_world_camera) @ place.T_world_camera
+        far_m = np.linalg.norm(T[:, :3, 3], axis=1) - settings.drift.sigmas * sigma_m
+        turned = angle_rad(T) - settings.drift.sigmas * sigma_rad
+        seen = settings.candidates
+        near = (far_m <= seen.view_m) & (turned <= np.deg2rad(seen.view_deg))
+        return np.asarray(near & (way_m >= seen.min_path_m))
+
+    def likeness(self, place: Place) -> Float64:
+        """Likeness (N,) of each to a place, in [0, 1]."""
+        return self._words.likeness(place.words)
+
+
+class WordIndex:
+    """Which picture has which words.
+
+    Runs of sorted words are merged when they are of one size, as in a binary counter, so that a
+    word is moved and looked for as often as the number of pictures has digits.
+
+    Ref:
+        O'Neil et al., "The log-structured merge-tree", Acta Informatica 1996.
+    """
+
+    def __init__(self) -> None:
+        self._counts: list[int] = []
+        self._runs: list[tuple[int, NDArray[np.uint32], NDArray[np.uint32]]] = []
+
+    def add(self, words: NDArray[np.uint32]) -> None:
+        """Take the words of the next picture, each once, sorted."""
+        owner = np.full(len(words), len(self._counts), np.uint32)
+        self._counts.append(len(words))
+        run = (1, np.asarray(words), owner)
+        while self._runs and self._runs[-1][0] == run[0]:
+            run = _merged(self._runs.pop(), run)
+        self._runs.append(run)
+
+    def likeness(self, words: NDArray[np.uint32]) -> Float64:
+        """Share of words (N,) that each picture has in common with another one, in [0, 1]."""
+        shared = np.zeros(len(self._counts))
+        for _, known, owners in self._runs:
+            begin, end = (np.searchsorted(known, words, side) for side in ("left", "right"))
+            # All places of words[k] in the run are begin[k], begin[k] + 1, … end[k] - 1.
+            found = end - begin
+            before = np.cumsum(found) - found
+            places = np.arange(found.sum()) + np.repeat(begin - before, found)
+            shared += np.bincount(owners[places], minlength=len(shared))
+        sizes = np.sqrt(np.array(self._counts, np.float64) * len(words))
+        return np.divide(shared, sizes, out=np.zeros(len(shared)), where=sizes > 0)
+
+
+def _merged(
+    one: tuple[int, NDArray[np.uint32], NDArray[np.uint32]],
+    other: tuple[int, NDArray[np.uint32], NDArray[np.uint32]],
+) -> tuple[int, NDArray[np.uint32], NDArray[np.uint32]]:
+    """Two runs as one."""
+    words, owners = (np.concatenate([one[k], other[k]]) for k in (1, 2))
+    # The stable sort sees that two parts are sorted, and merges them.
+    order = np.argsort(words, kind="stable")
+    return one[0] + other[0], words[order], owners[order]
