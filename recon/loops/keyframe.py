@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final
@@ -19,6 +20,10 @@ from recon.structures.arrays import Float32, Float64, UInt8, freeze
 _DESCRIPTOR_BYTES: Final = 32
 _EDGE_PX: Final = 16  # half of the patch that a descriptor looks at
 _SURPLUS: Final = 3  # corners to choose from, per feature
+# Up to 1.3⁴ = 2.9 times the size. OpenCV's eight scales, 1.2 apart, take a third longer, and 118
+# pairs of kitti_raw_0013's frames gave 111 loops instead of 110.
+_SCALE_STEP: Final = 1.3
+_SCALES: Final = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +74,14 @@ def make_keyframe(
     """
     orb = cv2.ORB.create(
         nfeatures=_SURPLUS * settings.features,
+        scaleFactor=_SCALE_STEP,
+        nlevels=_SCALES,
         edgeThreshold=_EDGE_PX,
         fastThreshold=settings.fast_threshold,
     )
     corners = _spread(orb.detect(pair.left), pair.left.shape, settings)
     described, descriptors = orb.compute(pair.left, corners)
-    uv = np.array([c.pt for c in described], np.float32).reshape(-1, 2)
+    uv = _places_of(described)
     if descriptors is None:
         descriptors = np.zeros((0, _DESCRIPTOR_BYTES), np.uint8)
     uvd = np.column_stack([uv, _disparity(disparity, uv, settings, pair.camera)])
@@ -111,16 +118,23 @@ def _chosen_bits(tables: int, bits: int) -> NDArray[np.intp]:
     return np.resize(shuffled, tables * bits)
 
 
-def _spread(corners: Any, shape: tuple[int, ...], settings: KeyframeSettings) -> list[Any]:
+def _spread(corners: Sequence[Any], shape: tuple[int, ...], settings: KeyframeSettings) -> Any:
     """The strongest corners of each cell, in turn, until there are enough."""
-    columns = -(-shape[1] // settings.cell_px)
-    by_cell: dict[int, list[Any]] = {}
-    for corner in sorted(corners, key=lambda c: (-c.response, c.pt, c.octave)):
-        u, v = (int(x) // settings.cell_px for x in corner.pt)
-        by_cell.setdefault(v * columns + u, []).append(corner)
-    ranked = [(rank, cell) for cell, found in by_cell.items() for rank in range(len(found))]
-    chosen = sorted(ranked)[: settings.features]
-    return [by_cell[cell][rank] for rank, cell in chosen]
+    uv = _places_of(corners)
+    strength = np.array([corner.response for corner in corners], np.float32)
+    octave = np.array([corner.octave for corner in corners], np.int32)
+    column, row = (uv // settings.cell_px).astype(np.int64).T
+    cell = row * -(-shape[1] // settings.cell_px) + column
+    by_cell = np.lexsort((octave, uv[:, 1], uv[:, 0], -strength, cell))
+    sizes = np.unique(cell, return_counts=True)[1]
+    rank = np.arange(len(cell)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    chosen = by_cell[np.lexsort((cell[by_cell], rank))[: settings.features]]
+    return [corners[number] for number in chosen.tolist()]
+
+
+def _places_of(corners: Sequence[Any]) -> Float32:
+    """Columns and rows (N, 2); also of none, for which OpenCV gives no array."""
+    return np.asarray(cv2.KeyPoint.convert(corners), np.float32).reshape(-1, 2)
 
 
 def _disparity(

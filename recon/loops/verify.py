@@ -84,8 +84,10 @@ def _aligned(
 ) -> Alignment | str:
     """The motion that the matches prove, or why they prove none."""
     T_there = locate(first.xyz, last.uvd[:, :2], camera, settings)
+    if T_there is None:
+        return "no common motion"
     T_back = locate(last.xyz, first.uvd[:, :2], camera, settings)
-    if T_there is None or T_back is None:
+    if T_back is None:
         return "no common motion"
     if not _inverse(T_there, T_back, settings):
         return "there and back differ"
