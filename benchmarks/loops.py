@@ -14,8 +14,9 @@ import argparse
 import json
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -23,14 +24,16 @@ import numpy as np
 
 from recon.evaluation import evaluate_map
 from recon.geometry import se3
+from recon.geometry.alignment import fit_points
 from recon.geometry.transform import transform_cloud
 from recon.mapping import add_floor, estimate_ground_surface, flatten, fusion_range_m
 from recon.odometry import Odometry, OdometryFrame, OdometryResult, make_odometry
 from recon.pipeline.config import ReconConfig, load_config
 from recon.pipeline.sequence import MappedSequence, map_sequence
 from recon.pipeline.workspace import Workspace
+from recon.reports.plots import grid_figure, loops_figure
 from recon.sources.synthetic import SyntheticSource
-from recon.structures import OCCUPIED, PointCloud, StereoPair, Trajectory
+from recon.structures import OCCUPIED, OccupancyGrid, PointCloud, StereoPair, Trajectory
 from recon.structures.arrays import Float64
 from recon.synthetic.truth import true_surface
 
@@ -83,9 +86,10 @@ class Drifting:
 def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(arguments)
     result: dict[str, Any] = {"width": options.width, "seed": options.seed}
-    block = Filmed(config_of(options, "block").street)
-    result["block"] = closing(block, config_of(options, "block"), 0.0)
-    result["drift"] = closing(block, config_of(options, "block"), options.drift_percent)
+    config = config_of(options, "block")
+    block = Filmed(config.street)
+    result["block"] = closing(block, config, 0.0, options.pictures)
+    result["drift"] = closing(block, config, options.drift_percent, options.pictures)
     result["alike"] = deceiving(Filmed(config_of(options, "alike").street), options)
     print(json.dumps(result, indent=2) if options.json else table(result))
 
@@ -99,6 +103,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--drift-percent", type=float, default=1.0, help="planted drift; it turns as many °/100 m"
     )
+    parser.add_argument("--pictures", type=Path, help="draw paths and grids into this folder")
     return parser.parse_args(arguments)
 
 
@@ -119,22 +124,18 @@ def config_of(options: argparse.Namespace, drive: str) -> ReconConfig:
     return load_config(None, texts)
 
 
-def closing(source: Filmed, config: ReconConfig, drift_percent: float) -> dict[str, Any]:
+def closing(
+    source: Filmed, config: ReconConfig, drift_percent: float, pictures: Path | None
+) -> dict[str, Any]:
     """A drive around a block, before and after closing."""
     mapped, seconds = mapped_with(source, config, drift_percent)
     if mapped.loops is None:
         raise SystemExit("loop closure is off")
     surface = true_surface(source.camera, range_m=fusion_range_m(mapped.camera, config.fusion))
-    before = MappedSequence(
-        mapped.loops.odometry,
-        mapped.health,
-        mapped.submaps,
-        config,
-        mapped.T_map_world,
-        mapped.camera,
-        mapped.sample,
-        mapped.seconds,
-    )
+    odometry = mapped.loops.odometry
+    before = replace(mapped, trajectory=odometry, T_corrected_world=None, loops=None)
+    if pictures is not None:
+        draw(pictures, "drift" if drift_percent else "block", before, mapped)
     frames = len(mapped.trajectory)
     return {
         "path_m": round(source.trajectory.path_length_m, 2),
@@ -188,7 +189,8 @@ def quality(mapped: MappedSequence, source: Filmed, surface: PointCloud) -> dict
     """How far path and maps are from the truth."""
     truth, path = source.trajectory, mapped.trajectory
     off_m = np.linalg.norm(path.positions_m - truth.positions_m, axis=1)
-    T_true_world = rigid_fit(path.positions_m, truth.positions_m)
+    # A map is judged by its shape: the error of the first metres' heading turns all of it.
+    T_true_world = fit_points(path.positions_m, truth.positions_m).T_to_from
     cells, obstacles = footprints(mapped, surface, source, T_true_world)
     cloud = transform_cloud(mapped.cloud, T_true_world, frame="world")
     return {
@@ -212,18 +214,6 @@ def scores(cloud: PointCloud, surface: PointCloud, threshold_m: float) -> dict[s
     }
 
 
-def rigid_fit(positions_m: Float64, true_m: Float64) -> Float64:
-    """``T_true_world`` (4, 4) that brings a path closest to the true one (Umeyama).
-
-    A map is judged by its shape: the error of the first metres' heading turns all of it.
-    """
-    centre, true_centre = positions_m.mean(axis=0), true_m.mean(axis=0)
-    U, _, Vt = np.linalg.svd((true_m - true_centre).T @ (positions_m - centre))
-    U[:, -1] *= np.sign(np.linalg.det(U @ Vt))
-    R = U @ Vt
-    return se3.make_transform(R, true_centre - R @ centre)
-
-
 def rms_m(positions_m: Float64, truth: Trajectory) -> float:
     off_m = np.linalg.norm(positions_m - truth.positions_m, axis=1)
     return float(np.sqrt(np.mean(off_m**2)))
@@ -233,12 +223,7 @@ def footprints(
     mapped: MappedSequence, surface: PointCloud, source: Filmed, T_true_world: Float64
 ) -> tuple[PointCloud, PointCloud]:
     """Occupied cells of the flat grid, and the obstacles that were seen, both on the ground."""
-    config, T = mapped.config, mapped.T_map_world
-    cloud = transform_cloud(mapped.cloud, T, frame="map")
-    path_m = se3.apply(T, mapped.trajectory.positions_m)
-    floor = add_floor(cloud, mapped.voxels, config.ground)
-    ground = estimate_ground_surface(floor, path_m, config.ground)
-    grid = flatten(mapped.voxels, ground, config.grid)
+    T, grid = mapped.T_map_world, flat_grid(mapped)
     row, column = np.nonzero(grid.cells == OCCUPIED)
     cells_m = (np.column_stack([column, row]) + 0.5) * grid.resolution_m + grid.origin_m
     level = np.column_stack([cells_m, np.full(len(cells_m), -source.settings.camera_height_m)])
@@ -248,6 +233,29 @@ def footprints(
     height_m = true[:, 2] + source.settings.camera_height_m
     standing = (height_m > BAND_M[0]) & (height_m < BAND_M[1])
     return on_the_ground(laid[:, :2]), on_the_ground(true[standing, :2])
+
+
+def flat_grid(mapped: MappedSequence) -> OccupancyGrid:
+    """The flat grid of a drive."""
+    config, T = mapped.config, mapped.T_map_world
+    cloud = transform_cloud(mapped.cloud, T, frame="map")
+    path_m = se3.apply(T, mapped.trajectory.positions_m)
+    floor = add_floor(cloud, mapped.voxels, config.ground)
+    ground = estimate_ground_surface(floor, path_m, config.ground)
+    return flatten(mapped.voxels, ground, config.grid)
+
+
+def draw(folder: Path, name: str, before: MappedSequence, after: MappedSequence) -> None:
+    """Path and grids before and after closing, to look at."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if after.loops is None:
+        return
+    pairs = [(loop.first, loop.last) for loop in after.loops.closure.closed]
+    path = loops_figure(before.trajectory, after.trajectory, pairs, after.T_map_world)
+    (folder / f"{name}_path.png").write_bytes(path)
+    for moment, mapped in (("before", before), ("after", after)):
+        grid = grid_figure(flat_grid(mapped), mapped.trajectory, mapped.T_map_world)
+        (folder / f"{name}_grid_{moment}.png").write_bytes(grid)
 
 
 def on_the_ground(xy_m: Float64) -> PointCloud:

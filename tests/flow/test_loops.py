@@ -1,0 +1,145 @@
+"""A drive around a block closes, broken off or not; a street that repeats itself deceives none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from recon.formats.trajectory import read_tum
+from recon.pipeline.config import load_config
+from recon.pipeline.frame import FrameReconstructor
+from recon.pipeline.map_run import MapOptions, MapRun, run_map
+from recon.pipeline.observer import FrameResult
+from recon.reports import present_map
+from recon.sources import open_source
+from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.synthetic import StreetSettings
+
+pytestmark = pytest.mark.slow
+
+RIG = {"width_px": 480, "height_px": 180, "focal_px": 270.0, "smooth_edges": False}
+BLOCK = StreetSettings(path="block", block_m=(64.0, 60.0), frames=250, seed=1, **RIG)
+LAP = 230
+"""Frames of a lap."""
+ALIKE = StreetSettings(path="straight", repeat_m=40.0, frames=80, seed=1, **RIG)
+FILES = [
+    "trajectory_kitti.txt",
+    "trajectory_tum.txt",
+    "map/cloud.ply",
+    "map/grid.pgm",
+    "map/octomap.ot",
+    "map/octomap.bt",
+]
+
+
+class _Breaks:
+    """An observer that interrupts a run before a frame is reported."""
+
+    def __init__(self, frame: int) -> None:
+        self.frame = frame
+
+    def on_start(self, name: str, total: int) -> None: ...
+
+    def on_frame(self, result: FrameResult) -> None:
+        if result.index == self.frame:
+            raise KeyboardInterrupt
+
+    def on_stage(self, name: str) -> None: ...
+
+    def on_finish(self) -> None: ...
+
+
+def _run(drive: Path, out: Path, *settings: str, resume: bool = False, breaks: int = -1) -> MapRun:
+    options = MapOptions(
+        out=out, mesh=False, resume=resume, observers=(_Breaks(breaks),), present=present_map
+    )
+    return run_map(open_source(drive), load_config(None, settings), options)
+
+
+def _content(folder: Path, *more: str) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in [*FILES, *more]}
+
+
+@pytest.fixture(scope="module")
+def block(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("block")
+    write_kitti(SyntheticSource(BLOCK), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def closed(block: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MapRun, int]:
+    """Folder and run of the drive, and how many pairs were matched."""
+    folder = tmp_path_factory.mktemp("closed")
+    match = FrameReconstructor.reconstruct
+    with patch.object(FrameReconstructor, "reconstruct", autospec=True, side_effect=match) as asked:
+        run = _run(block, folder)
+    return folder, run, asked.call_count
+
+
+def test_a_drive_around_a_block_closes_to_a_fifth_of_a_percent(
+    closed: tuple[Path, MapRun, int],
+) -> None:
+    folder, run, _ = closed
+    assert run.truth is not None
+    truth = run.truth.trajectory
+    assert truth is not None
+    limit_m = 0.002 * truth.path_length_m
+
+    before = read_tum(folder / "trajectory_odometry_tum.txt").positions_m[-1]
+    after = read_tum(folder / "trajectory_tum.txt").positions_m[-1]
+    assert np.linalg.norm(after - truth.positions_m[-1]) < limit_m
+    # Odometry alone is not that good, or there would be nothing to show.
+    assert np.linalg.norm(before - truth.positions_m[-1]) > limit_m
+
+
+def test_loops_stand_in_summary_report_and_file(closed: tuple[Path, MapRun, int]) -> None:
+    folder, run, _ = closed
+    figures = json.loads((folder / "summary.json").read_text())["loops"]
+    edges = json.loads((folder / "loops.json").read_text())
+
+    assert figures["closed"] == len(edges["closed"]) >= 5
+    assert figures["refused_by_graph"] == len(edges["refused"]) == 0
+    assert 0.3 < figures["largest_correction_m"] < 5.0
+    for edge in edges["closed"]:
+        assert abs(edge["last"] - edge["first"] - LAP) <= 8
+    page = (folder / "report.html").read_text()
+    assert f"{figures['closed']} of {figures['found']}" in page
+    assert "times the camera came back to a place" in page
+    assert run.warnings == ()
+
+
+def test_the_map_is_rebuilt_without_matching_again(closed: tuple[Path, MapRun, int]) -> None:
+    assert closed[2] == BLOCK.frames
+
+
+def test_a_drive_that_was_broken_off_after_its_loops_closes_in_the_same_way(
+    block: Path, closed: tuple[Path, MapRun, int], tmp_path: Path
+) -> None:
+    with pytest.raises(KeyboardInterrupt, match="--resume"):
+        _run(block, tmp_path, breaks=LAP + 12)
+    run = _run(block, tmp_path, resume=True)
+
+    more = ("loops.json", "trajectory_odometry_tum.txt")
+    assert _content(tmp_path, *more) == _content(closed[0], *more)
+    assert run.summary["loops"] == closed[1].summary["loops"]
+
+
+def test_a_street_that_repeats_itself_is_mapped_as_if_nobody_looked_for_loops(
+    tmp_path: Path,
+) -> None:
+    drive = tmp_path / "drive"
+    write_kitti(SyntheticSource(ALIKE), drive)
+    looked = _run(drive, tmp_path / "looked")
+    _run(drive, tmp_path / "off", "loops.enabled=false")
+    blind = _run(drive, tmp_path / "blind", "loops.drift.share=1", "loops.drift.turn_deg=5")
+
+    assert looked.summary["loops"]["found"] == 0
+    assert _content(tmp_path / "looked") == _content(tmp_path / "off")
+    assert not (tmp_path / "looked" / "loops.json").exists()
+    # The trap is a real one: pictures and shapes alone would have closed it.
+    assert blind.summary["loops"]["found"] >= 3
