@@ -10,16 +10,14 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from recon.geometry.se3 import angle_rad, invert
-from recon.loops.drift import Drift, drift_over, is_possible
+from recon.loops.agree import ALIKE, agreeing_loops
+from recon.loops.drift import drift_over, is_possible
 from recon.loops.keyframe import Keyframe, make_keyframe, words_of
 from recon.loops.places import Place, Places
 from recon.loops.settings import LoopSettings
 from recon.loops.verify import Loop, verify
 from recon.structures import Disparity, RectifiedPair
 from recon.structures.arrays import Float64
-
-ALIKE = Drift(0.3, np.deg2rad(1.0))
-"""Standard deviation of a verified loop that drift is compared with: small, and never nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,47 +185,3 @@ class LoopDetector:
         T = invert(self._places.T_world_camera[old]) @ new.T_world_camera
         drift = drift_over(new.path_m - float(self._places.path_m[old]), self._settings.drift)
         return is_possible(invert(T) @ loop.T_first_last, drift, ALIKE, self._settings.drift)
-
-
-def agreeing_loops(
-    loops: list[Loop], poses: dict[int, tuple[Float64, float]], settings: LoopSettings
-) -> list[Loop]:
-    """The loops that enough others of other keyframes confirm.
-
-    Two neighbouring loops and the odometry between their ends make a ring that must close
-    within the drift over its two short ways; a false match would have to be wrong in the same
-    way time after time.
-
-    Args:
-        loops: Verified loops.
-        poses: For each keyframe of a loop its pose by odometry, and the path up to it.
-        settings: How near neighbours are, and how many must agree.
-    """
-    paths_m = np.array([(poses[loop.first][1], poses[loop.last][1]) for loop in loops])
-    agreeing = []
-    for number, loop in enumerate(loops):
-        apart_m = np.abs(paths_m - paths_m[number]).max(axis=1)
-        others = [loops[k] for k in np.flatnonzero(apart_m <= settings.agree_m)]
-        same = {other.last for other in others if _agree(loop, other, poses, settings)}
-        if len(same) >= settings.min_agreeing:
-            agreeing.append(loop)
-    return agreeing
-
-
-def _agree(
-    one: Loop, other: Loop, poses: dict[int, tuple[Float64, float]], settings: LoopSettings
-) -> bool:
-    """Whether two neighbouring loops tell the same."""
-    T_lasts, lasts_m = _between(one.last, other.last, poses)
-    T_firsts, firsts_m = _between(one.first, other.first, poses)
-    ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
-    drift = drift_over(lasts_m + firsts_m, settings.drift)
-    return is_possible(ring, drift, ALIKE, settings.drift)
-
-
-def _between(
-    first: int, last: int, poses: dict[int, tuple[Float64, float]]
-) -> tuple[Float64, float]:
-    """``T_first_last`` by odometry, and the path between the two."""
-    (T_world_first, from_m), (T_world_last, to_m) = poses[first], poses[last]
-    return invert(T_world_first) @ T_world_last, abs(to_m - from_m)

@@ -65,6 +65,7 @@ class DriveLoops:
         return {
             "keyframes": self.keyframes,
             "found": self.found,
+            "unconfirmed": self.found - len(self.closure.closed) - len(self.closure.refused),
             "closed": len(self.closure.closed),
             "refused_by_graph": len(self.closure.refused),
             "refused": dict(sorted(self.refused.items())),
