@@ -29,7 +29,8 @@ class OdometryHealth:
     """How far the pose of one frame can be trusted. NaN = does not apply or not measured.
 
     Attributes:
-        ok: False where the pose rests on no measurement (it is then extrapolated).
+        ok: False where the pose is not to be trusted: it rests on no measurement (it is then
+            extrapolated), or the picture speaks against it.
         tracks: Features followed from the last frame.
         inliers: Features that agree with the visual motion.
         reprojection_px: Their median reprojection error.

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from recon.errors import SettingsError
+from recon.odometry.checked import CheckedOdometry
 from recon.odometry.fused import FusedOdometry
 from recon.odometry.kiss import KissOdometry
 from recon.odometry.protocol import Odometry
@@ -20,7 +21,7 @@ ODOMETRIES: Final[dict[str, Callable[[OdometrySettings], Odometry]]] = {
 
 
 def make_odometry(name: str, settings: OdometrySettings | None = None) -> Odometry:
-    """Make the odometry of a name.
+    """Make the odometry of a name; it doubts its poses.
 
     Args:
         name: A key of `ODOMETRIES`.
@@ -32,4 +33,5 @@ def make_odometry(name: str, settings: OdometrySettings | None = None) -> Odomet
     if name not in ODOMETRIES:
         choices = ", ".join(sorted(ODOMETRIES))
         raise SettingsError("unknown odometry", got=repr(name), expected=f"one of: {choices}")
-    return ODOMETRIES[name](settings or OdometrySettings())
+    settings = settings or OdometrySettings()
+    return CheckedOdometry(ODOMETRIES[name](settings), settings.trust)

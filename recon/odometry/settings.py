@@ -94,6 +94,37 @@ class PoseSettings(Settings):
     )
 
 
+class AgreementSettings(Settings):
+    """How the whole picture is asked whether a motion explains it."""
+
+    stride_px: int = Field(5, ge=1, le=32, description="Every n-th row and column is looked at")
+    patch_px: int = Field(48, ge=8, le=512, description="Edge of a patch")
+    min_pixels: int = Field(24, ge=4, description="Pixels with a disparity that a patch needs")
+    min_texture: float = Field(
+        3.0,
+        gt=0.0,
+        description="A patch is asked if its grey values change, in the direction in which they "
+        "change least, by so much more than noise makes them (in squares)",
+    )
+    min_correlation: float = Field(
+        0.6, gt=0.0, lt=1.0, description="Correlation from which a patch looks alike"
+    )
+    min_telling: int = Field(8, ge=1, description="Fewer patches tell nothing")
+    min_share: float = Field(
+        0.6, gt=0.0, lt=1.0, description="Motions that explain fewer patches are not trusted"
+    )
+
+
+class TrustSettings(Settings):
+    """Which poses are trusted. Frames with others go into no map."""
+
+    max_sigma_m: float = Field(
+        0.05, gt=0.0, description="Largest standard deviation of a motion that is trusted, plus"
+    )
+    max_sigma_share: float = Field(0.05, ge=0.0, description="this share of its length")
+    agreement: AgreementSettings = AgreementSettings()
+
+
 class VisualSettings(Settings):
     """Visual odometry: corners, tracks, pose, window."""
 
@@ -223,6 +254,7 @@ class OdometrySettings(Settings):
     """The odometries: which one, and how each works."""
 
     method: OdometryName = Field("fused", description="visual, kiss or fused")
+    trust: TrustSettings = TrustSettings()
     visual: VisualSettings = VisualSettings()
     kiss: KissSettings = KissSettings()
     fused: FusedSettings = FusedSettings()

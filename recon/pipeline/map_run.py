@@ -245,7 +245,7 @@ def _summary(run: MapRun) -> dict[str, Any]:
         "fps": frames / seconds if seconds > 0 else None,
         "path_length_m": run.mapped.trajectory.path_length_m,
         "faces": 0 if run.mesh is None else len(run.mesh.faces),
-        "frames_not_measured": sum(not record.ok for record in run.mapped.health),
+        "frames_not_trusted": sum(not record.ok for record in run.mapped.health),
         "T_map_world": run.mapped.T_map_world.tolist(),
         "warnings": list(run.warnings),
     }

@@ -70,10 +70,12 @@ class Mapper:
         T_world_camera = registered.T_world_camera
         health = replace(registered.health, warnings=(*frame.warnings, *registered.health.warnings))
         with stage("map"):
-            near = frame.cloud.select(frame.cloud.xyz[:, 2] <= self._fusion_range_m)
-            cloud_world = transform_cloud(near, T_world_camera, frame="world")
             builder = self._builder_from(frame)
-            builder.integrate(cloud_world, frame.cloud, T_world_camera)
+            # A map that is wrong is worse than one with a hole.
+            cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))
+            near = cloud.select(cloud.xyz[:, 2] <= self._fusion_range_m)
+            cloud_world = transform_cloud(near, T_world_camera, frame="world")
+            builder.integrate(cloud_world, cloud, T_world_camera)
         with stage("store"):
             if builder.full:
                 self.submaps.add(builder.close())

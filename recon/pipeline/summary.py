@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, is_dataclass
-from typing import Any
+from typing import Any, Final
 
 from recon.odometry import OdometryHealth
 from recon.pipeline.machine import peak_memory_mb
 from recon.pipeline.stopwatch import Stopwatch
+
+_MANY: Final = 0.1
+"""Share of frames without a trusted pose from which the whole drive is in question."""
 
 
 def plain(value: Any) -> Any:
@@ -42,7 +45,13 @@ def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:
     for first, last in _stretches(bad):
         why = "; ".join(dict.fromkeys(health[first].notes)) or "no reason recorded"
         where = _frames(first, last)
-        lines.append(f"{where}: pose not measured, extrapolated from the frames before ({why})")
+        lines.append(f"{where}: the pose is not to be trusted, nothing of it is mapped ({why})")
+    if len(bad) > _MANY * len(health):
+        lines.insert(
+            0,
+            f"PATH AND MAP ARE NOT TO BE TRUSTED: the poses of {len(bad)} of {len(health)} frames "
+            "are not, and an error once made stays in all that follows",
+        )
     return lines
 
 

@@ -58,7 +58,7 @@ def test_the_trajectory_follows_the_truth(demo: tuple[Path, dict[str, Any]]) -> 
     _, summary = demo
     assert 0.0 < summary["trajectory"]["t_rel_percent"] < 0.7
     assert 0.0 < summary["trajectory"]["ate_m"] < 0.15
-    assert summary["frames_not_measured"] == 0
+    assert summary["frames_not_trusted"] == 0
 
 
 def test_the_map_lies_on_the_true_surface(demo: tuple[Path, dict[str, Any]]) -> None:

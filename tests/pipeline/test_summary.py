@@ -26,9 +26,17 @@ def test_plain_values_survive_json_and_nan_becomes_null() -> None:
 
 def test_lost_frames_are_named_by_stretches() -> None:
     good, lost = OdometryHealth(), OdometryHealth(ok=False, notes=("dark",))
-    lines = health_warnings([good, lost, lost, good, lost])
+    lines = health_warnings([good, lost, lost, good, lost, *[good] * 30])
     assert [line.split(":")[0] for line in lines] == ["frames 1-2", "frame 4"]
     assert all("dark" in line for line in lines)
+
+
+def test_a_drive_with_many_lost_frames_is_called_what_it_is_first() -> None:
+    good, lost = OdometryHealth(), OdometryHealth(ok=False, notes=("dark",))
+    first, *others = health_warnings([good, *[lost] * 3, *[good] * 16])
+    assert first.startswith("PATH AND MAP ARE NOT TO BE TRUSTED")
+    assert "3 of 20 frames" in first
+    assert len(others) == 1
 
 
 def test_a_healthy_drive_has_no_warning() -> None:

@@ -1,0 +1,183 @@
+"""Whether a motion explains the pictures: every patch is asked, not the features that gave it.
+
+Features may agree on a motion that is not the camera's: that of a lorry ahead, or none at all
+where they slide along the edge of a road. The rest of the picture then tells: shifted by the
+motion, its patches do not look like what is seen where they should lie.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.geometry.projection import project, unproject
+from recon.geometry.se3 import apply, invert
+from recon.geometry.triangulation import depth_from_disparity
+from recon.odometry.settings import AgreementSettings
+from recon.structures import Disparity, RectifiedCamera
+from recon.structures.arrays import Float64, UInt8
+
+Int64 = NDArray[np.int64]
+
+_LEAST_NOISE = 0.5
+"""Grey values: rounding alone leaves 0.3."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How many patches of a picture a motion explains.
+
+    Attributes:
+        telling: Patches with texture in all directions, which can tell motions apart.
+        share: Share of them that look alike where the motion takes them; NaN = there is none.
+    """
+
+    telling: int
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """One frame as the check needs it.
+
+    Attributes:
+        left: uint8 (H, W).
+        disparity: Its disparity.
+    """
+
+    left: UInt8
+    disparity: Disparity
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Pixels of a picture that another picture should show too.
+
+    Attributes:
+        patch: int64 (N,), number of the patch of each.
+        before: float64 (N,), grey values in the one.
+        now: float64 (N,), grey values in the other.
+        slope: float64 (N, 2), change of the first per pixel to the right and down.
+    """
+
+    patch: Int64
+    before: Float64
+    now: Float64
+    slope: Float64
+
+
+def explain_motion(
+    before: Sight,
+    left: UInt8,
+    T_before_now: Float64,
+    camera: RectifiedCamera,
+    settings: AgreementSettings,
+) -> Agreement:
+    """Count the patches of the last picture that a motion takes to where they are in this one.
+
+    Every pixel with a disparity is taken along by the motion. A patch is explained where its grey
+    values correlate with those that are there, noise set aside; brightness and contrast may
+    change. Patches without texture, or with edges of one direction alone, look alike after
+    many motions and are not counted.
+
+    Args:
+        before: The last frame.
+        left: uint8 (H, W), this picture.
+        T_before_now: float64 (4, 4), the motion in question.
+        camera: The rectified camera.
+        settings: Patches, texture, correlation.
+    """
+    samples = _sample(before, left, T_before_now, camera, settings)
+    count = np.bincount(samples.patch)
+    noise = (noise_sigma(before.left), noise_sigma(left))
+    telling = (count >= settings.min_pixels) & _textured(samples, count, noise[0], settings)
+    if not telling.any():
+        return Agreement(0, float("nan"))
+    alike = _correlation(samples, count, noise)[telling] >= settings.min_correlation
+    return Agreement(int(telling.sum()), float(alike.mean()))
+
+
+def noise_sigma(grey: UInt8) -> float:
+    """Standard deviation of the noise of a picture, grey values.
+
+    From the median of its mixed fourth differences, in which slopes and straight edges cancel.
+
+    Ref:
+        Immerkær, "Fast noise variance estimation", CVIU 1996.
+    """
+    rows = grey.astype(np.int16)
+    across = rows[:, :-2:2] - 2 * rows[:, 1:-1:2] + rows[:, 2::2]
+    mixed = across[:-2:2] - 2 * across[1:-1:2] + across[2::2]
+    if not mixed.size:
+        return _LEAST_NOISE
+    # The weights' squares sum to 36; 0.6745 of a normal deviation is its median magnitude.
+    return max(float(np.median(np.abs(mixed))) / (6.0 * 0.6745), _LEAST_NOISE)
+
+
+def _sample(
+    before: Sight,
+    left: UInt8,
+    T_before_now: Float64,
+    camera: RectifiedCamera,
+    settings: AgreementSettings,
+) -> _Samples:
+    """Every n-th pixel with a disparity that the motion leaves in the picture."""
+    step, (height, width) = settings.stride_px, left.shape
+    # Slopes need a neighbour on either side.
+    row, column = np.nonzero(before.disparity.valid[1:-1:step, 1:-1:step])
+    row, column = 1 + step * row, 1 + step * column
+    depth_m = depth_from_disparity(before.disparity.values[row, column], camera)
+    xyz = unproject(column, row, depth_m.astype(np.float64), camera)
+    u, v, _ = project(apply(invert(T_before_now), xyz), camera)
+    with np.errstate(invalid="ignore"):
+        inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
+    row, column, u, v = row[inside], column[inside], u[inside], v[inside]
+    grey = before.left.astype(np.int16)
+    right, down = (grey[row, column + 1], grey[row + 1, column])
+    slope = np.stack([right - grey[row, column - 1], down - grey[row - 1, column]], axis=1)
+    patch = (row // settings.patch_px) * -(-width // settings.patch_px)
+    patch += column // settings.patch_px
+    return _Samples(
+        patch, grey[row, column].astype(np.float64), _interpolated(left, u, v), 0.5 * slope
+    )
+
+
+def _interpolated(image: UInt8, u: Float64, v: Float64) -> Float64:
+    """Grey values (N,) between pixels."""
+    if not len(u):
+        return np.zeros(0)
+    # A map of more than 32767 rows is refused, so the places fill rows of a picture.
+    rows = -(-len(u) // 1024)
+    columns, lines = (np.resize(x.astype(np.float32), (rows, 1024)) for x in (u, v))
+    grey = np.asarray(cv2.remap(image, columns, lines, cv2.INTER_LINEAR), dtype=np.float64)
+    return grey.reshape(-1)[: len(u)]
+
+
+def _textured(
+    samples: _Samples, count: Int64, sigma: float, settings: AgreementSettings
+) -> NDArray[np.bool_]:
+    """Patches that change in every direction by more than the noise does."""
+    x, y = samples.slope.T
+    xx, yy, xy = (_mean(samples, values, count) for values in (x * x, y * y, x * y))
+    least = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
+    # Half the difference of two noisy values has half their variance.
+    return np.asarray(least > settings.min_texture * 0.5 * sigma**2)
+
+
+def _correlation(samples: _Samples, count: Int64, noise: tuple[float, float]) -> Float64:
+    """Correlation (P,) of what a patch shows in the two pictures, their noise set aside."""
+    one, other = samples.before, samples.now
+    mean, mean_other = (_mean(samples, values, count) for values in (one, other))
+    both = _mean(samples, one * other, count) - mean * mean_other
+    power = _mean(samples, one**2, count) - mean**2 - noise[0] ** 2
+    power_other = _mean(samples, other**2, count) - mean_other**2 - noise[1] ** 2
+    floor = _LEAST_NOISE**2
+    return np.asarray(both / np.sqrt(np.maximum(power, floor) * np.maximum(power_other, floor)))
+
+
+def _mean(samples: _Samples, values: Float64, count: Int64) -> Float64:
+    """Mean of values (N,) in each patch; 0 in empty ones."""
+    return np.asarray(np.bincount(samples.patch, values) / np.maximum(count, 1))

@@ -1,0 +1,77 @@
+"""An odometry whose poses are doubted: what is unsure, or what the picture is against, is said."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from recon.geometry.se3 import invert
+from recon.odometry.agreement import Sight, explain_motion
+from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
+from recon.odometry.settings import TrustSettings
+from recon.structures.arrays import Float64
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedState:
+    """What is kept from frame to frame.
+
+    Attributes:
+        sight: The last frame.
+        T_world_camera: float64 (4, 4), its pose.
+    """
+
+    sight: Sight
+    T_world_camera: Float64
+
+
+class CheckedOdometry:
+    """Asks of every motion how sure it is, and whether the picture bears it out.
+
+    Poses stay as they are; ``health.ok`` and its notes say which are not to be trusted.
+
+    Args:
+        odometry: Finds the poses.
+        settings: What is trusted.
+    """
+
+    def __init__(self, odometry: Odometry, settings: TrustSettings) -> None:
+        self._odometry = odometry
+        self._settings = settings
+        self._state: CheckedState | None = None
+
+    def register(self, frame: OdometryFrame) -> OdometryResult:
+        """Register the next frame, and doubt the result."""
+        result, state = self._odometry.register(frame), self._state
+        sight = Sight(frame.pair.left, frame.disparity)
+        self._state = CheckedState(sight, result.T_world_camera)
+        if state is None or not result.health.ok:
+            return result
+        T_before_now = invert(state.T_world_camera) @ result.T_world_camera
+        doubts = self._doubts(result.health, state.sight, frame, T_before_now)
+        notes = (*result.health.notes, *doubts)
+        return replace(result, health=replace(result.health, ok=not doubts, notes=notes))
+
+    def _doubts(
+        self, health: OdometryHealth, before: Sight, frame: OdometryFrame, T_before_now: Float64
+    ) -> list[str]:
+        """What speaks against a motion; nothing, where it is to be trusted."""
+        settings = self._settings
+        length_m = float(np.linalg.norm(T_before_now[:3, 3]))
+        if health.sigma_m > settings.max_sigma_m + settings.max_sigma_share * length_m:
+            return [f"the motion is known to {health.sigma_m:.2f} m only"]
+        camera, agreement = frame.pair.camera, settings.agreement
+        found = explain_motion(before, frame.pair.left, T_before_now, camera, agreement)
+        if found.telling >= agreement.min_telling:
+            return _contradiction(found.share, found.telling, agreement.min_share)
+        # A motion of features says how sure it is; any other has nothing to show for itself here.
+        if np.isfinite(health.sigma_m):
+            return []
+        return [f"only {found.telling} patches of the picture can tell one motion from another"]
+
+
+def _contradiction(share: float, telling: int, min_share: float) -> list[str]:
+    if share >= min_share:
+        return []
+    return [f"only {100 * share:.0f} % of {telling} patches of the picture moved like that"]
