@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Json
+from recon.cli.options import Json, parse_numbers
 from recon.cli.session import print_evaluation, print_json, session
 
 
@@ -56,7 +56,6 @@ def trajectory(
       recon evaluate trajectory trajectory_tum.txt groundtruth.txt --align sim3
     """
     with session():
-        from recon.cli.options import parse_numbers
         from recon.evaluation import TrajectoryRules
         from recon.pipeline.evaluate_trajectory import TrajectoryFiles, run_evaluate_trajectory
         from recon.reports.trajectory_report import present_trajectory

@@ -63,7 +63,10 @@ def print_figures(title: str, figures: Mapping[str, Any]) -> None:
 def print_evaluation(title: str, figures: Mapping[str, Any]) -> None:
     """Print the figures of a comparison, those of each part too, its warnings and its folder."""
     shown = {key: value for key, value in figures.items() if key != "out"}
-    for part in (*figures.get("by_length", ()), *figures.get("by_threshold", ())):
+    limits = figures.get("by_threshold", ())
+    if len(limits) > 1:
+        shown = {key: value for key, value in shown.items() if key not in limits[0]}
+    for part in (*figures.get("by_length", ()), *(limits if len(limits) > 1 else ())):
         (_, name), *values = part.items()
         shown |= {f"{key} at {name:g} m": value for key, value in values}
     print_figures(title, shown)

@@ -9,7 +9,7 @@ from recon.evaluation.confidence import (
     share_within_sigma,
 )
 from recon.evaluation.disparity import evaluate_depth, evaluate_disparity
-from recon.evaluation.map import evaluate_map
+from recon.evaluation.map import evaluate_map, nearest_distances, register_cloud, within_reach
 from recon.evaluation.middlebury import MiddleburyRules, evaluate_middlebury
 from recon.evaluation.occupancy import evaluate_occupancy, grid_on_truth
 from recon.evaluation.trajectory import (
@@ -36,5 +36,8 @@ __all__ = [
     "grid_on_truth",
     "measure_reliability",
     "measure_sparsification",
+    "nearest_distances",
+    "register_cloud",
     "share_within_sigma",
+    "within_reach",
 ]

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from recon.adapters import open3d_clouds
+from recon.adapters.open3d_registration import icp
 from recon.errors import EvaluationError
-from recon.structures import MapMetrics, PointCloud
-from recon.structures.arrays import Float32
+from recon.structures import MapMetrics, PointCloud, Trajectory
+from recon.structures.arrays import Bool, Float32, Float64
+
+_BAND_PERCENT: Final = (0.1, 99.9)
+_BAND_M: Final = 0.2
 
 
 def evaluate_map(
@@ -51,6 +57,57 @@ def evaluate_map(
         points=len(estimate_xyz),
         reference_points=len(reference_xyz),
     )
+
+
+def within_reach(cloud: PointCloud, reference: PointCloud, path: Trajectory) -> Bool:
+    """Which points lie no higher over the path, and no lower, than what the reference saw.
+
+    A LiDAR looks little above its own height, a camera sees the crowns of the trees: what stands
+    there is neither right nor wrong. The band of heights is that of the whole reference, so that
+    what floats above a road still counts.
+
+    Args:
+        cloud: The estimate.
+        reference: What is taken as true.
+        path: The cameras, in the frame of both (y of a camera points down).
+
+    Returns:
+        bool (N,), one for each point of the cloud.
+    """
+    low_m, high_m = np.percentile(_heights_m(reference.xyz, path), _BAND_PERCENT)
+    heights_m = _heights_m(cloud.xyz, path)
+    return np.asarray((heights_m >= low_m - _BAND_M) & (heights_m <= high_m + _BAND_M))
+
+
+def _heights_m(xyz: Float32, path: Trajectory) -> Float64:
+    """float64 (N,): height over the nearest camera, along its y axis."""
+    nearest = open3d_clouds.nearest(xyz, path.positions_m)[0][:, 0]
+    down = path.T_world_camera[nearest, :3, 1]
+    return np.asarray(-np.einsum("ni,ni->n", down, xyz - path.positions_m[nearest]))
+
+
+def register_cloud(
+    cloud: PointCloud, reference: PointCloud, reach_m: float
+) -> tuple[Float64, float]:
+    """The rigid motion that lays a cloud onto a reference by ICP, from where it lies.
+
+    It hides a wrong pose of the whole map: what is left are the errors of its shape.
+
+    Args:
+        cloud: The estimate, off by less than ten times ``reach_m``.
+        reference: What is taken as true, in the same frame.
+        reach_m: How far points may be off in the end.
+
+    Returns:
+        float64 (4, 4), ``T_reference_cloud``, and the share of the points with a partner.
+
+    Raises:
+        EvaluationError: A cloud is empty or the frames differ.
+        RegistrationError: The clouds are too far apart.
+    """
+    _check(cloud, reference, reach_m)
+    thinned = [_thinned(one, reach_m / 2) for one in (cloud, reference)]
+    return icp(thinned[0], thinned[1], (10 * reach_m, 3 * reach_m, reach_m))
 
 
 def nearest_distances(xyz: Float32, reference_xyz: Float32) -> Float32:

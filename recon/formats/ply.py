@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from os import PathLike
 from typing import Any, Final
 
@@ -13,7 +14,7 @@ from recon.errors import FormatError
 from recon.formats.atomic import atomic_path
 from recon.formats.ply_tables import PlyHeader, Table, TableStream, read_tables, write_tables
 from recon.structures import Frame, PointCloud
-from recon.structures.arrays import UInt8
+from recon.structures.arrays import Float32, UInt8
 
 _XYZ: Final = ("x", "y", "z")
 _NORMAL: Final = ("nx", "ny", "nz")
@@ -33,6 +34,7 @@ def write_ply(
     path: str | PathLike[str],
     cloud: PointCloud,
     *,
+    quality: Float32 | None = None,
     ascii: bool = False,  # noqa: A002 - what the format calls it
 ) -> None:
     """Write a cloud, binary little endian unless ``ascii``.
@@ -43,12 +45,14 @@ def write_ply(
     Args:
         path: The file to write; it appears whole or not at all.
         cloud: The cloud.
+        quality: float32 (N,), written as ``quality`` in the place of the confidence.
         ascii: Write text (larger, slower, the same numbers).
 
     Raises:
         OutputError: The file cannot be written.
     """
-    write_tables(path, {"vertex": _table(cloud)}, [_FRAME + cloud.frame], ascii=ascii)
+    rated = cloud if quality is None else replace(cloud, confidence=quality)
+    write_tables(path, {"vertex": _table(rated)}, [_FRAME + cloud.frame], ascii=ascii)
 
 
 def write_ply_tiles(

@@ -11,7 +11,7 @@ from recon.geometry.se3 import make_transform
 from recon.structures import Trajectory
 from recon.structures.arrays import Float64, freeze
 
-_AXIS_M: Final = 1.0
+_AXIS_M: Final = 20.0  # how far from its cameras most of a map lies
 _IN_ONE_PLACE: Final = 1e-12
 
 
@@ -65,8 +65,9 @@ def fit_points(from_m: Float64, to_m: Float64, *, scaled: bool = False) -> Simil
 def fit_paths(from_path: Trajectory, to_path: Trajectory) -> Similarity:
     """The rigid motion that brings a path of cameras closest to another, pose by pose.
 
-    Each pose counts as its centre and the ends of its axes, a metre long: on a straight street
-    the centres alone leave the turn about the street open, and a map hangs on it.
+    Each pose counts as its centre and the ends of its axes, as long as cameras map: on a street
+    that is nearly straight, centres alone leave the turn about it to their noise, and a map that
+    hangs on them turns with it.
 
     Args:
         from_path: N ≥ 1 poses.

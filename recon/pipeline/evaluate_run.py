@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 
-from recon.errors import EvaluationError, FormatError
-from recon.evaluation import evaluate_disparity, evaluate_map
+from recon.errors import EvaluationError
+from recon.evaluation import evaluate_disparity
 from recon.formats.image import read_grey_levels
 from recon.formats.pfm import read_pfm
-from recon.formats.ply import read_ply
-from recon.geometry.se3 import invert
-from recon.geometry.transform import transform_cloud
 from recon.pipeline.middlebury_confidence import curve_figures
 from recon.pipeline.middlebury_score import dense_map, named_figures
 from recon.pipeline.pair_input import read_disparity
-from recon.pipeline.run_directory import RECORD
 from recon.pipeline.summary import plain
-from recon.structures import Disparity, DisparityTruth, PointCloud, Reason
-from recon.structures.arrays import Float32, Float64
+from recon.structures import Disparity, DisparityTruth, Reason
+from recon.structures.arrays import Float32
 
-ReferenceFrame = Literal["camera", "map"]
 _COUNTED: Final = 255
 
 
@@ -91,48 +85,3 @@ def _rated(values: Float32, path: Path) -> Disparity:
         sigma_px=np.full(values.shape, np.nan, np.float32),
         reason=np.where(known, np.uint8(Reason.VALID), np.uint8(Reason.AMBIGUOUS)),
     )
-
-
-def compare_maps(
-    run: Path, reference: Path, *, frame: ReferenceFrame, threshold_m: float
-) -> dict[str, Any]:
-    """Figures of a map against a reference cloud.
-
-    Args:
-        run: A run's folder, or a PLY. A PLY inside a run's folder is in that run's map axes; any
-            other PLY is taken to be in the axes of the reference already.
-        reference: A PLY.
-        frame: Axes of the reference: those of the first left camera, or the map's.
-        threshold_m: Distance below which a point counts as right.
-
-    Raises:
-        FormatError: A file cannot be read, or the folder holds no finished run.
-        EvaluationError: The two cannot be compared.
-    """
-    cloud, T_map_world = _read_cloud(run)
-    if frame == "camera" and T_map_world is not None:
-        cloud = transform_cloud(cloud, invert(T_map_world), frame="camera")
-    truth = PointCloud(xyz=read_ply(reference).xyz, frame=cloud.frame)
-    return dict(plain(evaluate_map(cloud, truth, threshold_m)))
-
-
-def _read_cloud(run: Path) -> tuple[PointCloud, Float64 | None]:
-    """The cloud, and T_map_world of the run that it belongs to, if any."""
-    if run.is_dir():
-        if not (run / RECORD).is_file():
-            raise FormatError("folder holds no finished run", where=run, expected=f"a {RECORD}")
-        return read_ply(run / "map" / "cloud.ply"), _read_axes(run / RECORD)
-    record = run.parent.parent / RECORD
-    inside = run.parent.name == "map" and record.is_file()
-    return read_ply(run), _read_axes(record) if inside else None
-
-
-def _read_axes(record: Path) -> Float64:
-    """T_map_world as the run recorded it."""
-    try:
-        T_map_world = np.array(json.loads(record.read_text(encoding="utf-8"))["T_map_world"], float)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FormatError("record of the run has no T_map_world", where=record) from error
-    if T_map_world.shape != (4, 4) or not np.isfinite(T_map_world).all():
-        raise FormatError("T_map_world is no 4x4 matrix", where=record)
-    return T_map_world

@@ -49,14 +49,19 @@ def test_a_straight_path_is_not_left_turned_about_itself() -> None:
     assert angle_rad(found.T_to_from @ T) < 1e-9
 
 
-def test_a_winding_path_is_fitted_by_its_places_more_than_by_its_directions() -> None:
-    poses = np.tile(np.eye(4), (60, 1, 1))
-    poses[:, :3, 3] = np.cumsum(np.abs(points(4, 60)), axis=0)
-    tilted = poses.copy()
-    tilted[:, :3, :3] = exp_so3(np.array([0.02, 0.0, 0.0]))
-    times = np.arange(60.0)
-    found = fit_paths(Trajectory(tilted, times), Trajectory(poses, times))
-    assert angle_rad(found.T_to_from) < 0.02 / 100
+def test_places_decide_more_the_wider_a_path_winds() -> None:
+    turns = []
+    for reach_m in (1.0, 30.0, 1000.0):
+        poses = np.tile(np.eye(4), (60, 1, 1))
+        poses[:, :3, 3] = np.random.default_rng(4).normal(0, reach_m, (60, 3))
+        tilted = poses.copy()
+        tilted[:, :3, :3] = exp_so3(np.array([0.02, 0.0, 0.0]))
+        times = np.arange(60.0)
+        found = fit_paths(Trajectory(tilted, times), Trajectory(poses, times))
+        turns.append(float(angle_rad(found.T_to_from)))
+    assert 0.019 < turns[0] < 0.02
+    assert turns[0] > turns[1] > turns[2]
+    assert turns[2] < 0.02 / 100
 
 
 def test_a_path_is_moved_with_its_size() -> None:
