@@ -14,6 +14,7 @@
     ├── MeshingError             a surface cannot be reconstructed
     ├── EvaluationError          an estimate cannot be compared with its truth
     ├── OutputError              a result cannot be written
+    ├── MemoryLimitError         a run takes more memory than it may
     └── MissingDependencyError   an optional package is not installed
 
 The command line prints ``str(error)`` and exits with 1; the library only raises.
@@ -106,6 +107,10 @@ class EvaluationError(ReconError):
 
 class OutputError(ReconError):
     """A result cannot be written."""
+
+
+class MemoryLimitError(ReconError):
+    """A run takes more memory than it may."""
 
 
 class MissingDependencyError(ReconError):

@@ -14,6 +14,7 @@ from recon.cli.options import (
     Json,
     LeftView,
     Matcher,
+    MemoryLimit,
     Mesh,
     Out,
     Quiet,
@@ -56,6 +57,7 @@ def map_(
     resume: Annotated[
         Path | None, typer.Option(help="Go on with the killed run in this folder; no SOURCE.")
     ] = None,
+    memory_limit: MemoryLimit = None,
     config: Config = None,
     set_: Set = None,
     json: Json = False,
@@ -85,7 +87,7 @@ def map_(
         method = [] if odometry is None else [f"odometry.method={odometry.value}"]
         views = source_overrides(calib, left, right, tolerance)
         overrides = [*(set_ or ()), *method, *matching_overrides(matcher), *views]
-        asked = MapRequest(source, kind, poses, mesh, out, resume)
+        asked = MapRequest(source, kind, poses, mesh, out, resume, memory_limit)
         request, settings = plan_map(asked, config, overrides)
         drive = open_requested(request, settings)
         announce(drive, quiet=quiet)

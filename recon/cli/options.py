@@ -79,3 +79,13 @@ def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:
         raise SettingsError(
             "not numbers separated by commas", where=option, got=text, expected="0.1,0.2,0.5"
         ) from error
+
+
+MemoryLimit = Annotated[
+    str | None,
+    typer.Option(
+        "--memory-limit",
+        help="Most memory that the process may take, such as 2G or 1500M; what cannot keep to it "
+        "stops and can be resumed. [default: no limit]",
+    ),
+]

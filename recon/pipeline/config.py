@@ -27,6 +27,7 @@ from recon.matching import MatchingSettings
 from recon.meshing import MeshSettings
 from recon.odometry import OdometrySettings
 from recon.pipeline.checkpoint import CheckpointSettings
+from recon.pipeline.memory import MemorySettings
 from recon.pipeline.paper_settings import PaperSettings
 from recon.rectification import InspectionSettings, RectificationSettings, UncalibratedSettings
 from recon.settings import Settings
@@ -64,6 +65,7 @@ class ReconConfig(Settings):
     occupancy: OccupancySettings = OccupancySettings()
     submaps: SubmapSettings = SubmapSettings()
     checkpoints: CheckpointSettings = CheckpointSettings()
+    memory: MemorySettings = MemorySettings()
     ground: GroundSettings = GroundSettings()
     grid: GridSettings = GridSettings()
     mesh: MeshSettings = MeshSettings()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, Final
@@ -25,7 +25,9 @@ from recon.structures.arrays import Float64
 Tile = tuple[int, int]
 _MARGIN_M: Final = 1.0
 """What the filters of the fused cloud see beyond a tile, at least."""
-_CACHED: Final = 6
+_LEAST_TILE_M: Final = 5.0
+_FUSED_BYTES: Final = 60
+_BLOCK_BYTES: Final = 4 * 3 * BLOCK_EDGE**3
 _ROW_BITS: Final = 32
 _ROW_MASK: Final = (1 << _ROW_BITS) - 1
 _ROW_ZERO: Final = 1 << (_ROW_BITS - 1)
@@ -36,15 +38,15 @@ class _Reach:
     """Where a submap has something, margins of tiles included, and what it knows of points.
 
     Attributes:
-        fused: Tiles of the fused cloud.
-        occupancy: Tiles of the occupancy.
+        fused: Number of voxels in tiles of the fused cloud.
+        occupancy: Number of blocks in tiles of the occupancy.
         known: Which fields of a cloud it has.
         low: Smallest x and y of its cells.
         high: Largest ones, plus one.
     """
 
-    fused: frozenset[Tile]
-    occupancy: frozenset[Tile]
+    fused: Mapping[Tile, int]
+    occupancy: Mapping[Tile, int]
     known: frozenset[str]
     low: tuple[int, int]
     high: tuple[int, int]
@@ -83,7 +85,7 @@ class DriveMap:
         margin_m = max(_MARGIN_M, 2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
         self._margin_voxels = math.ceil(margin_m / config.fusion.voxel_m)
         self._margin_blocks = math.ceil(config.grid.min_blob_cells / BLOCK_EDGE)
-        self._reach = [self._reach_of(self._submap(n)) for n in range(len(store))]
+        self._reach = self._fitting_reach()
         shared = frozenset(KNOWABLE).intersection(*(reach.known for reach in self._reach))
         # What one submap does not know, the map does not know: all tiles have the same fields.
         self._known = tuple(name for name in KNOWABLE if name in shared)
@@ -97,6 +99,10 @@ class DriveMap:
     def occupancy_tile_cells(self) -> int:
         """Edge of a tile of the occupancy, in cells; a power of two, at least 8."""
         return self._blocks_per_tile << BLOCK_BITS
+
+    @property
+    def _occupancy_tile_m(self) -> float:
+        return self.occupancy_tile_cells * self._config.occupancy.resolution_m
 
     @property
     def columns(self) -> tuple[Tile, Tile]:
@@ -116,23 +122,26 @@ class DriveMap:
         """
         for tile in _along_the_drive(reach.fused for reach in self._reach):
             cloud = self._cloud_of(tile)
+            self._config.memory.check("putting the cloud together")
             if len(cloud):
                 yield tile, cloud
 
     def occupancy_tiles(self) -> Iterator[tuple[Tile, OccupancyVoxels]]:
         """The observed voxels, map axes, tile by tile along the drive, each with its margin."""
         for tile in _along_the_drive(reach.occupancy for reach in self._reach):
-            yield tile, self.occupancy_of(tile)
+            voxels = self.occupancy_of(tile)
+            self._config.memory.check("putting the occupancy together")
+            yield tile, voxels
 
     def occupancy_of(self, tile: Tile) -> OccupancyVoxels:
         """The observed voxels of a tile, and of as many cells around it as small blobs have."""
         edge, margin = self._blocks_per_tile, self._margin_blocks
         low, high = np.array(tile) * edge - margin, (np.array(tile) + 1) * edge + margin
-        parts = []
-        for index in self._near(tile, lambda reach: reach.occupancy):
-            part = self._submap(index).occupancy
-            parts.append(part.select(_inside(part.blocks[:, :2], low, high)))
-        return join_occupancy(parts).voxels(self._config.occupancy.resolution_m)
+        near = self._near(tile, lambda reach: reach.occupancy)
+        # One after the other: a place that was passed often takes no more than one passed once.
+        parts = (self._submap(index).occupancy for index in near)
+        inside = (part.select(_inside(part.blocks[:, :2], low, high)) for part in parts)
+        return join_occupancy(inside).voxels(self._config.occupancy.resolution_m)
 
     def inner(self, tile: Tile, voxels: OccupancyVoxels) -> OccupancyVoxels:
         """The voxels of a tile without its margin."""
@@ -158,18 +167,32 @@ class DriveMap:
         """The filtered points of a tile."""
         config, edge, margin = self._config, self._voxels_per_tile, self._margin_voxels
         low, high = np.array(tile) * edge - margin, (np.array(tile) + 1) * edge + margin
-        parts = []
-        for index in self._near(tile, lambda reach: reach.fused):
-            part = self._submap(index).fused
-            parts.append(part.select(_inside(part.cells[:, [0, 2]], low, high)))
-        fused = replace(join_fused(parts), known=self._known)
+        parts = (self._submap(index).fused for index in self._near(tile, lambda reach: reach.fused))
+        inside = (part.select(_inside(part.cells[:, [0, 2]], low, high)) for part in parts)
+        fused = replace(join_fused(inside), known=self._known)
         # A drive of fewer frames than the least count must still give a map.
         least = min(config.fusion.min_count, self._frames)
         cloud = filter_cloud(fused.cloud(config.fusion.voxel_m, least), config.map_filters)
         home = np.floor(cloud.xyz[:, [0, 2]] / np.float32(self.cloud_tile_m))
         return cloud.select((home == tile).all(axis=1))
 
-    def _near(self, tile: Tile, kind: Callable[[_Reach], frozenset[Tile]]) -> list[int]:
+    def _fitting_reach(self) -> list[_Reach]:
+        """Where the submaps are, in tiles that are halved until the fullest one is small enough."""
+        limit = self._config.memory.tile_bytes
+        while True:
+            reach = [self._reach_of(self._submap(n)) for n in range(len(self._store))]
+            if limit is None:
+                return reach
+            cloud = _most(r.fused for r in reach) * _FUSED_BYTES > limit
+            blocks = _most(r.occupancy for r in reach) * _BLOCK_BYTES > limit
+            cloud &= self.cloud_tile_m >= 2 * _LEAST_TILE_M
+            blocks &= self._occupancy_tile_m >= 2 * _LEAST_TILE_M
+            if not (cloud or blocks):
+                return reach
+            self._voxels_per_tile //= 1 + cloud
+            self._blocks_per_tile //= 1 + blocks
+
+    def _near(self, tile: Tile, kind: Callable[[_Reach], Mapping[Tile, int]]) -> list[int]:
         """Numbers of the submaps that have something in a tile or its margin, in order."""
         return [n for n, reach in enumerate(self._reach) if tile in kind(reach)]
 
@@ -201,7 +224,7 @@ class DriveMap:
                 self._config.occupancy.resolution_m,
             )
             self._moved[index] = self._store.get(index).moved(motion)
-            while len(self._moved) > _CACHED:
+            while len(self._moved) > self._config.memory.cached_submaps:
                 self._moved.popitem(last=False)
         self._moved.move_to_end(index)
         return self._moved[index]
@@ -220,18 +243,32 @@ def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud | None:
     return PointCloud(xyz, frame=clouds[0].frame, **fields)
 
 
-def _tiles(cells: NDArray[np.int32], edge: int, margin: int) -> frozenset[Tile]:
-    """The tiles of ``edge`` cells that have a cell (N, 2) in them or within the margin."""
-    found: set[Tile] = set()
+def _tiles(cells: NDArray[np.int32], edge: int, margin: int) -> dict[Tile, int]:
+    """Tiles of ``edge`` cells that have a cell (N, 2) in them or within the margin; how many.
+
+    The number counts the cells that one corner of the margin brings in, where that is most.
+    """
+    found: dict[Tile, int] = {}
     for move in product((-margin, margin), repeat=2):
         column, row = ((cells.astype(np.int64) + move) // edge).T
         # One number for two: numpy sorts rows slowly.
-        numbers = np.unique((column << _ROW_BITS) + row + _ROW_ZERO)
-        found.update((n >> _ROW_BITS, (n & _ROW_MASK) - _ROW_ZERO) for n in numbers.tolist())
-    return frozenset(found)
+        packed = (column << _ROW_BITS) + row + _ROW_ZERO
+        numbers, counts = np.unique(packed, return_counts=True)
+        for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
+            tile = (number >> _ROW_BITS, (number & _ROW_MASK) - _ROW_ZERO)
+            found[tile] = max(count, found.get(tile, 0))
+    return found
 
 
-def _along_the_drive(groups: Iterable[frozenset[Tile]]) -> list[Tile]:
+def _most(groups: Iterable[Mapping[Tile, int]]) -> int:
+    """Largest sum that a tile has over all groups."""
+    total: Counter[Tile] = Counter()
+    for group in groups:
+        total.update(group)
+    return max(total.values(), default=0)
+
+
+def _along_the_drive(groups: Iterable[Mapping[Tile, int]]) -> list[Tile]:
     """All tiles, in the order of the first submap of each."""
     return list(dict.fromkeys(tile for group in groups for tile in sorted(group)))
 

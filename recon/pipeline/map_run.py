@@ -111,7 +111,7 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
 
     Raises:
         ReconError: The source cannot be read or registered; then nothing is left behind. Or the
-            folder cannot be written; then the run can be resumed.
+            folder cannot be written, or the memory limit not be kept; then the run can be resumed.
     """
     start = time.perf_counter()
     threads = use_threads(options.threads)
@@ -136,6 +136,7 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
             _tell(options.observers, "report")
             with watch.stage("report"):
                 options.present(run, directory)
+            config.memory.check("report")
         run.summary.update(cost(watch, time.perf_counter() - start))
         run.summary["out"] = str(directory.folder)
         directory.write_json("summary.json", run.summary)
@@ -177,12 +178,13 @@ def _finish(
         _tell(options.observers, "mesh")
         with watch.stage("mesh"):
             mesh = _mesh(read_ply(directory.path("map/cloud.ply")), config, warnings)
+        config.memory.check("mesh")
     truth = source.truth
     with watch.stage("compare"):
         # Poses that were given are no estimate; a drift of 0 % would be a lie.
         given = options.known_poses is not None
         metrics = None if given else _compare_paths(mapped.trajectory, truth, warnings)
-        map_metrics = _compare_surfaces(mapped.cloud, truth, warnings)
+        map_metrics = _compare_surfaces(mapped, truth, warnings)
         occupancy_metrics = compare_with_source(source, config, mapped, written.grid, warnings)
     run = MapRun(
         name=source.name,
@@ -226,12 +228,13 @@ def _compare_paths(
 
 
 def _compare_surfaces(
-    cloud: PointCloud, truth: SequenceTruth | None, warnings: list[str]
+    mapped: MappedSequence, truth: SequenceTruth | None, warnings: list[str]
 ) -> MapMetrics | None:
     if truth is None or truth.surface is None:
         return None
     try:
-        return evaluate_map(cloud, truth.surface, SURFACE_THRESHOLD_M)
+        # The whole cloud, in memory: only where there is a whole true surface in memory too.
+        return evaluate_map(mapped.cloud, truth.surface, SURFACE_THRESHOLD_M)
     except EvaluationError as error:
         warnings.append(f"not compared with the true surface: {error}")
         return None

@@ -45,7 +45,7 @@ class Mapper:
         self._poses: list[Float64] = []
         self._times_s: list[float] = []
         self._health: list[OdometryHealth] = []
-        self.submaps = SubmapStore(workspace.submaps)
+        self.submaps = SubmapStore(workspace.submaps, config.memory.cached_submaps)
         self.T_map_world: Float64 = np.eye(4)
 
     def __len__(self) -> int:
@@ -126,7 +126,13 @@ class Mapper:
 
     def _new_builder(self) -> SubmapBuilder:
         config = self._config
-        return SubmapBuilder(config.submaps, config.fusion, config.occupancy, self.T_map_world)
+        return SubmapBuilder(
+            config.submaps,
+            config.fusion,
+            config.occupancy,
+            self.T_map_world,
+            config.memory.submap_bytes,
+        )
 
 
 def _health(record: dict[str, Any]) -> OdometryHealth:

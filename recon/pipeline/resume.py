@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from recon.errors import OutputError, SettingsError
+from recon.errors import MemoryLimitError, OutputError, SettingsError
 from recon.formats.atomic import write_text
 from recon.pipeline.checkpoint import quick_fingerprint
 from recon.pipeline.config import ReconConfig, load_config
 from recon.pipeline.machine import versions
+from recon.pipeline.memory import memory_overrides
 from recon.pipeline.run_directory import STARTED, RunDirectory, state_folder
 from recon.sources import StereoSource, open_source
 from recon.structures import Trajectory
@@ -28,6 +29,7 @@ _OTHER: Final = {
     "versions": "other versions",
 }
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_MEMORY: Final = "memory"
 _NOTHING: Final = "there is no unfinished run to resume"
 
 
@@ -42,6 +44,7 @@ class MapRequest:
         mesh: Whether to reconstruct a surface.
         out: Result folder; None = a new one.
         resume: Folder of an unfinished run to go on with.
+        memory_limit: Most memory that the run may take, such as ``2G``.
     """
 
     source: Path | None
@@ -50,6 +53,7 @@ class MapRequest:
     mesh: bool = True
     out: Path | None = None
     resume: Path | None = None
+    memory_limit: str | None = None
 
     def arguments(self) -> dict[str, Any]:
         """What has to be known to open the same source again."""
@@ -73,7 +77,7 @@ def plan_map(
     """
     if request.resume is not None:
         return _plan_resumed(request, request.resume, config, overrides)
-    return request, load_config(config, overrides)
+    return request, load_config(config, [*overrides, *memory_overrides(request.memory_limit)])
 
 
 def _plan_resumed(
@@ -82,9 +86,12 @@ def _plan_resumed(
     started = read_started(folder)
     known = started["arguments"]
     settings = ReconConfig.parse(started["identity"]["config"], where=str(folder))
+    limit = memory_overrides(request.memory_limit)
+    asked = load_config(config, [*overrides, *limit])
     if config is not None or overrides:
-        asked = load_config(config, overrides)
         _refuse_others({"config": asked.model_dump(mode="json")}, started["identity"], folder)
+    if asked.memory.limit_mb is not None:
+        settings = settings.model_copy(update={_MEMORY: asked.memory})
     if request.out is not None and request.out.resolve() != folder.resolve():
         raise SettingsError("--out and --resume name two folders", got=request.out, expected=folder)
     if not request.mesh and known.get("mesh"):
@@ -141,8 +148,9 @@ def begin_or_resume(
         OutputError: It cannot be written, or there is no run to resume.
     """
     if directory.resumes:
-        _refuse_others(identity, read_started(directory.folder)["identity"], directory.folder)
-        return
+        started = read_started(directory.folder)
+        _refuse_others(identity, started["identity"], directory.folder)
+        arguments = arguments or started["arguments"]
     content = {"identity": dict(identity), "arguments": dict(arguments)}
     write_text(directory.state(STARTED), json.dumps(content, ensure_ascii=False))
 
@@ -153,22 +161,34 @@ def tell_how_to_resume(directory: RunDirectory) -> Iterator[None]:
 
     Raises:
         OutputError: The disk is full, or the folder cannot be written any more.
+        MemoryLimitError: There is no more memory.
     """
     try:
         yield
-    except (OutputError, OSError, KeyboardInterrupt) as error:
-        if not directory.resumable:
+    except (OutputError, MemoryLimitError, OSError, MemoryError, KeyboardInterrupt) as error:
+        told = _with_hint(error, directory.folder) if directory.resumable else None
+        if told is None:
             raise
-        hint = f"recon map --resume {shlex.quote(str(directory.folder))} goes on from there"
-        if isinstance(error, KeyboardInterrupt):
-            raise KeyboardInterrupt(hint) from error
-        if isinstance(error, OutputError):
-            told = OutputError(error.what, where=error.where, got=error.got, hint=hint)
-            raise told from error
-        if error.errno not in _NO_ROOM:
-            raise
-        full = OutputError("the disk is full", where=error.filename, got=error.strerror, hint=hint)
-        raise full from error
+        raise told from error
+
+
+def _with_hint(error: BaseException, folder: Path) -> BaseException | None:
+    """The error with a line on how to go on; None where it cannot be helped."""
+    hint = f"recon map --resume {shlex.quote(str(folder))} goes on from there"
+    if isinstance(error, KeyboardInterrupt):
+        return KeyboardInterrupt(hint)
+    if isinstance(error, OutputError):
+        return OutputError(error.what, where=error.where, got=error.got, hint=hint)
+    if isinstance(error, MemoryLimitError):
+        more = f"{hint} with a larger --memory-limit"
+        return MemoryLimitError(
+            error.what, where=error.where, got=error.got, expected=error.expected, hint=more
+        )
+    if isinstance(error, MemoryError):
+        return MemoryLimitError("out of memory", hint=f"{hint}; give it a --memory-limit")
+    if isinstance(error, OSError) and error.errno in _NO_ROOM:
+        return OutputError("the disk is full", where=error.filename, got=error.strerror, hint=hint)
+    return None
 
 
 def read_started(folder: Path) -> dict[str, Any]:
@@ -191,9 +211,10 @@ def _refuse_others(now: Mapping[str, Any], then: Mapping[str, Any], folder: Path
     """Refuse to go on with anything but the same."""
     # Through JSON, as what was read came: tuples and lists are the same.
     for part, value in json.loads(json.dumps(dict(now))).items():
-        if value == then.get(part):
+        after, before = _without_limit(value), _without_limit(then.get(part))
+        if after == before:
             continue
-        key, got, expected = _first_difference(value, then.get(part), part)
+        key, got, expected = _first_difference(after, before, part)
         raise SettingsError(
             f"the run was started with {_OTHER[part]}",
             where=folder,
@@ -201,6 +222,13 @@ def _refuse_others(now: Mapping[str, Any], then: Mapping[str, Any], folder: Path
             expected=expected,
             hint="resume with what it was started with, or start anew without --resume",
         )
+
+
+def _without_limit(part: Any) -> Any:
+    """A part of an identity apart from the memory limit, which a resumed run may change."""
+    if not isinstance(part, dict):
+        return part
+    return {name: value for name, value in part.items() if name != _MEMORY}
 
 
 def _first_difference(now: Any, then: Any, key: str) -> tuple[str, Any, Any]:

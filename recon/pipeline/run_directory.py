@@ -20,7 +20,7 @@ from typing import Any, Final
 
 from typing_extensions import Self
 
-from recon.errors import OutputError
+from recon.errors import MemoryLimitError, OutputError
 
 RECORD: Final = "run.json"
 STARTED: Final = "started.json"
@@ -29,7 +29,7 @@ _PARTIAL: Final = ".partial"
 _STATE: Final = ".state"
 _LOCK: Final = ".lock"
 #: What is no fault of the input: the run can go on later.
-_PASSING: Final = (OutputError, OSError, MemoryError, KeyboardInterrupt)
+_PASSING: Final = (OutputError, MemoryLimitError, OSError, MemoryError, KeyboardInterrupt)
 
 
 def state_folder(folder: Path) -> Path:

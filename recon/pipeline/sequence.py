@@ -179,6 +179,7 @@ class _Drive:
             self._sample = frame
         if len(self.mapper) - self._saved >= self._config.checkpoints.every_frames:
             self._save()
+        self._config.memory.check(f"frame {result.index}")
         now = time.perf_counter()
         seconds, self._last = now - self._last, now
         return replace(result, seconds=seconds)

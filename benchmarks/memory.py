@@ -1,0 +1,160 @@
+"""How much memory `recon map` takes for short and for long drives.
+
+One street that looks the same every 50 m is rendered once and driven along for as many frames as
+are asked for, so the map grows with every frame while the pictures stay those of one street. Each
+drive is mapped by a process of its own, whose peak is that of its resident memory; ``libraries``
+is the peak for a drive of a few frames: what the program takes before there is a map.
+
+Example: python benchmarks/memory.py --json --frames 1000 --frames 4000
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from recon.formats.atomic import write_text
+from recon.formats.trajectory import write_kitti_poses
+from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.structures import Trajectory
+from recon.synthetic import StreetSettings
+
+FRAMES = (1000, 4000)
+LIBRARIES_FRAMES = 8
+REPEAT_M = 50.0
+STEP_M = 0.5
+CAMERAS = ("image_0", "image_1")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    options = parse(arguments)
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        period = render_period(Path(folder) / "period", options.width)
+        counts = sorted(set(options.frames or FRAMES))
+        rows = [measure(period, count, options) for count in (LIBRARIES_FRAMES, *counts)]
+    result = {
+        "picture": [options.width, height_of(options.width)],
+        "mesh": options.mesh,
+        "settings": options.set,
+        "libraries": rows[0],
+        "drives": rows[1:],
+        "longest / shortest": ratio(rows[-1]["peak_mb"], rows[1]["peak_mb"]),
+        "longest / shortest, libraries aside": ratio(
+            rows[-1]["peak_mb"] - rows[0]["peak_mb"], rows[1]["peak_mb"] - rows[0]["peak_mb"]
+        ),
+    }
+    print(json.dumps(result, indent=2) if options.json else table(result))
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument(
+        "--frames", action="append", default=[], type=int, help="length of a drive; repeatable"
+    )
+    parser.add_argument("--width", type=int, default=320, help="of the pictures, pixels")
+    parser.add_argument("--mesh", action="store_true", help="also reconstruct a surface")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--folder", type=Path, help="where to work; 2 MB for each frame at most")
+    return parser.parse_args(arguments)
+
+
+def render_period(folder: Path, width_px: int) -> Path:
+    """A drive that is as long as the street takes to repeat, in KITTI's layout."""
+    period = round(REPEAT_M / STEP_M)
+    settings = StreetSettings(
+        # Two more periods: all that the last picture shows is there.
+        frames=3 * period,
+        speed_m_per_frame=STEP_M,
+        path="straight",
+        repeat_m=REPEAT_M,
+        sway=0.0,
+        width_px=width_px,
+        height_px=height_of(width_px),
+        focal_px=0.57 * width_px,
+    )
+    write_kitti(_Beginning(settings, period), folder)
+    return folder
+
+
+class _Beginning(SyntheticSource):
+    """The first frames of a drive."""
+
+    def __init__(self, settings: StreetSettings, length: int) -> None:
+        super().__init__(settings)
+        self._length = length
+
+    def __len__(self) -> int:
+        return self._length
+
+
+def height_of(width_px: int) -> int:
+    return round(0.375 * width_px)
+
+
+def measure(period: Path, frames: int, options: argparse.Namespace) -> dict[str, Any]:
+    """Map so many frames in a process of its own."""
+    drive, out = period.parent / f"drive_{frames}", period.parent / f"run_{frames}"
+    repeat(period, drive, frames)
+    command = [sys.executable, "-m", "recon", "map", str(drive), "--out", str(out)]
+    settings = [part for text in options.set for part in ("--set", text)]
+    mesh = [] if options.mesh else ["--no-mesh"]
+    command += [*mesh, *settings, "--json", "--quiet"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(done.stderr)
+    summary = json.loads(done.stdout)
+    files_mb = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6
+    return {
+        "frames": frames,
+        "peak_mb": summary["peak_memory_mb"],
+        "path_m": round(summary["path_length_m"], 1),
+        "points": summary["points"],
+        "voxels": summary["voxels"],
+        "files_mb": round(files_mb, 1),
+        "seconds": summary["seconds"],
+        "stages": summary["stages"],
+    }
+
+
+def repeat(period: Path, drive: Path, frames: int) -> None:
+    """The drive again and again, by links."""
+    names = sorted(path.name for path in (period / CAMERAS[0]).iterdir())
+    for camera in CAMERAS:
+        (drive / camera).mkdir(parents=True)
+        for index in range(frames):
+            picture = period / camera / names[index % len(names)]
+            (drive / camera / f"{index:06d}.png").symlink_to(picture)
+    write_text(drive / "calib.txt", (period / "calib.txt").read_text())
+    times_s = np.arange(frames) / 10.0
+    write_text(drive / "times.txt", "".join(f"{time_s:.6e}\n" for time_s in times_s))
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 2, 3] = STEP_M * np.arange(frames)
+    write_kitti_poses(drive / "poses.txt", Trajectory(poses, times_s))
+
+
+def ratio(one: float, other: float) -> float:
+    return round(one / other, 3)
+
+
+def table(result: dict[str, Any]) -> str:
+    lines = ["frames  path m   points   voxels  files MB  seconds  peak MB"]
+    lines += [
+        f"{row['frames']:6d}{row['path_m']:8.0f}{row['points']:9d}{row['voxels']:9d}"
+        f"{row['files_mb']:10.1f}{row['seconds']:9.1f}{row['peak_mb']:9.1f}"
+        for row in (result["libraries"], *result["drives"])
+    ]
+    lines += [f"{key}: {result[key]:.3f}" for key in result if key.startswith("longest")]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
