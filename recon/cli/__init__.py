@@ -19,6 +19,7 @@ from recon.cli.demo import demo
 from recon.cli.doctor import doctor
 from recon.cli.map import map_
 from recon.cli.mesh import mesh
+from recon.cli.occupancy import occupancy
 from recon.cli.pair import disparity, pair
 from recon.cli.paper import paper
 from recon.cli.rectify import rectify
@@ -32,6 +33,7 @@ app = typer.Typer(
 app.command()(demo)
 app.command()(pair)
 app.command("map")(map_)
+app.command()(occupancy)
 app.command()(mesh)
 app.command()(capture)
 app.command()(audit)

@@ -139,6 +139,51 @@ def _measure_points(
         values[n, 3] = 1.0 if near else 0.0
 
 
+def limit_points(
+    xyz: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    max_range: float,
+    beyond: float,
+    margin: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Move points that are out of range along their rays to a common distance.
+
+    Their rays stay free as far as before: what a point moves, its uncertainty is made smaller
+    by, down to none. So points far apart can be averaged, for they hit nothing anyway.
+
+    Args:
+        xyz: float32 (N, 3), camera axes.
+        sigma: float32 (N,), standard deviation of the depth, same unit.
+        max_range: Points up to here stay as they are.
+        beyond: Where the others are moved to, not below ``max_range``.
+        margin: Standard deviations before a point where free space ends.
+
+    Returns:
+        Points float32 (N, 3) and standard deviations float32 (N,).
+    """
+    moved, left = xyz.copy(), sigma.copy()
+    _limit_points(moved, left, (max_range, beyond, margin))
+    return moved, left
+
+
+@njit(cache=True, nogil=True)
+def _limit_points(
+    xyz: NDArray[np.float32], sigma: NDArray[np.float32], limits: tuple[float, float, float]
+) -> None:
+    """The loop of `limit_points`, in place."""
+    max_range, beyond, margin = limits
+    for n in range(len(xyz)):
+        x, y, z = np.float64(xyz[n, 0]), np.float64(xyz[n, 1]), np.float64(xyz[n, 2])
+        length = math.sqrt(x * x + y * y + z * z)
+        if length <= max_range:
+            continue
+        # A point between the two is moved outwards, and its free length does not change either.
+        shrink = beyond / length
+        surplus = np.float64(sigma[n]) * margin - abs(z) * (1.0 - shrink)
+        sigma[n] = max(surplus, 0.0) / margin if margin > 0 else sigma[n]
+        xyz[n, 0], xyz[n, 1], xyz[n, 2] = x * shrink, y * shrink, z * shrink
+
+
 def make_blocks(rows: int) -> Blocks:
     """No blocks yet, room for ``rows``, of whose cells nothing is said."""
     return Blocks(

@@ -32,6 +32,17 @@ def measure_points_reference(
     return ends, np.stack([spread, free, confidence, near.astype(float)], axis=1)
 
 
+def limit_points_reference(
+    xyz: NDArray[Any], sigma: NDArray[Any], max_range: float, beyond: float, margin: float
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Points (N, 3) and deviations (N,), as `recon.kernels.raycast.limit_points` says."""
+    length = np.linalg.norm(xyz, axis=1)
+    shrink = np.where(length <= max_range, 1.0, beyond / np.maximum(length, 1e-30))
+    nearer = np.abs(xyz[:, 2]) * (1.0 - shrink)
+    left = sigma if margin == 0 else np.maximum(sigma - nearer / margin, 0.0)
+    return xyz * shrink[:, None], np.where(shrink == 1.0, sigma, left)
+
+
 def walk_reference(
     origin: tuple[float, float, float], direction: tuple[float, float, float]
 ) -> Iterator[tuple[Cell, float, float]]:

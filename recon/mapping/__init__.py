@@ -11,6 +11,7 @@ from recon.mapping.ground import (
     estimate_ground_surface,
 )
 from recon.mapping.occupancy import OccupancyBuilder, OccupancySettings
+from recon.mapping.rays import ray_grain, thin_rays
 from recon.mapping.submaps import Submap, SubmapBuilder, SubmapMotion, SubmapSettings
 
 __all__ = [
@@ -37,4 +38,6 @@ __all__ = [
     "flatten",
     "fusion_range_m",
     "map_axes",
+    "ray_grain",
+    "thin_rays",
 ]

@@ -14,7 +14,7 @@ from recon.kernels import clamped, raycast, voxels
 from recon.mapping.occupancy_part import OccupancyPart
 from recon.settings import Settings
 from recon.structures import OccupancyVoxels, PointCloud
-from recon.structures.arrays import Float32, Float64
+from recon.structures.arrays import Float32, Float64, Int32
 
 
 class OccupancySettings(Settings):
@@ -49,6 +49,16 @@ class OccupancySettings(Settings):
     min_points: int = Field(
         2, ge=1, le=1000, description="Voxels with fewer points in a frame start no ray."
     )
+    rays_per_voxel: int = Field(
+        2,
+        ge=1,
+        le=16,
+        description="Points of a frame are averaged in cubes so many times finer than a voxel.",
+    )
+    keep_rays: bool = Field(
+        default=True,
+        description="Keep the rays of every frame in the run's folder, for recon occupancy.",
+    )
 
 
 class OccupancyBuilder:
@@ -72,7 +82,8 @@ class OccupancyBuilder:
         """Add what one frame saw.
 
         Args:
-            cloud: Points in camera axes. ``sigma_m`` None = exact; ``confidence`` None = 1.
+            cloud: Points in camera axes. ``sigma_m`` None = exact; ``confidence`` None = 1;
+                ``count`` is the number of points that each stands for, None = 1.
             T_world_camera: float64 (4, 4), pose of the camera.
 
         Raises:
@@ -122,7 +133,7 @@ class OccupancyBuilder:
             s.max_range_m / s.resolution_m,
             s.free_margin_sigmas,
         )
-        means, values = _reduce(ends, values, s.min_points)
+        means, values = _reduce(ends, values, cloud.count, s.min_points)
         sigma, free, confidence, hit = np.ascontiguousarray(values.T)
         return raycast.Rays(
             origin=T[:3, 3].copy(),
@@ -134,10 +145,13 @@ class OccupancyBuilder:
         )
 
 
-def _reduce(ends: Float32, values: Float32, least: int) -> tuple[Float64, Float32]:
+def _reduce(
+    ends: Float32, values: Float32, count: Int32 | None, least: int
+) -> tuple[Float64, Float32]:
     """Means of the ends (M, 3) and values (M, C) in each voxel with ``least`` trusted points."""
     trusted = (values[:, 2] > 0).astype(np.float32)
-    points = voxels.VoxelPoints(ends, trusted, values)
+    weights = trusted if count is None else trusted * count.astype(np.float32)
+    points = voxels.VoxelPoints(ends, weights, values)
     sums = voxels.add_points(voxels.make_sums(4096, values.shape[1]), points, 1.0, 0)
     enough = np.flatnonzero(sums.sums[: sums.used[0], 0] >= least)
     means = sums.sums[enough, 1:] / sums.sums[enough, :1]

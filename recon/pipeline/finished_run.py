@@ -17,6 +17,9 @@ from recon.structures.arrays import Float64, freeze
 CONFIG: Final = "config.yaml"
 GRID: Final = "map/grid.yaml"
 OCTOMAP: Final = "map/octomap.ot"
+RAYS_FILE: Final = "map/rays.bin"
+CLOUD: Final = "map/cloud.ply"
+TRAJECTORY: Final = "trajectory_kitti.txt"
 MAPPED_BY: Final = "mapped_by"
 """In the record of a run that took its drive from another: the command that mapped the drive."""
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from recon.cloud import back_project, filter_cloud, remove_flying_edges
+from recon.mapping import thin_rays
 from recon.matching import make_matcher
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.stopwatch import Stopwatch
@@ -12,6 +13,7 @@ from recon.rectification import Rectifier, check_inspection, inspect_pair
 from recon.structures import (
     Disparity,
     PointCloud,
+    RayCloud,
     RectifiedCamera,
     RectifiedPair,
     StereoCalibration,
@@ -28,12 +30,14 @@ class ReconstructedFrame:
         disparity: Its disparity, flying edges removed.
         cloud: Its points in camera axes, filtered.
         warnings: What is wrong with the pictures though they gave something.
+        rays: What of it is kept for occupancy; None where no map is made.
     """
 
     pair: RectifiedPair
     disparity: Disparity
     cloud: PointCloud
     warnings: tuple[str, ...] = ()
+    rays: RayCloud | None = None
 
 
 class FrameReconstructor:
@@ -102,3 +106,13 @@ class FrameReconstructor:
         with stage("filter"):
             cloud = filter_cloud(cloud, config.filters)
         return ReconstructedFrame(rectified, disparity, cloud, warnings)
+
+    def reconstruct_to_map(self, pair: StereoPair) -> ReconstructedFrame:
+        """Reconstruct one pair, with its rays.
+
+        Raises:
+            CalibrationError: Left and right are swapped.
+        """
+        frame = self.reconstruct(pair)
+        with self._stopwatch.stage("thin"):
+            return replace(frame, rays=thin_rays(frame.cloud, self._config.occupancy))

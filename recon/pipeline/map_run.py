@@ -17,6 +17,7 @@ from recon.formats.ply import read_ply
 from recon.formats.trajectory import write_kitti_poses, write_tum
 from recon.meshing import reconstruct_mesh
 from recon.pipeline.config import ReconConfig, dump_config
+from recon.pipeline.finished_run import RAYS_FILE
 from recon.pipeline.machine import use_threads
 from recon.pipeline.map_files import write_map
 from recon.pipeline.observer import Observer
@@ -27,7 +28,7 @@ from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.sequence import MappedSequence, map_sequence
 from recon.pipeline.stopwatch import Stopwatch
 from recon.pipeline.summary import cost, health_warnings, plain
-from recon.pipeline.workspace import Workspace
+from recon.pipeline.workspace import RAYS, Workspace
 from recon.sources import StereoSource
 from recon.structures import (
     MapMetrics,
@@ -274,6 +275,8 @@ def _write(run: MapRun, directory: RunDirectory) -> None:
         write_mesh(path("mesh/mesh.ply"), run.mesh)
         layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("map/cloud.ply")}
         write_mlp(path("mesh/mesh.mlp"), layers)
+    if run.config.occupancy.keep_rays:
+        directory.keep(RAYS, RAYS_FILE)
     write_text(path("config.yaml"), dump_config(run.config))
 
 

@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 
 from recon.geometry.transform import transform_cloud
-from recon.mapping import SubmapBuilder, estimate_ground, fusion_range_m, map_axes
+from recon.mapping import SubmapBuilder, estimate_ground, fusion_range_m, map_axes, thin_rays
 from recon.odometry import Odometry, OdometryFrame, OdometryHealth
 from recon.pipeline.checkpoint import pack_object, unpack_object
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.frame import ReconstructedFrame
 from recon.pipeline.observer import FrameResult
+from recon.pipeline.ray_log import RayLog
 from recon.pipeline.submap_store import SubmapStore
 from recon.pipeline.workspace import Workspace
-from recon.structures import RectifiedCamera, Trajectory
+from recon.structures import RayCloud, RectifiedCamera, Trajectory
 from recon.structures.arrays import Float64
 
 
@@ -45,6 +46,7 @@ class Mapper:
         self._poses: list[Float64] = []
         self._times_s: list[float] = []
         self._health: list[OdometryHealth] = []
+        self._rays = RayLog(workspace.rays, config.occupancy)
         self.submaps = SubmapStore(workspace.submaps, config.memory.cached_submaps)
         self.T_map_world: Float64 = np.eye(4)
 
@@ -73,10 +75,12 @@ class Mapper:
             builder = self._builder_from(frame)
             # A map that is wrong is worse than one with a hole.
             cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))
+            rays = self._rays_of(frame) if health.ok else thin_rays(cloud, self._config.occupancy)
             near = cloud.select(cloud.xyz[:, 2] <= self._fusion_range_m)
             cloud_world = transform_cloud(near, T_world_camera, frame="world")
-            builder.integrate(cloud_world, cloud, T_world_camera)
+            builder.integrate(cloud_world, rays.cloud(), T_world_camera)
         with stage("store"):
+            self._rays.add(rays)
             if builder.full:
                 self.submaps.add(builder.close())
         self._poses.append(T_world_camera)
@@ -91,6 +95,7 @@ class Mapper:
         """Close the submap of the moment, after the last frame."""
         if self._builder is not None and self._builder.frames:
             self.submaps.add(self._builder.close())
+        self._rays.close()
 
     def state(self) -> dict[str, Any]:
         """All that decides what comes later, as a tree of arrays and plain values."""
@@ -98,6 +103,7 @@ class Mapper:
             "odometry": pack_object(self._odometry),
             "builder": None if self._builder is None else self._builder.state(),
             "submaps": self.submaps.state(),
+            "rays": self._rays.state(),
             "T_map_world": self.T_map_world,
             "poses": np.array(self._poses).reshape(-1, 4, 4),
             "times_s": np.array(self._times_s),
@@ -108,6 +114,7 @@ class Mapper:
         """Go on from a `state`."""
         self._odometry = unpack_object(state["odometry"])
         self.submaps.restore(state["submaps"])
+        self._rays.restore(state["rays"])
         self.T_map_world = state["T_map_world"]
         self._poses = list(state["poses"])
         self._times_s = state["times_s"].tolist()
@@ -115,6 +122,11 @@ class Mapper:
         if state["builder"] is not None:
             self._builder = self._new_builder()
             self._builder.restore(state["builder"])
+
+    def _rays_of(self, frame: ReconstructedFrame) -> RayCloud:
+        """What of a frame is kept for occupancy."""
+        kept = frame.rays
+        return thin_rays(frame.cloud, self._config.occupancy) if kept is None else kept
 
     def _builder_from(self, frame: ReconstructedFrame) -> SubmapBuilder:
         """The maps that are being built; the first frame fixes their axes."""

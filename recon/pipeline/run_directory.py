@@ -84,6 +84,14 @@ class RunDirectory:
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
 
+    def keep(self, state: str, name: str) -> None:
+        """Make a file of the state a result too, without another copy where links are known."""
+        source, target = self.state(state), self.path(name)
+        try:
+            os.link(source, target)
+        except OSError:
+            shutil.copyfile(source, target)
+
     def files(self) -> list[str]:
         """Names of the files written so far, sorted; what is of the state is not among them."""
         written = (p.relative_to(self._partial) for p in self._partial.rglob("*") if p.is_file())

@@ -134,7 +134,7 @@ def map_sequence(
     try:
         with serial_algebra():
             pairs = source.frames(len(drive.mapper))
-            for frame in look_ahead(reconstructor.reconstruct, pairs):
+            for frame in look_ahead(reconstructor.reconstruct_to_map, pairs):
                 result = drive.add(frame, total=len(source))
                 for observer in audience:
                     observer.on_frame(result)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 from recon.pipeline.checkpoint import Checkpoint
 from recon.pipeline.stopwatch import Stopwatch
+
+RAYS: Final = "rays.bin"
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,11 @@ class Workspace:
     def loops(self) -> Path | None:
         """Folder of the keyframes."""
         return None if self.folder is None else self.folder / "loops"
+
+    @property
+    def rays(self) -> Path | None:
+        """File of the rays of all frames."""
+        return None if self.folder is None else self.folder / RAYS
 
     @property
     def checkpoint(self) -> Checkpoint | None:

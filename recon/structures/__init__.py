@@ -16,6 +16,7 @@ from recon.structures.metrics import (
     TrajectoryMetrics,
     VoxelMetrics,
 )
+from recon.structures.rays import RayCloud, RayGrain
 from recon.structures.trajectory import Trajectory
 from recon.structures.truth import DisparityTruth, OccupancyTruth, SequenceTruth
 
@@ -38,6 +39,8 @@ __all__ = [
     "OccupancyTruth",
     "OccupancyVoxels",
     "PointCloud",
+    "RayCloud",
+    "RayGrain",
     "Reason",
     "RectifiedCamera",
     "RectifiedPair",

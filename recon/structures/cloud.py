@@ -24,7 +24,8 @@ class PointCloud:
         sigma_m: float32 (N,), standard deviation along the viewing depth (``sigma_z``).
         confidence: float32 (N,) in [0, 1].
         weight: float32 (N,), sum of the weights of the measurements that were fused.
-        count: int32 (N,), number of frames that saw the point.
+        count: int32 (N,), number of frames that saw the point; in a thinned frame, of the points
+            that it stands for.
         frame: The axes that ``xyz`` is in: camera (x right, y down, z forward), world (the
             first rectified left camera) or map (x forward, y left, z up).
     """

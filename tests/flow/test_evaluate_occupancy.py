@@ -14,22 +14,14 @@ import pytest
 
 from recon.errors import EvaluationError, FormatError
 from recon.formats.nav2 import read_nav2
-from recon.pipeline.config import load_config
-from recon.pipeline.demo_source import demo_source
 from recon.pipeline.evaluate_occupancy import compare_occupancy
-from recon.pipeline.map_run import MapOptions, run_map
 from recon.pipeline.summary import plain
 from recon.reports.colour import GRID_ERRORS, GRID_NOT_COUNTED
 
-STREET = {"frames": 12, "width_px": 256, "height_px": 96, "focal_px": 150.0}
 
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    config = load_config(None, [f"street.{key}={value}" for key, value in STREET.items()])
-    out = tmp_path_factory.mktemp("demo") / "run"
-    run_map(demo_source(config), config, MapOptions(command="demo", out=out, mesh=False))
-    return out
+@pytest.fixture
+def run(small_demo: Path) -> Path:
+    return small_demo
 
 
 def test_the_files_of_a_run_give_its_own_figures(run: Path) -> None:

@@ -32,6 +32,7 @@ FILES = [
     "map/grid.yaml",
     "map/octomap.ot",
     "map/octomap.bt",
+    "map/rays.bin",
     "config.yaml",
 ]
 

@@ -13,6 +13,7 @@ from recon.kernels import clamped, raycast, voxels
 from recon.kernels.clamped_reference import apply_evidence_reference
 from recon.kernels.raycast_reference import (
     cast_rays_reference,
+    limit_points_reference,
     measure_points_reference,
     walk_reference,
 )
@@ -112,6 +113,21 @@ def test_measured_points_equal_those_of_the_reference(seed: int, n: int, margin:
     ):
         # float32 results near 100 against float64.
         np.testing.assert_allclose(ours, theirs, rtol=2e-5, atol=2e-5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(0, 20), margin=st.sampled_from([0.0, 0.5, 2]))
+def test_limited_points_equal_those_of_the_reference(seed: int, n: int, margin: float) -> None:
+    rng = np.random.default_rng(seed)
+    xyz = (rng.normal(0, 8, (n, 3)) * rng.choice([1, 10], (n, 1))).astype(np.float32)
+    sigma = rng.uniform(0, 4, n).astype(np.float32)
+    before = xyz.copy(), sigma.copy()
+    ours = raycast.limit_points(xyz, sigma, 12.0, 12.2, margin)
+    theirs = limit_points_reference(xyz.astype(float), sigma.astype(float), 12.0, 12.2, margin)
+    np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-6)
+    np.testing.assert_allclose(ours[1], theirs[1], rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(before[0], xyz)  # the given points stay
+    np.testing.assert_array_equal(before[1], sigma)
 
 
 @given(

@@ -1,0 +1,53 @@
+"""`recon occupancy`: other occupancy maps of a drive that was mapped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli.session import print_json, print_run, session
+
+
+def occupancy(
+    run: Annotated[Path, typer.Argument(help="Folder of a run of recon map or recon demo.")],
+    out: Out = None,
+    resolution: Annotated[
+        float | None, typer.Option(help="Edge of a cell in metres. [default: that of the run]")
+    ] = None,
+    min_height: Annotated[
+        float | None, typer.Option(help="Lower end of the grid's height band, metres.")
+    ] = None,
+    max_height: Annotated[float | None, typer.Option(help="Upper end of the band.")] = None,
+    max_range: Annotated[
+        float | None, typer.Option(help="Points farther away hit nothing, metres.")
+    ] = None,
+    config: Config = None,
+    set_: Set = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    threads: Threads = None,
+) -> None:
+    """Nav2 grid and OctoMap with other cells or heights, from what the run kept: no matching.
+
+    Examples:
+      recon occupancy outputs/map/latest --resolution 0.1
+      recon occupancy outputs/map/latest --min-height 0.5 --max-height 3.2 --out truck
+    """
+    del quiet  # there is no progress to hide; every command takes the option
+    with session():
+        from recon.pipeline.occupancy_run import OccupancyRequest, run_occupancy
+
+        given = {
+            "occupancy.resolution_m": resolution,
+            "grid.min_height_m": min_height,
+            "grid.max_height_m": max_height,
+            "occupancy.max_range_m": max_range,
+        }
+        named = [f"{key}={value}" for key, value in given.items() if value is not None]
+        request = OccupancyRequest(run, [*(set_ or ()), *named], config, out, threads)
+        summary = run_occupancy(request)
+    print_json(summary) if json else print_run(summary, stages=verbose)

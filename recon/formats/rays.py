@@ -1,0 +1,151 @@
+"""The rays of a drive, frame after frame, in one file that only grows.
+
+It is private to this project. Every frame has a checksum, for the file of a killed run may end
+anywhere: such a run cuts it to where its checkpoint says, and goes on.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Final
+
+import numpy as np
+
+from recon.errors import FormatError
+from recon.structures import RayCloud, RayGrain
+
+_MAGIC: Final = b"recon rays 1\n\0\0\0"
+_HEADER: Final = struct.Struct("<16s3d")
+_FRAME: Final = struct.Struct("<2I")
+_RAY_BYTES: Final = 10
+
+
+class RayWriter:
+    """Appends frames to a file.
+
+    Args:
+        path: The file; its folder exists.
+        grain: Of the rays.
+        size: Bytes to keep of a file that is there; None = begin a new one.
+
+    Raises:
+        FormatError: The file is shorter than what is to be kept.
+    """
+
+    def __init__(self, path: Path, grain: RayGrain, size: int | None = None) -> None:
+        if size is not None and (not path.is_file() or path.stat().st_size < size):
+            raise FormatError("rays of the unfinished run are missing", where=path)
+        self._file: IO[bytes] = path.open("wb" if size is None else "r+b")
+        if size is None:
+            header = _HEADER.pack(_MAGIC, grain.cell_m, grain.unit_m, grain.max_range_m)
+            self._file.write(header)
+        else:
+            self._file.truncate(size)
+            self._file.seek(size)
+
+    def append(self, rays: RayCloud) -> None:
+        """Write the next frame."""
+        arrays = (
+            rays.places.astype("<i2", copy=False),
+            rays.sigma_m.astype("<f2", copy=False),
+            rays.confidence,
+            rays.count,
+        )
+        content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+        self._file.write(_FRAME.pack(len(rays), zlib.crc32(content)))
+        self._file.write(content)
+
+    def sync(self) -> int:
+        """Wait until all is on the disk; the bytes so far."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        return self._file.tell()
+
+    def close(self) -> None:
+        """Nothing more is written."""
+        self.sync()
+        self._file.close()
+
+
+class RayFile:
+    """The frames of a file.
+
+    Args:
+        path: What a `RayWriter` wrote.
+
+    Raises:
+        FormatError: The file is missing, or is no such file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with self._open() as file:
+            header = file.read(_HEADER.size)
+        if len(header) != _HEADER.size or not header.startswith(_MAGIC):
+            raise FormatError("the file holds no rays of a run", where=path)
+        self.grain = RayGrain(*_HEADER.unpack(header)[1:])
+
+    def __len__(self) -> int:
+        """Number of frames.
+
+        Raises:
+            FormatError: The file is truncated.
+        """
+        frames = 0
+        with self._open() as file:
+            file.seek(_HEADER.size)
+            while (head := self._head(file)) is not None:
+                file.seek(head[0] * _RAY_BYTES, os.SEEK_CUR)
+                frames += 1
+        return frames
+
+    def __iter__(self) -> Iterator[RayCloud]:
+        """One frame after the other.
+
+        Raises:
+            FormatError: The file is truncated or damaged.
+        """
+        with self._open() as file:
+            file.seek(_HEADER.size)
+            while (head := self._head(file)) is not None:
+                count, checksum = head
+                content = file.read(count * _RAY_BYTES)
+                if zlib.crc32(content) != checksum:
+                    raise self._damaged()
+                yield _unpack(content, count, self.grain.unit_m)
+
+    def _open(self) -> IO[bytes]:
+        try:
+            return self._path.open("rb")
+        except OSError as error:
+            raise FormatError("cannot read the rays", where=self._path, got=error) from error
+
+    def _head(self, file: IO[bytes]) -> tuple[int, int] | None:
+        """Number of rays and checksum of the whole frame that begins here; None at the end."""
+        head = file.read(_FRAME.size)
+        if not head:
+            return None
+        if len(head) != _FRAME.size:
+            raise self._damaged()
+        count, checksum = _FRAME.unpack(head)
+        if count * _RAY_BYTES > self._path.stat().st_size - file.tell():
+            raise self._damaged()
+        return int(count), int(checksum)
+
+    def _damaged(self) -> FormatError:
+        return FormatError("the rays are truncated or damaged", where=self._path)
+
+
+def _unpack(content: bytes, count: int, unit_m: float) -> RayCloud:
+    places, sigma, rest = np.split(np.frombuffer(content, np.uint8), [6 * count, 8 * count])
+    return RayCloud(
+        places=places.view("<i2").astype(np.int16, copy=False).reshape(-1, 3),
+        sigma_m=sigma.view("<f2").astype(np.float16, copy=False),
+        confidence=rest[:count],
+        count=rest[count:],
+        unit_m=unit_m,
+    )

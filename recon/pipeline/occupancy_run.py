@@ -1,0 +1,214 @@
+"""`recon occupancy` without its command line: other occupancy maps of a drive that was mapped.
+
+They are made of the rays that the run kept, its path and its fused cloud; no picture is read.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from recon.errors import FormatError, SettingsError
+from recon.formats.atomic import write_text
+from recon.formats.ply import read_ply
+from recon.formats.rays import RayFile
+from recon.formats.trajectory import read_kitti_poses
+from recon.geometry.se3 import apply
+from recon.mapping import SubmapBuilder
+from recon.pipeline.config import ReconConfig, dump_config, load_config
+from recon.pipeline.drive_map import DriveMap, Tile
+from recon.pipeline.finished_run import (
+    CLOUD,
+    MAPPED_BY,
+    RAYS_FILE,
+    TRAJECTORY,
+    FinishedRun,
+    open_run,
+)
+from recon.pipeline.machine import use_threads
+from recon.pipeline.occupancy_files import OccupancyWriter
+from recon.pipeline.record import fingerprint, write_record
+from recon.pipeline.run_directory import RunDirectory
+from recon.pipeline.stopwatch import Stopwatch
+from recon.pipeline.submap_store import SubmapStore
+from recon.pipeline.summary import cost
+from recon.structures import FREE, OCCUPIED, OccupancyGrid, PointCloud, Trajectory
+
+_REMADE: Final = ("occupancy", "grid", "ground", "submaps")
+"""Sections of the configuration that can differ from those of the run."""
+
+
+@dataclass(frozen=True)
+class OccupancyRequest:
+    """What is asked for.
+
+    Attributes:
+        run: Folder of the run that mapped the drive.
+        overrides: ``key=value`` settings; all others are those of the run.
+        config: A YAML file of settings that come before the overrides; None = none.
+        out: Result folder; None = a new one below ``outputs/``.
+        threads: Threads to use; None = all cores.
+    """
+
+    run: Path
+    overrides: Sequence[str] = ()
+    config: Path | None = None
+    out: Path | None = None
+    threads: int | None = None
+
+
+def run_occupancy(request: OccupancyRequest) -> dict[str, Any]:
+    """Make voxels and grid of a run again with other settings, and write them.
+
+    Returns:
+        The figures of ``summary.json``.
+
+    Raises:
+        ReconError: The run kept no rays or is damaged, a setting asks for what the rays do not
+            hold, or the folder cannot be written; then nothing is left behind.
+    """
+    start = time.perf_counter()
+    use_threads(request.threads)
+    watch = Stopwatch()
+    drive = _Drive(request)
+    with RunDirectory.for_command("occupancy", request.out) as directory:
+        with watch.stage("map"):
+            store = drive.submaps(directory)
+        path_m = apply(drive.run.T_map_world, drive.trajectory.positions_m)
+        tiles = DriveMap(store, drive.config, drive.run.T_map_world)
+        writer = OccupancyWriter(tiles, drive.config, path_m, directory)
+        with watch.stage("octomap"):
+            for tile, cloud in drive.clouds(tiles.cloud_tile_m):
+                writer.put_cloud(tile, cloud)
+            voxels, warnings = writer.octomap()
+        with watch.stage("grid"):
+            grid = writer.grid()
+        write_text(directory.path("config.yaml"), dump_config(drive.config))
+        summary = {
+            "run": str(request.run),
+            "frames": len(drive.trajectory),
+            "voxels": voxels,
+            **_cells(grid),
+            "T_map_world": drive.run.T_map_world.tolist(),
+            "warnings": warnings,
+            **cost(watch, time.perf_counter() - start),
+            "out": str(directory.folder),
+        }
+        directory.write_json("summary.json", summary)
+        record = {
+            "source": str(request.run),
+            MAPPED_BY: drive.run.mapped_by,
+            "inputs": fingerprint([request.run / n for n in (RAYS_FILE, CLOUD, TRAJECTORY)]),
+            "T_map_world": drive.run.T_map_world.tolist(),
+            "timings": watch.seconds,
+            "warnings": warnings,
+        }
+        write_record(directory, "occupancy", record)
+    return summary
+
+
+class _Drive:
+    """What a run kept of its drive, checked against what is asked for."""
+
+    def __init__(self, request: OccupancyRequest) -> None:
+        self.run = open_run(request.run)
+        if request.out is not None and request.out.resolve() == request.run.resolve():
+            raise SettingsError(
+                "the results would replace the run", where=request.out, hint="another --out"
+            )
+        self.config = _configure(self.run, request)
+        self._rays = _open_rays(self.run.folder / RAYS_FILE)
+        self.trajectory: Trajectory = read_kitti_poses(self.run.folder / TRAJECTORY)
+        _check_grain(self._rays, self.config)
+        if len(self._rays) != len(self.trajectory):
+            raise FormatError(
+                "the run has not as many frames of rays as poses",
+                where=self.run.folder,
+                got=f"{len(self._rays)} and {len(self.trajectory)}",
+            )
+
+    def submaps(self, directory: RunDirectory) -> SubmapStore:
+        """The occupancy, in submaps on the disk."""
+        config = self.config
+        store = SubmapStore(directory.state("submaps"))
+        builder = SubmapBuilder(
+            config.submaps, config.fusion, config.occupancy, self.run.T_map_world
+        )
+        unfused = PointCloud(np.zeros((0, 3), np.float32), frame="world")
+        for rays, T_world_camera in zip(self._rays, self.trajectory.T_world_camera, strict=True):
+            builder.integrate(unfused, rays.cloud(), T_world_camera)
+            if builder.full:
+                store.add(builder.close())
+        if builder.frames:
+            store.add(builder.close())
+        return store
+
+    def clouds(self, edge_m: float) -> Iterator[tuple[Tile, PointCloud]]:
+        """The fused cloud, map axes, in tiles."""
+        cloud = read_ply(self.run.folder / CLOUD)
+        homes = np.floor(cloud.xyz[:, :2] / edge_m).astype(np.int64)
+        for tile in sorted(set(map(tuple, homes.tolist()))):
+            yield (tile[0], tile[1]), cloud.select((homes == tile).all(axis=1))
+
+
+def _configure(run: FinishedRun, request: OccupancyRequest) -> ReconConfig:
+    """The settings of the run, but for what is asked for."""
+    known = run.config.model_dump(mode="json")
+    config = load_config(request.config, request.overrides, defaults=known)
+    changed = config.model_dump(mode="json")
+    other = [name for name in known if name not in _REMADE and known[name] != changed[name]]
+    if other:
+        raise SettingsError(
+            "this setting changes nothing here: the drive is not mapped again",
+            got=other[0],
+            expected=f"settings of {', '.join(_REMADE)}",
+            hint="recon map takes it",
+        )
+    return config
+
+
+def _open_rays(path: Path) -> RayFile:
+    if not path.is_file():
+        raise FormatError(
+            "the run kept no rays to make occupancy of",
+            where=path,
+            hint="map the drive again with --set occupancy.keep_rays=true",
+        )
+    return RayFile(path)
+
+
+def _check_grain(rays: RayFile, config: ReconConfig) -> None:
+    """Refuse a map that is finer or larger than what was kept."""
+    grain, wanted = rays.grain, config.occupancy
+    # Half a per mille for resolutions that were typed, such as 0.33 for a third.
+    if wanted.resolution_m < grain.cell_m * 0.9995:
+        raise SettingsError(
+            "the run kept no rays for voxels so fine",
+            got=f"{wanted.resolution_m:g} m",
+            expected=f"at least {grain.cell_m:g} m",
+            hint="map the drive again with --set occupancy.rays_per_voxel= or resolution_m=",
+        )
+    if wanted.max_range_m > grain.max_range_m * (1 + 1e-9):
+        raise SettingsError(
+            "the run kept no rays that reach so far",
+            got=f"{wanted.max_range_m:g} m",
+            expected=f"at most {grain.max_range_m:g} m",
+            hint="map the drive again with --set occupancy.max_range_m=",
+        )
+
+
+def _cells(grid: OccupancyGrid) -> dict[str, Any]:
+    """Figures of the grid."""
+    rows, columns = grid.cells.shape
+    return {
+        "resolution_m": grid.resolution_m,
+        "rows": rows,
+        "columns": columns,
+        "occupied_cells": int((grid.cells == OCCUPIED).sum()),
+        "free_cells": int((grid.cells == FREE).sum()),
+    }

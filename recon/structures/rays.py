@@ -1,0 +1,66 @@
+"""What one frame says of free and occupied space, small enough to be kept of every frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.structures.arrays import UInt8, freeze
+from recon.structures.cloud import PointCloud
+
+_CERTAIN: Final = 255
+
+
+@dataclass(frozen=True)
+class RayGrain:
+    """How coarse kept rays are.
+
+    Attributes:
+        cell_m: Edge of the cubes in which points are averaged.
+        unit_m: Places are whole multiples of this.
+        max_range_m: Points farther away were moved along their rays to just beyond it.
+    """
+
+    cell_m: float
+    unit_m: float
+    max_range_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class RayCloud:
+    """Rays of one frame, from the camera to where points were seen; camera axes.
+
+    Attributes:
+        places: int16 (N, 3), ends of the rays in units.
+        sigma_m: float16 (N,), standard deviation of the depth.
+        confidence: uint8 (N,), 255 = certain.
+        count: uint8 (N,), points that were averaged; 255 = or more.
+        unit_m: What places are multiples of.
+    """
+
+    places: NDArray[np.int16]
+    sigma_m: NDArray[np.float16]
+    confidence: UInt8
+    count: UInt8
+    unit_m: float
+
+    def __post_init__(self) -> None:
+        freeze(self, "places", np.int16, (None, 3))
+        freeze(self, "sigma_m", np.float16, (len(self.places),))
+        freeze(self, "confidence", np.uint8, (len(self.places),))
+        freeze(self, "count", np.uint8, (len(self.places),))
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def cloud(self) -> PointCloud:
+        """The ends as points; their ``count`` is that of the points averaged."""
+        return PointCloud(
+            self.places * np.float32(self.unit_m),
+            sigma_m=self.sigma_m.astype(np.float32),
+            confidence=self.confidence / np.float32(_CERTAIN),
+            count=self.count.astype(np.int32),
+        )

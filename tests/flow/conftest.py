@@ -1,0 +1,22 @@
+"""A small drive with truth, mapped once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from recon.pipeline.config import load_config
+from recon.pipeline.demo_source import demo_source
+from recon.pipeline.map_run import MapOptions, run_map
+
+SMALL_STREET = {"frames": 12, "width_px": 256, "height_px": 96, "focal_px": 150.0}
+
+
+@pytest.fixture(scope="session")
+def small_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run; it must not be changed."""
+    config = load_config(None, [f"street.{key}={value}" for key, value in SMALL_STREET.items()])
+    out = tmp_path_factory.mktemp("demo") / "run"
+    run_map(demo_source(config), config, MapOptions(command="demo", out=out, mesh=False))
+    return out

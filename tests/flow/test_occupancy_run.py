@@ -1,0 +1,170 @@
+"""`recon occupancy`: other maps of a drive, of what its run kept."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon.errors import FormatError, OutputError, ReconError, SettingsError
+from recon.formats.nav2 import read_nav2
+from recon.formats.octomap import read_octomap
+from recon.pipeline import frame
+from recon.pipeline.evaluate_occupancy import compare_occupancy
+from recon.pipeline.occupancy_run import OccupancyRequest, run_occupancy
+from recon.structures import FREE, OCCUPIED
+
+
+def _remake(run: Path, out: Path, *overrides: str, **changes: Any) -> dict[str, Any]:
+    return run_occupancy(OccupancyRequest(run, overrides, out=out, **changes))
+
+
+def _copy(run: Path, folder: Path) -> Path:
+    return shutil.copytree(run, folder / "copy")
+
+
+def test_the_same_settings_give_the_same_map(small_demo: Path, tmp_path: Path) -> None:
+    summary = _remake(small_demo, tmp_path / "same")
+    for name in ("map/grid.pgm", "map/grid.yaml", "map/octomap.bt", "config.yaml"):
+        assert (tmp_path / "same" / name).read_bytes() == (small_demo / name).read_bytes()
+    ours, theirs = (read_octomap(f / "map/octomap.ot") for f in (small_demo, tmp_path / "same"))
+    np.testing.assert_array_equal(ours.keys, theirs.keys)
+    # Poses come from a file with 13 digits.
+    np.testing.assert_allclose(ours.log_odds, theirs.log_odds, atol=1e-4)
+    assert summary["frames"] == 12
+    assert summary["voxels"] > 10_000
+
+
+def test_nothing_is_matched(
+    small_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(frame, "make_matcher")
+    assert _remake(small_demo, tmp_path / "out")["occupied_cells"] > 0
+
+
+def test_another_height_band_changes_the_grid_alone(small_demo: Path, tmp_path: Path) -> None:
+    out = tmp_path / "high"
+    _remake(small_demo, out, "grid.min_height_m=2.2", "grid.max_height_m=6")
+    same = "map/octomap.bt"
+    assert (out / same).read_bytes() == (small_demo / same).read_bytes()
+    low, high = (read_nav2(f / "map/grid.yaml") for f in (small_demo, out))
+    assert low.cells.shape == high.cells.shape
+    parked = (low.cells == OCCUPIED) & (high.cells == FREE)
+    assert parked.sum() > 10  # cars are lower than the band
+
+
+# Few small pictures: what was measured is 0.96 and 0.53, 0.86 and 0.91, 0.91 and 0.96. At 0.1 m
+# neighbouring rays end farther apart than voxels, so that recall is low.
+@pytest.mark.parametrize(
+    ("resolution_m", "precision", "recall"), [(0.1, 0.9, 0.4), (0.25, 0.8, 0.85), (0.5, 0.85, 0.9)]
+)
+def test_another_resolution_is_right_too(
+    small_demo: Path, tmp_path: Path, resolution_m: float, precision: float, recall: float
+) -> None:
+    out = tmp_path / "out"
+    summary = _remake(small_demo, out, f"occupancy.resolution_m={resolution_m}")
+    assert summary["resolution_m"] == resolution_m
+    grid, voxels = read_nav2(out / "map/grid.yaml"), read_octomap(out / "map/octomap.ot")
+    assert grid.resolution_m == voxels.resolution_m == resolution_m
+    found = compare_occupancy(out).metrics
+    assert found.resolution_m == resolution_m
+    assert found.voxels.precision > precision
+    assert found.voxels.recall > recall
+
+
+def test_a_shorter_range_knows_less(small_demo: Path, tmp_path: Path) -> None:
+    near = _remake(small_demo, tmp_path / "near", "occupancy.max_range_m=12")
+    assert near["voxels"] < _remake(small_demo, tmp_path / "far")["voxels"] / 2
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("occupancy.resolution_m=0.09", r"so fine \(got 0\.09 m, expected at least 0\.1 m"),
+        ("occupancy.max_range_m=26", r"so far \(got 26 m, expected at most 25 m"),
+        ("matching.matcher=sgm", "changes nothing here.*matching"),
+        ("fusion.voxel_m=0.2", "changes nothing here.*fusion"),
+        ("grid.min_height_m=7", "height band"),
+        ("grid.heigth=7", "heigth"),
+    ],
+)
+def test_what_the_rays_do_not_hold_is_refused(
+    small_demo: Path, tmp_path: Path, setting: str, words: str
+) -> None:
+    with pytest.raises(ReconError, match=words):
+        _remake(small_demo, tmp_path / "out", setting)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_that_kept_no_rays_is_told(small_demo: Path, tmp_path: Path) -> None:
+    copy = _copy(small_demo, tmp_path)
+    (copy / "map/rays.bin").unlink()
+    with pytest.raises(FormatError, match=r"kept no rays.*keep_rays=true"):
+        _remake(copy, tmp_path / "out")
+
+
+def test_damaged_rays_leave_nothing_behind(small_demo: Path, tmp_path: Path) -> None:
+    copy = _copy(small_demo, tmp_path)
+    content = bytearray((copy / "map/rays.bin").read_bytes())
+    content[-100] ^= 1
+    (copy / "map/rays.bin").write_bytes(content)
+    with pytest.raises(FormatError, match="damaged"):
+        _remake(copy, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_rays_and_poses_must_be_of_the_same_frames(small_demo: Path, tmp_path: Path) -> None:
+    copy = _copy(small_demo, tmp_path)
+    lines = (copy / "trajectory_kitti.txt").read_text().splitlines(keepends=True)
+    (copy / "trajectory_kitti.txt").write_text("".join(lines[:-1]))
+    with pytest.raises(FormatError, match="12 and 11"):
+        _remake(copy, tmp_path / "out")
+
+
+def test_a_folder_that_is_no_run_is_told(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="no finished run"):
+        _remake(tmp_path, tmp_path / "out")
+
+
+def test_the_run_itself_and_other_files_are_never_replaced(
+    small_demo: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(SettingsError, match="replace the run"):
+        _remake(small_demo, small_demo)
+    (tmp_path / "diary.txt").write_text("mine")
+    with pytest.raises(OutputError, match="not of a run"):
+        _remake(small_demo, tmp_path)
+    assert (small_demo / "trajectory_kitti.txt").is_file()
+
+
+def test_the_command_prints_json_and_says_what_is_wrong(small_demo: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "recon", "occupancy", str(small_demo), "--out", str(out)]
+    good = subprocess.run(
+        [*command, "--json", "--resolution", "0.5", "--min-height", "0.5"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert good.returncode == 0, good.stderr
+    assert json.loads(good.stdout) == json.loads((out / "summary.json").read_text())
+    record = json.loads((out / "run.json").read_text())
+    assert record["command"] == "occupancy"
+    assert record["mapped_by"] == "demo"
+    assert set(record["files"]) == {
+        p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()
+    }
+    bad = subprocess.run(
+        [*command, "--resolution", "0.01"], capture_output=True, text=True, check=False
+    )
+    assert bad.returncode == 1
+    assert bad.stderr.count("\n") == 1
+    assert bad.stderr.startswith("error: ")
+    # The earlier result stays.
+    assert json.loads((out / "summary.json").read_text())["resolution_m"] == 0.5
