@@ -82,7 +82,7 @@ def map_(
         from recon.pipeline.map_run import MapOptions, run_map
         from recon.pipeline.resume import MapRequest, open_requested, plan_map
         from recon.reports import present_map
-        from recon.viewers import announce, choose_viewer
+        from recon.viewers import announce, choose_viewer, warn
 
         method = [] if odometry is None else [f"odometry.method={odometry.value}"]
         views = source_overrides(calib, left, right, tolerance)
@@ -91,6 +91,8 @@ def map_(
         request, settings = plan_map(asked, config, overrides)
         drive = open_requested(request, settings)
         announce(drive, quiet=quiet)
+        found = quick_warnings(drive, settings)
+        warn(found, quiet=quiet)
         options = MapOptions(
             out=request.out,
             threads=threads,
@@ -100,7 +102,7 @@ def map_(
             arguments=request.arguments(),
             observers=(choose_viewer(quiet=quiet),),
             present=present_map,
-            warnings=quick_warnings(drive, settings),
+            warnings=found,
         )
         run = run_map(drive, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

@@ -94,7 +94,7 @@ def find_series_faults(sample: Sample, gaps: Gaps, settings: AuditSettings) -> I
             "duplicates",
             False,
             f"{repeats.both} of {repeats.steps} frames repeat the one before; the recorder wrote "
-            "frames twice: drop them, or record at the cameras' own rate",
+            "frames twice, or the rig stood still: drop them, or record at the cameras' own rate",
         )
     blank = _blank_sides(sample, settings)
     for side, run in enumerate(repeats.frozen):
@@ -190,15 +190,17 @@ def find_range_faults(
     if len(disparity_px) < settings.min_features:
         return
     scale = camera.focal_px * camera.baseline_m
-    near = float(np.mean(disparity_px > reach_px)) if reach_px else 0.0
+    # A matcher counts columns of the pictures.
+    columns_px = disparity_px - camera.doffs_px
+    near = float(np.mean(columns_px > reach_px)) if reach_px else 0.0
     if reach_px and near > settings.near_share:
-        most = int(np.ceil(np.quantile(disparity_px, 0.98) / 16) * 16)
+        reach_m = scale / (reach_px + camera.doffs_px)
+        most = int(np.ceil(np.quantile(columns_px, 0.98) / 16) * 16)
         yield Finding(
             "near",
             False,
             f"{100 * near:.0f} % of the features are nearer than the search reaches "
-            f"({reach_px} px, {scale / reach_px:.1f} m); search {most} disparities: ndisp of the "
-            "matcher",
+            f"({reach_px} px, {reach_m:.1f} m); give the matcher an ndisp of {most}",
         )
     middle = float(np.median(disparity_px))
     if 0 < middle < settings.far_px:

@@ -26,6 +26,11 @@ from recon.structures.arrays import Float64
 # A quick look: two stretches, as many frames each as tell a camera that is late.
 _QUICK_RUNS = 2
 _LAG_PAIRS = 4
+# A video is decoded up to where one looks.
+_QUICK_REACH = 300
+# Smaller pictures have neither features nor a quarter of their size to compare detail with.
+_LEAST_SIDE_PX = 16
+_NO_FEATURES = PairFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
 
 
 @dataclass(eq=False)
@@ -78,7 +83,11 @@ def take_sample(
 
 
 def plan_stretches(frames: int, settings: AuditSettings, *, quick: bool) -> list[tuple[int, int]]:
-    """First frame and end of each stretch: the whole drive, or runs spread over it evenly."""
+    """First frame and end of each stretch: the whole drive, or runs spread over it evenly.
+
+    A quick look stays near the start.
+    """
+    frames = min(frames, _QUICK_REACH) if quick else frames
     runs = _QUICK_RUNS if quick else settings.runs
     length = 2 * settings.max_lag + 1 if quick else max(2, settings.frames // runs)
     if frames <= runs * length:
@@ -143,6 +152,10 @@ class _Sampler:
         sample.contrast_dn.append((float(pair.left.std()), float(pair.right.std())))
         sample.brightness_dn.append((float(pair.left.mean()), float(pair.right.mean())))
         if min(sample.contrast_dn[-1]) < settings.contrast_dn:
+            return
+        if min(pair.left.shape) < _LEAST_SIDE_PX:
+            sample.features.append(_NO_FEATURES)
+            sample.flows.append(np.zeros(0))
             return
         sample.sharpness.append((measure_sharpness(pair.left), measure_sharpness(pair.right)))
         features = match_features(pair.left, pair.right, settings.features)

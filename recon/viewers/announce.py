@@ -1,9 +1,10 @@
-"""Says what a source was taken for, before anything is done with it."""
+"""Says what a source was taken for and what is wrong with it, before anything is done with it."""
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterable
 from typing import TextIO
 
 from recon.sources import StereoSource
@@ -17,18 +18,24 @@ def announce(source: StereoSource, *, quiet: bool = False, stream: TextIO | None
         quiet: Whether to write nothing.
         stream: Where to; None = standard error, so that standard output stays for results.
     """
-    out = sys.stderr if stream is None else stream
-    if quiet:
-        return
-    if out.isatty():
-        out.write(f"{source.name}: {source.description}, {len(source)} pairs\n")
-        out.flush()
-        return
     event = {
         "event": "source",
         "name": source.name,
         "description": source.description,
         "frames": len(source),
     }
-    out.write(json.dumps(event, ensure_ascii=False) + "\n")
+    _tell(f"{source.name}: {source.description}, {len(source)} pairs", event, quiet, stream)
+
+
+def warn(lines: Iterable[str], *, quiet: bool = False, stream: TextIO | None = None) -> None:
+    """Write warnings while there is still time to act on them, each as `announce` does."""
+    for line in lines:
+        _tell(f"warning: {line}", {"event": "warning", "text": line}, quiet, stream)
+
+
+def _tell(text: str, event: dict[str, object], quiet: bool, stream: TextIO | None) -> None:
+    if quiet:
+        return
+    out = sys.stderr if stream is None else stream
+    out.write((text if out.isatty() else json.dumps(event, ensure_ascii=False)) + "\n")
     out.flush()

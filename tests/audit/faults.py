@@ -10,16 +10,23 @@ import cv2
 import numpy as np
 
 from recon.errors import FormatError
-from recon.geometry.se3 import exp_so3
+from recon.geometry.se3 import exp_so3, make_transform
 from recon.sources import StereoSource
-from recon.structures import RectifiedCamera, SequenceTruth, StereoPair
+from recon.structures import (
+    CameraIntrinsics,
+    RectifiedCamera,
+    SequenceTruth,
+    StereoCalibration,
+    StereoPair,
+)
+from recon.structures.arrays import Float64
 
 
 @dataclass(frozen=True, eq=False)
 class Spoiled:
     """A source whose pairs are made of those of another one; ``take(i)`` gives pair i."""
 
-    camera: RectifiedCamera
+    camera: RectifiedCamera | StereoCalibration
     count: int
     take: Callable[[int], StereoPair]
     name: str = "spoiled"
@@ -28,7 +35,7 @@ class Spoiled:
     files: Sequence[Path] = ()
 
     @property
-    def calibration(self) -> RectifiedCamera:
+    def calibration(self) -> RectifiedCamera | StereoCalibration:
         return self.camera
 
     def __len__(self) -> int:
@@ -69,7 +76,32 @@ def turned(source: StereoSource, pitch_deg: float = 0.0, roll_deg: float = 0.0) 
     R = exp_so3(np.radians([pitch_deg, 0.0, roll_deg]))
     H = K @ R @ np.linalg.inv(K)
     size = (camera.width_px, camera.height_px)
-    return changed(source, lambda left, right: (left, cv2.warpPerspective(right, H, size)))
+    return changed(source, lambda left, right: (left, warped(right, H, size)))
+
+
+def unrectified(
+    source: StereoSource, left_rad: Float64, right_rad: Float64, pitch_deg: float = 0.0
+) -> Spoiled:
+    """Cameras that are turned from where they look when rectified, and calibrated so.
+
+    The right one is off its calibration by ``pitch_deg``.
+    """
+    camera = rectified(source)
+    K, R_left, R_right = camera.matrix, exp_so3(left_rad), exp_so3(right_rad)
+    error = exp_so3(np.radians([pitch_deg, 0.0, 0.0]))
+    warps = [K @ R @ np.linalg.inv(K) for R in (R_left, error @ R_right)]
+    size = (camera.width_px, camera.height_px)
+    lens = CameraIntrinsics(K, np.zeros(0), *size)
+    centre_m = np.array([camera.baseline_m, 0.0, 0.0])
+    T_right_left = make_transform(R_right @ R_left.T, -R_right @ centre_m)
+    pictures = changed(
+        source, lambda left, right: (warped(left, warps[0], size), warped(right, warps[1], size))
+    )
+    return replace(pictures, camera=StereoCalibration(lens, lens, T_right_left))
+
+
+def warped(image: np.ndarray, H: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    return np.asarray(cv2.warpPerspective(image, H, size))
 
 
 def gain(source: StereoSource, factor: float) -> Spoiled:
@@ -117,7 +149,7 @@ def silently_wrong_size(source: StereoSource) -> Spoiled:
     """The same, and the calibration file does not tell what size it is for."""
     half = changed(source, lambda left, right: (left[::2, ::2].copy(), right[::2, ::2].copy()))
     height, width = half.take(0).left.shape[:2]
-    return replace(half, camera=replace(half.camera, width_px=width, height_px=height))
+    return replace(half, camera=replace(rectified(half), width_px=width, height_px=height))
 
 
 def blur(right: np.ndarray) -> np.ndarray:

@@ -74,7 +74,8 @@ def assert_mended(spoiled: faults.Spoiled, folder: Path) -> None:
     assert "rows" in {finding.code for finding in before.findings}
     path = folder / "mended.yaml"
     mend_calibration(spoiled, CONFIG, before, path)
-    mended = read_calibration(path, spoiled.camera.width_px, spoiled.camera.height_px)
+    height_px, width_px = spoiled.take(0).left.shape[:2]
+    mended = read_calibration(path, width_px, height_px)
     assert isinstance(mended, StereoCalibration)
     assert mended.baseline_m == pytest.approx(spoiled.camera.baseline_m, rel=1e-9)
     after = run_audit(replace(spoiled, camera=mended), CONFIG)
@@ -84,6 +85,13 @@ def assert_mended(spoiled: faults.Spoiled, folder: Path) -> None:
     assert before.figures["row_error_rms_px"] > 5 * after.figures["row_error_rms_px"]
     # Mending what is mended changes next to nothing.
     assert abs(after.figures["mend_pitch_deg"]) < 0.02
+
+
+def test_a_rig_that_is_not_rectified_is_mended_too(street: faults.Spoiled, tmp_path: Path) -> None:
+    """Both raw cameras look elsewhere than the rectified ones; the right one is off by 0.3°."""
+    left_rad, right_rad = np.radians([[-0.8, 2.0, 0.6], [1.1, -1.5, -0.7]])
+    assert codes(faults.unrectified(street, left_rad, right_rad)) == set()
+    assert_mended(faults.unrectified(street, left_rad, right_rad, pitch_deg=0.3), tmp_path)
 
 
 def test_half_a_frame_of_skew_is_measured(street: faults.Spoiled) -> None:

@@ -1,0 +1,169 @@
+"""`recon audit` as it is typed: its table, its JSON, the file it mends, one line for bad input."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from recon.cli import app
+from recon.sources import SourceSettings, open_source
+from recon.structures import RectifiedCamera, StereoPair
+from tests.audit import faults
+from tests.sources import drives
+
+pytest.importorskip("rosbags", reason="extra ros")
+from tests.sources.bags import TOPICS, Recording, recorder, write_bag
+
+Drive = tuple[list[StereoPair], RectifiedCamera]
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    return drives.rendered(FRAMES, width_px=400, height_px=136, focal_px=225.0, seed=5)
+
+
+@pytest.fixture(scope="module")
+def good(drive: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return drives.write_kitti(*drive, tmp_path_factory.mktemp("good"))
+
+
+def recon(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def spoiled(drive: Drive, **turn_deg: float) -> Drive:
+    pairs, camera = drive
+    source = faults.Spoiled(camera, len(pairs), pairs.__getitem__)
+    return list(faults.turned(source, **turn_deg)), camera
+
+
+def test_a_good_drive_is_announced_measured_and_found_good(good: Path) -> None:
+    done = recon("audit", good)
+    assert done.exit_code == 0
+    assert '"description": "KITTI odometry drive' in done.stderr
+    assert done.stdout.rstrip().endswith("verdict: good")
+    for subject in ("frames", "rows", "brightness", "sharpness", "depth error", "54 cm"):
+        assert subject in done.stdout
+    assert "not known" not in done.stdout
+
+
+def test_the_kind_can_be_overridden(good: Path) -> None:
+    assert recon("audit", good, "--source", "kitti").exit_code == 0
+    done = recon("audit", good, "--source", "euroc")
+    assert done.exit_code == 1
+    assert "cam0: folder of a camera is missing" in done.stderr
+
+
+def test_json_has_the_verdict_and_nothing_else_is_printed(drive: Drive, tmp_path: Path) -> None:
+    path = drives.write_kitti(*spoiled(drive, roll_deg=1.0), tmp_path)
+    done = recon("audit", path, "--json", "--quiet")
+    summary = json.loads(done.stdout)
+    assert done.exit_code == 0
+    assert summary["verdict"] == "not usable"
+    assert [finding["code"] for finding in summary["findings"]] == ["rows"]
+    assert summary["findings"][0]["severity"] == "fatal"
+    assert summary["mend_roll_deg"] == pytest.approx(-1, abs=0.1)
+    assert summary["frames"] == summary["frames_read"] == FRAMES
+    assert set(summary["depth_error_m"]) == {"2", "5", "10", "20", "50"}
+
+
+def test_what_it_mends_is_a_calibration_that_makes_the_drive_good(
+    drive: Drive, tmp_path: Path
+) -> None:
+    path = drives.write_kitti(*spoiled(drive, pitch_deg=0.3), tmp_path / "drive")
+    mended = tmp_path / "mended.yaml"
+    told = recon("audit", path, "--mend", mended, "--json", "--quiet")
+    assert json.loads(told.stdout)["mended"]["calibration"] == str(mended)
+    again = json.loads(recon("audit", path, "--calib", mended, "--json", "--quiet").stdout)
+    assert again["verdict"] == "good"
+    assert abs(again["row_error_mean_px"]) < 0.3
+    # The same file is what `recon map --calib` opens the drive with.
+    source = open_source(path, settings=SourceSettings(calibration=str(mended)))
+    assert source.calibration.baseline_m == pytest.approx(drive[1].baseline_m)
+
+
+def test_a_picture_of_another_size_is_a_finding(drive: Drive, tmp_path: Path) -> None:
+    pairs, camera = drive
+    half = [replace(p, left=p.left[::2, ::2].copy(), right=p.right[::2, ::2].copy()) for p in pairs]
+    done = recon("audit", drives.write_euroc(half, camera, tmp_path))
+    assert done.exit_code == 0
+    assert "fatal: " in done.stdout
+    assert "another size" in done.stdout
+    assert done.stdout.rstrip().endswith("verdict: not usable")
+
+
+def cut_off(path: Path) -> Path:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    return path
+
+
+def truncated_bag(drive: Drive, folder: Path) -> list[str | Path]:
+    return [cut_off(write_bag(*drive, folder, Recording("ros1")))]
+
+
+def missing_topic(drive: Drive, folder: Path) -> list[str | Path]:
+    bag = write_bag(*drive, folder, Recording("mcap"))
+    return [bag, "--left", "/front/image", "--right", TOPICS[1]]
+
+
+def stamps_out_of_order(drive: Drive, folder: Path) -> list[str | Path]:
+    with recorder(folder, Recording("ros2")) as bag:
+        for recorded, pair in enumerate([drive[0][1], drive[0][0], *drive[0][2:]]):
+            stamp = round(pair.timestamp_s * 1e9) + 10**18
+            for topic, image in zip(TOPICS, (pair.left, pair.right), strict=True):
+                bag.write(topic, recorded * 10**8, bag.image(stamp, image))
+    return [folder / "drive"]
+
+
+def unreadable_video(drive: Drive, folder: Path) -> list[str | Path]:
+    drives.write_lossy_videos(*drive, folder)
+    cut_off(folder / "left.mp4")
+    return [folder]
+
+
+def empty_folder(drive: Drive, folder: Path) -> list[str | Path]:
+    del drive
+    folder.mkdir(exist_ok=True)
+    return [folder]
+
+
+def unequal_counts(drive: Drive, folder: Path) -> list[str | Path]:
+    drives.write_folders(*drive, folder)
+    (folder / "right" / "right3.png").unlink()
+    return [folder]
+
+
+@pytest.mark.parametrize("command", ["audit", "map"])
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (truncated_bag, "reindex"),
+        (missing_topic, "/front/image"),
+        (stamps_out_of_order, "out of order"),
+        (unreadable_video, "left.mp4"),
+        (empty_folder, "folder is empty"),
+        (unequal_counts, "6 left and 5 right"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_1(
+    drive: Drive,
+    tmp_path: Path,
+    spoil: Callable[[Drive, Path], list[str | Path]],
+    told: str,
+    command: str,
+) -> None:
+    place = ["--out", tmp_path / "out"] if command == "map" else []
+    done = recon(command, *spoil(drive, tmp_path / "in"), *place)
+    assert done.exit_code == 1
+    assert done.stdout == ""
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert told in done.stderr
+    assert not (tmp_path / "out").exists()
