@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -19,11 +20,13 @@ from recon.loops.graph import Closure, close_loops
 from recon.loops.keyframe import Keyframe
 from recon.loops.verify import Loop
 from recon.pipeline.frame import ReconstructedFrame
+from recon.pipeline.stopwatch import Stopwatch
 from recon.pipeline.submap_store import SubmapEntry
 from recon.structures import Trajectory
 from recon.structures.arrays import Float64
 
 _CACHED: Final = 64
+_BEHIND: Final = 4  # frames by which looking for loops may be late
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,35 +103,62 @@ class DriveLoops:
 
 
 class LoopWatch:
-    """Looks for loops while a drive is mapped, and closes them at its end.
+    """Looks for loops while a drive is mapped, in a thread of its own, and closes them at its end.
 
     Args:
         settings: What is kept, compared and believed.
         folder: Where keyframes are written; None = they stay in memory.
+        stopwatch: Told the seconds.
     """
 
-    def __init__(self, settings: LoopSettings, folder: Path | None = None) -> None:
+    def __init__(
+        self,
+        settings: LoopSettings,
+        folder: Path | None = None,
+        stopwatch: Stopwatch | None = None,
+    ) -> None:
         self._settings = settings
+        self._stage = (stopwatch or Stopwatch()).stage
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
+        self._waiting: deque[Future[None]] = deque()
         self._store = KeyframeMemory() if folder is None else KeyframeFiles(folder)
         self._detector = LoopDetector(settings, self._store)
         self._path_m: list[float] = []
         self._last: Float64 = np.eye(4)
 
     def add(self, frame: ReconstructedFrame, T_world_camera: Float64, *, measured: bool) -> None:
-        """Take the next frame.
+        """Take the next frame, while those before may still be looked at.
 
         Raises:
             OutputError: A keyframe cannot be written.
         """
-        path_m = self._advance(T_world_camera, measured=measured)
-        self._detector.add(
-            len(self._path_m) - 1,
-            frame.pair,
-            frame.disparity,
-            T_world_camera,
-            path_m=path_m,
-            measured=measured,
-        )
+        path_m, number = self._advance(T_world_camera, measured=measured), len(self._path_m) - 1
+
+        def look() -> None:
+            with self._stage("loops"):
+                self._detector.add(
+                    number,
+                    frame.pair,
+                    frame.disparity,
+                    T_world_camera,
+                    path_m=path_m,
+                    measured=measured,
+                )
+
+        self._wait(_BEHIND)
+        self._waiting.append(self._pool.submit(look))
+
+    def settle(self) -> None:
+        """Wait until all frames so far have been looked at.
+
+        Raises:
+            OutputError: A keyframe cannot be written.
+        """
+        self._wait(0)
+
+    def stop(self) -> None:
+        """End the thread; what it has not begun is left."""
+        self._pool.shutdown(cancel_futures=True)
 
     def restore(self, T_world_camera: Iterable[Float64], measured: Iterable[bool]) -> None:
         """Go on after frames with these poses; their keyframes are in the store.
@@ -144,7 +174,12 @@ class LoopWatch:
                 self._detector.restore(stored)
 
     def close(self, trajectory: Trajectory) -> DriveLoops:
-        """Close the loops of a path."""
+        """Close the loops of a path.
+
+        Raises:
+            OutputError: A keyframe cannot be written.
+        """
+        self.settle()
         path_m = np.array(self._path_m)
         loops = self._detector.agreeing()
         return DriveLoops(
@@ -154,6 +189,11 @@ class LoopWatch:
             found=len(self._detector.loops),
             refused=dict(self._detector.refused),
         )
+
+    def _wait(self, left: int) -> None:
+        """Wait until no more frames than these are left to look at."""
+        while len(self._waiting) > left:
+            self._waiting.popleft().result()
 
     def _advance(self, T_world_camera: Float64, *, measured: bool) -> float:
         """The path up to the next frame, as the detector counts it."""

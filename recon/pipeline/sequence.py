@@ -126,9 +126,10 @@ def map_sequence(
         source.calibration, config, threads=threads, stopwatch=work.stopwatch
     )
     odometry = _odometry(config, known_poses, frames=len(source))
-    loops = LoopWatch(config.loops, work.loops) if config.loops.enabled else None
+    looking = config.loops.enabled and known_poses is None
+    loops = LoopWatch(config.loops, work.loops, work.stopwatch) if looking else None
     mapper = Mapper(config, reconstructor.camera, odometry, work)
-    drive = _Drive(mapper, loops if known_poses is None else None, config, work)
+    drive = _Drive(mapper, loops, config, work)
     for observer in audience:
         observer.on_start(source.name, len(source))
     try:
@@ -138,7 +139,9 @@ def map_sequence(
                 result = drive.add(frame, total=len(source))
                 for observer in audience:
                     observer.on_frame(result)
+            drive.settle()
     finally:
+        drive.stop()
         for observer in audience:
             observer.on_finish()
     return drive.finish(source, reconstructor)
@@ -173,8 +176,7 @@ class _Drive:
     def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
         result = self.mapper.add(frame, total=total)
         if self._loops is not None:
-            with self._stage("loops"):
-                self._loops.add(frame, result.T_world_camera, measured=result.health.ok)
+            self._loops.add(frame, result.T_world_camera, measured=result.health.ok)
         if result.index <= total // 2:
             self._sample = frame
         if len(self.mapper) - self._saved >= self._config.checkpoints.every_frames:
@@ -183,6 +185,16 @@ class _Drive:
         now = time.perf_counter()
         seconds, self._last = now - self._last, now
         return replace(result, seconds=seconds)
+
+    def settle(self) -> None:
+        """Wait for what is done beside the mapping."""
+        if self._loops is not None:
+            self._loops.settle()
+
+    def stop(self) -> None:
+        """End what is done beside the mapping, done or not."""
+        if self._loops is not None:
+            self._loops.stop()
 
     def finish(self, source: StereoSource, reconstructor: FrameReconstructor) -> MappedSequence:
         if not len(self.mapper):
@@ -208,6 +220,7 @@ class _Drive:
     def _save(self) -> None:
         if self._checkpoint is None:
             return
+        self.settle()  # or keyframes that a resumed run counts on might be missing
         with self._stage("checkpoint"):
             seconds = time.perf_counter() - self._start
             self._checkpoint.save({"mapper": self.mapper.state(), "seconds": seconds})

@@ -6,15 +6,18 @@ Each place is a wall of its own, 10 m ahead, and the drive is one lap and a bit 
 from __future__ import annotations
 
 import math
+import threading
+import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from recon.errors import FormatError
+from recon.errors import FormatError, OutputError
 from recon.geometry import se3
 from recon.loops import LoopSettings
+from recon.loops.detector import LoopDetector, StoredKeyframe
 from recon.loops.graph import close_loops
 from recon.pipeline.drive_loops import DriveLoops, KeyframeFiles, LoopWatch
 from recon.pipeline.frame import ReconstructedFrame
@@ -71,6 +74,7 @@ def _watch(frames, path: Trajectory, folder: Path | None = None, upto: int = FRA
     watch = LoopWatch(LoopSettings(), folder)
     for frame, T in zip(frames[:upto], path.T_world_camera, strict=False):
         watch.add(frame, T, measured=True)
+    watch.settle()
     return watch
 
 
@@ -151,6 +155,33 @@ def test_an_interrupted_drive_gives_the_same_loops(frames, closed, tmp_path, che
     assert np.array_equal(
         loops.closure.trajectory.T_world_camera, closed.closure.trajectory.T_world_camera
     )
+
+
+def test_a_full_disk_is_told_although_another_thread_met_it(frames, tmp_path, monkeypatch):
+    def full(self: KeyframeFiles, stored: StoredKeyframe) -> None:
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr(KeyframeFiles, "put", full)
+    with pytest.raises(OutputError, match="full"):
+        _watch(frames, _circle(), tmp_path, upto=1)
+
+
+def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):
+    looked, go_on = [], threading.Event()
+
+    def slow(self: LoopDetector, frame: int, *_: object, **__: object) -> None:
+        looked.append(frame)
+        go_on.wait(10)
+
+    monkeypatch.setattr(LoopDetector, "add", slow)
+    watch = LoopWatch(LoopSettings())
+    for frame in frames[:4]:
+        watch.add(frame, np.eye(4), measured=True)
+    while not looked:
+        time.sleep(0.001)
+    threading.Timer(0.05, go_on.set).start()
+    watch.stop()
+    assert looked == [0]
 
 
 def test_a_damaged_keyframe_is_told(frames, tmp_path):
