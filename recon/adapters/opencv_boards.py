@@ -38,8 +38,9 @@ def dark_rectangles(board: CalibrationBoard) -> Float64:
     for number, corners in zip(charuco.getIds().ravel(), charuco.getObjPoints(), strict=True):
         markers.append(_marker_cells(board, int(number), np.asarray(corners)[:, :2]))
     columns, rows = board.squares
-    # OpenCV's boards begin with a dark square at the upper left corner.
-    dark = [(x, y) for y in range(rows) for x in range(columns) if (x + y) % 2 == 0]
+    # OpenCV's boards begin with a dark square at the upper left corner, older ones ended so.
+    light = 1 if board.legacy and rows % 2 == 0 else 0
+    dark = [(x, y) for y in range(rows) for x in range(columns) if (x + y) % 2 == light]
     low = np.array(dark, dtype=np.float64) * board.square_m
     cells = np.concatenate([np.hstack([low, low + board.square_m]), *markers])
     return np.asarray(cells - board.square_m)
@@ -95,7 +96,9 @@ def _charuco(board: CalibrationBoard) -> Any:
             expected=f"at least {marker_count(board)}",
         )
     size = (board.columns, board.rows)
-    return cv2.aruco.CharucoBoard(size, board.square_m, board.marker_m, dictionary)
+    charuco = cv2.aruco.CharucoBoard(size, board.square_m, board.marker_m, dictionary)
+    charuco.setLegacyPattern(board.legacy)
+    return charuco
 
 
 def _marker_cells(board: CalibrationBoard, number: int, corners: Float64) -> Float64:

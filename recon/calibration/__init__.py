@@ -1,6 +1,6 @@
 """From pictures of a board to the cameras that took them."""
 
-from recon.calibration.board_size import check_charuco, check_chessboard
+from recon.calibration.board_size import check_charuco, check_chessboard, grown_size
 from recon.calibration.bootstrap import DepthError, Spread, measure_depth, measure_spread
 from recon.calibration.bundle import Sighting, View
 from recon.calibration.detect import find_board, orient_like
@@ -21,6 +21,7 @@ __all__ = [
     "check_chessboard",
     "coverage",
     "find_board",
+    "grown_size",
     "measure_depth",
     "measure_spread",
     "orient_like",

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import cv2
 import numpy as np
 
 from recon.adapters.opencv_boards import dictionary_names, find_markers, marker_count
-from recon.calibration.bundle import Sighting
 from recon.calibration.detect import find_chessboard, refine_corners
 from recon.errors import CalibrationError
 from recon.structures.arrays import Float64, UInt8
@@ -21,54 +20,65 @@ Inner = tuple[int, int]
 # An inner corner has dark and light quarters crosswise; beyond the pattern this contrast is gone.
 _CORNER_CONTRAST: Final = 0.5
 _LARGEST: Final = 60
-# Pictures that are asked for the true size when the claimed one is found in none.
+# So many pictures that agree on a size, or markers in a picture, are no accident.
+_SURE: Final = 3
+# Pictures that are asked for the true size when the claimed one is found in few.
 _PROBED: Final = 8
 # … and for the markers of all of OpenCV's dictionaries, of which there are twenty.
 _PROBED_MARKERS: Final = 2
 
 
 def check_chessboard(
-    pictures: Sequence[UInt8], seen: Sequence[Sighting | None], board: CalibrationBoard
+    sizes: Sequence[Inner | None], read: Callable[[int], UInt8], board: CalibrationBoard
 ) -> None:
     """Make sure that the board in the pictures has as many corners as was claimed.
 
     A part of a larger board is found without complaint, but not the same part in both pictures.
 
     Args:
-        pictures: uint8 (H, W) each.
-        seen: What was found in each.
+        sizes: `grown_size` of what was found in each picture, None where nothing was.
+        read: Gives a picture, uint8 (H, W), by its number.
         board: The board that was claimed.
 
     Raises:
         CalibrationError: Most pictures show another board; its size is told.
     """
-    sizes = [
-        grown_size(picture, sighting.pixels, board.inner)
-        for picture, sighting in zip(pictures, seen, strict=True)
-        if sighting is not None
-    ]
-    if 2 * len(sizes) < len(pictures):
+    claimed = _sorted(board.inner)
+    seen = Counter(_sorted(size) for size in sizes if size is not None)
+    if not seen:
+        _check_no_markers([read(n) for n in _spread(range(len(sizes)), _PROBED_MARKERS)], board)
+    probed: list[Inner | None] = []
+    if 2 * seen.total() < len(sizes):
         # What little was found may be a part of another board.
-        empty = [p for p, sighting in zip(pictures, seen, strict=True) if sighting is None]
-        sizes += [size for size in map(probe_size, spread(empty, _PROBED)) if size is not None]
-    counts = Counter(tuple(sorted(size)) for size in sizes)
-    if not counts:
-        return
-    size, votes = counts.most_common(1)[0]
-    if size != tuple(sorted(board.inner)) and 2 * votes > len(sizes):
-        raise _wrong_size(size, f"{votes} of {len(sizes)} pictures", board)
+        empty = [number for number, size in enumerate(sizes) if size is None]
+        probed = [probe_size(read(number)) for number in _spread(empty, _PROBED)]
+    others = Counter(_sorted(size) for size in probed if size is not None)
+    for votes, voters, enough in (
+        (others, len(probed), _SURE),
+        (seen + others, (seen + others).total(), (seen + others).total() // 2 + 1),
+    ):
+        size, most = next(iter(votes.most_common(1)), (claimed, 0))
+        larger = any(n > m for n, m in zip(size, claimed, strict=True))
+        # Where the claimed board was seen whole, a smaller one is a part of it.
+        if most >= enough and size != claimed and (larger or not seen[claimed]):
+            raise _wrong_size(size, f"{most} of {voters} pictures", board)
 
 
-def check_charuco(pictures: Sequence[UInt8], board: CalibrationBoard) -> None:
+def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBoard) -> None:
     """Say what is wrong where a ChArUco board is found in no picture.
 
+    Args:
+        count: Number of pictures.
+        read: Gives a picture, uint8 (H, W), by its number.
+        board: The board that was claimed.
+
     Raises:
-        CalibrationError: The markers are of another dictionary, or of a larger board.
+        CalibrationError: The markers are of another dictionary, or of a larger board, or there
+            are none but a plain chessboard.
     """
-    probed = spread(pictures, _PROBED_MARKERS)
-    votes = Counter({name: _marker_votes(probed, name) for name in dictionary_names()})
-    best, most = votes.most_common(1)[0]
-    if most and votes[board.dictionary] < most / 2:
+    probed = [read(number) for number in _spread(range(count), _PROBED_MARKERS)]
+    best, votes = _marker_votes(probed)
+    if votes[best] and votes[board.dictionary] < votes[best] / 2:
         raise CalibrationError(
             "markers of the board are of another dictionary",
             got=best.lower(),
@@ -82,6 +92,15 @@ def check_charuco(pictures: Sequence[UInt8], board: CalibrationBoard) -> None:
             got=f"markers up to number {numbers.max()}",
             expected=f"0 to {marker_count(board) - 1} for {board.columns}x{board.rows} squares",
             hint="count squares, not corners; columns come first",
+        )
+    plain = [size for size in map(probe_size, probed) if size is not None]
+    if plain:
+        columns, rows = max(plain, key=lambda size: size[0] * size[1])
+        raise CalibrationError(
+            "the pictures show a chessboard without markers",
+            got=f"{columns}x{rows} inner corners",
+            expected=str(board),
+            hint=f"try --board chess:{columns}x{rows}:…",
         )
 
 
@@ -124,10 +143,15 @@ def probe_size(grey: UInt8) -> Inner | None:
     return size if find_chessboard(grey, size) is not None else None
 
 
-def spread(pictures: Sequence[UInt8], count: int) -> list[UInt8]:
-    """At most so many pictures, evenly from first to last."""
-    picked = np.unique(np.linspace(0, len(pictures) - 1, min(count, len(pictures))).astype(int))
-    return [pictures[number] for number in picked]
+def _spread(numbers: Sequence[int], count: int) -> list[int]:
+    """At most so many of the numbers, evenly from first to last."""
+    at = np.unique(np.linspace(0, len(numbers) - 1, min(count, len(numbers))).astype(int))
+    return [numbers[place] for place in at]
+
+
+def _sorted(size: Inner) -> Inner:
+    """A board may be held upright or across."""
+    return min(size), max(size)
 
 
 def _continue(grey: UInt8, grid: Float64, axis: int, usual: float) -> Float64 | None:
@@ -171,11 +195,29 @@ def _sample(grey: UInt8, places: Float64) -> Float64:
     return np.where(inside, grey[y, x].astype(np.float64), np.nan)
 
 
-def _marker_votes(pictures: Sequence[UInt8], dictionary: str) -> int:
-    return sum(len(find_markers(picture, dictionary)) for picture in pictures)
+def _marker_votes(pictures: Sequence[UInt8]) -> tuple[str, Counter[str]]:
+    """The dictionary of which most markers are seen, and how many of each."""
+    votes = Counter(
+        {
+            name: sum(len(find_markers(picture, name)) for picture in pictures)
+            for name in dictionary_names()
+        }
+    )
+    return votes.most_common(1)[0][0], votes
 
 
-def _wrong_size(size: tuple[int, ...], where: str, board: CalibrationBoard) -> CalibrationError:
+def _check_no_markers(pictures: Sequence[UInt8], board: CalibrationBoard) -> None:
+    best, votes = _marker_votes(pictures)
+    if votes[best] >= _SURE * len(pictures):
+        raise CalibrationError(
+            "the pictures show a board with markers (ChArUco)",
+            got=f"markers of {best.lower()}",
+            expected=str(board),
+            hint=f"try --board charuco:COLUMNSxROWS:SQUARE:MARKER:{best.lower()}, in squares",
+        )
+
+
+def _wrong_size(size: Inner, where: str, board: CalibrationBoard) -> CalibrationError:
     columns, rows = size if board.columns <= board.rows else size[::-1]
     claimed = f"{board.columns}x{board.rows}"
     squares = (columns + 1, rows + 1) == (board.columns, board.rows)

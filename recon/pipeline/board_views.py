@@ -13,6 +13,7 @@ from recon.calibration import (
     check_charuco,
     check_chessboard,
     find_board,
+    grown_size,
     orient_like,
 )
 from recon.errors import CalibrationError, SourceError
@@ -33,6 +34,7 @@ class BoardViews:
         empty: Files in which it is not seen.
         size_px: (width, height) of every picture.
         count: Number of pairs of pictures.
+        board: The board as it is seen.
     """
 
     views: tuple[View, ...]
@@ -40,6 +42,16 @@ class BoardViews:
     empty: tuple[Path, ...]
     size_px: tuple[int, int]
     count: int
+    board: CalibrationBoard
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What one picture shows; the picture itself is not kept."""
+
+    size_px: tuple[int, int]
+    seen: Sighting | None
+    grown: tuple[int, int] | None
 
 
 def find_views(pictures: PicturePairs, board: CalibrationBoard, threads: int) -> BoardViews:
@@ -51,15 +63,13 @@ def find_views(pictures: PicturePairs, board: CalibrationBoard, threads: int) ->
         CalibrationError: The board is seen in no pair, or is another one; its size is told.
     """
     files = [path for pair in pictures.pairs for path in pair]
-    with ThreadPoolExecutor(threads) as pool:
-        greys = list(pool.map(_read_grey, files))
-        size = _one_size(files, greys)
-        seen = list(pool.map(lambda grey: find_board(grey, board), greys))
+    board, looks = _look_at_all(files, board, threads)
+    size = _one_size(files, looks)
     if board.kind == "chess":
-        check_chessboard(greys, seen, board)
-    elif not any(seen):
-        check_charuco(greys, board)
-    if not any(seen):
+        check_chessboard([look.grown for look in looks], lambda n: _read_grey(files[n]), board)
+    elif not any(look.seen for look in looks):
+        check_charuco(len(files), lambda n: _read_grey(files[n]), board)
+    if not any(look.seen for look in looks):
         raise CalibrationError(
             "the board is seen in no picture",
             where=files[0].parent,
@@ -67,15 +77,37 @@ def find_views(pictures: PicturePairs, board: CalibrationBoard, threads: int) ->
             expected=str(board),
             hint="all of it must be in view, with a light margin, sharp and evenly lit",
         )
-    empty = tuple(path for path, sighting in zip(files, seen, strict=True) if sighting is None)
+    empty = tuple(path for path, look in zip(files, looks, strict=True) if look.seen is None)
     views, pairs = {}, {}
     for number, pair in enumerate(pictures.pairs):
-        left, right = seen[2 * number : 2 * number + 2]
+        left, right = (look.seen for look in looks[2 * number : 2 * number + 2])
         if left is not None and right is not None:
             name = pair[0].name
             views[name] = View(name, (left, _same_order(left, right, board)))
             pairs[name] = pair
-    return BoardViews(tuple(views.values()), pairs, empty, size, len(pictures.pairs))
+    return BoardViews(tuple(views.values()), pairs, empty, size, len(pictures.pairs), board)
+
+
+def _look_at_all(
+    files: Sequence[Path], board: CalibrationBoard, threads: int
+) -> tuple[CalibrationBoard, list[_Look]]:
+    """What every picture shows; and the board, which may be of an older pattern than was said."""
+    with ThreadPoolExecutor(threads) as pool:
+        looks = list(pool.map(lambda path: _look(path, board), files))
+        if board.kind == "chess" or any(look.seen for look in looks):
+            return board, looks
+        other = replace(board, legacy=not board.legacy)
+        older = list(pool.map(lambda path: _look(path, other), files))
+        return (other, older) if any(look.seen for look in older) else (board, looks)
+
+
+def _look(path: Path, board: CalibrationBoard) -> _Look:
+    grey = _read_grey(path)
+    seen = find_board(grey, board)
+    grown = None
+    if seen is not None and board.kind == "chess":
+        grown = grown_size(grey, seen.pixels, board.inner)
+    return _Look((grey.shape[1], grey.shape[0]), seen, grown)
 
 
 def _same_order(left: Sighting, right: Sighting, board: CalibrationBoard) -> Sighting:
@@ -88,15 +120,15 @@ def _read_grey(path: Path) -> UInt8:
     return to_grey(read_image(path))
 
 
-def _one_size(files: Sequence[Path], pictures: Sequence[UInt8]) -> tuple[int, int]:
-    first = pictures[0].shape
-    for path, picture in zip(files, pictures, strict=True):
-        if picture.shape != first:
+def _one_size(files: Sequence[Path], looks: Sequence[_Look]) -> tuple[int, int]:
+    first = looks[0].size_px
+    for path, look in zip(files, looks, strict=True):
+        if look.size_px != first:
             raise SourceError(
                 "pictures differ in size",
                 where=path,
-                got=f"{picture.shape[1]}x{picture.shape[0]}",
-                expected=f"{first[1]}x{first[0]} as {files[0].name}",
+                got=f"{look.size_px[0]}x{look.size_px[1]}",
+                expected=f"{first[0]}x{first[1]} as {files[0].name}",
                 hint="both cameras must record the same size",
             )
-    return first[1], first[0]
+    return first

@@ -121,8 +121,8 @@ def run_calibration(
             fit = calibrate_stereo(seen.views, seen.size_px, config.calibration)
         with watch.stage("bootstrap"), serial_algebra():
             spread = measure_spread(fit, config.calibration)
-        run = _run(board, config, seen, fit, spread)
-        warnings = advise(board, pictures, run.summary)
+        run = _run(config, seen, fit, spread)
+        warnings = advise(seen.board, pictures, run.summary)
         run.summary["warnings"] = warnings
         _write(run, options, directory)
         run.summary.update(cost(watch, time.perf_counter() - start))
@@ -134,7 +134,7 @@ def run_calibration(
         directory.write_json("summary.json", run.summary)
         record = {
             "source": f"{left} {right}",
-            "board": str(board),
+            "board": str(seen.board),
             "inputs": fingerprint(path for pair in pictures.pairs for path in pair),
             "timings": watch.seconds,
             "warnings": warnings,
@@ -143,15 +143,13 @@ def run_calibration(
     return run
 
 
-def _run(
-    board: CalibrationBoard, config: ReconConfig, seen: BoardViews, fit: StereoFit, spread: Spread
-) -> CalibrationRun:
+def _run(config: ReconConfig, seen: BoardViews, fit: StereoFit, spread: Spread) -> CalibrationRun:
     turns = plan_turns(fit.calibration, config.rectification)
     rows_px = np.concatenate([_rows_apart(turns, fit, view) for view in fit.views])
-    summary = summarise(board, seen, fit, spread, rows_px)
+    summary = summarise(seen, fit, spread, rows_px)
     summary["rectified_focal_px"] = turns.camera.focal_px
     summary["model"] = config.calibration.model
-    return CalibrationRun(board, config, seen, fit, spread, turns, rows_px, summary)
+    return CalibrationRun(seen.board, config, seen, fit, spread, turns, rows_px, summary)
 
 
 def _rows_apart(turns: RectifyingTurns, fit: StereoFit, view: View) -> Float64:

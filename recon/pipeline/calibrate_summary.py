@@ -17,16 +17,15 @@ _FEW_VIEWS: Final = 10
 _SMALL_COVERAGE: Final = 0.5
 _SMALL_TILT_DEG: Final = 15.0
 _UNSURE_FOCAL: Final = 0.01  # half of the interval, of the focal length
+_USUAL_BASELINE_M: Final = (0.01, 2.0)
 _APART: Final = 2.0  # error together against alone
 
 
-def summarise(
-    board: CalibrationBoard, seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64
-) -> dict[str, Any]:
+def summarise(seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64) -> dict[str, Any]:
     """The figures of ``summary.json``, but for the run's cost."""
     rig = fit.calibration
     return {
-        "board": str(board),
+        "board": str(seen.board),
         "model": rig.left.model,
         "width_px": seen.size_px[0],
         "height_px": seen.size_px[1],
@@ -37,7 +36,7 @@ def summarise(
         "epipolar_95_px": float(np.quantile(np.abs(rows_px), 0.95)),
         "baseline_m": rig.baseline_m,
         "baseline_interval_m": list(spread.baseline_m),
-        "baseline_squares": rig.baseline_m / board.square_m,
+        "baseline_squares": rig.baseline_m / seen.board.square_m,
         "focal_px": float(rig.left.matrix[0, 0]),
         "focal_interval_px": list(spread.focal_px),
         "focal_right_px": float(rig.right.matrix[0, 0]),
@@ -83,6 +82,12 @@ def advise(board: CalibrationBoard, pictures: PicturePairs, summary: dict[str, A
     low, high = summary["focal_interval_px"]
     if high - low > 2 * _UNSURE_FOCAL * summary["focal_px"]:
         lines.append(f"focal length is unsure: {low:.1f} to {high:.1f} px; take more tilted views")
+    shortest, longest = _USUAL_BASELINE_M
+    if board.metric and not shortest <= summary["baseline_m"] <= longest:
+        lines.append(
+            f"baseline is {summary['baseline_m']:.3g} m: are the squares really "
+            f"{1e3 * board.square_m:g} mm?"
+        )
     alone = max(summary["left_rms_px"], summary["right_rms_px"])
     if summary["stereo_rms_px"] > _APART * alone:
         lines.append("both cameras together fit worse than alone: not synchronised, or moved?")

@@ -39,6 +39,8 @@ class CalibrationBoard:
         marker_m: Side of a marker; 0 for a chessboard.
         dictionary: OpenCV's name of the markers without ``DICT_``; "" for a chessboard.
         metric: Whether the size of a square was given; else a square counts as 1 m.
+        legacy: Whether a ChArUco board is of the pattern that OpenCV drew before 4.6, whose first
+            square is light where the number of rows is even.
     """
 
     kind: BoardKind
@@ -48,6 +50,7 @@ class CalibrationBoard:
     marker_m: float = 0.0
     dictionary: str = ""
     metric: bool = True
+    legacy: bool = False
 
     def __post_init__(self) -> None:
         if min(self.inner) < 2:
@@ -94,7 +97,8 @@ class CalibrationBoard:
         square = f"{self.square_m * 1e3:g}mm" if self.metric else "?"
         text = f"{self.kind}:{self.columns}x{self.rows}:{square}"
         marked = f":{self.marker_m * 1e3:g}mm:{self.dictionary.lower()}"
-        return text + (marked if self.kind == "charuco" else "")
+        older = ":legacy" if self.legacy else ""
+        return text + (marked + older if self.kind == "charuco" else "")
 
 
 def parse_board(text: str) -> CalibrationBoard:
@@ -102,7 +106,8 @@ def parse_board(text: str) -> CalibrationBoard:
 
     ``chess:9x6:25mm`` has 9 by 6 inner corners and squares of 25 mm.
     ``charuco:8x6:30mm:22mm:5x5_100`` has 8 by 6 squares and markers of 22 mm from that dictionary
-    (three quarters of a square and ``5x5_100`` if left out). Lengths are in mm, cm, m or in; a
+    (three quarters of a square and ``5x5_100`` if left out); ``:legacy`` after it means the pattern
+    that OpenCV drew before 4.6. Lengths are in mm, cm, m or in; a
     bare number is metres. Without any, a square counts as 1 m: see `CalibrationBoard.metric`.
 
     Raises:
@@ -112,7 +117,8 @@ def parse_board(text: str) -> CalibrationBoard:
     if kind.lower() not in ("chess", "charuco") or not parts:
         raise _unreadable(text)
     size = _SIZE.fullmatch(parts[0])
-    most = 2 if kind.lower() == "chess" else 4
+    legacy = kind.lower() == "charuco" and len(parts) == 5 and parts[4].lower() == "legacy"
+    most = 2 if kind.lower() == "chess" else 4 + legacy
     if size is None or len(parts) > most:
         raise _unreadable(text)
     columns, rows = int(size[1]), int(size[2])
@@ -122,7 +128,8 @@ def parse_board(text: str) -> CalibrationBoard:
     marker_m = _length_m(parts[2], text) if len(parts) > 2 else square_m * _DEFAULT_MARKER
     dictionary = _DICTIONARY.fullmatch(parts[3]) if len(parts) > 3 else None
     name = dictionary[1].upper() if dictionary else _DEFAULT_DICTIONARY
-    return CalibrationBoard("charuco", columns, rows, square_m, marker_m, name, len(parts) > 1)
+    sized = len(parts) > 1
+    return CalibrationBoard("charuco", columns, rows, square_m, marker_m, name, sized, legacy)
 
 
 def _length_m(text: str, whole: str) -> float:

@@ -6,8 +6,7 @@ from itertools import chain
 import numpy as np
 import pytest
 
-from recon.calibration import check_charuco, check_chessboard, find_board, orient_like
-from recon.calibration.board_size import grown_size
+from recon.calibration import check_charuco, check_chessboard, find_board, grown_size, orient_like
 from recon.errors import CalibrationError, SettingsError
 from recon.structures.arrays import UInt8
 from recon.structures.board import parse_board
@@ -80,19 +79,23 @@ def test_corners_of_the_right_picture_run_as_in_the_left_one(turn: int) -> None:
 def test_a_wrong_size_is_found_out_and_the_true_one_said(true: str, claimed: str) -> None:
     board, shown = parse_board(f"chess:{claimed}:25mm"), pictures(f"chess:{true}:25mm")
     seen = [find_board(picture, board) for picture in shown]
+    sizes = [
+        None if sighting is None else grown_size(picture, sighting.pixels, board.inner)
+        for picture, sighting in zip(shown, seen, strict=True)
+    ]
     if sorted(claimed.split("x")) == sorted(true.split("x")):
-        assert all(sighting is not None for sighting in seen)
-        check_chessboard(shown, seen, board)
+        assert None not in sizes
+        check_chessboard(sizes, shown.__getitem__, board)
         return
     said = true if board.columns > board.rows else "x".join(sorted(true.split("x")))
     with pytest.raises(CalibrationError, match=rf"does not have {claimed}.*got {said} in"):
-        check_chessboard(shown, seen, board)
+        check_chessboard(sizes, shown.__getitem__, board)
 
 
 def test_squares_that_were_counted_for_corners_are_told() -> None:
     board, shown = parse_board("chess:10x7:25mm"), pictures("chess:9x6:25mm")
     with pytest.raises(CalibrationError, match="count inner corners, not squares"):
-        check_chessboard(shown, [None] * len(shown), board)
+        check_chessboard([None] * len(shown), shown.__getitem__, board)
 
 
 def test_a_part_of_a_grid_grows_to_the_whole_and_the_whole_no_further() -> None:
@@ -105,7 +108,7 @@ def test_a_part_of_a_grid_grows_to_the_whole_and_the_whole_no_further() -> None:
 def test_markers_of_another_dictionary_are_told() -> None:
     board = parse_board("charuco:8x6:30mm:22mm:4x4_50")
     with pytest.raises(CalibrationError, match=r"another dictionary \(got \S+, expected 4x4_50"):
-        check_charuco(pictures(CHARUCO), board)
+        check_charuco(4, pictures(CHARUCO).__getitem__, board)
 
 
 def test_a_charuco_board_of_another_size_is_told() -> None:
@@ -113,7 +116,31 @@ def test_a_charuco_board_of_another_size_is_told() -> None:
     with pytest.raises(
         CalibrationError, match=r"markers up to number 2\d, expected 0 to 9 for 5x4"
     ):
-        check_charuco(pictures(CHARUCO), board)
+        check_charuco(4, pictures(CHARUCO).__getitem__, board)
+
+
+def test_a_larger_board_is_told_although_parts_of_it_passed_for_the_claimed_one() -> None:
+    shown = pictures("chess:9x6:25mm")
+    sizes = [(7, 5), None, None, (7, 5), None, None, None]
+    with pytest.raises(CalibrationError, match=r"does not have 7x5.*got 9x6 in \d of 5"):
+        check_chessboard(sizes, lambda n: shown[n % 4], parse_board("chess:7x5:25mm"))
+
+
+def test_views_of_a_part_of_the_claimed_board_are_no_other_board() -> None:
+    """Most pictures cut the board off: what is left of it is no proof."""
+    view, left, _ = rendered("chess:9x6:25mm")[0]
+    cut = left.copy()
+    cut[:, : int(view.left_px.reshape(6, 9, 2)[:, 1].max())] = 90
+    sizes = [(9, 6), (9, 6), None, None, None, None]
+    check_chessboard(sizes, lambda n: cut, parse_board("chess:9x6:25mm"))
+
+
+def test_a_chessboard_for_a_charuco_board_is_told_and_the_other_way_round() -> None:
+    with pytest.raises(CalibrationError, match=r"without markers \(got 9x6 .*chess:9x6"):
+        check_charuco(4, pictures("chess:9x6:25mm").__getitem__, parse_board(CHARUCO))
+    shown = pictures(CHARUCO)
+    with pytest.raises(CalibrationError, match=r"board with markers \(ChArUco\) .*5x5_"):
+        check_chessboard([None] * 4, shown.__getitem__, parse_board("chess:11x9:25mm"))
 
 
 def test_no_board_is_seen_in_noise() -> None:
