@@ -71,6 +71,7 @@ def calibrate(
     del quiet  # there is no progress to hide; every command takes the option
     with session():
         from recon.pipeline.calibrate_run import CalibrateOptions, run_calibration
+        from recon.pipeline.calibrate_summary import tell_depths
         from recon.pipeline.config import load_config
         from recon.reports import present_calibration
         from recon.structures.board import parse_board
@@ -81,4 +82,7 @@ def calibrate(
         settings = load_config(config, [*fitting, *(set_ or ()), *chosen])
         options = CalibrateOptions(out, form.value, report, threads, present_calibration)
         run = run_calibration(left, right, parse_board(board), settings, options)
-    print_json(run.summary) if json else print_run(run.summary, stages=verbose)
+    if json:
+        print_json(run.summary)
+    else:
+        print_run(run.summary | tell_depths(run.summary), stages=verbose)

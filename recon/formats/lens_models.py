@@ -12,11 +12,12 @@ from recon.formats.files import StrPath
 from recon.structures import CameraIntrinsics, LensModel
 from recon.structures.arrays import Float64
 
-# Name -> our model, and the numbers of coefficients that the name allows.
+# Name -> our model, and the numbers of coefficients that the name allows; the first that will do is
+# written.
 Models = Mapping[str, tuple[LensModel, tuple[int, ...]]]
 
 ROS_MODELS: Final[Models] = {
-    "plumb_bob": ("pinhole", (0, 4, 5)),
+    "plumb_bob": ("pinhole", (5, 4, 0)),
     "rational_polynomial": ("pinhole", (8, 12, 14)),
     "equidistant": ("fisheye", (4,)),
     "fisheye": ("fisheye", (4,)),
@@ -69,9 +70,9 @@ def name_lens(models: Models, camera: CameraIntrinsics, form: str) -> tuple[str,
     """
     most = int(np.flatnonzero(camera.distortion).max(initial=-1)) + 1
     for name, (model, counts) in models.items():
-        fitting = [count for count in counts if count >= max(most, 4)]
-        if model == camera.model and fitting:
-            padded = np.zeros(fitting[-1])
+        count = next((count for count in counts if count >= most), None)
+        if model == camera.model and count is not None:
+            padded = np.zeros(count)
             padded[:most] = camera.distortion[:most]
             return name, padded
     raise CalibrationError(

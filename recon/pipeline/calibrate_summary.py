@@ -94,6 +94,19 @@ def advise(board: CalibrationBoard, pictures: PicturePairs, summary: dict[str, A
     return lines
 
 
+def tell_depths(summary: dict[str, Any]) -> dict[str, str]:
+    """The depth errors of a summary in words, one line for each distance."""
+    lines = {}
+    for depth, cm in summary["depth_error_cm"].items():
+        known = "no common view"
+        if cm["calibration"] is not None:
+            known = (
+                f"{cm['calibration']:.2g} cm, in the middle {cm['low']:+.2g} to {cm['high']:+.2g}"
+            )
+        lines[f"depth error at {depth} m"] = f"{known}; of matching {cm['matching']:.2g} cm"
+    return lines
+
+
 def _depth_cm(each: DepthError) -> dict[str, float | None]:
     metres = {
         "calibration": each.calibration_m,

@@ -9,10 +9,13 @@ import pytest
 from recon.errors import CalibrationError, OutputError, ReconError, SourceError
 from recon.formats.calibration import read_calibration
 from recon.formats.image import write_image
+from recon.pipeline.board_views import find_views
 from recon.pipeline.calibrate_run import CalibrateOptions, run_calibration
+from recon.pipeline.calibrate_summary import tell_depths
 from recon.pipeline.config import load_config
 from recon.rectification import Rectifier
 from recon.reports import present_calibration
+from recon.sources.picture_pairs import pair_pictures
 from recon.structures import StereoCalibration
 from recon.structures.board import parse_board
 from recon.synthetic.boards import board_rig, place_boards, render_views
@@ -120,6 +123,31 @@ def test_a_board_without_a_size_gives_squares_and_says_so(drawn: Path, tmp_path:
     assert run.summary["baseline_squares"] == pytest.approx(0.12 / 0.025, rel=0.01)
     assert run.summary["baseline_m"] == pytest.approx(run.summary["baseline_squares"])
     assert any("in squares" in line for line in run.summary["warnings"])
+
+
+def test_a_charuco_board_of_the_older_pattern_is_found_out(tmp_path: Path) -> None:
+    rig, older = board_rig(), parse_board("charuco:8x6:30mm:22mm:5x5_100:legacy")
+    views = place_boards(rig, older, 2, seed=3)
+    for number, pair in enumerate(render_views(rig, older, views)):
+        for side, picture in zip(("left", "right"), pair, strict=True):
+            write_image(tmp_path / f"{side}{number}.png", picture)
+    pictures = pair_pictures(f"{tmp_path}/left*.png", f"{tmp_path}/right*.png")
+    seen = find_views(pictures, parse_board("charuco:8x6:30mm:22mm:5x5_100"), 1)
+    assert seen.board == older
+    assert len(seen.views) == 2
+    for view, placed in zip(seen.views, views, strict=True):
+        left = view.seen[0]
+        np.testing.assert_allclose(left.pixels, placed.left_px[left.numbers], atol=0.5)
+
+
+def test_depth_errors_are_told_in_words() -> None:
+    known = {"calibration": 11.04, "low": -3.24, "high": 4.56, "matching": 2.25}
+    unknown = dict.fromkeys(known) | {"matching": 0.01}
+    told = tell_depths({"depth_error_cm": {"2": known, "0.1": unknown}})
+    assert told == {
+        "depth error at 2 m": "11 cm, in the middle -3.2 to +4.6; of matching 2.2 cm",
+        "depth error at 0.1 m": "no common view; of matching 0.01 cm",
+    }
 
 
 def test_a_folder_for_a_calibration_file_is_refused(drawn: Path, tmp_path: Path) -> None:

@@ -30,7 +30,24 @@ def test_a_board_is_read_from_text(text: str, board: CalibrationBoard) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["9x6", "chess", "chess:9", "chess:9x6:25kg", "chess:9x6:25mm:3mm", "circles:4x5:3mm", ""],
+    ["chess:9x6:25mm", "charuco:8x6:30mm:22mm:4x4_50", "charuco:8x6:30mm:22mm:4x4_50:legacy"],
+)
+def test_a_board_tells_itself_as_it_is_read(text: str) -> None:
+    assert str(parse_board(text)) == text
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "9x6",
+        "chess",
+        "chess:9",
+        "chess:9x6:25kg",
+        "chess:9x6:25mm:3mm",
+        "circles:4x5:3mm",
+        "",
+        "charuco:8x6:30mm:22mm:4x4_50:older",
+    ],
 )
 def test_what_is_no_board_is_told_both_forms(text: str) -> None:
     with pytest.raises(SettingsError, match=r"cannot read this board.*chess:9x6:25mm.*charuco:8x6"):
