@@ -52,6 +52,10 @@ def map_(
     poses: Annotated[
         Path | None, typer.Option(help="Known poses (KITTI or TUM) to use instead of odometry.")
     ] = None,
+    prior: Annotated[
+        Path | None,
+        typer.Option(help="Path by wheels, IMU or GPS (TUM, clock of the pictures) to go by."),
+    ] = None,
     matcher: Matcher = None,
     mesh: Mesh = True,
     resume: Annotated[
@@ -70,13 +74,16 @@ def map_(
     Examples:
       recon map ~/kitti/sequences/06 --out outputs/kitti06
       recon map drive.bag --calib camchain.yaml --left /cam0/image_raw --right /cam1/image_raw
+      recon map drive.bag --calib camchain.yaml --prior wheels.txt --set odometry.prior.axes=body
       recon map --resume outputs/kitti06
       recon map left.mp4 --right right.mp4 --calib stereo.yaml
     """
     if source is None and resume is None:
         raise typer.BadParameter("give SOURCE, or --resume FOLDER")
+    if poses is not None and prior is not None:
+        raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
     with session():
-        from recon.formats.trajectory import read_trajectory
+        from recon.formats.trajectory import read_trajectory, read_tum
         from recon.pipeline.audit_run import quick_warnings
         from recon.pipeline.config import matching_overrides, source_overrides
         from recon.pipeline.map_run import MapOptions, run_map
@@ -87,7 +94,7 @@ def map_(
         method = [] if odometry is None else [f"odometry.method={odometry.value}"]
         views = source_overrides(calib, left, right, tolerance)
         overrides = [*(set_ or ()), *method, *matching_overrides(matcher), *views]
-        asked = MapRequest(source, kind, poses, mesh, out, resume, memory_limit)
+        asked = MapRequest(source, kind, poses, prior, mesh, out, resume, memory_limit)
         request, settings = plan_map(asked, config, overrides)
         drive = open_requested(request, settings)
         announce(drive, quiet=quiet)
@@ -97,6 +104,7 @@ def map_(
             out=request.out,
             threads=threads,
             known_poses=None if request.poses is None else read_trajectory(request.poses),
+            prior=None if request.prior is None else read_tum(request.prior),
             mesh=request.mesh,
             resume=resume is not None,
             arguments=request.arguments(),

@@ -1,6 +1,7 @@
 """From frames to poses: a visual prior and a kiss-icp correction that must earn its place."""
 
 from recon.odometry.known import KnownPoses
+from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
 from recon.odometry.registry import ODOMETRIES, make_odometry
 from recon.odometry.settings import OdometrySettings
@@ -8,6 +9,7 @@ from recon.odometry.settings import OdometrySettings
 __all__ = [
     "ODOMETRIES",
     "KnownPoses",
+    "MotionPrior",
     "Odometry",
     "OdometryFrame",
     "OdometryHealth",

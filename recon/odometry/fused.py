@@ -20,6 +20,7 @@ from recon.odometry.gate import (
     step_covariance,
 )
 from recon.odometry.points import select_points
+from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
 from recon.odometry.settings import FusedSettings, VisualSettings
 from recon.odometry.surfaces import describe_surfaces, fit_surfaces
@@ -54,11 +55,14 @@ class FusedOdometry:
     Args:
         settings: Points, ICP and the gate.
         visual: The visual odometry.
+        prior: How the camera moved by other means.
     """
 
-    def __init__(self, settings: FusedSettings, visual: VisualSettings) -> None:
+    def __init__(
+        self, settings: FusedSettings, visual: VisualSettings, prior: MotionPrior | None = None
+    ) -> None:
         self._settings = settings
-        self._visual = VisualOdometry(visual)
+        self._visual = VisualOdometry(visual, prior)
         self._icp = KissIcp(
             KissIcpOptions(
                 max_range_m=settings.points.max_range_m,

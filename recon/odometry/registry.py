@@ -9,29 +9,40 @@ from recon.errors import SettingsError
 from recon.odometry.checked import CheckedOdometry
 from recon.odometry.fused import FusedOdometry
 from recon.odometry.kiss import KissOdometry
+from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import Odometry
 from recon.odometry.settings import OdometrySettings
 from recon.odometry.visual import VisualOdometry
+from recon.structures import Trajectory
 
-ODOMETRIES: Final[dict[str, Callable[[OdometrySettings], Odometry]]] = {
-    "visual": lambda settings: VisualOdometry(settings.visual),
-    "kiss": lambda settings: KissOdometry(settings.kiss),
-    "fused": lambda settings: FusedOdometry(settings.fused, settings.visual),
+ODOMETRIES: Final[dict[str, Callable[[OdometrySettings, MotionPrior | None], Odometry]]] = {
+    "visual": lambda settings, prior: VisualOdometry(settings.visual, prior),
+    "kiss": lambda settings, prior: KissOdometry(settings.kiss),
+    "fused": lambda settings, prior: FusedOdometry(settings.fused, settings.visual, prior),
 }
 
 
-def make_odometry(name: str, settings: OdometrySettings | None = None) -> Odometry:
+def make_odometry(
+    name: str, settings: OdometrySettings | None = None, prior: Trajectory | None = None
+) -> Odometry:
     """Make the odometry of a name; it doubts its poses.
 
     Args:
         name: A key of `ODOMETRIES`.
         settings: The settings of all odometries; each takes its own part.
+        prior: How the camera moved by other means, on the clock of the frames; None = not known.
 
     Raises:
-        SettingsError: There is no such odometry.
+        SettingsError: There is no such odometry, or it takes no prior.
+        RegistrationError: The prior tells no motion.
     """
     if name not in ODOMETRIES:
         choices = ", ".join(sorted(ODOMETRIES))
         raise SettingsError("unknown odometry", got=repr(name), expected=f"one of: {choices}")
+    if name == "kiss" and prior is not None:
+        raise SettingsError(
+            "kiss takes no prior", expected="visual or fused", hint="drop --prior or --odometry"
+        )
     settings = settings or OdometrySettings()
-    return CheckedOdometry(ODOMETRIES[name](settings), settings.trust)
+    told = None if prior is None else MotionPrior(prior, settings.prior)
+    return CheckedOdometry(ODOMETRIES[name](settings, told), settings.trust)

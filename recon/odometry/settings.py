@@ -125,6 +125,30 @@ class TrustSettings(Settings):
     agreement: AgreementSettings = AgreementSettings()
 
 
+class PriorSettings(Settings):
+    """How a path from elsewhere is used."""
+
+    axes: Literal["camera", "body"] = Field(
+        "camera",
+        description="Axes of its poses: of the left camera (x right, y down, z forward), or of a "
+        "body (x forward, y left, z up) that turns with it and is near to it",
+    )
+    max_gap_s: float = Field(
+        1.0, gt=0.0, description="Between poses farther apart in time nothing is told"
+    )
+    sigma_m: float = Field(
+        0.03, gt=0.0, description="Standard deviation of a motion from frame to frame, plus"
+    )
+    sigma_share: float = Field(0.03, ge=0.0, description="this share of its length")
+    sigma_deg: float = Field(0.5, gt=0.0, description="The same for its rotation")
+    max_sigmas: float = Field(
+        4.7,
+        gt=0.0,
+        description="What features say is not believed where it is farther from the path than "
+        "this, by the uncertainties of both",
+    )
+
+
 class VisualSettings(Settings):
     """Visual odometry: corners, tracks, pose, window."""
 
@@ -254,6 +278,7 @@ class OdometrySettings(Settings):
     """The odometries: which one, and how each works."""
 
     method: OdometryName = Field("fused", description="visual, kiss or fused")
+    prior: PriorSettings = PriorSettings()
     trust: TrustSettings = TrustSettings()
     visual: VisualSettings = VisualSettings()
     kiss: KissSettings = KissSettings()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,8 +11,10 @@ from recon.geometry.projection import project, unproject
 from recon.geometry.se3 import apply, invert
 from recon.geometry.triangulation import depth_from_disparity
 from recon.odometry.corners import find_corners
+from recon.odometry.gate import as_step, covariance_of, step_covariance
 from recon.odometry.motion import Motion
 from recon.odometry.pose import enough_agree, locate_camera
+from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
 from recon.odometry.settings import VisualSettings
 from recon.odometry.tracking import follow, sample_disparity
@@ -30,12 +32,14 @@ class VisualState:
         left: uint8 (H, W), the left picture of the newest of them.
         disparity: Its disparity.
         motion: Where the camera is by now, which may be some frames later.
+        seen_s: Time of the newest of the frames that were seen.
     """
 
     window: TrackWindow
     left: UInt8
     disparity: Disparity
     motion: Motion
+    seen_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +49,8 @@ class VisualEstimate:
     Attributes:
         result: Pose and health.
         information: float64 (6, 6) of a step (translation in metres, rotation vector in
-            radians) in camera axes; None where the pose is extrapolated.
+            radians) in camera axes, of what was seen or of the prior that carries; None where
+            the pose is extrapolated.
     """
 
     result: OdometryResult
@@ -66,10 +71,13 @@ class VisualOdometry:
 
     Args:
         settings: Corners, tracks, pose and window.
+        prior: How the camera moved by other means: features are looked for where it leads, it
+            carries through frames that show none, and features that contradict it are refused.
     """
 
-    def __init__(self, settings: VisualSettings) -> None:
+    def __init__(self, settings: VisualSettings, prior: MotionPrior | None = None) -> None:
         self._settings = settings
+        self._prior = prior
         self._state: VisualState | None = None
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
@@ -89,20 +97,44 @@ class VisualOdometry:
             motion = Motion(np.eye(4), frame.pair.timestamp_s)
             self._state = self._begin(frame, motion)
             return VisualEstimate(OdometryResult(np.eye(4), OdometryHealth()), None)
-        predicted = state.motion.predict(frame.pair.timestamp_s)
+        time_s = frame.pair.timestamp_s
+        told = self._told(state.motion.timestamp_s, time_s)
+        motion = state.motion.drifted(time_s)
+        if told is not None:
+            motion = state.motion.moved(state.motion.T_world_camera @ told, time_s)
+        predicted = motion.T_world_camera
         seen = self._followed(state, frame, predicted) or self._found_again(state, frame, predicted)
         if seen is None:
-            return self._lost(state, frame)
+            return self._lost(state, frame, motion, told)
+        if self._contradicts(state, seen, frame):
+            what = "features contradict the prior"
+            return self._lost(state, frame, motion, told, what)
         T_world_camera = seen.window.T_world_camera[-1].copy()
         window = self._replenish(seen.window.trimmed(self._settings.window.frames), frame)
-        motion = state.motion.moved(T_world_camera, frame.pair.timestamp_s)
-        self._state = VisualState(window, frame.pair.left, frame.disparity, motion)
+        motion = state.motion.moved(T_world_camera, time_s)
+        self._state = VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
         return self._estimate(seen, frame.pair.camera)
 
     def _begin(self, frame: OdometryFrame, motion: Motion) -> VisualState:
         """A new window at the pose where the camera is by now."""
         window = self._replenish(_empty(motion.T_world_camera), frame)
-        return VisualState(window, frame.pair.left, frame.disparity, motion)
+        time_s = frame.pair.timestamp_s
+        return VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
+
+    def _told(self, from_s: float, to_s: float) -> Float64 | None:
+        """The motion between two times by the prior, where there is one that tells."""
+        return None if self._prior is None else self._prior.motion(from_s, to_s)
+
+    def _contradicts(self, state: VisualState, seen: _Seen, frame: OdometryFrame) -> bool:
+        """Whether what was seen since the last frame that was, is no motion by the prior."""
+        told = self._told(state.seen_s, frame.pair.timestamp_s)
+        if told is None or self._prior is None:
+            return False
+        found = invert(state.window.T_world_camera[-1]) @ seen.window.T_world_camera[-1]
+        off = as_step(invert(told) @ found)
+        information = self._information(seen.window, frame.pair.camera)
+        both = covariance_of(information) + step_covariance(*self._prior.sigmas(told))
+        return float(np.sqrt(off @ np.linalg.solve(both, off))) > self._prior.settings.max_sigmas
 
     def _followed(
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
@@ -149,19 +181,28 @@ class VisualOdometry:
             return None
         return _Seen(window, len(tracks))
 
-    def _lost(self, state: VisualState, frame: OdometryFrame) -> VisualEstimate:
-        """The last motion goes on; what is seen of it decides from where it is followed next."""
-        motion = state.motion.drifted(frame.pair.timestamp_s)
+    def _lost(
+        self,
+        state: VisualState,
+        frame: OdometryFrame,
+        motion: Motion,
+        told: Float64 | None,
+        what: str = "no motion fits",
+    ) -> VisualEstimate:
+        """The motion goes on; what is seen of it decides from where it is followed next."""
         begun = self._begin(frame, motion)
         points = len(begun.window.xyz_world)
         sees = points >= self._settings.pose.min_inliers
-        self._state = (
-            begun if sees else VisualState(state.window, state.left, state.disparity, motion)
-        )
-        what = "no motion fits" if sees else "nothing to follow in the picture"
-        note = f"lost: {what} ({points} features); the last motion goes on"
-        health = OdometryHealth(False, notes=(note,))
-        return VisualEstimate(OdometryResult(motion.T_world_camera, health), None)
+        self._state = begun if sees else replace(state, motion=motion)
+        why = f"{what if sees else 'nothing to follow in the picture'} ({points} features)"
+        if told is None or self._prior is None:
+            health = OdometryHealth(False, notes=(f"lost: {why}; the last motion goes on",))
+            return VisualEstimate(OdometryResult(motion.T_world_camera, health), None)
+        sigma_m, sigma_deg = self._prior.sigmas(told)
+        note = f"carried by the prior: {why}"
+        health = OdometryHealth(sigma_m=sigma_m, sigma_deg=sigma_deg, notes=(note,))
+        information = np.asarray(np.linalg.inv(step_covariance(sigma_m, sigma_deg)), np.float64)
+        return VisualEstimate(OdometryResult(motion.T_world_camera, health), information)
 
     def _observe(self, state: VisualState, frame: OdometryFrame, predicted: Float64) -> Float64:
         """Column, row and disparity (N, 3) in the new frame of the points of the window."""
@@ -190,10 +231,15 @@ class VisualOdometry:
         uvd = np.column_stack([uv, d])[np.isfinite(d)]
         return window.with_points(uvd, _points(uvd, window.T_world_camera[-1], frame.pair.camera))
 
+    def _information(self, window: TrackWindow, camera: RectifiedCamera) -> Float64:
+        """Information (6, 6) of the newest pose, tracks being less independent than many."""
+        settings = self._settings.window
+        return settings.independence * pose_information(window, camera, settings)
+
     def _estimate(self, seen: _Seen, camera: RectifiedCamera) -> VisualEstimate:
         """What a registered frame says, and how sure it is."""
-        settings, window = self._settings.window, seen.window
-        information = settings.independence * pose_information(window, camera, settings)
+        window = seen.window
+        information = self._information(window, camera)
         newest = window.seen[-1]
         error = reprojection(window, camera)[newest, :2]
         sigma = np.sqrt(np.diag(np.linalg.inv(information + 1e-4 * np.eye(6))))

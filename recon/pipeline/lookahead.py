@@ -1,4 +1,4 @@
-"""Work on the next items while this one is being used."""
+"""Work on the next items while this one is being used, and on the last one still."""
 
 from __future__ import annotations
 
@@ -38,3 +38,39 @@ def look_ahead(
                 return
             waiting.append(pool.submit(work))
             yield done[0]
+
+
+class OneBehind:
+    """Does jobs in one thread, in order, while the caller goes on: one at a time.
+
+    A job begins when the one before has ended; who brings the next one earlier waits. So at most
+    one job is under way, and what it holds is all that is held longer.
+    """
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="one-behind")
+        self._job: Future[None] | None = None
+
+    def begin(self, job: Callable[[], None]) -> None:
+        """Begin a job, once the last one has ended.
+
+        Raises:
+            Exception: What the last job raised; then this one is not begun.
+        """
+        self.settle()
+        self._job = self._pool.submit(job)
+
+    def settle(self) -> None:
+        """Wait until the last job has ended.
+
+        Raises:
+            Exception: What it raised, once.
+        """
+        job, self._job = self._job, None
+        if job is not None:
+            job.result()
+
+    def abandon(self) -> None:
+        """Wait until the last job has ended, whatever came of it; no other can begin."""
+        self._job = None
+        self._pool.shutdown(wait=True)

@@ -87,6 +87,7 @@ class MapOptions:
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores. Changes no result.
         known_poses: Poses to use instead of odometry, one per frame.
+        prior: How the left camera moved by other means, on the clock of the source.
         mesh: Whether to reconstruct a surface.
         observers: Told of the progress.
         present: Writes pictures and the report of the run into its folder.
@@ -99,6 +100,7 @@ class MapOptions:
     out: Path | None = None
     threads: int | None = None
     known_poses: Trajectory | None = None
+    prior: Trajectory | None = None
     mesh: bool = True
     observers: tuple[Observer, ...] = ()
     present: Callable[[MapRun, RunDirectory], None] | None = None
@@ -117,7 +119,7 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
     start = time.perf_counter()
     threads = use_threads(options.threads)
     watch = Stopwatch()
-    identity = identity_of(source, config, options.known_poses)
+    identity = identity_of(source, config, options.known_poses, options.prior)
     target = RunDirectory.for_command(options.command, options.out, resume=options.resume)
     with target as directory, tell_how_to_resume(directory):
         begin_or_resume(directory, identity, options.arguments)
@@ -125,9 +127,9 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
             source,
             config,
             known_poses=options.known_poses,
+            prior=options.prior,
             observers=options.observers,
-            threads=threads,
-            workspace=Workspace(watch, directory.state(""), resume=options.resume),
+            workspace=Workspace(watch, directory.state(""), resume=options.resume, threads=threads),
         )
         run = _finish(source, mapped, options, directory, watch)
         with watch.stage("write"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,16 +14,17 @@ from recon.odometry import Odometry, OdometryFrame, OdometryHealth
 from recon.pipeline.checkpoint import pack_object, unpack_object
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.frame import ReconstructedFrame
+from recon.pipeline.lookahead import OneBehind
 from recon.pipeline.observer import FrameResult
 from recon.pipeline.ray_log import RayLog
 from recon.pipeline.submap_store import SubmapStore
 from recon.pipeline.workspace import Workspace
-from recon.structures import RayCloud, RectifiedCamera, Trajectory
+from recon.structures import PointCloud, RayCloud, RectifiedCamera, Trajectory
 from recon.structures.arrays import Float64
 
 
 class Mapper:
-    """Registers frames and adds them to the submap of the moment.
+    """Registers frames and adds them to the submap of the moment, which happens a frame behind.
 
     Args:
         config: The configuration.
@@ -42,6 +44,7 @@ class Mapper:
         self._odometry = odometry
         self._workspace = workspace
         self._fusion_range_m = fusion_range_m(camera, config.fusion)
+        self._behind = OneBehind()
         self._builder: SubmapBuilder | None = None
         self._poses: list[Float64] = []
         self._times_s: list[float] = []
@@ -71,18 +74,11 @@ class Mapper:
             registered = self._odometry.register(OdometryFrame(frame.pair, frame.disparity))
         T_world_camera = registered.T_world_camera
         health = replace(registered.health, warnings=(*frame.warnings, *registered.health.warnings))
-        with stage("map"):
-            builder = self._builder_from(frame)
-            # A map that is wrong is worse than one with a hole.
-            cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))
-            rays = self._rays_of(frame) if health.ok else thin_rays(cloud, self._config.occupancy)
-            near = cloud.select(cloud.xyz[:, 2] <= self._fusion_range_m)
-            cloud_world = transform_cloud(near, T_world_camera, frame="world")
-            builder.integrate(cloud_world, rays.cloud(), T_world_camera)
-        with stage("store"):
-            self._rays.add(rays)
-            if builder.full:
-                self.submaps.add(builder.close())
+        # A map that is wrong is worse than one with a hole.
+        cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))
+        rays = frame.rays if health.ok else None
+        builder = self._builder_from(frame)
+        self._behind.begin(partial(self._integrate, builder, cloud, rays, T_world_camera))
         self._poses.append(T_world_camera)
         self._times_s.append(frame.pair.timestamp_s)
         self._health.append(health)
@@ -91,14 +87,47 @@ class Mapper:
             len(self) - 1, total, 0.0, valid_share, len(frame.cloud), T_world_camera, health
         )
 
+    def _integrate(
+        self,
+        builder: SubmapBuilder,
+        cloud: PointCloud,
+        rays: RayCloud | None,
+        T_world_camera: Float64,
+    ) -> None:
+        """Add what a frame saw to the maps, while the next one is registered."""
+        stage = self._workspace.stopwatch.stage
+        with stage("map"):
+            rays = thin_rays(cloud, self._config.occupancy) if rays is None else rays
+            near = cloud.select(cloud.xyz[:, 2] <= self._fusion_range_m)
+            cloud_world = transform_cloud(near, T_world_camera, frame="world")
+            builder.integrate(cloud_world, rays.cloud(), T_world_camera)
+        with stage("store"):
+            self._rays.add(rays)
+            if builder.full:
+                self.submaps.add(builder.close())
+
+    def settle(self) -> None:
+        """Wait until all frames are in the map.
+
+        Raises:
+            ReconError: One of them cannot be mapped.
+        """
+        self._behind.settle()
+
+    def abandon(self) -> None:
+        """Leave off, once what is being done is done; needed after an error, harmless always."""
+        self._behind.abandon()
+
     def close(self) -> None:
         """Close the submap of the moment, after the last frame."""
+        self._behind.settle()
         if self._builder is not None and self._builder.frames:
             self.submaps.add(self._builder.close())
         self._rays.close()
 
     def state(self) -> dict[str, Any]:
         """All that decides what comes later, as a tree of arrays and plain values."""
+        self._behind.settle()
         return {
             "odometry": pack_object(self._odometry),
             "builder": None if self._builder is None else self._builder.state(),
@@ -122,11 +151,6 @@ class Mapper:
         if state["builder"] is not None:
             self._builder = self._new_builder()
             self._builder.restore(state["builder"])
-
-    def _rays_of(self, frame: ReconstructedFrame) -> RayCloud:
-        """What of a frame is kept for occupancy."""
-        kept = frame.rays
-        return thin_rays(frame.cloud, self._config.occupancy) if kept is None else kept
 
     def _builder_from(self, frame: ReconstructedFrame) -> SubmapBuilder:
         """The maps that are being built; the first frame fixes their axes."""

@@ -26,6 +26,7 @@ _OTHER: Final = {
     "config": "other settings",
     "source": "another source",
     "poses": "other poses",
+    "prior": "another prior",
     "versions": "other versions",
 }
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -41,6 +42,7 @@ class MapRequest:
         source: Path of the source; None = that of the run that is resumed.
         kind: What the source is; None = told by its files.
         poses: Known poses.
+        prior: How the camera moved by other means.
         mesh: Whether to reconstruct a surface.
         out: Result folder; None = a new one.
         resume: Folder of an unfinished run to go on with.
@@ -50,6 +52,7 @@ class MapRequest:
     source: Path | None
     kind: str | None = None
     poses: Path | None = None
+    prior: Path | None = None
     mesh: bool = True
     out: Path | None = None
     resume: Path | None = None
@@ -61,6 +64,7 @@ class MapRequest:
             "source": None if self.source is None else str(self.source.resolve()),
             "kind": self.kind,
             "poses": None if self.poses is None else str(self.poses.resolve()),
+            "prior": None if self.prior is None else str(self.prior.resolve()),
             "mesh": self.mesh,
         }
 
@@ -101,6 +105,7 @@ def _plan_resumed(
         source=request.source or _path(known.get("source")),
         kind=request.kind or known.get("kind"),
         poses=request.poses or _path(known.get("poses")),
+        prior=request.prior or _path(known.get("prior")),
         mesh=bool(known.get("mesh")),
         out=folder,
     )
@@ -124,18 +129,26 @@ def open_requested(request: MapRequest, config: ReconConfig) -> StereoSource:
 
 
 def identity_of(
-    source: StereoSource, config: ReconConfig, known_poses: Trajectory | None
+    source: StereoSource,
+    config: ReconConfig,
+    known_poses: Trajectory | None,
+    prior: Trajectory | None = None,
 ) -> dict[str, Any]:
     """All that has to be the same for a run to go on to the same result."""
-    poses = None
-    if known_poses is not None:
-        poses = hashlib.sha256(known_poses.T_world_camera.tobytes()).hexdigest()
     return {
         "config": config.model_dump(mode="json"),
         "source": {"frames": len(source), **quick_fingerprint(source.files)},
-        "poses": poses,
+        "poses": _digest(known_poses),
+        "prior": _digest(prior),
         "versions": versions(),
     }
+
+
+def _digest(path: Trajectory | None) -> str | None:
+    """What tells one path from another."""
+    if path is None:
+        return None
+    return hashlib.sha256(path.T_world_camera.tobytes() + path.timestamps_s.tobytes()).hexdigest()
 
 
 def begin_or_resume(

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from recon.errors import RegistrationError
-from recon.odometry import KnownPoses, Odometry, OdometryHealth, make_odometry
+from recon.odometry import KnownPoses, MotionPrior, Odometry, OdometryHealth, make_odometry
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.drive_loops import DriveLoops, LoopWatch
 from recon.pipeline.drive_map import DriveMap
@@ -21,7 +21,7 @@ from recon.pipeline.mapper import Mapper
 from recon.pipeline.observer import FrameResult, Observer
 from recon.pipeline.submap_store import SubmapStore
 from recon.pipeline.workspace import Workspace
-from recon.sources import StereoSource
+from recon.sources import StampedSource, StereoSource
 from recon.structures import OccupancyVoxels, PointCloud, RectifiedCamera, Trajectory
 from recon.structures.arrays import Float64
 
@@ -100,22 +100,25 @@ def map_sequence(
     config: ReconConfig,
     *,
     known_poses: Trajectory | None = None,
+    prior: Trajectory | None = None,
     observers: Iterable[Observer] = (),
-    threads: int | None = None,
     workspace: Workspace | None = None,
 ) -> MappedSequence:
     """Register and fuse all frames of a source, and close the loops of the path.
 
-    The next frames are matched while this one is registered; the result does not depend on it.
+    The next frames are matched while this one is registered and the last one still goes into the
+    map; the result does not depend on it.
 
     Args:
         source: Where the pairs come from.
         config: The configuration.
         known_poses: Poses to use instead of odometry, one per frame of the source; they are
             taken as they are, loops or not.
+        prior: How the left camera moved by wheels, an inertial unit or a satellite receiver, on
+            the clock of the source; only its motions count.
         observers: Told of the progress.
-        threads: Threads to use; None = all cores. Changes no result.
-        workspace: What the run may keep on the disk, and who times it; None = in memory, nobody.
+        workspace: What the run may keep on the disk, its threads, and who times it; None = in
+            memory, all cores, nobody.
 
     Raises:
         ReconError: A frame cannot be read, matched or registered.
@@ -123,9 +126,9 @@ def map_sequence(
     work = workspace or Workspace()
     audience = tuple(observers)
     reconstructor = FrameReconstructor(
-        source.calibration, config, threads=threads, stopwatch=work.stopwatch
+        source.calibration, config, threads=work.threads, stopwatch=work.stopwatch
     )
-    odometry = _odometry(config, known_poses, frames=len(source))
+    odometry = _odometry(config, source, known_poses, prior)
     looking = config.loops.enabled and known_poses is None
     loops = LoopWatch(config.loops, work.loops, work.stopwatch) if looking else None
     mapper = Mapper(config, reconstructor.camera, odometry, work)
@@ -187,12 +190,15 @@ class _Drive:
         return replace(result, seconds=seconds)
 
     def settle(self) -> None:
-        """Wait for what is done beside the mapping."""
+        """Wait for what is done beside the registration: the last frame, and the loops."""
+        self.mapper.settle()
         if self._loops is not None:
             self._loops.settle()
+        self._last = time.perf_counter()
 
     def stop(self) -> None:
-        """End what is done beside the mapping, done or not."""
+        """End what is done beside the registration, done or not."""
+        self.mapper.abandon()
         if self._loops is not None:
             self._loops.stop()
 
@@ -234,14 +240,21 @@ class _Drive:
         return reconstructor.reconstruct(next(source.frames(index)))
 
 
-def _odometry(config: ReconConfig, known_poses: Trajectory | None, *, frames: int) -> Odometry:
+def _odometry(
+    config: ReconConfig,
+    source: StereoSource,
+    known_poses: Trajectory | None,
+    prior: Trajectory | None,
+) -> Odometry:
     if known_poses is None:
-        return make_odometry(config.odometry.method, config.odometry)
-    if len(known_poses) < frames:
+        if prior is not None and isinstance(source, StampedSource):
+            MotionPrior(prior, config.odometry.prior).check_covers(source.stamps_s)
+        return make_odometry(config.odometry.method, config.odometry, prior)
+    if len(known_poses) < len(source):
         raise RegistrationError(
             "fewer known poses than frames",
             got=f"{len(known_poses)} poses",
-            expected=f"{frames}",
+            expected=f"{len(source)}",
             hint="the pose file must list every frame of the source",
         )
     return KnownPoses(known_poses)

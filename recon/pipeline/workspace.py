@@ -22,11 +22,13 @@ class Workspace:
             does not grow with the drive and a killed run can go on; it must stay as long as the
             result is used. None = all stays in memory.
         resume: Go on from the checkpoint in the folder, where there is one.
+        threads: Threads of the matcher; None = all cores.
     """
 
     stopwatch: Stopwatch = field(default_factory=Stopwatch)
     folder: Path | None = None
     resume: bool = False
+    threads: int | None = None
 
     @property
     def submaps(self) -> Path | None:

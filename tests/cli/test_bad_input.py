@@ -189,3 +189,37 @@ def test_evaluating_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
 def test_wrong_usage_exits_with_two(tmp_path: Path) -> None:
     assert recon("map").returncode == 2
     assert recon("map", tmp_path, "--no-such-option").returncode == 2
+
+
+def prior_without_times(path: Path) -> str:
+    path.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
+    return "8"
+
+
+def prior_of_another_clock(path: Path) -> str:
+    path.write_text("".join(f"{1.7e9 + k} 0 0 {k} 0 0 0 1\n" for k in range(3)))
+    return "same clock"
+
+
+def prior_of_one_pose(path: Path) -> str:
+    path.write_text("0 0 0 0 0 0 0 1\n")
+    return "two poses"
+
+
+def prior_with_a_word_in_it(path: Path) -> str:
+    path.write_text("0 0 0 0 0 0 0 one\n")
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [prior_without_times, prior_of_another_clock, prior_of_one_pose, prior_with_a_word_in_it],
+)
+def test_a_prior_that_tells_nothing(
+    write: Callable[[Path], str], good_drive: Path, tmp_path: Path
+) -> None:
+    word = write(tmp_path / "prior.txt")
+    out = tmp_path / "out"
+    done = recon("map", good_drive, "--prior", tmp_path / "prior.txt", "--out", out, "--quiet")
+    assert_one_line(done, word)
+    assert not out.exists()

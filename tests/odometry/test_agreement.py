@@ -57,6 +57,10 @@ def test_a_picture_without_texture_tells_nothing(blind: See) -> None:
     assert np.isnan(found.share)
 
 
+def test_a_picture_that_is_dark_now_tells_nothing(see: See, blind: See) -> None:
+    assert ask(see(np.eye(4)), blind(2), STEP).telling == 0
+
+
 def test_edges_of_one_direction_tell_nothing(see: See) -> None:
     """Stripes look alike however far the camera went along them."""
     frame = see(np.eye(4))

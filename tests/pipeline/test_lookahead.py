@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.pipeline.lookahead import look_ahead
+from recon.pipeline.lookahead import OneBehind, look_ahead
 
 
 @given(st.lists(st.integers()), st.integers(min_value=1, max_value=5))
@@ -57,3 +58,41 @@ def test_an_error_of_the_source_is_raised_at_its_turn() -> None:
 def test_work_happens_in_another_thread() -> None:
     [thread] = look_ahead(lambda _: threading.current_thread().name, [0])
     assert thread.startswith("look-ahead")
+
+
+def test_jobs_behind_are_done_in_order() -> None:
+    behind, done = OneBehind(), []
+    for item in range(50):
+        behind.begin(partial(done.append, item))
+    behind.settle()
+    assert done == list(range(50))
+
+
+def test_one_job_at_a_time_is_behind() -> None:
+    behind, gate, done = OneBehind(), threading.Event(), []
+
+    def first() -> None:
+        gate.wait(10.0)
+        done.append("first")
+
+    behind.begin(first)
+    assert done == []
+    threading.Timer(0.05, gate.set).start()
+    behind.begin(partial(done.append, "second"))
+    assert done[0] == "first"
+    behind.abandon()
+    assert done == ["first", "second"]
+
+
+def test_an_error_of_a_job_is_raised_once_when_it_is_met() -> None:
+    behind = OneBehind()
+    behind.begin(partial(int, "no number"))
+    with pytest.raises(ValueError, match="no number"):
+        behind.settle()
+    behind.settle()
+
+
+def test_leaving_off_waits_and_raises_nothing() -> None:
+    behind = OneBehind()
+    behind.begin(partial(int, "no number"))
+    behind.abandon()

@@ -10,6 +10,7 @@ import pytest
 
 from recon.pipeline.config import load_config
 from recon.pipeline.sequence import map_sequence
+from recon.pipeline.workspace import Workspace
 from recon.sources import StereoSource, open_source, recognise_source
 from recon.structures import RectifiedCamera, StereoPair
 from recon.structures.arrays import Float64
@@ -98,7 +99,8 @@ def test_a_drive_can_be_entered_at_any_pair(
 
 def trajectory(path: Path) -> Float64:
     config = load_config(overrides=["matching.matcher=opencv-bm", "fusion.voxel_m=0.5"])
-    return map_sequence(open_source(path), config, threads=1).trajectory.T_world_camera
+    work = Workspace(threads=1)
+    return map_sequence(open_source(path), config, workspace=work).trajectory.T_world_camera
 
 
 @pytest.mark.slow

@@ -1,0 +1,89 @@
+"""How the camera moved by a path from elsewhere: wheels, an inertial unit, a satellite receiver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from recon.errors import RegistrationError
+from recon.geometry.se3 import invert, make_transform, orthonormalise
+from recon.odometry.motion import part_of
+from recon.odometry.settings import PriorSettings
+from recon.structures import Trajectory
+from recon.structures.arrays import Float64
+
+_CAMERA_FROM_BODY: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""Camera axes (x right, y down, z forward) of body axes (x forward, y left, z up)."""
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPrior:
+    """A path of the same rig on the same clock, of which only motions are used.
+
+    Attributes:
+        path: Where the left camera was; its rate may be any, its world any.
+        settings: Axes, gaps, accuracy.
+    """
+
+    path: Trajectory
+    settings: PriorSettings
+
+    def __post_init__(self) -> None:
+        if len(self.path) < 2:
+            raise RegistrationError(
+                "a prior of the motion needs two poses", got=f"{len(self.path)}", hint="see --prior"
+            )
+
+    def check_covers(self, stamps_s: Float64) -> None:
+        """Refuse a path that tells nothing about a drive.
+
+        Args:
+            stamps_s: float64 (N,), times of its frames.
+
+        Raises:
+            RegistrationError: No two frames that follow one another lie within the path.
+        """
+        known = np.array([self._pose_at(float(t)) is not None for t in stamps_s])
+        if len(stamps_s) < 2 or (known[1:] & known[:-1]).any():
+            return
+        spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" for t in (self.path.timestamps_s, stamps_s)]
+        raise RegistrationError(
+            "the prior does not cover the drive",
+            got=f"poses from {spans[0]}",
+            expected=f"frames from {spans[1]}, poses at most {self.settings.max_gap_s:g} s apart",
+            hint="both must use the same clock, in seconds",
+        )
+
+    def motion(self, from_s: float, to_s: float) -> Float64 | None:
+        """T_from_to (4, 4) of the camera between two times; None = the path does not tell."""
+        start, end = self._pose_at(from_s), self._pose_at(to_s)
+        if start is None or end is None or not to_s > from_s:
+            return None
+        T = invert(start) @ end
+        if self.settings.axes == "body":
+            turn = make_transform(_CAMERA_FROM_BODY, np.zeros(3))
+            T = turn @ T @ invert(turn)
+        return orthonormalise(T)
+
+    def sigmas(self, T_from_to: Float64) -> tuple[float, float]:
+        """Standard deviations of a motion: metres, degrees."""
+        s, length_m = self.settings, float(np.linalg.norm(T_from_to[:3, 3]))
+        return s.sigma_m + s.sigma_share * length_m, s.sigma_deg
+
+    def _pose_at(self, time_s: float) -> Float64 | None:
+        """The pose (4, 4) at a time, between the two nearest ones."""
+        times_s = self.path.timestamps_s
+        if not times_s[0] <= time_s <= times_s[-1]:
+            return None
+        after = int(np.searchsorted(times_s, time_s, side="left"))
+        T_after: Float64 = self.path.T_world_camera[after]
+        if times_s[after] == time_s:
+            return T_after
+        gap_s = times_s[after] - times_s[after - 1]
+        if gap_s > self.settings.max_gap_s:
+            return None
+        T_before = self.path.T_world_camera[after - 1]
+        share = float((time_s - times_s[after - 1]) / gap_s)
+        return np.asarray(T_before @ part_of(invert(T_before) @ T_after, share))
