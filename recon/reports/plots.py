@@ -217,9 +217,10 @@ def mark_ends(axes: Axes, path: NDArray[Any]) -> None:
     if len(path):
         axes.plot(*path[0], "o", color=ESTIMATE, markersize=9, markeredgecolor="white", zorder=5)
         axes.plot(*path[-1], "s", color=ESTIMATE, markersize=7, markeredgecolor="white", zorder=5)
-        for place, text in ((path[0], "start"), (path[-1], "end")):
+        # One above and one below: a drive may end where it began.
+        for place, text, up in ((path[0], "start", 9), (path[-1], "end", -18)):
             axes.annotate(
-                text, place, textcoords="offset points", xytext=(0, 9), ha="center", color=INK
+                text, place, textcoords="offset points", xytext=(0, up), ha="center", color=INK
             )
 
 
