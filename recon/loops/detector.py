@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from recon.loops.settings import LoopSettings
 from recon.loops.verify import Loop, verify
 from recon.structures import Disparity, RectifiedPair
 from recon.structures.arrays import Float64
+
+CONTRADICTED: Final = "odometry contradicts"
+"""Why a loop is refused whose motion odometry cannot have missed by so much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +162,7 @@ class LoopDetector:
             elif self._possible(old, place, verdict.loop):
                 return replace(new, loops=(verdict.loop,), refused=tuple(refused))
             else:
-                refused.append("odometry contradicts")
+                refused.append(CONTRADICTED)
         return replace(new, refused=tuple(refused))
 
     def _candidates(self, place: Place) -> list[int]:

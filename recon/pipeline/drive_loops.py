@@ -14,7 +14,7 @@ import numpy as np
 from recon.errors import FormatError
 from recon.formats.tree_file import read_tree, write_tree
 from recon.loops import LoopSettings
-from recon.loops.detector import KeyframeMemory, LoopDetector, StoredKeyframe
+from recon.loops.detector import CONTRADICTED, KeyframeMemory, LoopDetector, StoredKeyframe
 from recon.loops.drift import doubtful_path
 from recon.loops.graph import Closure, close_loops
 from recon.loops.keyframe import Keyframe
@@ -26,6 +26,7 @@ from recon.structures import Trajectory
 from recon.structures.arrays import Float64
 
 _CACHED: Final = 64
+_TELLING: Final = 3  # places recognised where the drive cannot have been, that are worth a warning
 _BEHIND: Final = 4  # frames by which looking for loops may be late
 
 
@@ -99,6 +100,10 @@ class DriveLoops:
             return [f"{refused} loops were found and none closed: {what}"]
         if refused:
             return [f"{refused} of {refused + closed} loops contradict the others; they are left"]
+        elsewhere = self.refused.get(CONTRADICTED, 0)
+        if elsewhere >= _TELLING and not closed:
+            why = "streets look alike, or the odometry is far off"
+            return [f"{elsewhere} places were recognised where the drive cannot have been: {why}"]
         return []
 
 

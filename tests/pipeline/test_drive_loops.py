@@ -17,7 +17,7 @@ import pytest
 from recon.errors import FormatError, OutputError
 from recon.geometry import se3
 from recon.loops import LoopSettings
-from recon.loops.detector import LoopDetector, StoredKeyframe
+from recon.loops.detector import CONTRADICTED, LoopDetector, StoredKeyframe
 from recon.loops.graph import close_loops
 from recon.pipeline.drive_loops import DriveLoops, KeyframeFiles, LoopWatch
 from recon.pipeline.frame import ReconstructedFrame
@@ -201,3 +201,12 @@ def test_loops_that_contradict_odometry_are_a_warning(closed):
 
     assert refused.trajectory is path
     assert "none closed" in loops.warnings()[0]
+
+
+@pytest.mark.parametrize(("times", "warned"), [(2, False), (3, True)])
+def test_places_where_the_drive_cannot_have_been_are_a_warning(times, warned):
+    path = _circle()
+    nothing = close_loops(path, path.distances_m, [], LoopSettings())
+    loops = DriveLoops(path, nothing, FRAMES, 0, {CONTRADICTED: times})
+
+    assert [("alike" in text) for text in loops.warnings()] == [True] * warned
