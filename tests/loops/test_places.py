@@ -34,6 +34,19 @@ def test_likeness_is_the_share_of_words_in_common(known, asked):
     np.testing.assert_allclose(index.likeness(_sorted(asked)), expected, rtol=1e-12)
 
 
+def test_likeness_is_that_of_the_right_picture_among_many():
+    rng = np.random.default_rng(0)
+    pictures = [np.unique(rng.integers(0, 1 << 20, 20, np.uint32)) for _ in range(900)]
+    index = WordIndex()
+    for words in pictures:
+        index.add(words)
+
+    for number in (0, 255, 256, 511, 512, 700, 899):
+        alike = index.likeness(pictures[number])
+        assert alike[number] == 1.0
+        assert np.delete(alike, number).max() < 0.2
+
+
 def _place(frame: int, x_m: float, path_m: float, turned_deg: float = 0.0) -> Place:
     R = se3.exp_so3(np.array([0.0, np.radians(turned_deg), 0.0]))
     T = se3.make_transform(R, np.array([x_m, 0.0, 0.0]))
