@@ -124,48 +124,90 @@ def refine_minima(
     L. Matthies, "Stereo vision for planetary rovers: stochastic modeling to near real-time
     implementation", IJCV 8, 1992 (variance).
     """
-    claimed = np.empty(minima.winner.shape[1], np.bool_)
+    width = minima.winner.shape[1]
+    # Of each column, with one more at either side: whether a pixel of the right view chose it.
+    chosen = np.empty(width + 2, np.uint8)
+    apart = np.empty(width, np.int32)
     for y in range(first, end):
-        _claim(minima.right_winner[y], rules, claimed)
-        for x in range(claimed.size):
-            refined.reason[y, x] = _judge(minima, texture[y, x], claimed[x], rules, y, x)
+        _mark_chosen(minima.right_winner[y], rules, chosen)
+        _compare_views(minima.winner[y], minima.right_winner[y], rules, apart)
+        _judge(minima, texture[y], chosen, apart, rules, y, refined.reason[y])
         _measure(minima, rules, y, refined)
 
 
 @njit(cache=True, nogil=True)
-def _claim(right_winner: NDArray[np.uint16], rules: Rules, claimed: NDArray[np.bool_]) -> None:
-    """Mark the columns of the left view where a pixel of the right view has its best match.
+def reject(mask: NDArray[np.bool_], code: int, refined: Refined) -> None:
+    """Take away what was found at the pixels of a mask, in place.
 
-    Their neighbours count too: a slanted surface that is wider in the left view leaves gaps.
+    Args:
+        mask: bool (H, W).
+        code: The reason that they get.
+        refined: Changed.
     """
-    width = claimed.size
-    claimed[:] = False
-    for x_right in range(width):
-        if right_winner[x_right] == rules.ndisp:
-            continue
-        x = x_right + rules.minimum + np.int64(right_winner[x_right])
-        for near in range(max(x - 1, 0), min(x + 2, width)):
-            claimed[near] = True
+    height, width = mask.shape
+    for y in range(height):
+        for x in range(width):
+            if mask[y, x]:
+                refined.values[y, x] = refined.sigma_px[y, x] = np.float32(np.nan)
+                refined.confidence[y, x], refined.reason[y, x] = np.float32(0), np.uint8(code)
 
 
 @njit(cache=True, nogil=True)
-def _judge(minima: Minima, texture: float, claimed: bool, rules: Rules, y: int, x: int) -> int:
-    """The reason of one pixel, before speckles are looked for."""
-    k = np.int64(minima.winner[y, x])
-    if k == rules.ndisp or np.isnan(texture):
-        return BORDER
-    if texture < rules.texture:
-        return LOW_TEXTURE
-    if max(minima.costs[1, y, x], minima.costs[2, y, x]) == NO_COST:
-        return OUT_OF_RANGE if k in (0, rules.ndisp - 1) else BORDER
-    if rules.left_right >= 0:
-        other = np.int64(minima.right_winner[y, x - rules.minimum - k])
-        if abs(other - k) > rules.left_right:
-            return LEFT_RIGHT if claimed else OCCLUDED
-    best, second = np.int64(minima.costs[0, y, x]), np.int64(minima.costs[3, y, x])
-    if rules.uniqueness > 0 and 100 * second <= best * (100 + rules.uniqueness):
-        return AMBIGUOUS
-    return VALID
+def _mark_chosen(right_winner: NDArray[np.uint16], rules: Rules, chosen: NDArray[np.uint8]) -> None:
+    """Mark the columns of the left view where a pixel of the right view has its best match."""
+    width = right_winner.size
+    chosen[:] = 0
+    for x_right in range(width):
+        x = x_right + rules.minimum + np.int64(right_winner[x_right])
+        if right_winner[x_right] != rules.ndisp and -1 <= x <= width:
+            chosen[x + 1] = 1
+
+
+@njit(cache=True, nogil=True)
+def _compare_views(
+    winner: NDArray[np.uint16],
+    right_winner: NDArray[np.uint16],
+    rules: Rules,
+    apart: NDArray[np.int32],
+) -> None:
+    """Write by how many candidates the right view disagrees with each winner; -1 = no winner."""
+    for x in range(winner.size):
+        k = np.int64(winner[x])
+        apart[x] = abs(right_winner[x - rules.minimum - k] - k) if k < rules.ndisp else -1
+
+
+@njit(cache=True, nogil=True)
+def _judge(
+    minima: Minima,
+    texture: NDArray[np.float32],
+    chosen: NDArray[np.uint8],
+    apart: NDArray[np.int32],
+    rules: Rules,
+    y: int,
+    reason: NDArray[np.uint8],
+) -> None:
+    """Write the reasons of one row: choices instead of branches, the first reason chosen last."""
+    winner, best_cost, cost_before = minima.winner[y], minima.costs[0, y], minima.costs[1, y]
+    cost_after, second_cost = minima.costs[2, y], minima.costs[3, y]
+    to_left, to_right = chosen, chosen[2:]
+    middle = chosen[1:]
+    ndisp, last = np.uint16(rules.ndisp), np.uint16(rules.ndisp - 1)
+    largest = np.int32(rules.left_right if rules.left_right >= 0 else rules.ndisp)
+    unique = np.int32(rules.uniqueness + 100 if rules.uniqueness > 0 else 0)
+    least_texture = np.float32(rules.texture)
+    for x in range(winner.size):
+        close = np.int32(second_cost[x]) * np.int32(100) <= np.int32(best_cost[x]) * unique
+        code = np.uint8(AMBIGUOUS) if close and unique > 0 else np.uint8(VALID)
+        # A slanted surface that is wider in the left view leaves gaps: neighbours count too.
+        seen = (to_left[x] | middle[x] | to_right[x]) != 0
+        differs = np.uint8(LEFT_RIGHT) if seen else np.uint8(OCCLUDED)
+        code = differs if apart[x] > largest else code
+        at_end = winner[x] == 0 or winner[x] == last
+        ends = np.uint8(OUT_OF_RANGE) if at_end else np.uint8(BORDER)
+        code = ends if max(cost_before[x], cost_after[x]) == NO_COST else code
+        code = np.uint8(LOW_TEXTURE) if texture[x] < least_texture else code
+        nothing = winner[x] == ndisp or np.isnan(texture[x])
+        reason[x] = np.uint8(BORDER) if nothing else code
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

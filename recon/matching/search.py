@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-import numpy as np
 from pydantic import AfterValidator, Field
 
 from recon.errors import MatchingError
-from recon.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA, Refined
+from recon.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA, Refined, reject
 from recon.kernels.speckle import find_speckles
 from recon.settings import Settings
 from recon.structures import Disparity, Reason, RectifiedCamera
@@ -125,10 +124,7 @@ def finish(refined: Refined, settings: SearchSettings) -> Disparity:
     if settings.speckle_size_px >= 2:
         largest_step, size = settings.speckle_range_px, settings.speckle_size_px
         small = find_speckles(refined.values, largest_step, size)
-        np.putmask(refined.values, small, np.nan)
-        np.putmask(refined.confidence, small, 0)
-        np.putmask(refined.sigma_px, small, np.nan)
-        np.putmask(refined.reason, small, Reason.SPECKLE)
+        reject(small, Reason.SPECKLE, refined)
     return Disparity(*refined)
 
 

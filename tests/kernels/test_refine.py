@@ -19,6 +19,7 @@ from recon.kernels.refine import (
     Rules,
     empty_refined,
     refine_minima,
+    reject,
 )
 from recon.kernels.refine_reference import refine_minima_reference
 from recon.structures import Reason
@@ -199,3 +200,14 @@ def test_sigma_is_the_limit_without_slope_and_the_floor_without_noise_or_doubt(
 
 def test_sigma_of_a_pixel_without_a_rival_is_that_of_a_wrong_one() -> None:
     assert refine_one(one_pixel((20, 60, 40, NO_COST)))[2] == refine.WRONG_PX
+
+
+def test_rejected_pixels_have_nothing_left_but_a_reason() -> None:
+    refined = refine_all(one_pixel((2, 6, 6, 20)), np.ones((1, 8), np.float32), RULES)
+    mask = np.arange(8)[None] >= 6
+    reject(mask, Reason.SPECKLE, refined)
+    np.testing.assert_array_equal(refined.reason == Reason.SPECKLE, mask)
+    assert np.isnan(refined.values[mask]).all()
+    assert np.isnan(refined.sigma_px[mask]).all()
+    assert (refined.confidence[mask] == 0).all()
+    assert np.isfinite(refined.values[0, 5])
