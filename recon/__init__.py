@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from recon.pipeline.api import match, reconstruct
     from recon.pipeline.config import ReconConfig, load_config
     from recon.pipeline.map_run import MapOptions, run_map
+    from recon.pipeline.occupancy_run import OccupancyRequest, run_occupancy
     from recon.pipeline.pair_run import PairInput, PairOptions, run_pair
     from recon.pipeline.sequence import MappedSequence, map_sequence
     from recon.sources import SourceSettings, StereoSource, open_source
@@ -59,6 +60,7 @@ _HOMES = {
     "recon.pipeline.api": ("match", "reconstruct"),
     "recon.pipeline.config": ("ReconConfig", "load_config"),
     "recon.pipeline.map_run": ("MapOptions", "run_map"),
+    "recon.pipeline.occupancy_run": ("OccupancyRequest", "run_occupancy"),
     "recon.pipeline.pair_run": ("PairInput", "PairOptions", "run_pair"),
     "recon.pipeline.sequence": ("MappedSequence", "map_sequence"),
     "recon.sources": ("SourceSettings", "StereoSource", "open_source"),
@@ -67,6 +69,7 @@ _HOMES = {
         "CameraIntrinsics",
         "Disparity",
         "OccupancyGrid",
+    "OccupancyRequest",
         "OccupancyVoxels",
         "PointCloud",
         "Reason",
@@ -117,6 +120,7 @@ __all__ = [
     "reconstruct",
     "reconstruct_mesh",
     "run_map",
+    "run_occupancy",
     "run_pair",
     "write_mesh",
     "write_ply",
