@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import pickle
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +18,7 @@ from recon.settings import Settings
 from recon.structures.arrays import UInt8
 
 _HEAD_BYTES: Final = 4096
+_ANEW: Final = "start the run anew, without --resume"
 #: What a saved odometry may consist of. Loading anything else would run what others wrote.
 _SAFE: Final = ("recon.", "numpy")
 
@@ -58,7 +59,24 @@ class Checkpoint:
         Raises:
             FormatError: The file is damaged.
         """
-        return read_tree(self._path)
+        try:
+            return read_tree(self._path)
+        except FormatError as error:
+            raise FormatError(error.what, where=error.where, got=error.got, hint=_ANEW) from error
+
+    def restore(self, use: Callable[[dict[str, Any]], None]) -> None:
+        """Let ``use`` go on from the state.
+
+        Raises:
+            FormatError: The file is damaged, or holds something else.
+        """
+        state = self.load()
+        try:
+            use(state)
+        except (KeyError, TypeError, ValueError) as error:
+            raise FormatError(
+                "the file holds no state of this run", where=self._path, got=error, hint=_ANEW
+            ) from error
 
 
 def pack_object(value: object) -> UInt8:

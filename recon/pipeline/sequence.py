@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -166,15 +167,9 @@ class _Drive:
         self._stage = workspace.stopwatch.stage
         self._sample: ReconstructedFrame | None = None
         self._saved = 0
-        spent_s = 0.0
+        self._start = self._last = time.perf_counter()
         if workspace.resume and self._checkpoint is not None and self._checkpoint.exists():
-            state = self._checkpoint.load()
-            mapper.restore(state["mapper"])
-            if loops is not None:
-                loops.restore(mapper.trajectory.T_world_camera, [h.ok for h in mapper.health])
-            spent_s, self._saved = state["seconds"], len(mapper)
-        self._last = time.perf_counter()
-        self._start = self._last - spent_s
+            self._checkpoint.restore(self._restore)
 
     def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
         result = self.mapper.add(frame, total=total)
@@ -222,6 +217,15 @@ class _Drive:
             return mapped
         with self._stage("close_loops"):
             return mapped.closed(self._loops.close(mapped.trajectory))
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        self.mapper.restore(state["mapper"])
+        if self._loops is not None:
+            path, health = self.mapper.trajectory, self.mapper.health
+            self._loops.restore(path.T_world_camera, [record.ok for record in health])
+        self._saved = len(self.mapper)
+        self._last = time.perf_counter()
+        self._start = self._last - state["seconds"]
 
     def _save(self) -> None:
         if self._checkpoint is None:

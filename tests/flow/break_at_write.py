@@ -1,0 +1,47 @@
+"""`recon` in a process that ends, or meets a full disk, at its n-th write.
+
+``python break_at_write.py (kill|full|count) N ARGUMENTS…``: a write is what makes a file appear
+whole under its name. ``kill`` ends the process by SIGKILL before it (even N) or after it (odd N),
+``full`` lets the disk be full from there on, ``count`` prints how many writes there were.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+from pathlib import Path
+
+from recon.cli import main
+
+MODE, LAST = sys.argv[1], int(sys.argv[2])
+_replace, _fsync = Path.replace, os.fsync
+_writes = 0
+
+
+def replace(self: Path, target: Path) -> Path:
+    global _writes  # noqa: PLW0603
+    _writes += 1
+    broken = MODE == "kill" and _writes == LAST
+    if broken and LAST % 2 == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    moved = _replace(self, target)
+    if broken:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return moved
+
+
+def fsync(handle: int) -> None:
+    if MODE == "full" and _writes >= LAST:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    _fsync(handle)
+
+
+Path.replace, os.fsync = replace, fsync  # type: ignore[method-assign,assignment]
+sys.argv = ["recon", *sys.argv[3:]]
+try:
+    main()
+finally:
+    if MODE == "count":
+        Path(os.environ["COUNT"]).write_text(str(_writes))

@@ -1,0 +1,134 @@
+"""Runs of the command line that are killed, or meet a full disk, go on to the same files."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.synthetic import StreetSettings
+
+STREET = StreetSettings(frames=24, width_px=192, height_px=72, focal_px=110.0)
+SETTINGS = ["checkpoints.every_frames=5", "submaps.length_m=4", "submaps.tile_m=12.8"]
+BREAKER = Path(__file__).with_name("break_at_write.py")
+KILLS = 10
+
+
+class Runs:
+    """One drive, and what an unbroken run makes of it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.drive = folder / "drive"
+        write_kitti(SyntheticSource(STREET), self.drive)
+        os.environ["COUNT"] = str(folder / "count")
+        begun = time.monotonic()
+        done = self.broken(folder / "unbroken", "count", 0)
+        self.seconds = time.monotonic() - begun
+        assert done.returncode == 0, done.stderr
+        self.writes = int((folder / "count").read_text())
+        self.content = content(folder / "unbroken")
+        # The last writes move finished files to their places.
+        self.before_moving = self.writes - len(list((folder / "unbroken").rglob("*.*")))
+
+    def arguments(self, out: Path) -> list[str]:
+        """Start the run, or go on with it where it has begun."""
+        if (out / ".partial" / ".state" / "started.json").exists():
+            return ["map", "--quiet", "--resume", str(out)]
+        settings = [part for text in SETTINGS for part in ("--set", text)]
+        return ["map", "--quiet", str(self.drive), "--out", str(out), "--no-mesh", *settings]
+
+    def broken(self, out: Path, mode: str, at: int) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, str(BREAKER), mode, str(at), *self.arguments(out)]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    def finish(self, out: Path) -> None:
+        """Go on to the end, and find the files of the unbroken run."""
+        if not (out / "run.json").exists():
+            command = [sys.executable, "-m", "recon", *self.arguments(out)]
+            subprocess.run(command, check=True, capture_output=True)
+        assert content(out) == self.content
+        assert not list(out.rglob(".*-*")), "a temporary file was left"
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    """All files of a run but those that hold times."""
+    timed = {"summary.json", "run.json", "report.html"}
+    files = [path for path in folder.rglob("*") if path.is_file() and ".partial" not in path.parts]
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in files
+        if path.name not in timed
+    }
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
+    return Runs(tmp_path_factory.mktemp("runs"))
+
+
+@pytest.mark.slow
+def test_runs_killed_at_ten_random_moments_give_the_same_files(runs: Runs, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    kills = 0
+    for number in range(2 * KILLS):
+        out = tmp_path / f"run{number}"
+        for _ in range(3):
+            command = [sys.executable, "-m", "recon", *runs.arguments(out)]
+            kills += kill(command, after_s=rng.uniform(0.2, 1.1) * runs.seconds)
+            if (out / "run.json").exists():
+                break
+        runs.finish(out)
+        if kills >= KILLS:
+            return
+    pytest.fail(f"only {kills} runs were killed before they were done")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["mapping", "exporting", "moving", "done"])
+def test_runs_killed_at_a_write_give_the_same_files(runs: Runs, tmp_path: Path, what: str) -> None:
+    last = {
+        "mapping": runs.writes // 4,
+        "exporting": runs.before_moving - 4,
+        "moving": runs.before_moving + 3,
+        "done": runs.writes,
+    }[what]
+    for at in (last - 1, last):  # one before the write, one after it
+        out = tmp_path / str(at)
+        done = runs.broken(out, "kill", at)
+        assert done.returncode == -signal.SIGKILL
+        runs.finish(out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["beginning", "mapping", "exporting"])
+def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
+    runs: Runs, tmp_path: Path, what: str
+) -> None:
+    at = {"beginning": 2, "mapping": runs.writes // 3, "exporting": runs.before_moving - 4}[what]
+    done = runs.broken(tmp_path / "run", "full", at)
+    assert done.returncode == 1
+    [line] = done.stderr.splitlines()
+    assert line.startswith("error: ")
+    assert "No space left on device" in line
+    assert f"recon map --resume {tmp_path / 'run'} goes on from there" in line
+    assert [path.name for path in (tmp_path / "run").iterdir()] == [".partial"]
+    runs.finish(tmp_path / "run")
+
+
+def kill(command: list[str], after_s: float) -> bool:
+    """Whether a command still ran when it was killed."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        process.wait(after_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        return True
+    return False
