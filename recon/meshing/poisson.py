@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -65,10 +66,25 @@ class MeshSettings(Settings):
     normals_neighbours: int = Field(
         default=20, ge=3, le=1000, description="neighbours for normals where the cloud has none"
     )
+    tile_m: float = Field(
+        default=50.0, gt=0, description="edge of the tiles in which the map of a drive is meshed"
+    )
+    overlap_m: float = Field(
+        default=3.0, ge=0, description="what the surface of a tile sees beyond its border"
+    )
+    seam_m: float = Field(
+        default=0.15, ge=0, description="widest gap that is closed where two tiles meet"
+    )
+    free_space: bool = Field(
+        default=True, description="cut off what hangs where the cameras of a drive looked through"
+    )
 
 
 def reconstruct_mesh(
-    cloud: PointCloud, settings: MeshSettings, viewpoint_m: Point | None = None
+    cloud: PointCloud,
+    settings: MeshSettings,
+    viewpoint_m: Point | None = None,
+    wrong: Callable[[Float32], Bool] | None = None,
 ) -> TriangleMesh:
     """Reconstruct the surface that a cloud was sampled from.
 
@@ -81,6 +97,7 @@ def reconstruct_mesh(
         settings: How.
         viewpoint_m: Where the points were seen from, in the frame of the cloud; used only where
             the cloud has no normals. None = neighbours agree, the sign of the whole is a guess.
+        wrong: Tells which vertices (V, 3) cannot be on a surface; None = nothing is known.
 
     Returns:
         The mesh, with unit normals out of the surface, and colours if the cloud has any.
@@ -103,6 +120,8 @@ def reconstruct_mesh(
     supported = density >= np.quantile(density, settings.trim_density_quantile)
     if settings.max_distance_spacings is not None:
         supported &= _near_data(vertices, cloud.xyz, settings.max_distance_spacings)
+    if wrong is not None:
+        supported &= ~wrong(vertices)
     vertices, faces = keep_vertices(vertices, faces, supported)
     vertices, faces = drop_small_components(vertices, faces, settings.min_component_faces)
     if settings.target_faces is not None and len(faces) > settings.target_faces:

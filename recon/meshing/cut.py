@@ -1,0 +1,162 @@
+"""Cutting meshes along planes, and closing the seams between pieces that were cut there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.adapters import open3d_clouds
+from recon.structures import TriangleMesh
+from recon.structures.arrays import Bool, Float32, Float64, Int32
+
+_CANDIDATES: Final = 8
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane across an axis.
+
+    Attributes:
+        axis: 0 = x, 1 = y, 2 = z.
+        at_m: Where.
+    """
+
+    axis: int
+    at_m: float
+
+    def holds(self, vertices: Float32) -> Bool:
+        """bool (V,): vertices that lie exactly in it, as those of a cut do."""
+        return np.asarray(vertices[:, self.axis] == np.float32(self.at_m))
+
+
+def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleMesh:
+    """The part of a mesh on one side of a plane; triangles that cross it are split in it.
+
+    Two meshes of one surface that are cut along one plane meet there without an overlap.
+
+    Args:
+        mesh: Any mesh.
+        plane: Where to cut.
+        keep_above: Keep what lies at larger coordinates, else what lies at smaller ones.
+
+    Returns:
+        The part; it may be empty. New vertices lie exactly in the plane, their normals and
+        colours are between those of the edge that they cut.
+    """
+    away = mesh.vertices[:, plane.axis] - np.float32(plane.at_m)
+    away = away if keep_above else -away
+    inside = away >= 0
+    count = inside[mesh.faces].sum(axis=1)
+    whole = mesh.faces[count == 3]
+    one, two = (_first_turned(mesh.faces[count == n], inside, n) for n in (1, 2))
+    # The edges that are cut: both at the only corner inside, or both at the only one outside.
+    cut = np.concatenate([one[:, [0, 1]], one[:, [0, 2]], two[:, [1, 2]], two[:, [0, 2]]])
+    edges, where = np.unique(np.sort(cut, axis=1), axis=0, return_inverse=True)
+    new = (len(mesh.vertices) + where.ravel()).astype(np.int32)
+    a, b, c, d = np.split(new, np.cumsum([len(one), len(one), len(two)]))
+    faces = np.concatenate(
+        [
+            whole,
+            np.stack([one[:, 0], a, b], axis=1),
+            np.stack([two[:, 0], two[:, 1], c], axis=1),
+            np.stack([two[:, 0], c, d], axis=1),
+        ]
+    )
+    return _compact(_with_cuts(mesh, edges, away, plane), faces.astype(np.int32))
+
+
+def open_edges(mesh: TriangleMesh, plane: Plane) -> Float32:
+    """Edges of a mesh that lie in a plane and belong to one triangle: float32 (E, 2, 3)."""
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges = edges[plane.holds(mesh.vertices)[edges].all(axis=1)]
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    return np.asarray(mesh.vertices[unique[count == 1]])
+
+
+def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float) -> TriangleMesh:
+    """Move the vertices in a plane onto the border of a neighbour that was cut there.
+
+    Args:
+        mesh: The mesh.
+        plane: Where both were cut.
+        border: float32 (E, 2, 3), the neighbour's `open_edges`.
+        reach_m: Vertices farther from the border stay: there the neighbour has no surface.
+    """
+    rows = np.flatnonzero(plane.holds(mesh.vertices))
+    if not len(rows) or not len(border):
+        return mesh
+    nearest, distance_m = nearest_on_edges(mesh.vertices[rows], border)
+    near = distance_m <= reach_m
+    vertices = mesh.vertices.copy()
+    vertices[rows[near]] = nearest[near]
+    vertices[rows[near], plane.axis] = np.float32(plane.at_m)
+    return TriangleMesh(vertices, mesh.faces, mesh.normals, mesh.rgb)
+
+
+def nearest_on_edges(points: Float32, edges: Float32) -> tuple[Float64, Float64]:
+    """The nearest points on line segments, of those whose middles are nearest.
+
+    Args:
+        points: float32 (N, 3).
+        edges: float32 (E, 2, 3), E ≥ 1.
+
+    Returns:
+        float64 (N, 3), and the distances, float64 (N,).
+    """
+    middles = edges.mean(axis=1)
+    candidates = open3d_clouds.nearest(points, middles, min(_CANDIDATES, len(edges)))[0]
+    begin = edges[candidates, 0].astype(np.float64)
+    along = edges[candidates, 1] - begin
+    to_point = points[:, None] - begin
+    length2 = np.maximum(np.einsum("nki,nki->nk", along, along), 1e-30)
+    share = np.clip(np.einsum("nki,nki->nk", to_point, along) / length2, 0, 1)
+    feet = begin + share[..., None] * along
+    distance_m = np.linalg.norm(points[:, None] - feet, axis=2)
+    best = np.argmin(distance_m, axis=1)
+    row = np.arange(len(points))
+    return feet[row, best], distance_m[row, best]
+
+
+def _first_turned(faces: Int32, inside: Bool, corners: int) -> Int32:
+    """Faces (F, 3) turned so that their ``corners`` corners inside come first."""
+    odd = inside[faces] if corners == 1 else ~inside[faces]
+    # The odd corner goes first where it is inside, last where it is outside.
+    start = (np.argmax(odd, axis=1) + (0 if corners == 1 else 1)) % 3
+    order = (start[:, None] + np.arange(3)) % 3
+    return np.asarray(np.take_along_axis(faces, order, axis=1), dtype=np.int32)
+
+
+def _with_cuts(mesh: TriangleMesh, edges: Int32, away: Float32, plane: Plane) -> TriangleMesh:
+    """The mesh with a new vertex where each edge (E, 2) meets the plane."""
+    first, last = edges.T
+    share = (away[first] / (away[first] - away[last]))[:, None].astype(np.float64)
+
+    def between(values: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray((1 - share) * values[first] + share * values[last])
+
+    new = between(mesh.vertices).astype(np.float32)
+    new[:, plane.axis] = np.float32(plane.at_m)
+    normals, rgb = mesh.normals, mesh.rgb
+    if normals is not None:
+        mixed = between(normals)
+        mixed /= np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12)
+        normals = np.concatenate([normals, mixed.astype(np.float32)])
+    if rgb is not None:
+        rgb = np.concatenate([rgb, np.rint(between(rgb)).astype(np.uint8)])
+    return TriangleMesh(np.concatenate([mesh.vertices, new]), mesh.faces, normals, rgb)
+
+
+def _compact(mesh: TriangleMesh, faces: Int32) -> TriangleMesh:
+    """The faces with the vertices that they use; what a cut left of no area is dropped."""
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    used, renumbered = np.unique(faces, return_inverse=True)
+    return TriangleMesh(
+        mesh.vertices[used],
+        renumbered.reshape(-1, 3).astype(np.int32),
+        None if mesh.normals is None else mesh.normals[used],
+        None if mesh.rgb is None else mesh.rgb[used],
+    )

@@ -1,0 +1,46 @@
+"""Where no surface can be: space that the cameras looked through."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.kernels.voxels import pack_keys
+from recon.structures import OccupancyVoxels
+from recon.structures.arrays import Bool, Float32
+
+
+def looked_through(vertices: Float32, voxels: OccupancyVoxels) -> Bool:
+    """Which vertices hang in free space: their voxel is free, and none around it is occupied.
+
+    A surface runs along voxels that are occupied, but half of it lies in their free neighbours.
+
+    Args:
+        vertices: float32 (V, 3), map axes.
+        voxels: What was observed there; what was not is not free.
+
+    Returns:
+        bool (V,).
+    """
+    if not len(voxels) or not len(vertices):
+        return np.zeros(len(vertices), dtype=bool)
+    cells = np.floor(vertices / np.float32(voxels.resolution_m)).astype(np.int64)
+    taken = voxels.log_odds > 0
+    free = _holds(np.sort(pack_keys(voxels.keys[~taken])), pack_keys(cells))
+    occupied = np.sort(pack_keys(voxels.keys[taken]))
+    rows = np.flatnonzero(free)
+    near = np.zeros(len(rows), dtype=bool)
+    for step in product((-1, 0, 1), repeat=3):
+        near |= _holds(occupied, pack_keys(cells[rows] + np.array(step)))
+    free[rows[near]] = False
+    return free
+
+
+def _holds(keys: NDArray[np.int64], wanted: NDArray[np.int64]) -> Bool:
+    """bool (N,): which of the wanted keys are among the sorted ones."""
+    if not len(keys):
+        return np.zeros(len(wanted), dtype=bool)
+    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.asarray(keys[place] == wanted)
