@@ -1,4 +1,4 @@
-"""`recon mesh`: a surface for any cloud."""
+"""`recon mesh`: a surface for any cloud, or for the map of a run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,12 @@ from recon.cli.session import print_json, print_run, session
 
 
 def mesh(
-    cloud: Annotated[Path, typer.Argument(help="PLY with points; normals and colours are used.")],
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CLOUD|RUN", help="PLY with points (normals and colours are used), or a run."
+        ),
+    ],
     out: Out = None,
     formats: Annotated[
         list[str] | None,
@@ -27,7 +32,11 @@ def mesh(
 ) -> None:
     """Screened Poisson surface of a PLY cloud, trimmed to where there is data.
 
-    Example: recon mesh map/cloud.ply --format obj --format glb
+    The map of a run is meshed in tiles, and cut where its cameras looked through.
+
+    Examples:
+      recon mesh cloud.ply --format obj --format glb
+      recon mesh outputs/map/latest --set mesh.target_faces=500000
     """
     del quiet  # there is no progress to hide; every command takes the option
     with session():
@@ -35,5 +44,5 @@ def mesh(
         from recon.pipeline.mesh_run import MeshOptions, run_mesh
 
         options = MeshOptions(out=out, formats=tuple(formats or ("ply",)), threads=threads)
-        summary = run_mesh(cloud, load_config(config, set_ or ()), options)
+        summary = run_mesh(source, load_config(config, set_ or ()), options)
     print_json(summary) if json else print_run(summary, stages=verbose)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -13,7 +14,13 @@ from recon.errors import FormatError, OutputError
 from recon.formats.atomic import atomic_path
 from recon.formats.glb import srgb_from_linear, write_glb
 from recon.formats.ply import colours_of, fill_vertices, normals_of, vertex_dtype
-from recon.formats.ply_tables import Table, list_length, read_tables, write_tables
+from recon.formats.ply_tables import (
+    Table,
+    list_length,
+    read_tables,
+    write_table_parts,
+    write_tables,
+)
 from recon.structures import TriangleMesh
 from recon.structures.arrays import Int32
 
@@ -52,6 +59,29 @@ def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
             open3d_meshes.write_mesh(temporary, mesh)
 
 
+def join_meshes(path: str | PathLike[str], parts: Sequence[tuple[Path, int, int]]) -> None:
+    """Write the meshes of several PLY files as one PLY; two of them are held at a time.
+
+    Args:
+        path: The file; it appears whole or not at all.
+        parts: File, vertices and faces of each part, at least one; all with the same fields.
+
+    Raises:
+        FormatError: A part cannot be read.
+        OutputError: The file cannot be written.
+    """
+    files, vertices, faces = zip(*parts, strict=True)
+    starts = np.concatenate([[0], np.cumsum(vertices)[:-1]]).astype(np.int32)
+
+    def tables(element: str) -> Iterator[Table]:
+        for file, start in zip(files, starts, strict=True):
+            yield _tables(read_mesh(file), int(start))[element]
+
+    write_table_parts(
+        path, {"vertex": (sum(vertices), tables("vertex")), "face": (sum(faces), tables("face"))}
+    )
+
+
 def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
     """Read a mesh.
 
@@ -78,15 +108,15 @@ def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
     return _checked(mesh, path)
 
 
-def _tables(mesh: TriangleMesh) -> dict[str, Table]:
-    """The two tables of a PLY mesh."""
+def _tables(mesh: TriangleMesh, start: int = 0) -> dict[str, Table]:
+    """The two tables of a PLY mesh; its vertices are numbered from ``start``."""
     fields = vertex_dtype(normals=mesh.normals is not None, colours=mesh.rgb is not None)
     vertices = np.zeros(len(mesh.vertices), fields)
     fill_vertices(vertices, mesh.vertices, mesh.normals, mesh.rgb)
     name = _INDICES[0]
     faces = np.zeros(len(mesh.faces), [(list_length(name), "u1"), (name, "<i4", (3,))])
     faces[list_length(name)] = 3
-    faces[name] = mesh.faces
+    faces[name] = mesh.faces + np.int32(start)
     return {"vertex": vertices, "face": faces}
 
 

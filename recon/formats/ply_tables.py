@@ -5,7 +5,7 @@ Ref: G. Turk, "The PLY polygon file format", 1994.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from os import SEEK_END, PathLike
 from pathlib import Path
@@ -97,6 +97,32 @@ def write_tables(
             if ascii:
                 _write_rows(stream, table)
             else:
+                stream.write(table.tobytes())
+
+
+def write_table_parts(
+    path: str | PathLike[str], elements: Mapping[str, tuple[int, Iterable[Table]]]
+) -> None:
+    """Write elements whose rows come in parts, binary little endian, atomically.
+
+    Args:
+        path: The file.
+        elements: For each the number of its rows, and its tables, all of one dtype; one is held
+            at a time. The first of each is made before the header is written.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    begun = {name: iter(tables) for name, (_, tables) in elements.items()}
+    first = {name: next(tables) for name, tables in begun.items()}
+    lines = ["ply", "format binary_little_endian 1.0"]
+    for name, (rows, _) in elements.items():
+        lines += [f"element {name} {rows}", *_property_lines(first[name].dtype)]
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        stream.write("\n".join([*lines, "end_header", ""]).encode())
+        for name, rest in begun.items():
+            stream.write(first.pop(name).tobytes())
+            for table in rest:
                 stream.write(table.tobytes())
 
 

@@ -11,12 +11,9 @@ from typing import Any, Final
 from recon.errors import EvaluationError, MeshingError
 from recon.evaluation import evaluate_map, evaluate_trajectory
 from recon.formats.atomic import write_text
-from recon.formats.mesh import write_mesh
-from recon.formats.mlp import write_mlp
-from recon.formats.ply import read_ply
 from recon.formats.trajectory import write_kitti_poses, write_tum
-from recon.meshing import reconstruct_mesh
 from recon.pipeline.config import ReconConfig, dump_config
+from recon.pipeline.drive_mesh import mesh_to_show, store_map, write_drive_mesh
 from recon.pipeline.finished_run import RAYS_FILE
 from recon.pipeline.machine import use_threads
 from recon.pipeline.map_files import write_map
@@ -55,7 +52,8 @@ class MapRun:
         mapped: Trajectory, health, fused cloud, voxels.
         cloud: Points of the fused cloud, spread evenly; all of a small one. Frame ``map``.
         grid: The flat grid.
-        mesh: The surface, map axes, or None where none was asked for or none could be made.
+        mesh: The surface, map axes, or None where none was asked for, none could be made, or it
+            is too large to be held.
         truth: What is known of the true path and surface.
         metrics: Distance to the true path, or None without one.
         map_metrics: Distance to the true surface, or None without one.
@@ -176,11 +174,11 @@ def _finish(
     _tell(options.observers, "map")
     written = write_map(mapped, directory, watch)
     warnings += written.warnings
-    mesh = None
+    mesh, faces = None, 0
     if options.mesh:
         _tell(options.observers, "mesh")
         with watch.stage("mesh"):
-            mesh = _mesh(read_ply(directory.path("map/cloud.ply")), config, warnings)
+            mesh, faces = _mesh(mapped, directory, warnings)
         config.memory.check("mesh")
     truth = source.truth
     with watch.stage("compare"):
@@ -204,18 +202,25 @@ def _finish(
         warnings=tuple(warnings),
     )
     odometry = "known poses" if given else config.odometry.method
-    sizes = {"points": written.points, "voxels": written.voxels}
+    sizes = {"points": written.points, "voxels": written.voxels, "faces": faces}
     run.summary.update(odometry=odometry, **_summary(run), **sizes)
     return run
 
 
-def _mesh(cloud: PointCloud, config: ReconConfig, warnings: list[str]) -> TriangleMesh | None:
-    """The surface; a map without one is still a map, so its failure is a warning."""
+def _mesh(
+    mapped: MappedSequence, directory: RunDirectory, warnings: list[str]
+) -> tuple[TriangleMesh | None, int]:
+    """Write the surface; a map without one is still a map, so its failure is a warning."""
+    store = store_map(mapped, directory.state("mesh"))
     try:
-        return reconstruct_mesh(cloud, config.mesh)
+        written = write_drive_mesh(
+            store, mapped.config.mesh, directory, directory.path("map/cloud.ply")
+        )
     except MeshingError as error:
         warnings.append(f"no mesh: {error}")
-        return None
+        return None, 0
+    warnings += written.warnings
+    return mesh_to_show(written, directory.path("mesh/mesh.ply")), written.faces
 
 
 def _compare_paths(
@@ -250,7 +255,6 @@ def _summary(run: MapRun) -> dict[str, Any]:
         "frames": frames,
         "fps": frames / seconds if seconds > 0 else None,
         "path_length_m": run.mapped.trajectory.path_length_m,
-        "faces": 0 if run.mesh is None else len(run.mesh.faces),
         "frames_not_trusted": sum(not record.ok for record in run.mapped.health),
         "T_map_world": run.mapped.T_map_world.tolist(),
         "warnings": list(run.warnings),
@@ -273,10 +277,6 @@ def _write(run: MapRun, directory: RunDirectory) -> None:
     if run.mapped.loops is not None and run.mapped.loops.closure.closed:
         write_tum(path("trajectory_odometry_tum.txt"), run.mapped.loops.odometry)
         directory.write_json("loops.json", run.mapped.loops.edges())
-    if run.mesh is not None:
-        write_mesh(path("mesh/mesh.ply"), run.mesh)
-        layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("map/cloud.ply")}
-        write_mlp(path("mesh/mesh.mlp"), layers)
     if run.config.occupancy.keep_rays:
         directory.keep(RAYS, RAYS_FILE)
     write_text(path("config.yaml"), dump_config(run.config))

@@ -1,0 +1,198 @@
+"""The surface of a drive: tile by tile, cut where tiles meet, so that memory stays bounded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.errors import MeshingError
+from recon.formats.mesh import join_meshes, read_mesh, write_mesh
+from recon.formats.mlp import write_mlp
+from recon.geometry.transform import transform_cloud
+from recon.meshing import (
+    MeshSettings,
+    Plane,
+    close_seam,
+    cut_mesh,
+    looked_through,
+    open_edges,
+    reconstruct_mesh,
+)
+from recon.pipeline.drive_map import Tile
+from recon.pipeline.run_directory import RunDirectory
+from recon.pipeline.sequence import MappedSequence
+from recon.pipeline.tile_store import TileStore
+from recon.structures import TriangleMesh
+from recon.structures.arrays import Float32
+
+SAMPLE_FACES: Final = 400_000
+"""Triangles up to which the whole mesh is kept to look at."""
+_SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))
+"""Axis, and whether it is the far side, of the four sides of a tile."""
+
+
+@dataclass(frozen=True)
+class MeshTile:
+    """A tile whose mesh is written.
+
+    Attributes:
+        tile: Its number.
+        path: Its PLY.
+        vertices: How many.
+        faces: How many.
+    """
+
+    tile: Tile
+    path: Path
+    vertices: int
+    faces: int
+
+
+@dataclass(frozen=True, eq=False)
+class WrittenMesh:
+    """What is known of a mesh whose files are written.
+
+    Attributes:
+        tiles: Its tiles.
+        warnings: What could not be meshed.
+    """
+
+    tiles: tuple[MeshTile, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def faces(self) -> int:
+        """Number of triangles."""
+        return sum(tile.faces for tile in self.tiles)
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return sum(tile.vertices for tile in self.tiles)
+
+
+def store_map(mapped: MappedSequence, folder: Path) -> TileStore:
+    """Put the fused cloud and the voxels of a drive by, tile by tile.
+
+    Raises:
+        OutputError: The folder cannot be written.
+    """
+    store = TileStore(folder, mapped.config.mesh.tile_m)
+    for _, cloud in mapped.map.cloud_tiles():
+        store.put_cloud(transform_cloud(cloud, mapped.T_map_world, frame="map"))
+    if mapped.config.mesh.free_space:
+        for tile, voxels in mapped.map.occupancy_tiles():
+            store.put_voxels(mapped.map.inner(tile, voxels))
+    return store
+
+
+def write_drive_mesh(
+    store: TileStore, settings: MeshSettings, directory: RunDirectory, cloud: Path
+) -> WrittenMesh:
+    """Write ``mesh/mesh.ply``, its tiles where there are several, and ``mesh/mesh.mlp``.
+
+    Args:
+        store: Points, and voxels where the cameras' free space is known.
+        settings: How; ``target_faces`` is that of all tiles together.
+        directory: The folder of the run.
+        cloud: A PLY in it, for the MeshLab project.
+
+    Raises:
+        MeshingError: No tile has a surface.
+        OutputError: A file cannot be written.
+    """
+    found = _Mesher(store, settings, directory).run()
+    if not found.tiles:
+        raise MeshingError(
+            "no part of the map gives a surface", got="; ".join(found.warnings) or "no point"
+        )
+    whole = directory.path("mesh/mesh.ply")
+    join_meshes(whole, [(tile.path, tile.vertices, tile.faces) for tile in found.tiles])
+    layers = {tile.path.stem: tile.path for tile in found.tiles}
+    if len(found.tiles) == 1:
+        found.tiles[0].path.unlink()
+        layers = {"mesh": whole}
+    write_mlp(directory.path("mesh/mesh.mlp"), {**layers, "cloud": cloud})
+    return found
+
+
+def mesh_to_show(written: WrittenMesh, whole: Path) -> TriangleMesh | None:
+    """The mesh for pictures; None where it is too large to be held."""
+    return read_mesh(whole) if written.faces <= SAMPLE_FACES else None
+
+
+@dataclass(eq=False)
+class _Mesher:
+    """Meshes the tiles in order; a tile closes its seams to those before it."""
+
+    store: TileStore
+    settings: MeshSettings
+    directory: RunDirectory
+    borders: dict[tuple[Tile, Plane], Float32] = field(default_factory=dict)
+
+    def run(self) -> WrittenMesh:
+        tiles: list[MeshTile] = []
+        failed: dict[Tile, MeshingError] = {}
+        for tile in self.store.tiles:
+            try:
+                mesh = self._mesh(tile)
+            except MeshingError as error:
+                failed[tile] = error
+                continue
+            if len(mesh.faces):
+                path = self.directory.path(f"mesh/tiles/tile_{tile[0]}_{tile[1]}.ply")
+                write_mesh(path, mesh)
+                tiles.append(MeshTile(tile, path, len(mesh.vertices), len(mesh.faces)))
+        return WrittenMesh(tuple(tiles), self._warnings(failed))
+
+    def _warnings(self, failed: dict[Tile, MeshingError]) -> tuple[str, ...]:
+        """One line about the tiles without a surface, of which the worst is named."""
+        if not failed:
+            return ()
+        worst = max(failed, key=self.store.points)
+        share = sum(map(self.store.points, failed)) / self.store.total
+        tiles = f"{len(failed)} of {len(self.store.tiles)} tiles"
+        return (f"no surface in {tiles}, {share:.1%} of the points ({failed[worst]})",)
+
+    def _mesh(self, tile: Tile) -> TriangleMesh:
+        """The surface of a tile, cut at its sides and joined to its neighbours."""
+        overlap_m = self.settings.overlap_m
+        cloud = self.store.cloud_in(tile, overlap_m)
+        if cloud is None:
+            raise MeshingError("there is no point")
+        voxels = self.store.voxels_in(tile, overlap_m)
+        use_voxels = self.settings.free_space and len(voxels) > 0
+        mesh = reconstruct_mesh(
+            cloud,
+            self.settings.model_copy(update={"target_faces": self._target(len(cloud))}),
+            wrong=(lambda vertices: looked_through(vertices, voxels)) if use_voxels else None,
+        )
+        for axis, far in _SIDES:
+            mesh = cut_mesh(mesh, self._plane(tile, axis, far), keep_above=not far)
+        return self._joined(tile, mesh)
+
+    def _target(self, seen: int) -> int | None:
+        """Triangles for a tile with its margin: as its points are to those of the drive."""
+        target = self.settings.target_faces
+        if target is None:
+            return None
+        return max(4, round(target * seen / self.store.total))
+
+    def _joined(self, tile: Tile, mesh: TriangleMesh) -> TriangleMesh:
+        for axis, far in _SIDES:
+            plane = self._plane(tile, axis, far)
+            step = np.zeros(2, int)
+            step[axis] = 1 if far else -1
+            neighbour = (tile[0] + int(step[0]), tile[1] + int(step[1]))
+            border = self.borders.pop((neighbour, plane), None)
+            if border is not None:
+                mesh = close_seam(mesh, plane, border, self.settings.seam_m)
+            else:
+                self.borders[tile, plane] = open_edges(mesh, plane)
+        return mesh
+
+    def _plane(self, tile: Tile, axis: int, far: int) -> Plane:
+        return Plane(axis, float(self.store.bounds_m(tile)[far][axis]))
