@@ -1,18 +1,15 @@
-"""Cutting meshes along planes, and closing the seams between pieces that were cut there."""
+"""Cutting meshes along planes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.adapters import open3d_clouds
 from recon.structures import TriangleMesh
 from recon.structures.arrays import Bool, Float32, Float64, Int32
-
-_CANDIDATES: Final = 8
 
 
 @dataclass(frozen=True)
@@ -68,56 +65,30 @@ def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleM
     return _compact(_with_cuts(mesh, edges, away, plane), faces.astype(np.int32))
 
 
-def open_edges(mesh: TriangleMesh, plane: Plane) -> Float32:
-    """Edges of a mesh that lie in a plane and belong to one triangle: float32 (E, 2, 3)."""
-    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges = edges[plane.holds(mesh.vertices)[edges].all(axis=1)]
-    unique, count = np.unique(edges, axis=0, return_counts=True)
-    return np.asarray(mesh.vertices[unique[count == 1]])
-
-
-def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float) -> TriangleMesh:
-    """Move the vertices in a plane onto the border of a neighbour that was cut there.
+def with_vertices(mesh: TriangleMesh, new: Float32, edges: Int32, share: Float64) -> TriangleMesh:
+    """The mesh with vertices that no face uses yet, on its edges.
 
     Args:
-        mesh: The mesh.
-        plane: Where both were cut.
-        border: float32 (E, 2, 3), the neighbour's `open_edges`.
-        reach_m: Vertices farther from the border stay: there the neighbour has no surface.
+        mesh: Any mesh.
+        new: float32 (N, 3), the vertices.
+        edges: int32 (N, 2), the edge that each lies on; its normal and colour come from there.
+        share: float64 (N,), how far along the edge, from 0 to 1.
     """
-    rows = np.flatnonzero(plane.holds(mesh.vertices))
-    if not len(rows) or not len(border):
-        return mesh
-    nearest, distance_m = nearest_on_edges(mesh.vertices[rows], border)
-    near = distance_m <= reach_m
-    vertices = mesh.vertices.copy()
-    vertices[rows[near]] = nearest[near]
-    vertices[rows[near], plane.axis] = np.float32(plane.at_m)
-    return TriangleMesh(vertices, mesh.faces, mesh.normals, mesh.rgb)
+    normals, rgb = mesh.normals, mesh.rgb
+    if normals is not None:
+        mixed = between(normals, edges, share)
+        mixed /= np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12)
+        normals = np.concatenate([normals, mixed.astype(np.float32)])
+    if rgb is not None:
+        mixed = np.rint(between(rgb, edges, share))
+        rgb = np.concatenate([rgb, mixed.astype(np.uint8)])
+    return TriangleMesh(np.concatenate([mesh.vertices, new]), mesh.faces, normals, rgb)
 
 
-def nearest_on_edges(points: Float32, edges: Float32) -> tuple[Float64, Float64]:
-    """The nearest points on line segments, of those whose middles are nearest.
-
-    Args:
-        points: float32 (N, 3).
-        edges: float32 (E, 2, 3), E ≥ 1.
-
-    Returns:
-        float64 (N, 3), and the distances, float64 (N,).
-    """
-    middles = edges.mean(axis=1)
-    candidates = open3d_clouds.nearest(points, middles, min(_CANDIDATES, len(edges)))[0]
-    begin = edges[candidates, 0].astype(np.float64)
-    along = edges[candidates, 1] - begin
-    to_point = points[:, None] - begin
-    length2 = np.maximum(np.einsum("nki,nki->nk", along, along), 1e-30)
-    share = np.clip(np.einsum("nki,nki->nk", to_point, along) / length2, 0, 1)
-    feet = begin + share[..., None] * along
-    distance_m = np.linalg.norm(points[:, None] - feet, axis=2)
-    best = np.argmin(distance_m, axis=1)
-    row = np.arange(len(points))
-    return feet[row, best], distance_m[row, best]
+def between(values: NDArray[Any], edges: Int32, share: Float64) -> Float64:
+    """float64 (N, 3): values (V, 3) of vertices, at a share of the way along edges."""
+    first, last = values[edges[:, 0]], values[edges[:, 1]]
+    return np.asarray((1 - share[:, None]) * first + share[:, None] * last)
 
 
 def _first_turned(faces: Int32, inside: Bool, corners: int) -> Int32:
@@ -132,21 +103,10 @@ def _first_turned(faces: Int32, inside: Bool, corners: int) -> Int32:
 def _with_cuts(mesh: TriangleMesh, edges: Int32, away: Float32, plane: Plane) -> TriangleMesh:
     """The mesh with a new vertex where each edge (E, 2) meets the plane."""
     first, last = edges.T
-    share = (away[first] / (away[first] - away[last]))[:, None].astype(np.float64)
-
-    def between(values: NDArray[Any]) -> NDArray[Any]:
-        return np.asarray((1 - share) * values[first] + share * values[last])
-
-    new = between(mesh.vertices).astype(np.float32)
+    share = (away[first] / (away[first] - away[last])).astype(np.float64)
+    new = between(mesh.vertices, edges, share).astype(np.float32)
     new[:, plane.axis] = np.float32(plane.at_m)
-    normals, rgb = mesh.normals, mesh.rgb
-    if normals is not None:
-        mixed = between(normals)
-        mixed /= np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12)
-        normals = np.concatenate([normals, mixed.astype(np.float32)])
-    if rgb is not None:
-        rgb = np.concatenate([rgb, np.rint(between(rgb)).astype(np.uint8)])
-    return TriangleMesh(np.concatenate([mesh.vertices, new]), mesh.faces, normals, rgb)
+    return with_vertices(mesh, new, edges, share)
 
 
 def _compact(mesh: TriangleMesh, faces: Int32) -> TriangleMesh:

@@ -1,0 +1,145 @@
+"""Closing the seams between meshes that were cut along one plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from recon.adapters import open3d_clouds
+from recon.meshing.cut import Plane, with_vertices
+from recon.structures import TriangleMesh
+from recon.structures.arrays import Float32, Float64, Int32
+
+_CANDIDATES: Final = 8
+_SAME_M: Final = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class OnEdges:
+    """Where points come to lie on line segments.
+
+    Attributes:
+        edge: int64 (N,), the segment.
+        share: float64 (N,), how far along it, from 0 to 1.
+        feet: float64 (N, 3), the place.
+        distance_m: float64 (N,), how far the point is from there.
+    """
+
+    edge: np.ndarray[tuple[int], np.dtype[np.int64]]
+    share: Float64
+    feet: Float64
+    distance_m: Float64
+
+
+def open_edges(mesh: TriangleMesh, plane: Plane) -> Float32:
+    """Edges of a mesh that lie in a plane and belong to one triangle: float32 (E, 2, 3)."""
+    return np.asarray(mesh.vertices[_open_corners(mesh, plane)[:, :2]])
+
+
+def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float) -> TriangleMesh:
+    """Let a mesh end on the border of its neighbour that was cut in the same plane.
+
+    The vertices of the mesh move onto the border, and those of the border are inserted into the
+    mesh, so that both follow one line.
+
+    Args:
+        mesh: The mesh.
+        plane: Where both were cut.
+        border: float32 (E, 2, 3), the neighbour's `open_edges`.
+        reach_m: What is farther from the other stays: there the other has no surface.
+    """
+    rows = np.flatnonzero(plane.holds(mesh.vertices))
+    if not len(rows) or not len(border):
+        return mesh
+    found = nearest_on_edges(mesh.vertices[rows], border)
+    near = found.distance_m <= reach_m
+    vertices = mesh.vertices.copy()
+    vertices[rows[near]] = found.feet[near]
+    vertices[rows[near], plane.axis] = np.float32(plane.at_m)
+    return _with_inserted(replace(mesh, vertices=vertices), plane, border, reach_m)
+
+
+def nearest_on_edges(points: Float32, edges: Float32) -> OnEdges:
+    """The nearest points on line segments, of those whose middles are nearest.
+
+    Args:
+        points: float32 (N, 3).
+        edges: float32 (E, 2, 3), E ≥ 1.
+    """
+    middles = edges.mean(axis=1)
+    candidates = open3d_clouds.nearest(points, middles, min(_CANDIDATES, len(edges)))[0]
+    begin = edges[candidates, 0].astype(np.float64)
+    along = edges[candidates, 1] - begin
+    to_point = points[:, None] - begin
+    length2 = np.maximum(np.einsum("nki,nki->nk", along, along), 1e-30)
+    share = np.clip(np.einsum("nki,nki->nk", to_point, along) / length2, 0, 1)
+    feet = begin + share[..., None] * along
+    distance_m = np.linalg.norm(points[:, None] - feet, axis=2)
+    best = np.argmin(distance_m, axis=1)
+    row = np.arange(len(points))
+    edge = candidates[row, best].astype(np.int64)
+    return OnEdges(edge, share[row, best], feet[row, best], distance_m[row, best])
+
+
+def _with_inserted(
+    mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float
+) -> TriangleMesh:
+    """The mesh with the vertices of a border on those of its open edges that they lie beside."""
+    corners = _open_corners(mesh, plane)
+    if not len(corners):
+        return mesh
+    points = np.unique(border.reshape(-1, 3), axis=0)
+    ends = mesh.vertices[corners[:, :2]]
+    found = nearest_on_edges(points, ends)
+    to_ends_m = np.linalg.norm(points[:, None] - ends[found.edge], axis=2).min(axis=1)
+    inside = (found.distance_m <= reach_m) & (found.share > 0) & (found.share < 1)
+    inside &= to_ends_m > _SAME_M
+    # A triangle with two open edges takes vertices on the first of them alone.
+    _, first = np.unique(corners[:, 3], return_index=True)
+    inside &= np.isin(found.edge, first)
+    chosen = np.flatnonzero(inside)
+    chosen = chosen[np.lexsort((found.share[chosen], found.edge[chosen]))]
+    new = (len(mesh.vertices) + np.arange(len(chosen))).astype(np.int32)
+    edges = corners[found.edge[chosen], :2].astype(np.int32)
+    grown = with_vertices(mesh, points[chosen], edges, found.share[chosen])
+    return replace(grown, faces=_split_faces(mesh.faces, corners, found.edge[chosen], new))
+
+
+def _split_faces(
+    faces: Int32, corners: Int32, edge: np.ndarray[tuple[int], np.dtype[np.int64]], new: Int32
+) -> Int32:
+    """Faces whose open edges have new vertices become fans about their opposite corners.
+
+    Args:
+        faces: int32 (F, 3).
+        corners: As of `_open_corners`.
+        edge: int64 (N,), row of ``corners`` that each new vertex lies on, rising.
+        new: int32 (N,), the new vertices, in their order along each edge.
+    """
+    kept = np.ones(len(faces), dtype=bool)
+    fans = [faces[:0]]
+    for row in np.unique(edge):
+        first, last, opposite, face = corners[row]
+        line = np.concatenate([[first], new[edge == row], [last]])
+        kept[face] = False
+        apex = np.full(len(line) - 1, opposite)
+        fans.append(np.stack([line[:-1], line[1:], apex], axis=1).astype(np.int32))
+    return np.concatenate([faces[kept], *fans])
+
+
+def _open_corners(mesh: TriangleMesh, plane: Plane) -> Int32:
+    """Edges in a plane that belong to one triangle: int32 (E, 4).
+
+    First and last vertex in the order of the triangle, its third vertex, and its number.
+    """
+    number = np.repeat(np.arange(len(mesh.faces), dtype=np.int32), 3)
+    turned = mesh.faces[:, [[0, 1, 2], [1, 2, 0], [2, 0, 1]]].reshape(-1, 3)
+    inside = plane.holds(mesh.vertices)[turned[:, :2]].all(axis=1)
+    turned, number = turned[inside], number[inside]
+    _, where, count = np.unique(
+        np.sort(turned[:, :2], axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    single = count[where.ravel()] == 1
+    return np.concatenate([turned[single], number[single, None]], axis=1).astype(np.int32)
