@@ -28,7 +28,7 @@ from recon.pipeline.tile_store import TileStore
 from recon.structures import TriangleMesh
 from recon.structures.arrays import Float32
 
-SAMPLE_FACES: Final = 400_000
+SAMPLE_FACES: Final = 2_000_000
 """Triangles up to which the whole mesh is kept to look at."""
 _SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))
 """Axis, and whether it is the far side, of the four sides of a tile."""
