@@ -171,7 +171,8 @@ def _find_row_faults(geometry: Geometry, settings: AuditSettings) -> Iterator[Fi
             alignment.rms_px > settings.bad_row_px,
             f"rows of left and right do not correspond: {alignment.rms_px:.2f} px rms, mean "
             f"{alignment.mean_px:+.2f} px, spread {alignment.spread_px:.2f} px; turning the right "
-            f"camera by {pitch:+.3f} deg pitch and {roll:+.3f} deg roll mends it: --mend FILE",
+            f"camera by {pitch:+.3f} deg pitch and {roll:+.3f} deg roll mends it: "
+            "recon audit --mend FILE",
         )
 
 

@@ -97,7 +97,7 @@ def quick_warnings(source: StereoSource, config: ReconConfig) -> tuple[str, ...]
         audit = run_audit(source, config, quick=True)
     except CalibrationError:
         return ()
-    return tuple(f"{finding.text} [recon audit]" for finding in audit.findings)
+    return tuple(f"{finding.text} [quick audit]" for finding in audit.findings)
 
 
 def mend_calibration(

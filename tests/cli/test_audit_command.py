@@ -89,6 +89,26 @@ def test_what_it_mends_is_a_calibration_that_makes_the_drive_good(
     assert source.calibration.baseline_m == pytest.approx(drive[1].baseline_m)
 
 
+@pytest.mark.slow
+def test_mapping_warns_of_rows_first_and_takes_the_mended_file(
+    drive: Drive, tmp_path: Path
+) -> None:
+    path = drives.write_kitti(*spoiled(drive, pitch_deg=0.6), tmp_path / "drive")
+    common = ("--no-mesh", "--json", "--set", "matching.matcher=opencv-bm")
+    done = recon("map", path, *common, "--out", tmp_path / "bad")
+    events = [json.loads(line) for line in done.stderr.splitlines() if line.startswith("{")]
+    order = [event["event"] for event in events]
+    assert order.index("source") < order.index("warning") < order.index("frame")
+    assert any("[quick audit]" in line for line in json.loads(done.stdout)["warnings"])
+    mended = tmp_path / "mended.yaml"
+    assert recon("audit", path, "--mend", mended).exit_code == 0
+    again = recon("map", path, "--calib", mended, *common, "--out", tmp_path / "good")
+    assert again.exit_code == 0
+    summary = json.loads(again.stdout)
+    assert not any("rows" in line for line in summary["warnings"])
+    assert summary["points"] > json.loads(done.stdout)["points"]
+
+
 def test_a_picture_of_another_size_is_a_finding(drive: Drive, tmp_path: Path) -> None:
     pairs, camera = drive
     half = [replace(p, left=p.left[::2, ::2].copy(), right=p.right[::2, ::2].copy()) for p in pairs]

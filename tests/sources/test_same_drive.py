@@ -109,7 +109,10 @@ def test_every_layout_gives_the_same_trajectory(written: dict[str, Path]) -> Non
     travelled_m = np.linalg.norm(expected[-1, :3, 3])
     assert travelled_m > 8  # eleven frames a metre apart: it does follow the drive
     for layout, path in written.items():
-        np.testing.assert_array_equal(trajectory(path), expected, err_msg=layout)
+        # Stamps of today have 0.2 µs in a double, and a motion goes on by its times: over eleven
+        # metres that is a tenth of a millimetre, and no pixel.
+        apart = np.abs(trajectory(path) - expected).max()
+        assert apart < 1e-4, layout
 
 
 @pytest.mark.slow
