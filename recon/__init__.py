@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from recon.formats.trajectory import read_trajectory
     from recon.meshing import reconstruct_mesh
     from recon.pipeline.api import match, reconstruct
+    from recon.pipeline.audit_run import Audit, run_audit
     from recon.pipeline.config import ReconConfig, load_config
     from recon.pipeline.map_run import MapOptions, run_map
     from recon.pipeline.occupancy_run import OccupancyRequest, run_occupancy
@@ -58,6 +59,7 @@ _HOMES = {
     "recon.formats.trajectory": ("read_trajectory",),
     "recon.meshing": ("reconstruct_mesh",),
     "recon.pipeline.api": ("match", "reconstruct"),
+    "recon.pipeline.audit_run": ("Audit", "run_audit"),
     "recon.pipeline.config": ("ReconConfig", "load_config"),
     "recon.pipeline.map_run": ("MapOptions", "run_map"),
     "recon.pipeline.occupancy_run": ("OccupancyRequest", "run_occupancy"),
@@ -83,6 +85,7 @@ _HOMES = {
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Audit",
     "CameraIntrinsics",
     "Disparity",
     "MapOptions",
@@ -119,6 +122,7 @@ __all__ = [
     "read_trajectory",
     "reconstruct",
     "reconstruct_mesh",
+    "run_audit",
     "run_map",
     "run_occupancy",
     "run_pair",
