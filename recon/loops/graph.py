@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.adapters.open3d_pose_graph import PoseEdge, optimise_poses
+from recon.errors import RegistrationError
 from recon.geometry.se3 import (
     exp_so3,
     hat,
@@ -38,7 +39,8 @@ class Closure:
         trajectory: The path, bent so that the loops close; the very same where none does.
         closed: The loops that it closes.
         refused: The loops that the rest of the graph contradicts.
-        bend_chi2: Mean misfit of the odometry, per step between nodes; 0 without loops.
+        bend_chi2: Mean misfit of the odometry, per step between nodes; 0 without loops, infinite
+            where the graph has no solution.
     """
 
     trajectory: Trajectory
@@ -76,7 +78,10 @@ def close_loops(
     nodes = _nodes(path_m, settings)
     steps = _odometry_edges(trajectory, path_m, nodes, settings)
     ties = [_loop_edge(loop, trajectory, path_m, nodes, settings) for loop in loops]
-    poses, weights = _solve(trajectory.T_world_camera[nodes], steps, ties, settings)
+    try:
+        poses, weights = _solve(trajectory.T_world_camera[nodes], steps, ties, settings)
+    except RegistrationError:  # a map of the drive as odometry saw it is better than none
+        return Closure(trajectory, (), tuple(loops), math.inf)
     bend_chi2 = float(np.mean([misfit(edge, poses) for edge in steps]))
     kept = weights >= _KEPT
     if bend_chi2 > settings.graph.max_bend_chi2 or not kept.any():
@@ -111,7 +116,7 @@ def _solve(
     """Poses of the nodes, and the weights of the loops."""
     poses = start
     worst = max(misfit(edge, poses) for edge in ties)
-    rounds = max(0, math.ceil(math.log(worst / settings.graph.max_chi2, _EASING)))
+    rounds = math.ceil(math.log(max(worst / settings.graph.max_chi2, 1.0), _EASING))
     for k in range(rounds, -1, -1):
         tolerance = settings.graph.max_chi2 * _EASING**k
         poses, weights = optimise_poses(poses, [*steps, *ties], tolerance)

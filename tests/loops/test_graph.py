@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from recon.errors import RegistrationError
 from recon.geometry import se3
 from recon.loops.drift import Drift, doubtful_path, drift_over, is_possible
 from recon.loops.graph import close_loops
@@ -99,6 +100,27 @@ def test_a_false_loop_alone_is_refused_whole(odometry, truth):
 
     assert closure.trajectory is odometry
     assert closure.refused == (false,)
+
+
+def test_a_path_that_closes_already_stays_where_it_is():
+    """There and back, to the very same numbers: every misfit is exactly 0."""
+    poses = np.tile(np.eye(4), (41, 1, 1))
+    poses[:, 2, 3] = 20.0 - np.abs(np.arange(41) - 20.0)
+    path = Trajectory(poses, 0.1 * np.arange(41))
+    closure = _close(path, [_loop(path, k, 40 - k) for k in range(5)])
+
+    assert len(closure.closed) == 5
+    assert np.allclose(closure.trajectory.T_world_camera, poses, atol=1e-9)
+
+
+def test_a_graph_without_a_solution_closes_nothing(odometry, loops, monkeypatch):
+    def fails(*_: object) -> None:
+        raise RegistrationError("the pose graph has no solution")
+
+    monkeypatch.setattr("recon.loops.graph.optimise_poses", fails)
+    closure = _close(odometry, loops)
+    assert closure.trajectory is odometry
+    assert closure.refused == tuple(loops)
 
 
 def test_steps_stay_smooth(odometry, loops):
