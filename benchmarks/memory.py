@@ -29,6 +29,7 @@ from recon.synthetic import StreetSettings
 
 FRAMES = (1000, 4000)
 LIBRARIES_FRAMES = 8
+COMPILING_FRAMES = 60
 REPEAT_M = 50.0
 STEP_M = 0.5
 CAMERAS = ("image_0", "image_1")
@@ -39,6 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         period = render_period(Path(folder) / "period", options.width)
         counts = sorted(set(options.frames or FRAMES))
+        # The first run may compile kernels, which takes more memory than it will ever again.
+        measure(period, COMPILING_FRAMES, options)
         rows = [measure(period, count, options) for count in (LIBRARIES_FRAMES, *counts)]
     result = {
         "picture": [options.width, height_of(options.width)],

@@ -1,4 +1,4 @@
-"""Fewer points and triangles, evenly and always the same ones, for the picture in 3-D."""
+"""Fewer points, triangles and cells, evenly and always the same ones, for pictures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.structures import PointCloud, TriangleMesh
+from recon.structures import OccupancyGrid, PointCloud, TriangleMesh
 from recon.structures.arrays import UInt8
 
 
@@ -30,6 +30,21 @@ def thin_mesh(mesh: TriangleMesh, limit: int) -> TriangleMesh:
         size = max(grown, _typical_edge(mesh))
         thinned = _merge_vertices(mesh, size)
     return thinned
+
+
+def thin_grid(grid: OccupancyGrid, limit: int) -> OccupancyGrid:
+    """A grid of larger cells with at most ``limit`` a side: for pictures of large maps.
+
+    A larger cell is occupied where one of its cells is, else free where one is, so that no
+    obstacle is lost.
+    """
+    factor = math.ceil(max(grid.cells.shape) / limit)
+    if factor <= 1:
+        return grid
+    rows, columns = (np.arange(0, size, factor) for size in grid.cells.shape)
+    # Unknown is -1 and free 0, so the largest value is the one to keep.
+    cells = np.maximum.reduceat(np.maximum.reduceat(grid.cells, rows, axis=0), columns, axis=1)
+    return OccupancyGrid(cells, grid.resolution_m * factor, grid.origin_m)
 
 
 def quantise_colours(rgb: UInt8, depth: int = 8) -> tuple[UInt8, UInt8]:

@@ -27,11 +27,13 @@ from recon.reports.canvas import (
     write_note,
 )
 from recon.reports.colour import GRID_FREE, GRID_OCCUPIED, GRID_UNKNOWN, colour_grid, unit_colour
+from recon.reports.decimate import thin_grid
 from recon.structures import UNKNOWN, OccupancyGrid, Trajectory
 from recon.structures.arrays import Float64
 
 _X_LABEL = "x, forward at the start (m)"
 _Y_LABEL = "y, left at the start (m)"
+_MOST_CELLS = 2400  # of a grid's picture, a side: some for each of its pixels
 _MARGIN_CELLS = 10
 _PATH_MARGIN_M = 3.0
 
@@ -137,7 +139,7 @@ def grid_figure(
         trajectory: The path of the camera, or None.
         T_map_world: (4, 4), turns world to map axes.
     """
-    grid = _crop_to_known(grid)
+    grid = thin_grid(_crop_to_known(grid), _MOST_CELLS)
     x, y = grid.origin_m
     far = np.asarray(grid.cells.shape[::-1]) * grid.resolution_m + grid.origin_m
     corners = np.stack([grid.origin_m, far])

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.reports.decimate import quantise_colours, thin_cloud, thin_mesh
-from recon.structures import PointCloud, TriangleMesh
+from recon.reports.decimate import quantise_colours, thin_cloud, thin_grid, thin_mesh
+from recon.structures import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud, TriangleMesh
 
 
 @given(count=st.integers(0, 400), limit=st.integers(1, 100), seed=st.integers(0, 99))
@@ -70,3 +70,18 @@ def test_two_colours_of_unequal_number_stay_two() -> None:
     rgb = np.array([[0, 0, 0]] * 3 + [[200, 10, 10]] * 97, dtype=np.uint8)
     palette, index = quantise_colours(rgb)
     np.testing.assert_array_equal(palette[index], rgb)
+
+
+def test_a_thinned_grid_keeps_its_obstacles_and_its_place() -> None:
+    cells = np.full((7, 10), UNKNOWN, np.int8)
+    cells[:3] = FREE
+    cells[1, 9] = cells[6, 0] = OCCUPIED
+    thinned = thin_grid(OccupancyGrid(cells, 0.2, (-3.0, 4.0)), 4)
+    assert (thinned.resolution_m, thinned.origin_m) == (pytest.approx(0.6), (-3.0, 4.0))
+    expected = [[FREE, FREE, FREE, OCCUPIED], [UNKNOWN] * 4, [OCCUPIED, *[UNKNOWN] * 3]]
+    np.testing.assert_array_equal(thinned.cells, expected)
+
+
+def test_a_small_grid_stays_as_it_is() -> None:
+    grid = OccupancyGrid(np.zeros((3, 4), np.int8), 0.2, (0.0, 0.0))
+    assert thin_grid(grid, 4) is grid
