@@ -1,19 +1,26 @@
-"""How fast clouds become maps: our ray casting beside OctoMap's, on the same rays.
+"""How fast a drive becomes a map, stage by stage; and our ray casting beside OctoMap's.
 
-Both start from an empty map, and every round runs both in turn, so that a busy machine is busy for
+A drive is mapped as `recon map` does it, mesh and report included. ``fps`` and
+``frame_ms`` are of the mapping alone, from the first frame to the last; stages overlap, so they add
+up to more than a frame takes. ``after_s`` is what comes once all frames are in.
+
+For the rays, both start from an empty map, and every round runs both in turn, so that a busy machine is busy for
 both; the figures are medians over the rounds. ``agreement`` compares the cells that both call
 occupied or free: their share among the cells that either names.
 
-Example: python benchmarks/mapping.py --json
+Example: python benchmarks/mapping.py --json --drive DRIVE
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
+import tempfile
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +29,11 @@ from numpy.typing import NDArray
 
 from recon.geometry.se3 import make_transform
 from recon.mapping import OccupancyBuilder, OccupancySettings
+from recon.pipeline.config import load_config
+from recon.pipeline.machine import available_cores
+from recon.pipeline.map_run import MapOptions, run_map
+from recon.reports import present_map
+from recon.sources import open_source
 from recon.structures import PointCloud
 from recon.structures.arrays import Float64
 
@@ -32,6 +44,12 @@ RESOLUTIONS_M = (0.2, 0.1)
 ORIGIN_M = np.array([0.33, -0.21, 0.47])
 HEIGHT_M = 1.65
 HALF_WIDTH_M = 8.0
+PER_FRAME = (
+    *("rectify", "match", "edges", "inspect", "back_project", "filter", "thin"),
+    *("odometry", "map", "store", "loops", "checkpoint"),
+)
+"""Stages that every frame goes through; the first seven, those from the odometry on, mapping
+and the search for loops each run in a thread of their own."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -41,6 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "rays": options.rays,
         "rounds": options.rounds,
         "ray_casting": ray_casting(options.rays, options.rounds),
+        "drive": None if options.drive is None else budget(options.drive, options.set),
     }
     print(json.dumps(result, indent=2) if options.json else table(result))
 
@@ -50,7 +69,39 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     parser.add_argument("--rounds", type=int, default=7, help="runs that a median is taken of")
     parser.add_argument("--rays", type=int, default=RAYS, help="rays of one frame")
+    parser.add_argument(
+        "--drive", type=Path, default=real_drive(), help="source; RECON_DATA's kitti_raw_0013"
+    )
+    parser.add_argument("--set", action="append", default=[], help="a setting of recon map")
     return parser.parse_args(arguments)
+
+
+def real_drive() -> Path | None:
+    """The drive that the figures of the documentation are of, where there is one."""
+    folder = Path(os.environ.get("RECON_DATA", "")) / "driven" / "kitti_raw_0013"
+    return folder if folder.is_dir() else None
+
+
+def budget(drive: Path, overrides: Sequence[str]) -> dict[str, Any]:
+    """Milliseconds per frame of each stage of a drive, and seconds of what comes after."""
+    source, config = open_source(drive), load_config(None, overrides)
+    with tempfile.TemporaryDirectory() as folder:
+        options = MapOptions(out=Path(folder) / "run", present=present_map)
+        before_s = time.process_time()
+        summary = run_map(source, config, options).summary
+    frames, stages = summary["frames"], summary["stages"]
+    return {
+        "source": source.name,
+        "frames": frames,
+        "cores": available_cores(),
+        "fps": round(summary["fps"], 2),
+        "frame_ms": round(1e3 / summary["fps"], 1),
+        "stages_ms": {k: round(1e3 * v / frames, 1) for k, v in stages.items() if k in PER_FRAME},
+        "after_s": {k: round(v, 2) for k, v in stages.items() if k not in PER_FRAME},
+        "whole_run_s": summary["seconds"],
+        "processor_s": round(time.process_time() - before_s, 1),
+        "peak_memory_mb": summary["peak_memory_mb"],
+    }
 
 
 def ray_casting(rays: int, rounds: int) -> list[dict[str, Any]]:
@@ -174,7 +225,19 @@ def table(result: dict[str, Any]) -> str:
             f"  octomap {ms['octomap']:8.1f}  {row['octomap / recon']:6.1f}x"
             f"  same cells: occupied {same['occupied']:.4f}, free {same['free']:.4f}"
         )
-    return "\n".join(lines)
+    return "\n".join([*lines, *budget_table(result["drive"])])
+
+
+def budget_table(drive: dict[str, Any] | None) -> list[str]:
+    if drive is None:
+        return ["no drive: give --drive, or name the data in RECON_DATA"]
+    stages = ", ".join(f"{name} {ms:g}" for name, ms in drive["stages_ms"].items())
+    after = ", ".join(f"{name} {s:g}" for name, s in drive["after_s"].items())
+    return [
+        f"{drive['source']}: {drive['frames']} frames, {drive['fps']:g} frames per second",
+        f"  ms per frame ({drive['frame_ms']:g}, overlapping): {stages}",
+        f"  seconds after the last frame: {after}",
+    ]
 
 
 if __name__ == "__main__":

@@ -6,15 +6,40 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
+
+import pytest
+
+from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.synthetic import StreetSettings
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "mapping.py"
 
 
-def test_our_rays_and_those_of_octomap_end_in_the_same_cells() -> None:
-    command = [sys.executable, str(BENCHMARK), "--json", "--rays", "3000", "--rounds", "1"]
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    drive = tmp_path_factory.mktemp("drive")
+    street = StreetSettings(frames=4, width_px=192, height_px=72, focal_px=110.0)
+    write_kitti(SyntheticSource(street), drive)
+    options = ["--json", "--rays", "3000", "--rounds", "1", "--drive", str(drive)]
+    command = [sys.executable, str(BENCHMARK), *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    rows = json.loads(done.stdout)["ray_casting"]
+    return json.loads(done.stdout)
+
+
+def test_the_budget_of_a_drive_names_every_stage(result: dict[str, Any]) -> None:
+    drive = result["drive"]
+    assert drive["frames"] == 4
+    assert drive["fps"] == pytest.approx(1e3 / drive["frame_ms"], rel=0.05)
+    assert {"match", "back_project", "odometry", "map", "loops"} <= set(drive["stages_ms"])
+    assert {"cloud", "octomap", "grid", "mesh", "report"} <= set(drive["after_s"])
+    # Every stage of the run is in one of the two; the whole holds those after the last frame.
+    assert sum(drive["after_s"].values()) < drive["whole_run_s"]
+
+
+def test_our_rays_and_those_of_octomap_end_in_the_same_cells(result: dict[str, Any]) -> None:
+    rows = result["ray_casting"]
     assert [(row["scene"], row["resolution_m"]) for row in rows] == [
         ("street", 0.2),
         ("street", 0.1),
