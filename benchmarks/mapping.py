@@ -4,9 +4,9 @@ A drive is mapped as `recon map` does it, mesh and report included. ``fps`` and
 ``frame_ms`` are of the mapping alone, from the first frame to the last; stages overlap, so they add
 up to more than a frame takes. ``after_s`` is what comes once all frames are in.
 
-For the rays, both start from an empty map, and every round runs both in turn, so that a busy machine is busy for
-both; the figures are medians over the rounds. ``agreement`` compares the cells that both call
-occupied or free: their share among the cells that either names.
+For the rays, both start from an empty map, and every round runs both in turn, so that a busy
+machine is busy for both; the figures are medians over the rounds. ``agreement`` compares the cells
+that both call occupied or free: their share among the cells that either names.
 
 Example: python benchmarks/mapping.py --json --drive DRIVE
 """
