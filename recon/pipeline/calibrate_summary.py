@@ -100,11 +100,15 @@ def tell_depths(summary: dict[str, Any]) -> dict[str, str]:
     for depth, cm in summary["depth_error_cm"].items():
         known = "no common view"
         if cm["calibration"] is not None:
-            known = (
-                f"{cm['calibration']:.2g} cm, in the middle {cm['low']:+.2g} to {cm['high']:+.2g}"
-            )
-        lines[f"depth error at {depth} m"] = f"{known}; of matching {cm['matching']:.2g} cm"
+            known = f"{_short(cm['calibration'])} cm"
+            known += f", in the middle {_short(cm['low'])} to {_short(cm['high'])}"
+        lines[f"depth error at {depth} m"] = f"{known}; of matching {_short(cm['matching'])} cm"
     return lines
+
+
+def _short(value: float) -> str:
+    """Two digits, and never a power of ten."""
+    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
 
 
 def _depth_cm(each: DepthError) -> dict[str, float | None]:

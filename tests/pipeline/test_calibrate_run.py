@@ -141,11 +141,11 @@ def test_a_charuco_board_of_the_older_pattern_is_found_out(tmp_path: Path) -> No
 
 
 def test_depth_errors_are_told_in_words() -> None:
-    known = {"calibration": 11.04, "low": -3.24, "high": 4.56, "matching": 2.25}
+    known = {"calibration": 110.4, "low": -3.24, "high": 4.56, "matching": 2.251}
     unknown = dict.fromkeys(known) | {"matching": 0.01}
     told = tell_depths({"depth_error_cm": {"2": known, "0.1": unknown}})
     assert told == {
-        "depth error at 2 m": "11 cm, in the middle -3.2 to +4.6; of matching 2.2 cm",
+        "depth error at 2 m": "110 cm, in the middle -3.2 to 4.6; of matching 2.3 cm",
         "depth error at 0.1 m": "no common view; of matching 0.01 cm",
     }
 
