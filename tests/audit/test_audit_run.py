@@ -16,6 +16,7 @@ from recon.sources.synthetic import SyntheticSource
 from recon.structures import StereoCalibration, StereoPair
 from recon.synthetic import StreetSettings
 from tests.audit import faults
+from tests.sources import drives
 
 CONFIG = load_config()
 FRAMES = 10
@@ -125,6 +126,13 @@ def test_nothing_is_found_on_real_drives(recon_data: Path, drive: str) -> None:
 
 
 @pytest.mark.real
+@pytest.mark.parametrize("scene", ["Motorcycle", "Piano", "Playroom", "Recycle", "Teddy"])
+def test_nothing_is_found_on_scenes_of_one_pair(recon_data: Path, scene: str) -> None:
+    source = open_source(recon_data / "middlebury/MiddEval3/trainingQ" / scene)
+    assert run_audit(source, CONFIG).findings == ()
+
+
+@pytest.mark.real
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", faults.FAULTS)
 @pytest.mark.parametrize("drive", ["kitti_raw_0013", "kitti_06_51"])
@@ -141,6 +149,32 @@ def test_each_planted_fault_is_found_on_real_drives(
 def test_a_real_drive_is_mended(recon_data: Path, tmp_path: Path, drive: str) -> None:
     source = open_source(recon_data / "driven" / drive)
     assert_mended(faults.turned(source, pitch_deg=0.3), tmp_path)
+
+
+def test_a_source_of_one_pair_is_measured_too(street: faults.Spoiled) -> None:
+    audit = run_audit(replace(street, count=1), CONFIG)
+    assert audit.verdict == "good"
+    assert audit.figures["frames_read"] == 1
+    assert audit.figures["row_error_rms_px"] < 0.2
+
+
+def test_a_black_picture_now_and_then_is_no_black_camera(street: faults.Spoiled) -> None:
+    def take(index: int) -> StereoPair:
+        pair = street.take(index)
+        return replace(pair, right=np.zeros_like(pair.right)) if index == 4 else pair
+
+    assert "black" not in codes(replace(street, take=take))
+
+
+def test_frames_that_are_missing_are_told_with_the_place(
+    street: faults.Spoiled, tmp_path: Path
+) -> None:
+    pairs = [street.take(index) for index in (0, 1, 2, 3, 7, 8, 9)]
+    pairs = [replace(pair, index=k) for k, pair in enumerate(pairs)]
+    grey = [replace(p, left=p.left[:, :, 0], right=p.right[:, :, 0]) for p in pairs]
+    source = open_source(drives.write_kitti(grey, faults.rectified(street), tmp_path))
+    findings = {finding.code: finding.text for finding in run_audit(source, CONFIG).findings}
+    assert "missing at 1 places, at most 0.40 s after frame 3" in findings["gaps"]
 
 
 def test_noise_is_no_frozen_camera() -> None:
