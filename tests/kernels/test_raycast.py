@@ -130,6 +130,7 @@ def test_limited_points_equal_those_of_the_reference(seed: int, n: int, margin: 
     np.testing.assert_array_equal(before[1], sigma)
 
 
+@settings(deadline=None)
 @given(
     origin=st.tuples(*[st.floats(-4, 4)] * 3),
     angles=st.tuples(st.floats(-math.pi, math.pi), st.floats(-1.5, 1.5)),
