@@ -22,6 +22,12 @@ class FusionSettings(Settings):
     min_count: int = Field(
         3, ge=1, le=1000, description="Voxels seen by fewer frames are not exported."
     )
+    precise_sigma_m: float | None = Field(
+        0.08,
+        gt=0.0,
+        le=10.0,
+        description="Voxels at least this precise need one frame less; null = none does.",
+    )
     min_sigma_m: float = Field(
         0.02,
         gt=0.0,
@@ -109,12 +115,14 @@ class MapBuilder:
         """The map so far, one point per voxel, in the order in which voxels were first seen.
 
         Args:
-            min_count: Voxels seen by fewer frames are left out; None = as in the settings.
+            min_count: Voxels seen by fewer frames are left out, or by fewer than one less where
+                they are precise; None = as in the settings.
 
         Returns:
             As `FusedPart.cloud` gives it.
         """
-        return self.part().cloud(self._settings.voxel_m, min_count or self._settings.min_count)
+        s = self._settings
+        return self.part().cloud(s.voxel_m, min_count or s.min_count, s.precise_sigma_m)
 
     def part(self) -> FusedPart:
         """What was seen since the start, or since the last `take`."""

@@ -78,14 +78,19 @@ class FusedPart:
         sums[:, _TURNED] = rotate(T_new_world, sums[:, _TURNED])
         return _merged(replace(self, keys=voxels.pack_keys(cells), sums=sums))
 
-    def cloud(self, voxel_m: float, least: int) -> PointCloud:
-        """One point per voxel that at least ``least`` frames saw.
+    def cloud(self, voxel_m: float, least: int, precise_m: float | None = None) -> PointCloud:
+        """One point per voxel that enough frames saw.
+
+        Args:
+            voxel_m: Edge of a voxel.
+            least: How many are enough.
+            precise_m: Where ``sigma_m`` is at most this, one less is enough; None = nowhere.
 
         Returns:
             Frame ``world``. ``sigma_m`` treats frames as independent, and the points of one
             frame in one voxel as one measurement. Voxels whose normals cancel are left out.
         """
-        rows = np.flatnonzero(self.frames >= least)
+        rows = np.flatnonzero(self.frames >= self._needed(least, precise_m))
         part = self.select(rows[self._has_direction(rows)])
         weight = part.sums[:, :1]
         values = part.sums[:, 4:] / weight
@@ -101,6 +106,13 @@ class FusedPart:
             count=part.frames,
             frame="world",
         )
+
+    def _needed(self, least: int, precise_m: float | None) -> Int32:
+        """int32 (N,), frames that must have seen each voxel."""
+        if precise_m is None or "sigma_m" not in self.known:
+            return np.full(len(self), least, np.int32)
+        precise = self.information >= np.float32(precise_m**-2)
+        return np.where(precise, max(1, least - 1), least).astype(np.int32)
 
     def _has_direction(self, rows: NDArray[np.intp]) -> Bool:
         """Which voxels have normals that do not cancel; all, where normals are not known."""

@@ -172,7 +172,8 @@ class DriveMap:
         fused = replace(join_fused(inside), known=self._known)
         # A drive of fewer frames than the least count must still give a map.
         least = min(config.fusion.min_count, self._frames)
-        cloud = filter_cloud(fused.cloud(config.fusion.voxel_m, least), config.map_filters)
+        points = fused.cloud(config.fusion.voxel_m, least, config.fusion.precise_sigma_m)
+        cloud = filter_cloud(points, config.map_filters)
         home = np.floor(cloud.xyz[:, [0, 2]] / np.float32(self.cloud_tile_m))
         return cloud.select((home == tile).all(axis=1))
 
