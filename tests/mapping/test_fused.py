@@ -15,7 +15,7 @@ def _cloud(xyz: np.ndarray, **fields: np.ndarray) -> PointCloud:
     return PointCloud(np.asarray(xyz, np.float32), frame="world", **fields)
 
 
-def _build(*clouds: PointCloud, **settings: float) -> MapBuilder:
+def _build(*clouds: PointCloud, **settings: float | None) -> MapBuilder:
     builder = MapBuilder(FusionSettings(**settings))
     for cloud in clouds:
         builder.integrate(cloud)
@@ -42,6 +42,18 @@ def test_voxels_seen_too_rarely_are_not_exported() -> None:
     assert len(builder) == 2
     assert builder.cloud().xyz.tolist() == pytest.approx(np.float32(often))
     assert len(builder.cloud(min_count=1)) == 2
+
+
+def test_precise_voxels_need_one_frame_less() -> None:
+    xyz = np.array([[0.05, 0.05, 0.05], [1.05, 1.05, 1.05]])
+    # Two frames of 0.1 m make 0.071 m, two of 0.15 m make 0.106 m.
+    cloud = _cloud(xyz, sigma_m=np.array([0.1, 0.15], np.float32))
+    for limit_m, exported in ((0.08, 1), (0.07, 0), (0.11, 2), (None, 0)):
+        builder = _build(cloud, cloud, min_count=3, precise_sigma_m=limit_m)
+        assert len(builder.cloud()) == exported
+    once = _build(cloud, min_count=3, precise_sigma_m=10.0)
+    assert len(once.cloud()) == 0
+    assert len(once.cloud(min_count=1)) == 2
 
 
 def test_precise_points_pull_the_mean_by_the_square_of_their_precision() -> None:
