@@ -5,7 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import hypothesis
 import pytest
+
+# A deadline would fail examples that compile, and any of them on a busy machine.
+hypothesis.settings.register_profile("recon", deadline=None)
+hypothesis.settings.load_profile("recon")
 
 
 @pytest.fixture(scope="session")
