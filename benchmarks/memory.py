@@ -144,8 +144,9 @@ def repeat(period: Path, drive: Path, frames: int) -> None:
     write_kitti_poses(drive / "poses.txt", Trajectory(poses, times_s))
 
 
-def ratio(one: float, other: float) -> float:
-    return round(one / other, 3)
+def ratio(one: float, other: float) -> float | None:
+    """None where a drive is so short that its map takes nothing beside the libraries."""
+    return round(one / other, 3) if other > 0 else None
 
 
 def table(result: dict[str, Any]) -> str:
@@ -155,7 +156,7 @@ def table(result: dict[str, Any]) -> str:
         f"{row['files_mb']:10.1f}{row['seconds']:9.1f}{row['peak_mb']:9.1f}"
         for row in (result["libraries"], *result["drives"])
     ]
-    lines += [f"{key}: {result[key]:.3f}" for key in result if key.startswith("longest")]
+    lines += [f"{key}: {result[key]}" for key in result if key.startswith("longest")]
     return "\n".join(lines)
 
 
