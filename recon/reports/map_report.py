@@ -132,7 +132,7 @@ def _figures(inputs: MapReportInputs) -> list[tuple[str, str]]:
         figures.append(("Position error (ATE)", f"{inputs.metrics.ate_m:.2f} m"))
     if inputs.health:
         lost = sum(not record.ok for record in inputs.health)
-        figures.append(("Frames not measured", f"{lost} of {len(inputs.health)}"))
+        figures.append(("Frames not trusted", f"{lost} of {len(inputs.health)}"))
     if inputs.loops is not None and inputs.loops.found:
         moved = f"{float(inputs.loops.corrections_m.max()):.2f} m"
         closed = f"{len(inputs.loops.closure.closed)} of {inputs.loops.found}"
@@ -192,7 +192,7 @@ def _path_blocks(inputs: MapReportInputs) -> list[Block]:
         caption = "Both paths start at the same pose, so all drift shows."
         blocks.append(FigureBlock("Error along the path", error, caption))
     if inputs.health:
-        caption = "What each pose rests on; frames that rest on no measurement are shaded red."
+        caption = "What each pose rests on; frames whose pose is not trusted are shaded red."
         blocks.append(FigureBlock("Health of the odometry", health_figure(inputs.health), caption))
     return blocks + _tables(inputs)
 

@@ -180,7 +180,7 @@ def timing_figure(stages: Mapping[str, float]) -> bytes:
 
 
 def health_figure(health: Sequence[OdometryHealth]) -> bytes:
-    """What each frame's pose rests on; frames that rest on no measurement are shaded red."""
+    """What each frame's pose rests on; frames whose pose is not trusted are shaded red."""
     rows = (
         ("inlier tracks", [float(record.inliers) for record in health]),
         ("overlap with\nthe map (share)", [record.overlap for record in health]),
@@ -190,8 +190,11 @@ def health_figure(health: Sequence[OdometryHealth]) -> bytes:
     figure = new_figure(WIDE_IN, 5.6)
     all_axes = figure.subplots(len(rows), 1, sharex=True)
     for axes, (label, values) in zip(all_axes, rows, strict=True):
-        if np.isfinite(values).any():
-            axes.plot(frames, values, color=ESTIMATE, linewidth=1.3)
+        known = np.isfinite(values)
+        if known.any():
+            # What is measured every few frames has no neighbours that a line could join.
+            marker = "" if known.all() else "."
+            axes.plot(frames, values, color=ESTIMATE, linewidth=1.3, marker=marker)
             axes.set_ylim(bottom=0)
         else:
             write_note(axes, "not measured")

@@ -88,7 +88,7 @@ def test_report_of_a_drive_puts_the_main_figures_first(drive: MapReportInputs) -
     figures = dict(map_report(drive).figures)
     assert figures["Path"] == "10.0 m"
     assert figures["Drift (t_rel)"] == "0.62 %"
-    assert figures["Frames not measured"] == "1 of 11"
+    assert figures["Frames not trusted"] == "1 of 11"
     assert figures["Mapping rate"] == "4.2 fps"
     assert figures["Points in the map"] == "2,000"
 
