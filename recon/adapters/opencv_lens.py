@@ -12,6 +12,9 @@ from recon.structures import CameraIntrinsics
 from recon.structures.arrays import Float32, Float64
 
 _ORIGIN: Final = np.zeros(3)
+_LARGEST_MISS_PX: Final = 0.01
+"""A ray whose pixel is farther off than this is not the inverse of the lens."""
+
 # OpenCV inverts a lens by iteration and by default stops early (five rounds, 0.01).
 _EXACT: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
 
@@ -79,9 +82,25 @@ def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
     else:
         plane = cv2.undistortPoints(points, matrix, distortion, criteria=_EXACT)
     rays = np.concatenate([plane.reshape(-1, 2), np.ones((len(points), 1))], axis=1)
-    # OpenCV marks a fisheye's failures with -1e6.
-    rays[np.abs(rays).max(axis=1) > 1e5] = np.nan
+    # OpenCV marks a fisheye's failures with -1e6, and those of other lenses not at all.
+    rays[~(np.abs(rays).max(axis=1) < 1e5)] = np.nan
+    if camera.model != "fisheye":
+        with np.errstate(invalid="ignore"):
+            missed = np.abs(project(camera, rays) - points[:, 0]).max(axis=1) > _LARGEST_MISS_PX
+        rays[missed] = np.nan
     return rays
+
+
+def sees_all(camera: CameraIntrinsics) -> bool:
+    """Whether each pixel on the border of the picture has a ray of its own.
+
+    The polynomials of a lens were fitted where points were seen; farther out they may turn back.
+    """
+    w, h = camera.width_px - 1.0, camera.height_px - 1.0
+    t = np.linspace(0, 1, 65)
+    sides = [(0 * t, h * t), (w + 0 * t, h * t), (w * t, 0 * t), (w * t, h + 0 * t)]
+    border = np.concatenate([np.stack(side, axis=1) for side in sides])
+    return bool(np.isfinite(unproject(camera, border)).all())
 
 
 def rectifying_maps(
@@ -108,4 +127,17 @@ def rectifying_maps(
         size,
         cv2.CV_32FC1,
     )
+    if camera.model != "fisheye" and not sees_all(camera):
+        return _without_folds(camera, rotation, matrix, size)
     return np.asarray(maps[0]), np.asarray(maps[1])
+
+
+def _without_folds(
+    camera: CameraIntrinsics, rotation: Float64, matrix: Float64, size: tuple[int, int]
+) -> tuple[Float32, Float32]:
+    """Maps that lead nowhere, (-1, -1), where a lens folds back into its picture."""
+    x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]).astype(np.float64)
+    xyz = (np.linalg.inv(rotation) @ np.linalg.inv(matrix[:, :3]) @ rays).T
+    pixels = np.nan_to_num(project_into_picture(camera, xyz), nan=-1.0).astype(np.float32)
+    return pixels[:, 0].reshape(x.shape), pixels[:, 1].reshape(x.shape)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from recon.adapters.opencv_lens import rectifying_maps, unproject
+from recon.adapters.opencv_lens import rectifying_maps, sees_all, unproject
 from recon.errors import CalibrationError
 from recon.geometry.se3 import angle_rad
 from recon.rectification.grey import GreyMode, to_grey
@@ -206,7 +206,7 @@ def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) 
     left, right = calibration.left, calibration.right
     size = (left.width_px, left.height_px)
     try:
-        if "fisheye" in (left.model, right.model):
+        if "fisheye" in (left.model, right.model) or not (sees_all(left) and sees_all(right)):
             R1, R2, P1, P2 = plan_wide_view(
                 calibration, settings.alpha, same_principal_point=settings.same_principal_point
             )

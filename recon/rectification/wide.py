@@ -1,4 +1,4 @@
-"""The common view of two cameras of which one at least is a fisheye."""
+"""The common view of two cameras, one of which at least cannot show all it sees on a plane."""
 
 from __future__ import annotations
 

@@ -40,6 +40,7 @@ def photograph(camera: CameraIntrinsics, T_left_camera: np.ndarray) -> np.ndarra
     paint = cv2.normalize(paint, None, 20, 235, cv2.NORM_MINMAX)
     # 6 mm a texel, seen at about 4 mm a pixel.
     at = (np.stack([xyz[:, 0] + xyz[:, 2], xyz[:, 1]]) / 0.006 % 510).astype(np.float32)
+    at = np.nan_to_num(at)  # A fisheye's corners see nothing.
     grey = cv2.remap(paint, *(each.reshape(u.shape) for each in at), cv2.INTER_LINEAR)
     return np.asarray(grey).astype(np.uint8)
 

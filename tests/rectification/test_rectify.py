@@ -352,3 +352,18 @@ def fisheye_stripes() -> StereoPair:
         grey = np.nan_to_num(128 + 100 * np.sin(angle * 12), nan=0.0)
         images.append(np.rint(grey).astype(np.uint8).reshape(HEIGHT, WIDTH))
     return StereoPair(images[0], images[1])
+
+
+def test_a_lens_that_folds_in_its_corners_is_not_zoomed_into_its_middle() -> None:
+    """Eight coefficients fitted to boards in the middle turn back at 0.75 of the focal length."""
+    folding = [-0.169, -0.0451, 3.7e-4, -3e-4, -0.0485, 0.1282, -0.0238, -0.0986]
+    matrix = np.array([[336.0, 0, 243], [0, 336, 176], [0, 0, 1]])
+    camera = CameraIntrinsics(matrix, np.array(folding), 480, 360)
+    T_right_left = np.eye(4)
+    T_right_left[0, 3] = -0.12
+    rectifier = Rectifier(StereoCalibration(camera, camera, T_right_left))
+    assert 200 < rectifier.camera.focal_px < 500
+    assert rectifier.valid is not None
+    assert 0.8 < rectifier.valid.mean() <= 1.0
+    corner = np.array([[0.0, 0.0]])
+    assert np.isnan(unproject_raw(camera, corner)).all()
