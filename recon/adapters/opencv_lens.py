@@ -114,6 +114,8 @@ def rectifying_maps(
         matrix: float64 (3, 3) or (3, 4), the view's pinhole matrix.
         size: (width, height) of the view, pixels.
     """
+    if camera.model != "fisheye" and not sees_all(camera):
+        return _without_folds(camera, rotation, matrix, size)
     make = (
         cv2.fisheye.initUndistortRectifyMap
         if camera.model == "fisheye"
@@ -127,8 +129,6 @@ def rectifying_maps(
         size,
         cv2.CV_32FC1,
     )
-    if camera.model != "fisheye" and not sees_all(camera):
-        return _without_folds(camera, rotation, matrix, size)
     return np.asarray(maps[0]), np.asarray(maps[1])
 
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Final, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ from recon.kernels.refine import (
 )
 from recon.kernels.sad import sad_minima
 from recon.matching.fill import fill_holes
+from recon.matching.gradients import clipped_gradients, texture
 from recon.matching.rooms import Rooms
 from recon.matching.search import (
     FITS,
@@ -33,10 +34,7 @@ from recon.matching.search import (
     finish,
 )
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
-from recon.structures.arrays import Float32, UInt8
-
-_GAIN_OF_SOBEL: Final = 8.0
-"""A 3×3 Sobel filter answers a slope of one grey level per pixel with 8."""
+from recon.structures.arrays import UInt8
 
 
 class SadSettings(MeasuredSettings):
@@ -108,15 +106,16 @@ class SadMatcher:
             MatchingError: No disparity of the range lies within the picture.
         """
         search, rules = self._plan(pair.camera)
-        texture = _texture(pair, self._settings)
-        left = _prefiltered(pair.left, self._settings)
-        views = lay_out(left, _prefiltered(pair.right, self._settings), search)
+        s = self._settings
+        enough = texture(pair, (s.window_px, s.window_height_px), s.min_texture)
+        left = _prefiltered(pair.left, s)
+        views = lay_out(left, _prefiltered(pair.right, s), search)
         refined = empty_refined(*left.shape)
 
         def strip(first: int, end: int) -> None:
             with self._rooms.borrow(search, views.width) as room:
                 sad_minima(views, search, first, end, room, minima)
-            refine_minima(minima, texture, rules, first, end, refined)
+            refine_minima(minima, enough, rules, first, end, refined)
 
         with self._minima.borrow(*left.shape) as minima:
             _in_strips(strip, len(left), self._threads)
@@ -157,26 +156,7 @@ def _prefiltered(image: UInt8, settings: SadSettings) -> UInt8:
     """What the windows compare: uint8 (H, W)."""
     if settings.prefilter == "none":
         return image
-    cap = settings.prefilter_cap
-    gradient = cv2.Sobel(image, cv2.CV_16S, 1, 0, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(np.clip(gradient, -cap, cap) + cap, dtype=np.uint8)
-
-
-def _texture(pair: RectifiedPair, settings: SadSettings) -> Float32:
-    """Mean horizontal gradient in the window, grey levels per pixel; NaN = no picture."""
-    gradient = cv2.Sobel(pair.left, cv2.CV_16S, 1, 0, borderType=cv2.BORDER_REPLICATE)
-    size = (settings.window_px, settings.window_height_px)
-    total = cv2.boxFilter(
-        np.abs(gradient).view(np.uint16),
-        cv2.CV_32F,
-        size,
-        normalize=False,
-        borderType=cv2.BORDER_REPLICATE,
-    )
-    mean = total * np.float32(1 / (_GAIN_OF_SOBEL * size[0] * size[1]))
-    if pair.valid is not None:
-        mean[~pair.valid] = np.nan
-    return np.asarray(mean, dtype=np.float32)
+    return clipped_gradients(image, settings.prefilter_cap)
 
 
 def _in_strips(work: Callable[[int, int], None], rows: int, threads: int) -> None:

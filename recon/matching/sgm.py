@@ -6,8 +6,6 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final
 
-import cv2
-import numpy as np
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
@@ -29,13 +27,11 @@ from recon.kernels.refine import (
     refine_minima,
 )
 from recon.kernels.semi_global import ROWS, Paths, empty_room, semi_global_minima
+from recon.matching.gradients import clipped_gradients, texture
 from recon.matching.rooms import Rooms
 from recon.matching.search import FITS, MeasuredSettings, OddInt, finish
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
-from recon.structures.arrays import Float32, UInt8
-
-_GAIN_OF_SOBEL: Final = 8.0
-"""A 3×3 Sobel filter answers a slope of one grey level per pixel with 8."""
+from recon.structures.arrays import UInt8
 
 _LEVELS: Final = 250
 """Of the 255 that a path cost has; rounding needs the others."""
@@ -152,18 +148,18 @@ class SgmMatcher:
         views, window = _views(pair, ndisp, s), _window(s)
         levels = window.levels
         paths, rules = _paths(s, ndisp, levels), _rules(s, ndisp, levels)
-        texture = _texture(pair, s)
-        refined = empty_refined(*texture.shape)
+        enough = texture(pair, (s.window_px, s.window_height_px), s.min_texture)
+        refined = empty_refined(*enough.shape)
 
         def work(strip: range) -> None:
             with self._rooms.borrow(pair.camera.width_px, paths) as room:
                 semi_global_minima(views, window, paths, strip, room, minima)
-            refine_minima(minima, texture, rules, strip.start, strip.stop, refined)
+            refine_minima(minima, enough, rules, strip.start, strip.stop, refined)
 
         strip_rows, at_once = self._strips(pair.camera, ndisp)
         height = pair.camera.height_px
         strips = [range(y, min(y + strip_rows, height)) for y in range(0, height, strip_rows)]
-        with self._minima.borrow(*texture.shape) as minima, ThreadPoolExecutor(at_once) as pool:
+        with self._minima.borrow(*enough.shape) as minima, ThreadPoolExecutor(at_once) as pool:
             list(pool.map(work, strips))
         return finish(refined, s)
 
@@ -236,28 +232,4 @@ def _views(pair: RectifiedPair, ndisp: int, settings: SgmSettings) -> Views:
 def _planes(image: UInt8, settings: SgmSettings) -> list[UInt8]:
     """Gradients and census, uint8 (H, W) each."""
     census = census_planes(image, settings.census_height_px // 2, settings.census_px // 2)
-    return [_gradients(image, settings.prefilter_cap), *census]
-
-
-def _gradients(image: UInt8, cap: int) -> UInt8:
-    """Horizontal gradients, uint8 (H, W), ``cap`` where there is none."""
-    gradient = cv2.Sobel(image, cv2.CV_16S, 1, 0, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(np.clip(gradient, -cap, cap) + cap, dtype=np.uint8)
-
-
-def _texture(pair: RectifiedPair, settings: SgmSettings) -> Float32:
-    """Mean horizontal gradient in the window, grey levels per pixel; NaN = no picture.
-
-    Where nothing is asked of it, it is not computed: 0.
-    """
-    mean = np.zeros(pair.left.shape, np.float32)
-    if settings.min_texture > 0:
-        gradient = cv2.Sobel(
-            pair.left, cv2.CV_32F, 1, 0, scale=1 / _GAIN_OF_SOBEL, borderType=cv2.BORDER_REPLICATE
-        )
-        window = (settings.window_px, settings.window_height_px)
-        blurred = cv2.blur(np.abs(gradient), window, borderType=cv2.BORDER_REPLICATE)
-        mean = np.asarray(blurred, dtype=np.float32)
-    if pair.valid is not None:
-        mean[~pair.valid] = np.nan
-    return mean
+    return [clipped_gradients(image, settings.prefilter_cap), *census]
