@@ -219,7 +219,7 @@ def _sum_window(values: NDArray[Any], window: int, room: Room, sums: NDArray[np.
     pairs, fours = room.pairs, room.fours
     beside, beyond = values[1:], pairs[2:]
     for i in range(values.size - 1):
-        pairs[i] = values[i] + beside[i]
+        pairs[i] = np.uint16(values[i]) + np.uint16(beside[i])
     for i in range(values.size - 3):
         fours[i] = np.uint16(pairs[i]) + np.uint16(beyond[i])
     # One pass for up to two fours and the rest, 1 or 3; a term that is not there is noughts.

@@ -76,11 +76,13 @@ def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]
     assert (minima.winner == 0).all()
 
 
-def test_largest_costs_do_not_overflow() -> None:
+# One row: the sums over a column fit into bytes, those over two do not.
+@pytest.mark.parametrize(("radius", "rows_radius"), [(7, 7), (1, 0), (4, 0)])
+def test_largest_costs_do_not_overflow(radius: int, rows_radius: int) -> None:
     left, right = np.full((40, 40), 255, np.uint8), np.zeros((40, 40), np.uint8)
-    search = Search(ndisp=3, minimum=0, radius=7, rows_radius=7, cost_cap=255, lean=0)
+    search = Search(3, 0, radius, rows_radius, cost_cap=255, lean=0)
     costs = search_all(left, right, search).costs[0]
-    assert (costs == 15 * 16 * 255).all()
+    assert (costs == (2 * radius + 1) * 2 * (rows_radius + 1) * 255).all()
     assert costs.max() < NO_COST
 
 
