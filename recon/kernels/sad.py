@@ -1,9 +1,10 @@
 """Sums of absolute differences over a window, and the best candidate of each pixel.
 
-How it is fast: every loop that costs time runs over neighbouring columns, in uint8 and uint16
-alone, for one candidate or eight at once, so that a vector instruction does 32 or 64 pixels. A
-window is made of two halves (`recon.kernels.half_windows`), each summed up once for two rows.
-Blocks of columns are so narrow that all this stays in a core's own cache.
+How it is fast: the candidates of a pixel lie side by side, and all that costs time is done for
+`LANES` of them by one instruction or two (`recon.kernels.lanes`). A window is made of two halves
+(`recon.kernels.half_windows`), each summed up once for two rows. The least cost is kept of each
+lane while the costs are made, so they are never written down; only at the end the lanes of a pixel
+are compared. Rows are done in blocks of columns whose halves stay in a core's own cache.
 
 Two halves that are moved against each other make a window that leans: beside the upright window
 it costs one more addition, not one more search.
@@ -22,7 +23,28 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.kernels.half_windows import BLOCK, Halves, Room, Search, Views, next_half
+from recon.kernels.half_windows import (
+    RUN,
+    Halves,
+    Room,
+    Search,
+    Views,
+    existing,
+    fill_columns,
+    sum_halves,
+)
+from recon.kernels.lanes import (
+    LANES,
+    Lanes,
+    least,
+    load,
+    lowest,
+    lowest_pair,
+    most,
+    ramp,
+    splat,
+    where_less,
+)
 from recon.kernels.minima import NO_COST, Minima, claim_right
 
 
@@ -49,160 +71,103 @@ def sad_minima(
         room: Memory from `make_room`; not shared with another thread.
         minima: Written: the rows ``first`` to ``end - 1``.
     """
+    start = first - search.rows_radius
     for x0 in range(0, views.width, room.block):
-        x1 = min(x0 + room.block, views.width)
-        for y in range(first - search.rows_radius, end):
-            halves = next_half(views, search, first, y, x0, room)
-            if y >= first:
-                _choose(halves, search, y, x0, x1, room.found, minima)
+        width = min(room.block, views.width - x0)
+        fill_columns(views, search, start, x0, room)
+        for y in range(start, end):
+            lower = room.halves[(y - start) % len(room.halves)]
+            # The half above row y is that below row y - rows_radius, the oldest of the ring.
+            upper = room.halves[(y - start + 1) % len(room.halves)]
+            halves = Halves(upper, lower, room.places)
+            for c in range(0, width, RUN):
+                stop = min(c + RUN, width)
+                sum_halves(views, search, y, x0, c, stop, room, lower)
+                if y >= first:
+                    _choose(halves, search, y, x0, c, stop, minima)
+                    _look_beside(halves, search, y, x0, c, stop, minima)
     for y in range(first, end):
         claim_right(search.ndisp, search.minimum, y, minima)
 
 
 @njit(cache=True, nogil=True)
 def _choose(
-    halves: Halves,
-    search: Search,
-    y: int,
-    x0: int,
-    x1: int,
-    found: NDArray[np.uint16],
-    minima: Minima,
+    halves: Halves, search: Search, y: int, x0: int, start: int, end: int, minima: Minima
 ) -> None:
-    """Choose among the candidates of columns ``x0`` to ``x1 - 1`` of row ``y``."""
-    width, ahead, block = minima.winner.shape[1], search.minimum - x0, x1 - x0
-    found[:BLOCK] = search.ndisp
-    found[BLOCK:] = NO_COST
-    # Candidate k exists in columns [k + ahead, k + ahead + width) of the block.
-    for k in range(0, search.ndisp, 8):
-        start, end = max(k + 7 + ahead, 0), min(k + ahead + width, block)
-        if k + 8 > search.ndisp or start >= end:
-            start = end = block
-        # Calls are dear here, and most blocks lie wholly where all eight exist.
-        if start > 0:
-            _offer_each(halves, search, k, ahead, width, 0, start, found)
-        if start < end:
-            _offer_eight(halves, search.lean, k, start, end, found)
-        if end < block:
-            _offer_each(halves, search, k, ahead, width, end, block, found)
-    minima.winner[y, x0:x1] = found[:block]
-    minima.costs[0, y, x0:x1] = found[BLOCK : BLOCK + block]
-    minima.costs[3, y, x0:x1] = found[2 * BLOCK : 2 * BLOCK + block]
-    _look_beside(halves, search, y, x0, x1, minima)
+    """Write the best candidate, its cost and the second best cost, of columns of a block."""
+    width, lean = minima.winner.shape[1], search.lean
+    none, numbers = splat(np.uint16(NO_COST)), ramp(np.uint16(0))
+    one, three = splat(np.uint16(1)), splat(np.uint16(3))
+    for c in range(start, end):
+        x, at = np.uint64(x0 + c), c * halves.places + abs(lean)
+        first, stop = existing(search, width, x0 + c)
+        k, best, which, second = first // LANES * LANES, none, none, none
+        if k < first:
+            cost = _close(_costs(halves, at + k, lean), k, first, stop)
+            best, which, second = _offer(cost, k, best, which, second)
+            k += LANES
+        while k + LANES <= stop:
+            best, which, second = _offer(_costs(halves, at + k, lean), k, best, which, second)
+            k += LANES
+        if k < stop:
+            cost = _close(_costs(halves, at + k, lean), k, first, stop)
+            best, which, second = _offer(cost, k, best, which, second)
+        which = which + numbers
+        lowest_cost, winner = lowest_pair(best, which)
+        # Candidates of one lane are far from each other: where its best is the winner, or beside
+        # it, its second best is two or more away.
+        near = which + one - splat(winner)
+        minima.winner[y, x] = winner if lowest_cost != NO_COST else search.ndisp
+        minima.costs[0, y, x] = lowest_cost
+        minima.costs[3, y, x] = lowest(where_less(near, three, second, best))
 
 
 @njit(cache=True, nogil=True)
-def _offer_each(
-    halves: Halves,
-    search: Search,
-    first: int,
-    ahead: int,
-    width: int,
-    start: int,
-    end: int,
-    found: NDArray[np.uint16],
+def _offer(
+    cost: Lanes, k: int, best: Lanes, which: Lanes, second: Lanes
+) -> tuple[Lanes, Lanes, Lanes]:
+    """What is known of each lane once candidates ``k`` and on are offered."""
+    which = where_less(cost, best, splat(np.uint16(k)), which)
+    return least(best, cost), which, least(second, most(best, cost))
+
+
+@njit(cache=True, nogil=True)
+def _costs(halves: Halves, at: int, lean: int) -> Lanes:
+    """The costs of neighbouring candidates: each that of the better of its two windows."""
+    upper, lower = halves.upper, halves.lower
+    upright = load(upper, at) + load(lower, at)
+    return least(upright, load(upper, at - lean) + load(lower, at + lean))
+
+
+@njit(cache=True, nogil=True)
+def _close(costs: Lanes, k: int, first: int, end: int) -> Lanes:
+    """The costs of candidates ``k`` and on, of which those from ``first`` to ``end - 1`` exist."""
+    places = ramp(np.uint16(k)) - splat(np.uint16(first))
+    return where_less(places, splat(np.uint16(end - first)), costs, splat(np.uint16(NO_COST)))
+
+
+@njit(cache=True, nogil=True)
+def _look_beside(
+    halves: Halves, search: Search, y: int, x0: int, start: int, end: int, minima: Minima
 ) -> None:
-    """Offer the candidates from ``first`` on, at most eight, to the columns where each exists."""
-    upper, lower, lean = halves.upper, halves.lower, search.lean
-    for k in range(first, min(first + 8, search.ndisp)):
-        n, begin = k + abs(lean), k + ahead
-        for x in range(max(begin, start), min(begin + width, end)):
-            cost = _lower(upper[n, x], lower[n, x], upper[n - lean, x], lower[n + lean, x])
-            best, second, prior = x + BLOCK, x + 2 * BLOCK, x + 3 * BLOCK
-            found[x], found[best], found[second], found[prior] = _weigh(
-                cost, np.uint16(k), found[x], found[best], found[second], found[prior]
-            )
-
-
-@njit(cache=True, nogil=True)
-def _offer_eight(
-    halves: Halves, lean: int, k: int, start: int, end: int, found: NDArray[np.uint16]
-) -> None:
-    """As `_offer_each` where all of eight candidates exist, with what was found in registers."""
-    upper, lower, n = halves.upper, halves.lower, k + abs(lean)
-    u0, u1, u2, u3 = upper[n], upper[n + 1], upper[n + 2], upper[n + 3]
-    u4, u5, u6, u7 = upper[n + 4], upper[n + 5], upper[n + 6], upper[n + 7]
-    l0, l1, l2, l3 = lower[n], lower[n + 1], lower[n + 2], lower[n + 3]
-    l4, l5, l6, l7 = lower[n + 4], lower[n + 5], lower[n + 6], lower[n + 7]
-    n -= lean
-    v0, v1, v2, v3 = upper[n], upper[n + 1], upper[n + 2], upper[n + 3]
-    v4, v5, v6, v7 = upper[n + 4], upper[n + 5], upper[n + 6], upper[n + 7]
-    n += 2 * lean
-    m0, m1, m2, m3 = lower[n], lower[n + 1], lower[n + 2], lower[n + 3]
-    m4, m5, m6, m7 = lower[n + 4], lower[n + 5], lower[n + 6], lower[n + 7]
-    k0, k1, k2, k3 = np.uint16(k), np.uint16(k + 1), np.uint16(k + 2), np.uint16(k + 3)
-    k4, k5, k6, k7 = np.uint16(k + 4), np.uint16(k + 5), np.uint16(k + 6), np.uint16(k + 7)
-    best, second, prior = np.uint64(BLOCK), np.uint64(2 * BLOCK), np.uint64(3 * BLOCK)
-    # Unsigned: an index that cannot be negative needs no check, which would cost the vectors.
-    for x in range(np.uint64(start), np.uint64(end)):
-        c0 = _lower(u0[x], l0[x], v0[x], m0[x])
-        c1 = _lower(u1[x], l1[x], v1[x], m1[x])
-        c2 = _lower(u2[x], l2[x], v2[x], m2[x])
-        c3 = _lower(u3[x], l3[x], v3[x], m3[x])
-        c4 = _lower(u4[x], l4[x], v4[x], m4[x])
-        c5 = _lower(u5[x], l5[x], v5[x], m5[x])
-        c6 = _lower(u6[x], l6[x], v6[x], m6[x])
-        c7 = _lower(u7[x], l7[x], v7[x], m7[x])
-        w, b, s, p = found[x], found[x + best], found[x + second], found[x + prior]
-        w, b, s, p = _weigh(c0, k0, w, b, s, p)
-        w, b, s, p = _weigh(c1, k1, w, b, s, p)
-        w, b, s, p = _weigh(c2, k2, w, b, s, p)
-        w, b, s, p = _weigh(c3, k3, w, b, s, p)
-        w, b, s, p = _weigh(c4, k4, w, b, s, p)
-        w, b, s, p = _weigh(c5, k5, w, b, s, p)
-        w, b, s, p = _weigh(c6, k6, w, b, s, p)
-        w, b, s, p = _weigh(c7, k7, w, b, s, p)
-        found[x], found[x + best], found[x + second], found[x + prior] = w, b, s, p
-
-
-@njit(cache=True, nogil=True)
-def _lower(
-    upper: np.uint16, lower: np.uint16, leaning_upper: np.uint16, leaning_lower: np.uint16
-) -> np.uint16:
-    """The cost of the better of the two windows."""
-    return min(np.uint16(upper + lower), np.uint16(leaning_upper + leaning_lower))
-
-
-@njit(cache=True, nogil=True)
-def _weigh(
-    cost: np.uint16,
-    k: np.uint16,
-    winner: np.uint16,
-    best: np.uint16,
-    second: np.uint16,
-    prior: np.uint16,
-) -> tuple[np.uint16, np.uint16, np.uint16, np.uint16]:
-    """What is found of a pixel (winner, best, second, prior) once candidate ``k`` is offered."""
-    # Choices, not branches, and nothing computed in them: so they become vector instructions.
-    least = min(second, cost)
-    least = second if winner == np.uint16(k - np.uint16(1)) else least
-    second = prior if cost < best else least
-    winner = k if cost < best else winner
-    return winner, min(best, cost), second, best
-
-
-@njit(cache=True, nogil=True)
-def _look_beside(halves: Halves, search: Search, y: int, x0: int, x1: int, minima: Minima) -> None:
     """Write the costs before and after each best, from the window that won: a fit mixes no two."""
-    upper, lower = halves.upper.reshape(-1), halves.lower.reshape(-1)
-    width, stride = minima.winner.shape[1], halves.upper.shape[1]
-    lean = search.lean * stride
-    for x in range(x0, x1):
-        before, after = np.uint16(NO_COST), np.uint16(NO_COST)
+    upper, lower, lean = halves.upper, halves.lower, search.lean
+    for c in range(start, end):
+        x, before, after = np.uint64(x0 + c), np.uint16(NO_COST), np.uint16(NO_COST)
+        first, stop = existing(search, minima.winner.shape[1], x0 + c)
         k = np.int64(minima.winner[y, x])
         if k < search.ndisp:
-            at = (k + abs(search.lean)) * stride + x - x0
-            own = lean if _of(upper, lower, at, lean) < _of(upper, lower, at, 0) else 0
-            right = x - search.minimum - k
-            if k > 0 and right + 1 < width:
-                before = _of(upper, lower, at - stride, own)
-            if k + 1 < search.ndisp and right > 0:
-                after = _of(upper, lower, at + stride, own)
+            at = c * halves.places + abs(lean) + k
+            own = lean if _cost(upper, lower, at, lean) < _cost(upper, lower, at, 0) else 0
+            if k > first:
+                before = _cost(upper, lower, at - 1, own)
+            if k + 1 < stop:
+                after = _cost(upper, lower, at + 1, own)
         minima.costs[1, y, x], minima.costs[2, y, x] = before, after
 
 
 @njit(cache=True, nogil=True)
-def _of(upper: NDArray[np.uint16], lower: NDArray[np.uint16], at: int, lean: int) -> np.uint16:
+def _cost(upper: NDArray[np.uint16], lower: NDArray[np.uint16], at: int, lean: int) -> np.uint16:
     """The cost of the window whose halves lean by so many places; unsigned needs no checks."""
     cost: np.uint16 = np.uint16(upper[np.uint64(at - lean)] + lower[np.uint64(at + lean)])
     return cost

@@ -1,0 +1,266 @@
+"""Vectors of neighbouring values, for loops that the compiler does not turn into vectors itself.
+
+A vector is `LANES` values that lie side by side in an array; what is written for one is done to
+all of them by one instruction or two. The functions here are plain numpy: that is what they mean,
+and what runs where numba is switched off. Compiled, each becomes the LLVM instruction that is
+registered for it further down, and a vector lives in a register.
+
+Arithmetic wraps around, as numpy's does. A vector is no value to keep: no function that Python
+calls takes or returns one.
+
+Ref: LLVM Language Reference Manual, "Vector Operations"; numba manual, "Low-level extension API".
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import lower_builtin, models, register_model, type_callable
+from numpy.typing import NDArray
+
+LANES: Final = 32
+"""Values of a vector: one register of 16-bit values, or half of one of bytes, where registers have
+512 bits; elsewhere the compiler takes several for one."""
+
+Lanes: TypeAlias = NDArray[Any]
+"""uint8 or uint16 (LANES,)."""
+
+
+def load(array: NDArray[Any], at: int) -> Lanes:
+    """The values ``at`` to ``at + LANES - 1`` of a uint8 or uint16 array (n,); no check."""
+    return array[at : at + LANES].copy()
+
+
+def store(array: NDArray[Any], at: int, lanes: Lanes) -> None:
+    """Write a vector to ``at`` and on; no check."""
+    array[at : at + LANES] = lanes
+
+
+def splat(value: np.uint8 | np.uint16) -> Lanes:
+    """The same value in each lane."""
+    return np.full(LANES, value)
+
+
+def spread(fourfold: NDArray[np.uint32], at: int) -> Lanes:
+    """A byte in each lane, from an array where each value is that byte four times.
+
+    Unlike a single byte, four are spread on their way from memory.
+    """
+    return np.repeat(fourfold[at : at + 1], LANES // 4).view(np.uint8)
+
+
+def ramp(first: np.uint16) -> Lanes:
+    """``first``, ``first + 1`` and so on."""
+    return np.arange(first, first + LANES).astype(np.uint16)
+
+
+def least(a: Lanes, b: Lanes) -> Lanes:
+    """The smaller value of each lane."""
+    return np.minimum(a, b)
+
+
+def most(a: Lanes, b: Lanes) -> Lanes:
+    """The larger value of each lane."""
+    return np.maximum(a, b)
+
+
+def distance(a: Lanes, b: Lanes) -> Lanes:
+    """``|a - b|`` of each lane."""
+    return np.maximum(a, b) - np.minimum(a, b)
+
+
+def where_equal(a: Lanes, b: Lanes, then: Lanes, otherwise: Lanes) -> Lanes:
+    """``then`` in the lanes where ``a == b``."""
+    return np.where(a == b, then, otherwise)
+
+
+def where_less(a: Lanes, b: Lanes, then: Lanes, otherwise: Lanes) -> Lanes:
+    """``then`` in the lanes where ``a < b``."""
+    return np.where(a < b, then, otherwise)
+
+
+def fit(lanes: Lanes, array: NDArray[Any]) -> Lanes:
+    """Bytes, as values of the kind that an array holds."""
+    return lanes.astype(array.dtype)
+
+
+def widen_signed(lanes: Lanes) -> Lanes:
+    """Bytes that stand for -128 to 127, as uint16 that wraps; uint16 as it is."""
+    return lanes.view(np.int8).astype(np.uint16) if lanes.dtype == np.uint8 else lanes
+
+
+def lowest(lanes: Lanes) -> Any:
+    """The smallest value."""
+    return lanes.min()
+
+
+def lowest_pair(first: Lanes, second: Lanes) -> tuple[Any, Any]:
+    """The smallest value of ``first``, uint16, and the smallest of ``second`` among its lanes."""
+    smallest = first.min()
+    return smallest, second[first == smallest].min()
+
+
+class _Vector(types.Type):  # type: ignore[misc]
+    """What numba knows of a vector: the type of its values."""
+
+    def __init__(self, element: types.Integer) -> None:
+        self.element = element
+        super().__init__(name=f"Vector({element} x {LANES})")
+
+
+@register_model(_Vector)
+class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
+    """How a vector is held: as LLVM's vector."""
+
+    def __init__(self, manager: Any, vector: _Vector) -> None:
+        super().__init__(manager, vector, _llvm(vector.element.bitwidth))
+
+
+def _llvm(bits: int, lanes: int = LANES) -> ir.VectorType:
+    return ir.VectorType(ir.IntType(bits), lanes)
+
+
+def _compile(function: Callable[..., Any], typer: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorate what writes LLVM instructions for a function of vectors.
+
+    Args:
+        function: The function in plain numpy.
+        typer: Its result's type, from those of its arguments.
+    """
+    type_callable(function)(lambda context: typer)
+    return lower_builtin(function, types.VarArg(types.Any))  # type: ignore[no-any-return]
+
+
+def _binary(function: Callable[..., Any], write: Callable[..., Any]) -> None:
+    """Register a function of two vectors of one kind."""
+
+    def typer(a: Any, b: Any) -> Any:
+        return a if isinstance(a, _Vector) and a == b else None
+
+    type_callable(function)(lambda context: typer)
+    # For vectors alone: an operator has other meanings, which are to stay.
+    lower_builtin(function, _Vector, _Vector)(
+        lambda context, builder, signature, arguments: write(builder, *arguments)
+    )
+
+
+def _intrinsic(name: str) -> Callable[..., Any]:
+    """What writes LLVM's own function of two vectors."""
+
+    def write(builder: Any, a: Any, b: Any) -> Any:
+        kind = ir.FunctionType(a.type, [a.type, a.type])
+        full_name = f"llvm.{name}.v{a.type.count}i{a.type.element.width}"
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, full_name), [a, b])
+
+    return write
+
+
+def _write_distance(builder: Any, a: Any, b: Any) -> Any:
+    # A difference that saturates at nought, either way round: one of the two is nought.
+    minus = _intrinsic("usub.sat")
+    return builder.or_(minus(builder, a, b), minus(builder, b, a))
+
+
+_binary(operator.add, lambda builder, a, b: builder.add(a, b))
+_binary(operator.sub, lambda builder, a, b: builder.sub(a, b))
+_binary(least, _intrinsic("umin"))
+_binary(most, _intrinsic("umax"))
+_binary(distance, _write_distance)
+
+
+def _write_lowest(builder: Any, lanes: Any) -> Any:
+    value = lanes.type.element
+    name = f"llvm.vector.reduce.umin.v{lanes.type.count}i{value.width}"
+    kind = ir.FunctionType(value, [lanes.type])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [lanes])
+
+
+def _write_splat(builder: Any, value: Any, lanes: int) -> Any:
+    kind = _llvm(value.type.width, lanes)
+    one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
+    return builder.shuffle_vector(one, one, ir.Constant(_llvm(32, lanes), [0] * lanes))
+
+
+def _address(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
+    """Where the second argument points to in the first, an array, as an address of some kind."""
+    array = context.make_array(signature.args[0])(context, builder, arguments[0])
+    return builder.bitcast(builder.gep(array.data, [arguments[1]]), kind.as_pointer())
+
+
+@_compile(load, lambda array, at: _Vector(array.dtype))
+def _load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    kind = _llvm(signature.return_type.element.bitwidth)
+    return builder.load(_address(context, builder, signature, arguments, kind), align=1)
+
+
+@_compile(store, lambda array, at, lanes: types.none)
+def _store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    lanes = arguments[2]
+    address = _address(context, builder, signature, arguments, lanes.type)
+    builder.store(lanes, address, align=1)
+    return context.get_dummy_value()
+
+
+@_compile(splat, lambda value: _Vector(value))
+def _splat(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return _write_splat(builder, arguments[0], LANES)
+
+
+@_compile(ramp, lambda first: _Vector(types.uint16))
+def _ramp(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    start = _write_splat(builder, arguments[0], LANES)
+    return builder.add(start, ir.Constant(_llvm(16), list(range(LANES))))
+
+
+@_compile(spread, lambda fourfold, at: _Vector(types.uint8))
+def _spread(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    four = builder.load(_address(context, builder, signature, arguments, ir.IntType(32)))
+    return builder.bitcast(_write_splat(builder, four, LANES // 4), _llvm(8))
+
+
+@_compile(where_equal, lambda a, b, then, otherwise: then)
+def _where_equal(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    a, b, then, otherwise = arguments
+    return builder.select(builder.icmp_unsigned("==", a, b), then, otherwise)
+
+
+@_compile(where_less, lambda a, b, then, otherwise: then)
+def _where_less(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    a, b, then, otherwise = arguments
+    return builder.select(builder.icmp_unsigned("<", a, b), then, otherwise)
+
+
+@_compile(fit, lambda lanes, array: _Vector(array.dtype))
+def _fit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.zext(arguments[0], _llvm(signature.return_type.element.bitwidth))
+
+
+@_compile(widen_signed, lambda lanes: _Vector(types.uint16))
+def _widen_signed(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.sext(arguments[0], _llvm(16))
+
+
+@_compile(lowest, lambda lanes: lanes.element)
+def _lowest(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return _write_lowest(builder, arguments[0])
+
+
+@_compile(lowest_pair, lambda first, second: types.UniTuple(types.uint16, 2))
+def _lowest_pair(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    # Values of 32 bits with the first as upper half; in the order that an "unpack" makes of parts
+    # of 128 bits, because the minimum does not care and any other order takes more instructions.
+    first, second = arguments
+    parts = range(0, LANES, 8)
+    order = [part + half + i for half in (0, 4) for part in parts for i in range(4)]
+    mixed = ir.Constant(_llvm(32, 2 * LANES), [n for i in order for n in (i, LANES + i)])
+    pairs = builder.bitcast(builder.shuffle_vector(second, first, mixed), _llvm(32))
+    pair = _write_lowest(builder, pairs)
+    halves = builder.lshr(pair, pair.type(16)), pair
+    values = [builder.trunc(half, ir.IntType(16)) for half in halves]
+    return context.make_tuple(builder, signature.return_type, values)
