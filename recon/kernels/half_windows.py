@@ -31,6 +31,7 @@ from recon.kernels.lanes import (
     store,
     widen_signed,
 )
+from recon.kernels.minima import NO_COST
 from recon.kernels.path_costs import aligned
 
 _CACHE_BYTES: Final = 512 * 1024
@@ -94,6 +95,8 @@ class Room(NamedTuple):
         carried: uint16 (N,), the half windows of the last column done.
         halves: uint16 (rows_radius + 1, at least block·N), a ring of rows; of each column: sums
             over a half.
+        none: uint16 (LANES,), `NO_COST`. From memory, because compilers make a register of ones
+            out of the register itself: then no pixel starts before the last one is done.
         places: Places of a column, N.
         block: Columns done at a time.
     """
@@ -101,6 +104,7 @@ class Room(NamedTuple):
     columns: NDArray[Any]
     carried: NDArray[np.uint16]
     halves: NDArray[np.uint16]
+    none: NDArray[np.uint16]
     places: int
     block: int
 
@@ -150,6 +154,7 @@ def make_room(search: Search, width: int) -> Room:
         columns=aligned(((block + 2 * search.radius + 1) * places,), narrow),
         carried=aligned((places,), np.uint16),
         halves=aligned((rows, (block + 1) * places), np.uint16),
+        none=np.full(LANES, NO_COST, np.uint16),
         places=places,
         block=block,
     )

@@ -71,7 +71,7 @@ def sad_minima(
         room: Memory from `make_room`; not shared with another thread.
         minima: Written: the rows ``first`` to ``end - 1``.
     """
-    start = first - search.rows_radius
+    start, none = first - search.rows_radius, load(room.none, 0)
     for x0 in range(0, views.width, room.block):
         width = min(room.block, views.width - x0)
         fill_columns(views, search, start, x0, room)
@@ -84,7 +84,7 @@ def sad_minima(
                 stop = min(c + RUN, width)
                 sum_halves(views, search, y, x0, c, stop, room, lower)
                 if y >= first:
-                    _choose(halves, search, y, x0, c, stop, minima)
+                    _choose(halves, search, none, y, x0, c, stop, minima)
                     _look_beside(halves, search, y, x0, c, stop, minima)
     for y in range(first, end):
         claim_right(search.ndisp, search.minimum, y, minima)
@@ -92,27 +92,34 @@ def sad_minima(
 
 @njit(cache=True, nogil=True)
 def _choose(
-    halves: Halves, search: Search, y: int, x0: int, start: int, end: int, minima: Minima
+    halves: Halves,
+    search: Search,
+    none: Lanes,
+    y: int,
+    x0: int,
+    start: int,
+    end: int,
+    minima: Minima,
 ) -> None:
     """Write the best candidate, its cost and the second best cost, of columns of a block."""
     width, lean = minima.winner.shape[1], search.lean
-    none, numbers = splat(np.uint16(NO_COST)), ramp(np.uint16(0))
-    one, three = splat(np.uint16(1)), splat(np.uint16(3))
+    step, one, three = splat(np.uint16(LANES)), splat(np.uint16(1)), splat(np.uint16(3))
     for c in range(start, end):
         x, at = np.uint64(x0 + c), c * halves.places + abs(lean)
         first, stop = existing(search, width, x0 + c)
         k, best, which, second = first // LANES * LANES, none, none, none
+        numbers = ramp(np.uint16(k))
         if k < first:
             cost = _close(_costs(halves, at + k, lean), k, first, stop)
-            best, which, second = _offer(cost, k, best, which, second)
-            k += LANES
+            best, which, second = _offer(cost, numbers, best, which, second)
+            k, numbers = k + LANES, numbers + step
         while k + LANES <= stop:
-            best, which, second = _offer(_costs(halves, at + k, lean), k, best, which, second)
-            k += LANES
+            cost = _costs(halves, at + k, lean)
+            best, which, second = _offer(cost, numbers, best, which, second)
+            k, numbers = k + LANES, numbers + step
         if k < stop:
             cost = _close(_costs(halves, at + k, lean), k, first, stop)
-            best, which, second = _offer(cost, k, best, which, second)
-        which = which + numbers
+            best, which, second = _offer(cost, numbers, best, which, second)
         lowest_cost, winner = lowest_pair(best, which)
         # Candidates of one lane are far from each other: where its best is the winner, or beside
         # it, its second best is two or more away.
@@ -124,10 +131,10 @@ def _choose(
 
 @njit(cache=True, nogil=True)
 def _offer(
-    cost: Lanes, k: int, best: Lanes, which: Lanes, second: Lanes
+    cost: Lanes, numbers: Lanes, best: Lanes, which: Lanes, second: Lanes
 ) -> tuple[Lanes, Lanes, Lanes]:
-    """What is known of each lane once candidates ``k`` and on are offered."""
-    which = where_less(cost, best, splat(np.uint16(k)), which)
+    """What is known of each lane once a candidate of it is offered."""
+    which = where_less(cost, best, numbers, which)
     return least(best, cost), which, least(second, most(best, cost))
 
 
@@ -158,7 +165,7 @@ def _look_beside(
         k = np.int64(minima.winner[y, x])
         if k < search.ndisp:
             at = c * halves.places + abs(lean) + k
-            own = lean if _cost(upper, lower, at, lean) < _cost(upper, lower, at, 0) else 0
+            own = lean if minima.costs[0, y, x] < _cost(upper, lower, at, 0) else 0
             if k > first:
                 before = _cost(upper, lower, at - 1, own)
             if k + 1 < stop:
