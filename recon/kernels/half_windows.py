@@ -37,6 +37,9 @@ from recon.kernels.path_costs import aligned
 _CACHE_BYTES: Final = 512 * 1024
 """What the ring of half windows may take of a core's own cache (1 MB on most machines of today)."""
 
+_FOURFOLD: Final = np.uint32(0x01010101)
+"""A byte times this is that byte four times."""
+
 RUN: Final = 32
 """Columns of a row whose halves are summed up, and chosen from, before the next: they stay in the
 first cache."""
@@ -123,23 +126,53 @@ class Halves(NamedTuple):
     places: int
 
 
-def lay_out(left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search) -> Views:
-    """Both pictures as the search reads them.
+def empty_views(search: Search, height: int, width: int) -> Views:
+    """Arrays for `lay_out` to write to."""
+    columns = width + 2 * search.radius + 1
+    right = np.empty((height, columns - 1 + _places(search)), np.uint8)
+    return Views(np.empty((height, columns), np.uint32), right, width)
+
+
+@njit(cache=True, nogil=True)
+def lay_out(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    search: Search,
+    first: int,
+    end: int,
+    views: Views,
+) -> None:
+    """Lay out some rows of both pictures as the search reads them.
 
     Args:
         left: uint8 (H, W).
         right: uint8 (H, W).
         search: What will be searched.
+        first: First row to do.
+        end: The row after the last.
+        views: Written: the rows.
     """
-    width = left.shape[1]
-    columns = np.arange(width + 2 * search.radius + 1) - search.radius - 1
-    last_first = columns[-1] - search.minimum + abs(search.lean)
-    mirrored = last_first - np.arange(len(columns) - 1 + _places(search))
-    return Views(
-        np.take(left, columns, axis=1, mode="clip") * np.uint32(0x01010101),
-        np.take(right, mirrored, axis=1, mode="clip"),
-        width,
-    )
+    width, left_at = views.width, search.radius + 1
+    # Mirrored, the picture's last column comes first.
+    right_at = views.left.shape[1] - width - left_at - search.minimum + abs(search.lean)
+    mirrored = np.empty(width, np.uint8)
+    for y in range(first, end):
+        for x in range(width):
+            mirrored[x] = right[y, np.uint64(width - 1 - x)]
+        _continue(left[y], left_at, _FOURFOLD, views.left[y])
+        _continue(mirrored, right_at, np.uint8(1), views.right[y])
+
+
+@njit(cache=True, nogil=True)
+def _continue(pixels: NDArray[np.uint8], at: int, factor: Any, view: NDArray[Any]) -> None:
+    """Write a row of pixels, times a factor, to ``at`` and on, and its ends to all before and after."""
+    start = min(max(at, 0), view.size)
+    end = min(max(at + pixels.size, start), view.size)
+    view[:start] = pixels[0] * factor
+    view[end:] = pixels[-1] * factor
+    shown, inside = pixels[start - at :], view[start:end]
+    for c in range(inside.size):
+        inside[c] = shown[c] * factor
 
 
 def make_room(search: Search, width: int) -> Room:

@@ -41,14 +41,14 @@ def texture(pair: RectifiedPair, window: tuple[int, int], least: float) -> Float
     """
     mean = np.zeros(pair.left.shape, np.float32)
     if least > 0:
-        total = cv2.boxFilter(
+        mean = cv2.boxFilter(
             np.abs(_sobel(pair.left)).view(np.uint16),
             cv2.CV_32F,
             window,
             normalize=False,
             borderType=cv2.BORDER_REPLICATE,
         )
-        mean = total * np.float32(1 / (_GAIN_OF_SOBEL * window[0] * window[1]))
+        mean *= np.float32(1 / (_GAIN_OF_SOBEL * window[0] * window[1]))
     if pair.valid is not None:
         mean[~pair.valid] = np.nan
     return np.asarray(mean, dtype=np.float32)

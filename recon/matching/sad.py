@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import cv2
@@ -14,7 +15,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from recon.kernels.half_windows import Search, lay_out, make_room
+from recon.kernels.half_windows import Search, empty_views, lay_out, make_room
 from recon.kernels.minima import empty_minima
 from recon.kernels.refine import (
     Rules,
@@ -97,6 +98,7 @@ class SadMatcher:
         self._settings = settings
         self._threads = max(1, threads or os.cpu_count() or 1)
         self._rooms = Rooms(make_room, self._threads)
+        self._views = Rooms(empty_views, 1)
         self._minima = Rooms(empty_minima, 1)
 
     def match(self, pair: RectifiedPair) -> Disparity:
@@ -106,21 +108,33 @@ class SadMatcher:
             MatchingError: No disparity of the range lies within the picture.
         """
         search, rules = self._plan(pair.camera)
-        s = self._settings
-        enough = texture(pair, (s.window_px, s.window_height_px), s.min_texture)
-        left = _prefiltered(pair.left, s)
-        views = lay_out(left, _prefiltered(pair.right, s), search)
-        refined = empty_refined(*left.shape)
+        s, (height, width) = self._settings, pair.left.shape
+        refined = empty_refined(height, width)
+
+        def lay(first: int, end: int) -> None:
+            lay_out(left, right, search, first, end, views)
 
         def strip(first: int, end: int) -> None:
-            with self._rooms.borrow(search, views.width) as room:
+            with self._rooms.borrow(search, width) as room:
                 sad_minima(views, search, first, end, room, minima)
-            refine_minima(minima, enough, rules, first, end, refined)
+            refine_minima(minima, enough.result(), rules, first, end, refined)
 
-        with self._minima.borrow(*left.shape) as minima:
-            _in_strips(strip, len(left), self._threads)
-        found = finish(refined, self._settings)
-        return _smoothed(found, self._settings.median_px)
+        with (
+            ThreadPoolExecutor(self._threads) as pool,
+            self._views.borrow(search, height, width) as views,
+            self._minima.borrow(height, width) as minima,
+        ):
+            window = s.window_px, s.window_height_px
+            enough = pool.submit(texture, pair, window, s.min_texture)
+            left, right = pool.map(partial(_prefiltered, settings=s), (pair.left, pair.right))
+            self._in_strips(pool, lay, height)
+            self._in_strips(pool, strip, height)
+        return _smoothed(finish(refined, s), s.median_px)
+
+    def _in_strips(self, pool: Executor, work: Callable[[int, int], None], rows: int) -> None:
+        """Do all rows, in one strip per thread."""
+        edges = np.linspace(0, rows, min(self._threads, rows) + 1).astype(int).tolist()
+        list(pool.map(work, edges[:-1], edges[1:]))
 
     def _plan(self, camera: RectifiedCamera) -> tuple[Search, Rules]:
         s = self._settings
@@ -158,9 +172,3 @@ def _prefiltered(image: UInt8, settings: SadSettings) -> UInt8:
         return image
     return clipped_gradients(image, settings.prefilter_cap)
 
-
-def _in_strips(work: Callable[[int, int], None], rows: int, threads: int) -> None:
-    """Do all rows, in one strip per thread."""
-    edges = np.linspace(0, rows, min(threads, rows) + 1).astype(int).tolist()
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(work, edges[:-1], edges[1:]))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from recon.kernels.half_windows import Search, lay_out, make_room
+from recon.kernels.half_windows import Search, empty_views, lay_out, make_room
 from recon.kernels.minima import NO_COST, Minima, empty_minima
 from recon.kernels.sad import sad_minima
 from recon.kernels.sad_reference import sad_minima_reference
@@ -21,7 +21,8 @@ Image = NDArray[np.uint8]
 
 def search_all(left: Image, right: Image, search: Search, strips: int = 1) -> Minima:
     minima = empty_minima(*left.shape)
-    views, room = lay_out(left, right, search), make_room(search, left.shape[1])
+    views, room = empty_views(search, *left.shape), make_room(search, left.shape[1])
+    lay_out(left, right, search, 0, len(left), views)
     edges = np.linspace(0, len(left), strips + 1).astype(int)
     for first, end in itertools.pairwise(edges):
         sad_minima(views, search, int(first), int(end), room, minima)
