@@ -165,7 +165,7 @@ def lay_out(
 
 @njit(cache=True, nogil=True)
 def _continue(pixels: NDArray[np.uint8], at: int, factor: Any, view: NDArray[Any]) -> None:
-    """Write a row of pixels, times a factor, to ``at`` and on, and its ends to all before and after."""
+    """Write a row of pixels to ``at`` and on, continued by its ends, all times a factor."""
     start = min(max(at, 0), view.size)
     end = min(max(at + pixels.size, start), view.size)
     view[:start] = pixels[0] * factor
@@ -207,7 +207,7 @@ def existing(search: Search, width: int, x: int) -> tuple[int, int]:
 
 @njit(cache=True, nogil=True)
 def fill_columns(views: Views, search: Search, y: int, x0: int, room: Room) -> None:
-    """Sum up the columns of a block as `sum_halves` wants them before the lower half of row ``y``."""
+    """Sum up the columns of a block, as `sum_halves` wants them before row ``y``."""
     columns = room.columns
     cap, columns[:] = splat(np.uint8(search.cost_cap)), 0
     for row in range(y - 1, y + search.rows_radius):

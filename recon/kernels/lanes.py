@@ -34,7 +34,8 @@ Lanes: TypeAlias = NDArray[Any]
 
 def load(array: NDArray[Any], at: int) -> Lanes:
     """The values ``at`` to ``at + LANES - 1`` of a uint8 or uint16 array (n,); no check."""
-    return array[at : at + LANES].copy()
+    lanes: Lanes = array[at : at + LANES].copy()
+    return lanes
 
 
 def store(array: NDArray[Any], at: int, lanes: Lanes) -> None:
@@ -207,7 +208,7 @@ def _store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return context.get_dummy_value()
 
 
-@_compile(splat, lambda value: _Vector(value))
+@_compile(splat, _Vector)
 def _splat(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return _write_splat(builder, arguments[0], LANES)
 

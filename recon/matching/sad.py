@@ -171,4 +171,3 @@ def _prefiltered(image: UInt8, settings: SadSettings) -> UInt8:
     if settings.prefilter == "none":
         return image
     return clipped_gradients(image, settings.prefilter_cap)
-
