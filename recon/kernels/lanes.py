@@ -208,7 +208,12 @@ def _store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return context.get_dummy_value()
 
 
-@_compile(splat, _Vector)
+def _vector_of(value: types.Integer) -> _Vector:
+    # Not the class itself: numba reads the parameters of what it calls.
+    return _Vector(value)
+
+
+@_compile(splat, _vector_of)
 def _splat(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return _write_splat(builder, arguments[0], LANES)
 
