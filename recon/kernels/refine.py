@@ -72,10 +72,16 @@ class Refined(NamedTuple):
     reason: NDArray[np.uint8]
 
 
-def empty_refined(height: int, width: int) -> Refined:
-    """Arrays for `refine_minima` to write to."""
-    values, confidence, sigma_px = np.empty((3, height, width), np.float32)
-    return Refined(values, confidence, sigma_px, np.empty((height, width), np.uint8))
+REFINED_BYTES: Final = 13
+"""What a pixel of `Refined` takes."""
+
+
+def refined_in(memory: NDArray[np.uint8], height: int, width: int) -> Refined:
+    """Arrays for `refine_minima` to write to, in memory of `REFINED_BYTES` for each pixel."""
+    reason = memory[12 * height * width :].reshape(height, width)
+    floats = memory[: 12 * height * width].view(np.float32)
+    values, confidence, sigma_px = floats.reshape(3, height, width)
+    return Refined(values, confidence, sigma_px, reason)
 
 
 @njit(cache=True, nogil=True)

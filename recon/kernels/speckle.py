@@ -49,8 +49,8 @@ def find_speckles(
     on Image Processing 17, 2008.
     """
     height, width = values.shape
-    block = np.empty((4, values.size), np.int32)
-    runs = _Runs(block[0], block[1], block[2], block[3])
+    block = np.empty((values.size, 4), np.int32)
+    runs = _Runs(block[:, 0], block[:, 1], block[:, 2], block[:, 3])
     # Of each column: its run in the row above and in this one.
     above, here = np.empty(width, np.int32), np.empty(width, np.int32)
     count = 0

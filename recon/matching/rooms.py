@@ -11,6 +11,10 @@ from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from typing import Generic, TypeVar
 
+import numpy as np
+
+from recon.structures.arrays import UInt8
+
 T = TypeVar("T")
 
 
@@ -42,3 +46,35 @@ class Rooms(Generic[T]):
         yield room
         # Not after an error: somebody may still work in it.
         self._free.append((size, room))
+
+
+class Loans:
+    """Lends memory for results, which comes back by itself when nobody holds the result any more.
+
+    Args:
+        most: So many blocks that came back are kept.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._free: deque[UInt8] = deque(maxlen=most)
+
+    def lend(self, size_bytes: int) -> UInt8:
+        """uint8 (size_bytes,), lent for as long as it or a view of it is held."""
+        try:
+            block = self._free.pop()
+        except IndexError:
+            block = np.empty(0, np.uint8)
+        if block.size != size_bytes:
+            block = np.empty(size_bytes, np.uint8)
+        return np.asarray(_Loan(block, self._free))
+
+
+class _Loan:
+    """What an array on loan, and so each view of it, keeps alive."""
+
+    def __init__(self, block: UInt8, free: deque[UInt8]) -> None:
+        self.__array_interface__ = block.__array_interface__
+        self._block, self._free = block, free
+
+    def __del__(self) -> None:
+        self._free.append(self._block)

@@ -17,15 +17,11 @@ from typing_extensions import Self
 
 from recon.kernels.half_windows import Search, empty_views, lay_out, make_room
 from recon.kernels.minima import empty_minima
-from recon.kernels.refine import (
-    Rules,
-    empty_refined,
-    refine_minima,
-)
+from recon.kernels.refine import REFINED_BYTES, Rules, refine_minima, refined_in
 from recon.kernels.sad import sad_minima
 from recon.matching.fill import fill_holes
 from recon.matching.gradients import clipped_gradients, texture
-from recon.matching.rooms import Rooms
+from recon.matching.rooms import Loans, Rooms
 from recon.matching.search import (
     FITS,
     MeasuredSettings,
@@ -100,6 +96,7 @@ class SadMatcher:
         self._rooms = Rooms(make_room, self._threads)
         self._views = Rooms(empty_views, 1)
         self._minima = Rooms(empty_minima, 1)
+        self._results = Loans(2)
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair.
@@ -109,7 +106,8 @@ class SadMatcher:
         """
         search, rules = self._plan(pair.camera)
         s, (height, width) = self._settings, pair.left.shape
-        refined = empty_refined(height, width)
+        results = self._results.lend(REFINED_BYTES * height * width)
+        refined = refined_in(results, height, width)
 
         def lay(first: int, end: int) -> None:
             lay_out(left, right, search, first, end, views)

@@ -21,14 +21,10 @@ from recon.kernels.path_costs import (
     scaled_window,
 )
 from recon.kernels.plane_minima import PARTS
-from recon.kernels.refine import (
-    Rules,
-    empty_refined,
-    refine_minima,
-)
+from recon.kernels.refine import REFINED_BYTES, Rules, refine_minima, refined_in
 from recon.kernels.semi_global import ROWS, Paths, empty_room, semi_global_minima
 from recon.matching.gradients import clipped_gradients, texture
-from recon.matching.rooms import Rooms
+from recon.matching.rooms import Loans, Rooms
 from recon.matching.search import FITS, MeasuredSettings, OddInt, finish
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import UInt8
@@ -136,6 +132,7 @@ class SgmMatcher:
         self._threads = max(1, threads or os.cpu_count() or 1)
         self._rooms = Rooms(empty_room, self._threads)
         self._minima = Rooms(empty_minima, 1)
+        self._results = Loans(2)
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair.
@@ -149,7 +146,8 @@ class SgmMatcher:
         levels = window.levels
         paths, rules = _paths(s, ndisp, levels), _rules(s, ndisp, levels)
         enough = texture(pair, (s.window_px, s.window_height_px), s.min_texture)
-        refined = empty_refined(*enough.shape)
+        results = self._results.lend(REFINED_BYTES * enough.size)
+        refined = refined_in(results, *enough.shape)
 
         def work(strip: range) -> None:
             with self._rooms.borrow(pair.camera.width_px, paths) as room:

@@ -15,10 +15,11 @@ from recon.kernels.minima import NO_COST, Minima
 from recon.kernels.refine import (
     EQUIANGULAR,
     PARABOLA,
+    REFINED_BYTES,
     Refined,
     Rules,
-    empty_refined,
     refine_minima,
+    refined_in,
     reject,
 )
 from recon.kernels.refine_reference import refine_minima_reference
@@ -37,7 +38,8 @@ RULES = Rules(
 
 
 def refine_all(minima: Minima, texture: np.ndarray, rules: Rules) -> Refined:
-    refined = empty_refined(*minima.winner.shape)
+    shape = minima.winner.shape
+    refined = refined_in(np.empty(REFINED_BYTES * minima.winner.size, np.uint8), *shape)
     refine_minima(minima, texture, rules, 0, len(texture), refined)
     return refined
 
