@@ -22,6 +22,8 @@ from recon.meshing import (
     reconstruct_mesh,
 )
 from recon.pipeline.drive_map import Tile
+from recon.pipeline.lookahead import side_by_side
+from recon.pipeline.machine import available_cores
 from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.sequence import MappedSequence
 from recon.pipeline.tile_store import TileStore
@@ -30,6 +32,7 @@ from recon.structures.arrays import Float32
 
 SAMPLE_FACES: Final = 2_000_000
 """Triangles up to which the whole mesh is kept to look at."""
+_MOST_AT_ONCE: Final = 4
 _SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))
 """Axis, and whether it is the far side, of the four sides of a tile."""
 
@@ -90,7 +93,11 @@ def store_map(mapped: MappedSequence, folder: Path) -> TileStore:
 
 
 def write_drive_mesh(
-    store: TileStore, settings: MeshSettings, directory: RunDirectory, cloud: Path
+    store: TileStore,
+    settings: MeshSettings,
+    directory: RunDirectory,
+    cloud: Path,
+    threads: int | None = None,
 ) -> WrittenMesh:
     """Write ``mesh/mesh.ply``, its tiles where there are several, and ``mesh/mesh.mlp``.
 
@@ -99,12 +106,15 @@ def write_drive_mesh(
         settings: How; ``target_faces`` is that of all tiles together.
         directory: The folder of the run.
         cloud: A PLY in it, for the MeshLab project.
+        threads: Tiles that are reconstructed at a time, each in a process of its own; None = one
+            per core, at most four, since each takes its memory. Changes no result.
 
     Raises:
         MeshingError: No tile has a surface.
         OutputError: A file cannot be written.
     """
-    found = _Mesher(store, settings, directory).run()
+    at_once = threads or min(available_cores(), _MOST_AT_ONCE)
+    found = _Mesher(store, settings, directory, at_once).run()
     if not found.tiles:
         raise MeshingError(
             "no part of the map gives a surface", got="; ".join(found.warnings) or "no point"
@@ -126,22 +136,23 @@ def mesh_to_show(written: WrittenMesh, whole: Path) -> TriangleMesh | None:
 
 @dataclass(eq=False)
 class _Mesher:
-    """Meshes the tiles in order; a tile closes its seams to those before it."""
+    """Reconstructs some tiles at a time; in order, a tile closes its seams to those before it."""
 
     store: TileStore
     settings: MeshSettings
     directory: RunDirectory
+    threads: int
     borders: dict[tuple[Tile, Plane], Float32] = field(default_factory=dict)
 
     def run(self) -> WrittenMesh:
         tiles: list[MeshTile] = []
         failed: dict[Tile, MeshingError] = {}
-        for tile in self.store.tiles:
-            try:
-                mesh = self._mesh(tile)
-            except MeshingError as error:
-                failed[tile] = error
+        surfaces = side_by_side(self._surface, self.store.tiles, threads=self.threads)
+        for tile, surface in zip(self.store.tiles, surfaces, strict=True):
+            if isinstance(surface, MeshingError):
+                failed[tile] = surface
                 continue
+            mesh = self._joined(tile, surface)
             if len(mesh.faces):
                 path = self.directory.path(f"mesh/tiles/tile_{tile[0]}_{tile[1]}.ply")
                 write_mesh(path, mesh)
@@ -157,8 +168,15 @@ class _Mesher:
         tiles = f"{len(failed)} of {len(self.store.tiles)} tiles"
         return (f"no surface in {tiles}, {share:.1%} of the points ({failed[worst]})",)
 
-    def _mesh(self, tile: Tile) -> TriangleMesh:
-        """The surface of a tile, cut at its sides and joined to its neighbours."""
+    def _surface(self, tile: Tile) -> TriangleMesh | MeshingError:
+        """The surface of a tile; or, for its turn, why there is none."""
+        try:
+            return self._cut(tile)
+        except MeshingError as error:
+            return error
+
+    def _cut(self, tile: Tile) -> TriangleMesh:
+        """The surface of a tile with its margin, cut at the tile's sides."""
         overlap_m = self.settings.overlap_m
         cloud = self.store.cloud_in(tile, overlap_m)
         if cloud is None:
@@ -172,7 +190,7 @@ class _Mesher:
         )
         for axis, far in _SIDES:
             mesh = cut_mesh(mesh, self._plane(tile, axis, far), keep_above=not far)
-        return self._joined(tile, mesh)
+        return mesh
 
     def _target(self, seen: int) -> int | None:
         """Triangles for a tile with its margin: as its points are to those of the drive."""
@@ -182,6 +200,7 @@ class _Mesher:
         return max(4, round(target * seen / self.store.total))
 
     def _joined(self, tile: Tile, mesh: TriangleMesh) -> TriangleMesh:
+        """A tile's mesh, joined to those of its neighbours that were before it."""
         for axis, far in _SIDES:
             plane = self._plane(tile, axis, far)
             step = np.zeros(2, int)

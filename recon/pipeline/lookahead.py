@@ -40,6 +40,23 @@ def look_ahead(
             yield done[0]
 
 
+def side_by_side(
+    function: Callable[[Item], Result], items: Iterable[Item], *, threads: int
+) -> Iterator[Result]:
+    """Yield ``function(item)`` in order, computed in several threads.
+
+    At most ``threads + 1`` results exist at a time. An error is raised at its item's turn.
+    """
+    with ThreadPoolExecutor(threads, thread_name_prefix="side-by-side") as pool:
+        waiting: deque[Future[Result]] = deque()
+        for item in items:
+            waiting.append(pool.submit(function, item))
+            if len(waiting) > threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
 class OneBehind:
     """Does jobs in one thread, in order, while the caller goes on: one at a time.
 

@@ -178,7 +178,7 @@ def _finish(
     if options.mesh:
         _tell(options.observers, "mesh")
         with watch.stage("mesh"):
-            mesh, faces = _mesh(mapped, directory, warnings)
+            mesh, faces = _mesh(mapped, directory, options.threads, warnings)
         config.memory.check("mesh")
     truth = source.truth
     with watch.stage("compare"):
@@ -208,14 +208,15 @@ def _finish(
 
 
 def _mesh(
-    mapped: MappedSequence, directory: RunDirectory, warnings: list[str]
+    mapped: MappedSequence, directory: RunDirectory, threads: int | None, warnings: list[str]
 ) -> tuple[TriangleMesh | None, int]:
     """Write the surface; a map without one is still a map, so its failure is a warning."""
     store = store_map(mapped, directory.state("mesh"))
+    # Each tile that is worked on takes its memory.
+    at_once = threads if mapped.config.memory.limit_mb is None else 1
+    layer = directory.path("map/cloud.ply")
     try:
-        written = write_drive_mesh(
-            store, mapped.config.mesh, directory, directory.path("map/cloud.ply")
-        )
+        written = write_drive_mesh(store, mapped.config.mesh, directory, layer, at_once)
     except MeshingError as error:
         warnings.append(f"no mesh: {error}")
         return None, 0

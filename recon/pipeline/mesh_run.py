@@ -57,7 +57,7 @@ def run_mesh(source: Path, config: ReconConfig, options: MeshOptions) -> dict[st
             folder cannot be written; then nothing is left behind.
     """
     start = time.perf_counter()
-    use_threads(options.threads)
+    threads = use_threads(options.threads)
     _check_formats(options.formats)
     watch = Stopwatch()
     cloud_path = open_run(source).folder / CLOUD if source.is_dir() else source
@@ -66,7 +66,7 @@ def run_mesh(source: Path, config: ReconConfig, options: MeshOptions) -> dict[st
     with RunDirectory.for_command("mesh", options.out) as directory:
         write_ply(directory.path("mesh/cloud.ply"), cloud)
         if source.is_dir():
-            figures = _mesh_run(source, cloud, config.mesh, directory, watch)
+            figures = _mesh_run(source, cloud, config.mesh, directory, threads, watch)
         else:
             figures = _mesh_cloud(cloud, config.mesh, directory, watch)
         with watch.stage("write"):
@@ -109,6 +109,7 @@ def _mesh_run(
     cloud: PointCloud,
     settings: MeshSettings,
     directory: RunDirectory,
+    threads: int,
     watch: Stopwatch,
 ) -> dict[str, Any]:
     """Write the surface of a run's map tile by tile."""
@@ -121,7 +122,8 @@ def _mesh_run(
         elif settings.free_space:
             warnings.append(f"the run has no {OCTOMAP}: free space is not known")
     with watch.stage("mesh"):
-        written = write_drive_mesh(store, settings, directory, directory.path("mesh/cloud.ply"))
+        layer = directory.path("mesh/cloud.ply")
+        written = write_drive_mesh(store, settings, directory, layer, threads)
     return {
         "vertices": written.vertices,
         "faces": written.faces,

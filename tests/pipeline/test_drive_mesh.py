@@ -71,12 +71,13 @@ def filled(folder: Path) -> TileStore:
 
 
 def written(
-    store: TileStore, folder: Path, settings: MeshSettings = SETTINGS
+    store: TileStore, folder: Path, settings: MeshSettings = SETTINGS, threads: int | None = None
 ) -> tuple[TriangleMesh, list[TriangleMesh], tuple[str, ...]]:
     """The whole mesh, that of each tile, and the warnings."""
     with RunDirectory(folder) as directory:
-        write_ply(directory.path("mesh/cloud.ply"), street())
-        found = write_drive_mesh(store, settings, directory, directory.path("mesh/cloud.ply"))
+        layer = directory.path("mesh/cloud.ply")
+        write_ply(layer, street())
+        found = write_drive_mesh(store, settings, directory, layer, threads)
         directory.write_json("run.json", {"files": directory.files()})
     tiles = [read_mesh(folder / "mesh" / "tiles" / tile.path.name) for tile in found.tiles]
     return read_mesh(folder / "mesh" / "mesh.ply"), tiles, found.warnings
@@ -110,6 +111,12 @@ def test_no_gap_is_left_where_tiles_meet(made: tuple[TriangleMesh, list[Triangle
         # Where the rims of street and wall begin, each tile has its own idea, below a voxel.
         assert distance_m.max() < STEP_M
         assert np.percentile(distance_m, 95) < 1e-4
+
+
+def test_tiles_made_at_once_are_those_made_one_by_one(store: TileStore, tmp_path: Path) -> None:
+    alone, together = (written(store, tmp_path / str(n), threads=n)[0] for n in (1, 3))
+    np.testing.assert_array_equal(together.vertices, alone.vertices)
+    np.testing.assert_array_equal(together.faces, alone.faces)
 
 
 def test_a_target_is_that_of_all_tiles(store: TileStore, tmp_path: Path) -> None:

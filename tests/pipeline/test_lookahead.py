@@ -10,12 +10,41 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.pipeline.lookahead import OneBehind, look_ahead
+from recon.pipeline.lookahead import OneBehind, look_ahead, side_by_side
 
 
 @given(st.lists(st.integers()), st.integers(min_value=1, max_value=5))
 def test_results_come_in_order(items: list[int], depth: int) -> None:
     assert list(look_ahead(lambda x: x + 1, items, depth=depth)) == [x + 1 for x in items]
+
+
+@given(st.lists(st.integers()), st.integers(min_value=1, max_value=5))
+def test_results_of_several_threads_come_in_order(items: list[int], threads: int) -> None:
+    assert list(side_by_side(lambda x: x + 1, items, threads=threads)) == [x + 1 for x in items]
+
+
+def test_as_many_items_are_worked_on_as_there_are_threads() -> None:
+    # Each waits for the other: one thread alone would wait for ever.
+    both = threading.Barrier(2, timeout=30)
+
+    def meet(item: int) -> int:
+        both.wait()
+        return item
+
+    assert list(side_by_side(meet, range(4), threads=2)) == [0, 1, 2, 3]
+
+
+def test_no_more_items_are_begun_than_can_be_held() -> None:
+    begun: list[int] = []
+
+    def work(item: int) -> int:
+        begun.append(item)
+        return item
+
+    results = side_by_side(work, range(100), threads=2)
+    assert next(results) == 0
+    results.close()
+    assert len(begun) <= 3
 
 
 def test_at_most_depth_items_are_drawn_ahead() -> None:
