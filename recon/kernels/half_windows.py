@@ -40,7 +40,7 @@ _CACHE_BYTES: Final = 512 * 1024
 _FOURFOLD: Final = np.uint32(0x01010101)
 """A byte times this is that byte four times."""
 
-RUN: Final = 32
+RUN: Final = 48
 """Columns of a row whose halves are summed up, and chosen from, before the next: they stay in the
 first cache."""
 

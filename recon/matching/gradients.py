@@ -41,8 +41,9 @@ def texture(pair: RectifiedPair, window: tuple[int, int], least: float) -> Float
     """
     mean = np.zeros(pair.left.shape, np.float32)
     if least > 0:
+        sizes = _sobel(pair.left)
         mean = cv2.boxFilter(
-            np.abs(_sobel(pair.left)).view(np.uint16),
+            np.abs(sizes, out=sizes).view(np.uint16),
             cv2.CV_32F,
             window,
             normalize=False,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -31,7 +32,7 @@ from recon.matching.search import (
     finish,
 )
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
-from recon.structures.arrays import UInt8
+from recon.structures.arrays import Float32, UInt8
 
 
 class SadSettings(MeasuredSettings):
@@ -115,24 +116,36 @@ class SadMatcher:
         def strip(first: int, end: int) -> None:
             with self._rooms.borrow(search, width) as room:
                 sad_minima(views, search, first, end, room, minima)
-            refine_minima(minima, enough.result(), rules, first, end, refined)
+            refine_minima(minima, enough, rules, first, end, refined)
+
+        def prefilter() -> tuple[UInt8, UInt8]:
+            return _prefiltered(pair.left, s), _prefiltered(pair.right, s)
+
+        def judge() -> Float32:
+            return texture(pair, (s.window_px, s.window_height_px), s.min_texture)
 
         with (
             ThreadPoolExecutor(self._threads) as pool,
             self._views.borrow(search, height, width) as views,
             self._minima.borrow(height, width) as minima,
         ):
-            window = s.window_px, s.window_height_px
-            enough = pool.submit(texture, pair, window, s.min_texture)
-            left, right = pool.map(partial(_prefiltered, settings=s), (pair.left, pair.right))
-            self._in_strips(pool, lay, height)
-            self._in_strips(pool, strip, height)
+            enough, (left, right) = self._together(pool, judge, prefilter)
+            self._together(pool, *self._in_strips(lay, height))
+            self._together(pool, *self._in_strips(strip, height))
         return _smoothed(finish(refined, s), s.median_px)
 
-    def _in_strips(self, pool: Executor, work: Callable[[int, int], None], rows: int) -> None:
-        """Do all rows, in one strip per thread."""
+    def _in_strips(self, work: Callable[[int, int], None], rows: int) -> list[Callable[[], None]]:
+        """The work on all rows, in one strip per thread."""
         edges = np.linspace(0, rows, min(self._threads, rows) + 1).astype(int).tolist()
-        list(pool.map(work, edges[:-1], edges[1:]))
+        return [partial(work, first, end) for first, end in itertools.pairwise(edges)]
+
+    def _together(self, pool: Executor, *jobs: Callable[[], Any]) -> list[Any]:
+        """Do jobs at the same time, one of them in this thread: to hand it over takes time."""
+        if self._threads == 1:
+            return [job() for job in jobs]
+        handed_over = [pool.submit(job) for job in jobs[:-1]]
+        last = jobs[-1]()
+        return [*(job.result() for job in handed_over), last]
 
     def _plan(self, camera: RectifiedCamera) -> tuple[Search, Rules]:
         s = self._settings
