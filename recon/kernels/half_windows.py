@@ -208,11 +208,11 @@ def existing(search: Search, width: int, x: int) -> tuple[int, int]:
 @njit(cache=True, nogil=True)
 def fill_columns(views: Views, search: Search, y: int, x0: int, room: Room) -> None:
     """Sum up the columns of a block, as `sum_halves` wants them before row ``y``."""
-    columns = room.columns
+    columns, width = room.columns, min(room.block, views.width - x0)
     cap, columns[:] = splat(np.uint8(search.cost_cap)), 0
     for row in range(y - 1, y + search.rows_radius):
         pixels = _row(views, row)
-        for c in range(columns.size // room.places):
+        for c in range(width + 2 * search.radius + 1):
             for n in range(0, room.places, LANES):
                 at = c * room.places + n
                 plus = _costs(pixels, x0 + c, n, cap)

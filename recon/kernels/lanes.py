@@ -58,7 +58,7 @@ def spread(fourfold: NDArray[np.uint32], at: int) -> Lanes:
 
 def ramp(first: np.uint16) -> Lanes:
     """``first``, ``first + 1`` and so on."""
-    return np.arange(first, first + LANES).astype(np.uint16)
+    return np.arange(LANES, dtype=np.uint16) + first
 
 
 def least(a: Lanes, b: Lanes) -> Lanes:
@@ -74,11 +74,6 @@ def most(a: Lanes, b: Lanes) -> Lanes:
 def distance(a: Lanes, b: Lanes) -> Lanes:
     """``|a - b|`` of each lane."""
     return np.maximum(a, b) - np.minimum(a, b)
-
-
-def where_equal(a: Lanes, b: Lanes, then: Lanes, otherwise: Lanes) -> Lanes:
-    """``then`` in the lanes where ``a == b``."""
-    return np.where(a == b, then, otherwise)
 
 
 def where_less(a: Lanes, b: Lanes, then: Lanes, otherwise: Lanes) -> Lanes:
@@ -228,12 +223,6 @@ def _ramp(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 def _spread(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     four = builder.load(_address(context, builder, signature, arguments, ir.IntType(32)))
     return builder.bitcast(_write_splat(builder, four, LANES // 4), _llvm(8))
-
-
-@_compile(where_equal, lambda a, b, then, otherwise: then)
-def _where_equal(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    a, b, then, otherwise = arguments
-    return builder.select(builder.icmp_unsigned("==", a, b), then, otherwise)
 
 
 @_compile(where_less, lambda a, b, then, otherwise: then)

@@ -110,7 +110,7 @@ def _choose(
         k, best, which, second = first // LANES * LANES, none, none, none
         numbers = ramp(np.uint16(k))
         if k < first:
-            cost = _close(_costs(halves, at + k, lean), k, first, stop)
+            cost = _close(_costs(halves, at + k, lean), none, k, first, stop)
             best, which, second = _offer(cost, numbers, best, which, second)
             k, numbers = k + LANES, numbers + step
         while k + LANES <= stop:
@@ -118,7 +118,7 @@ def _choose(
             best, which, second = _offer(cost, numbers, best, which, second)
             k, numbers = k + LANES, numbers + step
         if k < stop:
-            cost = _close(_costs(halves, at + k, lean), k, first, stop)
+            cost = _close(_costs(halves, at + k, lean), none, k, first, stop)
             best, which, second = _offer(cost, numbers, best, which, second)
         lowest_cost, winner = lowest_pair(best, which)
         # Candidates of one lane are far from each other: where its best is the winner, or beside
@@ -147,10 +147,10 @@ def _costs(halves: Halves, at: int, lean: int) -> Lanes:
 
 
 @njit(cache=True, nogil=True)
-def _close(costs: Lanes, k: int, first: int, end: int) -> Lanes:
+def _close(costs: Lanes, none: Lanes, k: int, first: int, end: int) -> Lanes:
     """The costs of candidates ``k`` and on, of which those from ``first`` to ``end - 1`` exist."""
     places = ramp(np.uint16(k)) - splat(np.uint16(first))
-    return where_less(places, splat(np.uint16(end - first)), costs, splat(np.uint16(NO_COST)))
+    return where_less(places, splat(np.uint16(end - first)), costs, none)
 
 
 @njit(cache=True, nogil=True)

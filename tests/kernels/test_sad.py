@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from recon.kernels.half_windows import Search, empty_views, lay_out, make_room
+from recon.kernels.half_windows import RUN, Search, empty_views, lay_out, make_room
+from recon.kernels.lanes import LANES
 from recon.kernels.minima import NO_COST, Minima, empty_minima
 from recon.kernels.sad import sad_minima
 from recon.kernels.sad_reference import sad_minima_reference
@@ -19,9 +20,12 @@ from recon.kernels.sad_reference import sad_minima_reference
 Image = NDArray[np.uint8]
 
 
-def search_all(left: Image, right: Image, search: Search, strips: int = 1) -> Minima:
+def search_all(
+    left: Image, right: Image, search: Search, strips: int = 1, block: int | None = None
+) -> Minima:
     minima = empty_minima(*left.shape)
     views, room = empty_views(search, *left.shape), make_room(search, left.shape[1])
+    room = room._replace(block=block or room.block)
     lay_out(left, right, search, 0, len(left), views)
     edges = np.linspace(0, len(left), strips + 1).astype(int)
     for first, end in itertools.pairwise(edges):
@@ -66,6 +70,28 @@ def test_strips_do_not_change_the_result(
     pair: tuple[Image, Image], search: Search, strips: int
 ) -> None:
     assert_equal(search_all(*pair, search, strips), search_all(*pair, search))
+
+
+@pytest.mark.parametrize("lean", [0, 1, -2])
+@pytest.mark.parametrize(("ndisp", "minimum"), [(64, 0), (65, -40), (33, 20), (100, 60)])
+def test_wide_pictures_are_searched_in_runs_and_vectors(
+    ndisp: int, minimum: int, lean: int
+) -> None:
+    rng = np.random.default_rng(ndisp + lean)
+    # Few grey levels, so that vectors and runs have equal costs to decide between.
+    left, right = rng.integers(0, 4, (2, 5, 2 * RUN + 35), dtype=np.uint8)
+    search = Search(ndisp, minimum, 2, 1, cost_cap=2, lean=lean)
+    assert ndisp + 2 * abs(lean) > LANES
+    assert_equal(search_all(left, right, search), sad_minima_reference(left, right, search))
+
+
+@settings(deadline=None)  # the first call compiles
+@given(pairs(), searches, st.integers(1, 12))
+def test_blocks_do_not_change_the_result(
+    pair: tuple[Image, Image], search: Search, block: int
+) -> None:
+    fewer = min(block, pair[0].shape[1])
+    assert_equal(search_all(*pair, search, block=fewer), search_all(*pair, search))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])

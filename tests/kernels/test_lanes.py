@@ -1,0 +1,108 @@
+"""Compiled, vectors do what their plain numpy does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numba import njit
+
+from recon.kernels import lanes
+from recon.kernels.lanes import LANES
+
+KINDS = (np.uint8, np.uint16)
+
+
+@njit
+def add(a: Any, b: Any, out: Any) -> None:
+    lanes.store(out, 1, lanes.load(a, 2) + lanes.load(b, 0))
+
+
+@njit
+def subtract(a: Any, b: Any, out: Any) -> None:
+    lanes.store(out, 1, lanes.load(a, 2) - lanes.load(b, 0))
+
+
+@njit
+def compare(a: Any, b: Any, out: Any) -> None:
+    x, y = lanes.load(a, 2), lanes.load(b, 0)
+    lanes.store(out, 0, lanes.least(x, y))
+    lanes.store(out, LANES, lanes.most(x, y))
+    lanes.store(out, 2 * LANES, lanes.distance(x, y))
+    lanes.store(out, 3 * LANES, lanes.where_less(x, y, y, x))
+    out[4 * LANES] = lanes.lowest(x)
+
+
+@njit
+def resize(a: Any, b: Any, out: Any) -> None:
+    x = lanes.load(a, 2)
+    lanes.store(out, 0, lanes.fit(x, out))
+    lanes.store(out, LANES, lanes.widen_signed(x))
+    lanes.store(out, 2 * LANES, lanes.fit(lanes.splat(a[0]), out))
+
+
+@njit
+def pair(a: Any, b: Any, out: Any) -> None:
+    out[0], out[1] = lanes.lowest_pair(lanes.load(a, 2), lanes.load(b, 0))
+    lanes.store(out, LANES, lanes.ramp(a[0]))
+
+
+@njit
+def spread(a: Any, b: Any, out: Any) -> None:
+    lanes.store(out, 0, lanes.spread(a, 3))
+
+
+def assert_same(function: Callable[..., None], a: Any, b: Any, kind: Any) -> None:
+    compiled, plain = np.zeros((2, 5 * LANES), kind)
+    function(a, b, compiled)
+    getattr(function, "py_func", function)(a, b, plain)
+    np.testing.assert_array_equal(compiled, plain)
+
+
+def arrays(kind: Any) -> st.SearchStrategy[Any]:
+    # Few values make ties, the whole range makes overflows.
+    values = st.one_of(st.integers(0, 3), st.integers(0, int(np.iinfo(kind).max)))
+    return hnp.arrays(kind, LANES + 5, elements=values)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(st.data())
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("function", [add, subtract, compare])
+def test_vectors_of_one_kind_do_as_numpy_does(
+    function: Callable[..., None], kind: Any, data: st.DataObject
+) -> None:
+    assert_same(function, data.draw(arrays(kind)), data.draw(arrays(kind)), kind)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(arrays(np.uint8))
+def test_bytes_are_widened_as_numpy_does(a: Any) -> None:
+    assert_same(resize, a, a, np.uint16)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(arrays(np.uint16), arrays(np.uint16))
+def test_pairs_are_compared_as_numpy_does(a: Any, b: Any) -> None:
+    assert_same(pair, a, b, np.uint16)
+
+
+def test_the_lowest_pair_is_decided_by_its_first_value() -> None:
+    first, second = np.full(LANES, 9, np.uint16), np.zeros(LANES, np.uint16)
+    first[[3, 30]], second[[3, 30]] = 2, (60000, 40000)
+    assert lanes.lowest_pair(first, second) == (2, 40000)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(st.integers(0, 255))
+def test_four_equal_bytes_fill_a_vector(value: int) -> None:
+    fourfold = np.arange(8, dtype=np.uint32)
+    fourfold[3] = value * 0x01010101
+    out = np.zeros(LANES, np.uint8)
+    spread(fourfold, fourfold, out)
+    assert (out == value).all()
