@@ -1,6 +1,6 @@
-"""Census: which neighbours of a pixel are darker, one bit each.
+"""What is compared of two pictures: gradients, and the census: which neighbours are darker.
 
-It stays what it is under any change of brightness that keeps the order of grey levels.
+The census stays what it is under any change of brightness that keeps the order of grey levels.
 
 Ref: R. Zabih, J. Woodfill, "Non-parametric local transforms for computing visual
 correspondence", ECCV 1994.
@@ -8,96 +8,148 @@ correspondence", ECCV 1994.
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit, types
-from numba.extending import intrinsic, overload
+from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.lanes import LANES, load_row, splat, store_row, where_less
+
 PLANES: Final = 3
-"""Planes come in threes: 5 by 5 has three, and fewer loops are faster ones."""
+"""Planes of bits come in threes: 5 by 5 has three, and fewer loops are faster ones."""
 
 
-def count_bits(bits: Any) -> Any:
-    """Number of bits of a uint8 that are set."""
-    return np.uint8(int(bits).bit_count())
+class Look(NamedTuple):
+    """What is looked at.
 
-
-@intrinsic
-def _population_count(_: Any, bits: Any) -> Any:
-    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
-        return builder.ctpop(arguments[0])
-
-    return (types.uint8(types.uint8), generate) if bits == types.uint8 else None
-
-
-@overload(count_bits)
-def _count_bits_compiled(bits: Any) -> Any:
-    """Let compiled code count by the instruction of the processor, if it has one."""
-
-    def count(bits: Any) -> Any:
-        return _population_count(bits)
-
-    return count if bits == types.uint8 else None
-
-
-def census_planes(grey: NDArray[np.uint8], rows_radius: int, radius: int) -> NDArray[np.uint8]:
-    """Compare each pixel with the neighbours around it.
-
-    Args:
-        grey: uint8 (H, W); continued by its border pixels.
-        rows_radius: Rows above and below that are compared.
-        radius: Columns to each side that are compared.
-
-    Returns:
-        uint8 (B, H, W). Bit ``n % 8`` of plane ``n // 8`` is set where neighbour ``n`` (row by
-        row, the middle left out) is darker than the pixel; unused bits are 0.
+    Attributes:
+        cap: Horizontal gradients (Sobel units) are clipped to plus or minus this; at most 127.
+        rows_radius: Rows above and below that the census compares.
+        radius: Columns to each side that it compares.
     """
-    height, width = grey.shape
-    neighbours = (2 * rows_radius + 1) * (2 * radius + 1) - 1
-    planes = np.zeros((number_of_planes(neighbours), height, width), np.uint8)
-    around = np.pad(grey, ((rows_radius,) * 2, (radius,) * 2), mode="edge")
-    n = 0
-    for dy in range(2 * rows_radius + 1):
-        for dx in range(2 * radius + 1):
-            if (dy, dx) != (rows_radius, radius):
-                neighbour = around[dy : dy + height, dx : dx + width]
-                _set_bits(grey, neighbour, np.uint8(1 << (n % 8)), planes[n // 8])
-                n += 1
-    return planes
 
+    cap: int
+    rows_radius: int
+    radius: int
 
-def number_of_planes(neighbours: int) -> int:
-    """Planes for so many bits."""
-    return (neighbours + 8 * PLANES - 1) // (8 * PLANES) * PLANES
+    @property
+    def planes(self) -> int:
+        """How many planes that makes: one of gradients, and those of bits, three at least."""
+        neighbours = (2 * self.rows_radius + 1) * (2 * self.radius + 1) - 1
+        return 1 + PLANES * max(1, -(-neighbours // (8 * PLANES)))
 
 
 @njit(cache=True, nogil=True)
-def _set_bits(
-    grey: NDArray[np.uint8], neighbour: NDArray[np.uint8], bit: np.uint8, plane: NDArray[np.uint8]
+def write_planes(
+    grey: NDArray[np.uint8],
+    look: Look,
+    place: int,
+    first: int,
+    end: int,
+    planes: NDArray[np.uint8],
 ) -> None:
-    """Set one bit wherever the neighbour is darker."""
-    for y in range(grey.shape[0]):
-        for x in range(grey.shape[1]):
-            darker = bit if neighbour[y, x] < grey[y, x] else np.uint8(0)
-            plane[y, x] = np.uint8(plane[y, x] | darker)
+    """Write the gradients and the census of some rows, continued by those of the border pixels.
 
+    Plane 0 is the gradient plus the cap. Bit ``n % 8`` of plane ``1 + n // 8`` is set where
+    neighbour ``n`` (row by row, the middle left out) is darker than the pixel; unused bits are 0.
 
-def census_planes_reference(
-    grey: NDArray[np.uint8], rows_radius: int, radius: int
-) -> NDArray[np.uint8]:
-    """The plain-numpy twin of `census_planes`."""
+    Args:
+        grey: uint8 (H, W); continued by its border pixels.
+        look: What is looked at.
+        place: Where column 0 of the picture stands, which may be outside.
+        first: First row to do.
+        end: The row after the last.
+        planes: Written: uint8 (H, ``look.planes``, R), the rows.
+    """
     height, width = grey.shape
-    around = np.pad(grey, ((rows_radius,) * 2, (radius,) * 2), mode="edge")
-    planes = np.zeros((0, height, width), np.uint8)
+    rows_radius, radius = max(look.rows_radius, 1), max(look.radius, 1)
+    # Row y is at place y % N of the rows around, column x at radius + x.
+    around = np.empty((2 * rows_radius + 1, radius + width + radius + LANES), np.uint8)
+    row = np.empty((planes.shape[1], width + LANES), np.uint8)
+    for y in range(first - 2 * rows_radius, end):
+        line = min(max(y + rows_radius, 0), height - 1)
+        _continue(grey[line], radius, around[(y + rows_radius) % around.shape[0]])
+        if y >= first:
+            _write_gradient(around, y, radius, look.cap, row[0, :width])
+            _write_census(around, y, radius, look, width, row)
+            for n in range(row.shape[0]):
+                _continue(row[n, :width], place, planes[y, n])
+
+
+@njit(cache=True, nogil=True)
+def _continue(row: NDArray[np.uint8], place: int, longer: NDArray[np.uint8]) -> None:
+    """Place a row in a longer one, which its first and its last value fill up."""
+    start = min(max(place, 0), longer.size)
+    end = min(max(place + row.size, 0), longer.size)
+    longer[:start] = row[0]
+    longer[start:end] = row[start - place : end - place]
+    longer[end:] = row[-1]
+
+
+@njit(cache=True, nogil=True)
+def _write_gradient(
+    around: NDArray[np.uint8], y: int, radius: int, cap: int, gradient: NDArray[np.uint8]
+) -> None:
+    """Write the clipped Sobel gradient of a row."""
+    rows, most = around.shape[0], np.int16(cap)
+    above, same, below = around[(y - 1) % rows], around[y % rows], around[(y + 1) % rows]
+    above_left, above_right = above[radius - 1 :], above[radius + 1 :]
+    same_left, same_right = same[radius - 1 :], same[radius + 1 :]
+    below_left, below_right = below[radius - 1 :], below[radius + 1 :]
+    for x in range(gradient.size):
+        middle = np.int16(np.int16(same_right[x]) - np.int16(same_left[x]))
+        upper = np.int16(np.int16(above_right[x]) - np.int16(above_left[x]))
+        lower = np.int16(np.int16(below_right[x]) - np.int16(below_left[x]))
+        slope = np.int16(np.int16(upper + lower) + np.int16(middle + middle))
+        gradient[x] = np.uint8(np.int16(min(max(slope, np.int16(-most)), most) + most))
+
+
+@njit(cache=True, nogil=True)
+def _write_census(
+    around: NDArray[np.uint8],
+    y: int,
+    radius: int,
+    look: Look,
+    width: int,
+    planes: NDArray[np.uint8],
+) -> None:
+    """Write the bits of a row."""
+    planes[1:] = np.uint8(0)
+    rows, none, first = around.shape[0], splat(np.uint8(0)), splat(np.uint8(1))
+    for x in range(0, width, LANES):
+        middle = load_row(around, y % rows, radius + x)
+        n, bits, bit = 0, none, first
+        for dy in range(-look.rows_radius, look.rows_radius + 1):
+            line = (y + dy) % rows
+            for dx in range(-look.radius, look.radius + 1):
+                if dy != 0 or dx != 0:
+                    neighbour = load_row(around, line, radius + dx + x)
+                    bits, bit = where_less(neighbour, middle, bits + bit, bits), bit + bit
+                    n += 1
+                    if n % 8 == 0:
+                        store_row(planes, n // 8, x, bits)
+                        bits, bit = none, first
+        if n % 8 > 0:
+            store_row(planes, n // 8 + 1, x, bits)
+
+
+def planes_reference(grey: NDArray[np.uint8], look: Look) -> NDArray[np.uint8]:
+    """The plain-numpy twin of `write_planes`: uint8 (``look.planes``, H, W)."""
+    height, width = grey.shape
+    around = np.pad(grey.astype(np.int64), 1, mode="edge")
+    slopes = around[:, 2:] - around[:, :-2]
+    gradient = slopes[:-2] + 2 * slopes[1:-1] + slopes[2:]
+    planes = np.zeros((look.planes, height, width), np.uint8)
+    planes[0] = np.clip(gradient, -look.cap, look.cap) + look.cap
+    around = np.pad(grey, ((look.rows_radius,) * 2, (look.radius,) * 2), mode="edge")
     bits = [
         around[dy : dy + height, dx : dx + width] < grey
-        for dy in range(2 * rows_radius + 1)
-        for dx in range(2 * radius + 1)
-        if (dy, dx) != (rows_radius, radius)
+        for dy in range(2 * look.rows_radius + 1)
+        for dx in range(2 * look.radius + 1)
+        if (dy, dx) != (look.rows_radius, look.radius)
     ]
     if bits:
-        planes = np.packbits(np.stack(bits), axis=0, bitorder="little")
-    unused = number_of_planes(len(bits)) - len(planes)
-    return np.pad(planes, ((0, unused), (0, 0), (0, 0)))
+        packed = np.packbits(np.stack(bits), axis=0, bitorder="little")
+        planes[1 : 1 + len(packed)] = packed
+    return planes

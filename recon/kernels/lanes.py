@@ -43,6 +43,17 @@ def store(array: NDArray[Any], at: int, lanes: Lanes) -> None:
     array[at : at + LANES] = lanes
 
 
+def load_row(rows: NDArray[Any], n: int, at: int) -> Lanes:
+    """The same of row ``n`` of an array (m, n)."""
+    lanes: Lanes = rows[n, at : at + LANES].copy()
+    return lanes
+
+
+def store_row(rows: NDArray[Any], n: int, at: int, lanes: Lanes) -> None:
+    """Write a vector to row ``n``, to ``at`` and on; no check."""
+    rows[n, at : at + LANES] = lanes
+
+
 def splat(value: np.uint8 | np.uint16) -> Lanes:
     """The same value in each lane."""
     return np.full(LANES, value)
@@ -76,6 +87,17 @@ def distance(a: Lanes, b: Lanes) -> Lanes:
     return np.maximum(a, b) - np.minimum(a, b)
 
 
+def mean(a: Lanes, b: Lanes) -> Lanes:
+    """Mean of two bytes, rounded up."""
+    return ((a.astype(np.uint16) + b + 1) >> 1).astype(np.uint8)
+
+
+def differing_bits(a: Lanes, b: Lanes) -> Lanes:
+    """How many bits of two bytes differ."""
+    bits = np.unpackbits(np.bitwise_xor(a, b)).reshape(-1, 8)
+    return np.asarray(bits.sum(axis=1, dtype=np.uint8))
+
+
 def where_less(a: Lanes, b: Lanes, then: Lanes, otherwise: Lanes) -> Lanes:
     """``then`` in the lanes where ``a < b``."""
     return np.where(a < b, then, otherwise)
@@ -84,6 +106,11 @@ def where_less(a: Lanes, b: Lanes, then: Lanes, otherwise: Lanes) -> Lanes:
 def fit(lanes: Lanes, array: NDArray[Any]) -> Lanes:
     """Bytes, as values of the kind that an array holds."""
     return lanes.astype(array.dtype)
+
+
+def narrow(lanes: Lanes) -> Lanes:
+    """The lower bytes of uint16."""
+    return lanes.astype(np.uint8)
 
 
 def widen_signed(lanes: Lanes) -> Lanes:
@@ -163,8 +190,25 @@ def _write_distance(builder: Any, a: Any, b: Any) -> Any:
     return builder.or_(minus(builder, a, b), minus(builder, b, a))
 
 
+def _write_mean(builder: Any, a: Any, b: Any) -> Any:
+    wide = _llvm(16)
+    one = ir.Constant(wide, [1] * LANES)
+    total = builder.add(builder.add(builder.zext(a, wide), builder.zext(b, wide)), one)
+    return builder.trunc(builder.lshr(total, one), a.type)
+
+
+def _write_differing(builder: Any, a: Any, b: Any) -> Any:
+    kind, name = ir.FunctionType(a.type, [a.type]), f"llvm.ctpop.v{LANES}i8"
+    count = cgutils.get_or_insert_function(builder.module, kind, name)
+    return builder.call(count, [builder.xor(a, b)])
+
+
 _binary(operator.add, lambda builder, a, b: builder.add(a, b))
 _binary(operator.sub, lambda builder, a, b: builder.sub(a, b))
+_binary(operator.mul, lambda builder, a, b: builder.mul(a, b))
+_binary(operator.rshift, lambda builder, a, b: builder.lshr(a, b))
+_binary(mean, _write_mean)
+_binary(differing_bits, _write_differing)
 _binary(least, _intrinsic("umin"))
 _binary(most, _intrinsic("umax"))
 _binary(distance, _write_distance)
@@ -187,6 +231,41 @@ def _address(context: Any, builder: Any, signature: Any, arguments: Any, kind: A
     """Where the second argument points to in the first, an array, as an address of some kind."""
     array = context.make_array(signature.args[0])(context, builder, arguments[0])
     return builder.bitcast(builder.gep(array.data, [arguments[1]]), kind.as_pointer())
+
+
+def _address_in_row(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
+    """Where the second and third argument point to in the first, an array of rows."""
+    rows = context.make_array(signature.args[0])(context, builder, arguments[0])
+    n, at = (
+        context.cast(builder, value, given, types.intp)
+        for value, given in zip(arguments[1:3], signature.args[1:3], strict=True)
+    )
+    start = builder.add(builder.mul(n, builder.extract_value(rows.shape, 1)), at)
+    return builder.bitcast(builder.gep(rows.data, [start]), kind.as_pointer())
+
+
+def _type_in_row(rows: Any, n: Any, at: Any) -> Any:
+    # Of any other layout the address would be another one.
+    fits = isinstance(rows, types.Array) and rows.ndim == 1 + 1 and rows.layout == "C"
+    return _Vector(rows.dtype) if fits else None
+
+
+def _store_type(rows: Any, n: Any, at: Any, lanes: Any) -> Any:
+    return types.none if lanes == _type_in_row(rows, n, at) else None
+
+
+@_compile(load_row, _type_in_row)
+def _load_row(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    kind = _llvm(signature.return_type.element.bitwidth)
+    return builder.load(_address_in_row(context, builder, signature, arguments, kind), align=1)
+
+
+@_compile(store_row, _store_type)
+def _store_row(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    lanes = arguments[3]
+    address = _address_in_row(context, builder, signature, arguments, lanes.type)
+    builder.store(lanes, address, align=1)
+    return context.get_dummy_value()
 
 
 @_compile(load, lambda array, at: _Vector(array.dtype))
@@ -234,6 +313,11 @@ def _where_less(context: Any, builder: Any, signature: Any, arguments: Any) -> A
 @_compile(fit, lambda lanes, array: _Vector(array.dtype))
 def _fit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.zext(arguments[0], _llvm(signature.return_type.element.bitwidth))
+
+
+@_compile(narrow, lambda lanes: _Vector(types.uint8))
+def _narrow(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.trunc(arguments[0], _llvm(8))
 
 
 @_compile(widen_signed, lambda lanes: _Vector(types.uint16))

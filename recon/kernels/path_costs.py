@@ -2,33 +2,38 @@
 
 One row is an array (candidates, W): the pixels of a candidate lie side by side, in the left view
 as in the right, so that vector registers are filled along the row and need no padding but at its
-end. The sums over a window's width are kept for as many rows as the window is high. Every
-intermediate is cast back to its width, and where a row starts at a variable column it is sliced
-first (an index that might be negative is looked at for every pixel), or the loops lose their
-vector instructions.
+end. The sums over a window's width are kept for as many rows as the window is high.
 
 The twin in plain numpy is `recon.kernels.semi_global_reference.path_costs_reference`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.kernels.census import PLANES, count_bits
+from recon.kernels.census import PLANES, Look, write_planes
+from recon.kernels.lanes import (
+    LANES,
+    Lanes,
+    differing_bits,
+    distance,
+    fit,
+    least,
+    load_row,
+    narrow,
+    splat,
+    store_row,
+)
 
-LANES: Final = 64
-"""Columns are padded to a multiple of this: the bytes of a vector register."""
+ALIGNMENT: Final = 64
+"""Bytes of a cache line."""
 
 BLOCK: Final = 16
 """Candidates whose rows are kept at a time."""
-
-TOGETHER: Final = 4
-"""Candidates are padded to a multiple of this: so many are done in one loop."""
 
 
 class Views(NamedTuple):
@@ -36,8 +41,8 @@ class Views(NamedTuple):
 
     Attributes:
         grey: uint8 (H, W), the left picture.
-        left: uint8 (H, 1 + B, R), its gradients and census, from `left_planes`.
-        right: uint8 (H, 1 + B, R + P - 1), those of the right picture, from `right_planes`.
+        left: uint8 (H, 1 + B, R), its gradients and census, from column ``-radius`` on.
+        right: uint8 (H, 1 + B, R + P - 1), those of the right picture; `places_of` says where.
     """
 
     grey: NDArray[np.uint8]
@@ -55,7 +60,7 @@ class Window(NamedTuple):
         row_shift: Bits that the sum over the window's width loses, to fit into uint8.
         factor: The sum over its height, times this, fits into uint16 ...
         shift: ... and loses so many bits.
-        top: Cost of the candidates that only pad, not below any other; at most 253.
+        top: The largest cost; at most 253.
     """
 
     radius: int
@@ -77,16 +82,12 @@ class CostRows(NamedTuple):
     """Room for the rows around the present one.
 
     Attributes:
-        pixels: uint8 (R + LANES), costs of single pixels of one candidate.
-        wide: uint16 (C), sums over the window's width, before they lose bits.
-        across: uint8 (C), the same afterwards.
-        rows: uint8 (2·rows_radius + 1, BLOCK, C), the same for the rows of the window.
+        pixels: uint8 (BLOCK, R + LANES), costs of single pixels.
+        rows: uint8 (2·rows_radius + 1, BLOCK, C), sums over the window's width, for its rows.
         sums: uint16 (BLOCK, C), their sums.
     """
 
     pixels: NDArray[np.uint8]
-    wide: NDArray[np.uint16]
-    across: NDArray[np.uint8]
     rows: NDArray[np.uint8]
     sums: NDArray[np.uint16]
 
@@ -99,8 +100,8 @@ def padded(number: int, multiple: int = LANES) -> int:
 def aligned(shape: tuple[int, ...], kind: type[np.uint8 | np.uint16] = np.uint8) -> NDArray[Any]:
     """Zeros that start where a vector register's load crosses no cache line."""
     size = int(np.prod(shape)) * np.dtype(kind).itemsize
-    room = np.zeros(size + LANES, np.uint8)
-    start = -room.ctypes.data % LANES
+    room = np.zeros(size + ALIGNMENT, np.uint8)
+    start = -room.ctypes.data % ALIGNMENT
     return room[start : start + size].view(kind).reshape(shape)
 
 
@@ -128,44 +129,45 @@ def scaled_window(
     )
 
 
-def left_planes(planes: Sequence[NDArray[np.uint8]], radius: int) -> NDArray[np.uint8]:
-    """Planes (H, W) with their borders repeated: (H, B, R), from column ``-radius`` on."""
-    width = planes[0].shape[1]
-    return _placed(planes, padded(width + 2 * radius), radius)
+def empty_planes(
+    height: int, width: int, planes: int, radius: int, ndisp: int
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Room for what is compared, ``planes`` of each picture: `Views.left` and `Views.right`."""
+    # What is read of a row, wherever a band of the picture begins.
+    reach = padded(width + 2 * radius) + LANES
+    left, right = (height, planes, reach), (height, planes, reach + ndisp - 1)
+    return np.empty(left, np.uint8), np.empty(right, np.uint8)
 
 
-def right_planes(
-    planes: Sequence[NDArray[np.uint8]], radius: int, ndisp: int, minimum: int
-) -> NDArray[np.uint8]:
-    """Planes (H, W) of the right view for all candidates: (H, B, R + P - 1).
+def write_views(
+    right: NDArray[np.uint8], look: Look, places: tuple[int, int], rows: range, views: Views
+) -> None:
+    """Write what is compared of some rows.
 
-    What column ``x`` of `left_planes` is compared with as candidate ``k`` stands at
-    ``x - k + P - 1``; where the right picture ends, its borders are repeated.
+    Args:
+        right: uint8 (H, W), the right picture; that on the left is in ``views``.
+        look: What is looked at.
+        places: Where column 0 of each picture stands, from `places_of`.
+        rows: The rows.
+        views: Written.
     """
-    width, candidates = planes[0].shape[1], padded(ndisp, TOGETHER)
-    size = padded(width + 2 * radius) + candidates - 1
-    return _placed(planes, size, candidates - 1 + radius + minimum)
+    write_planes(views.grey, look, places[0], rows.start, rows.stop, views.left)
+    write_planes(right, look, places[1], rows.start, rows.stop, views.right)
 
 
-def _placed(planes: Sequence[NDArray[np.uint8]], size: int, start: int) -> NDArray[np.uint8]:
-    """Rows of that size with the planes from ``start`` on, which may be outside."""
-    height, width = planes[0].shape
-    placed = np.empty((height, len(planes), size), np.uint8)
-    first, end = min(max(start, 0), size), min(max(start + width, 0), size)
-    for n, plane in enumerate(planes):
-        placed[:, n, :first] = plane[:, :1]
-        placed[:, n, first:end] = plane[:, first - start : end - start]
-        placed[:, n, end:] = plane[:, -1:]
-    return placed
+def places_of(window: Window, ndisp: int, minimum: int) -> tuple[int, int]:
+    """Where column 0 of the left and the right picture stand in their planes.
+
+    What column ``x`` of the left ones is compared with as candidate ``k`` stands in the right ones
+    at ``x - k + P - 1``.
+    """
+    return window.radius, ndisp - 1 + window.radius + minimum
 
 
-def empty_cost_rows(width: int, window: Window) -> CostRows:
-    """Room for `write_costs`."""
-    columns = padded(width)
+def empty_cost_rows(columns: int, window: Window) -> CostRows:
+    """Room for `write_costs`; columns is a multiple of `LANES`."""
     return CostRows(
-        aligned((padded(width + 2 * window.radius) + LANES,)),
-        aligned((columns,), np.uint16),
-        aligned((columns,)),
+        aligned((BLOCK, padded(columns + 2 * window.radius) + LANES)),
         aligned((2 * window.rows_radius + 1, BLOCK, columns)),
         aligned((BLOCK, columns), np.uint16),
     )
@@ -175,20 +177,20 @@ def empty_cost_rows(width: int, window: Window) -> CostRows:
 def write_costs(
     views: Views,
     window: Window,
-    ndisp: int,
+    columns: tuple[int, int],
     top: int,
     bottom: int,
     rows: CostRows,
     costs: NDArray[np.uint8],
 ) -> None:
-    """Write the costs (N, P, C) of the rows from ``top`` until before ``bottom``.
+    """Write the costs (N, P, C) of some columns of the rows from ``top`` until before ``bottom``.
 
     Row ``y`` goes to place ``y % N``. A block of candidates is done at a time, so that the rows of
     a window stay in the cache.
     """
     if top >= bottom:
         return
-    block = rows.sums.shape[0]
+    block, ndisp = rows.sums.shape[0], costs.shape[1]
     for first in range(0, ndisp, block):
         rows.rows[:] = np.uint8(0)
         rows.sums[:] = np.uint16(0)
@@ -196,15 +198,14 @@ def write_costs(
         for y in range(top - window.rows_radius, bottom + window.rows_radius):
             # The first rows are written over.
             middle = max(y - window.rows_radius, top) % costs.shape[0]
-            _write_block(views, window, first, end, y, rows, costs[middle])
-    for y in range(top, bottom):
-        costs[y % costs.shape[0], ndisp:] = np.uint8(window.top)
+            _write_block(views, window, columns, first, end, y, rows, costs[middle])
 
 
 @njit(cache=True, nogil=True)
 def _write_block(
     views: Views,
     window: Window,
+    columns: tuple[int, int],
     first: int,
     end: int,
     y: int,
@@ -219,32 +220,41 @@ def _write_block(
     height = 2 * window.rows_radius + 1
     oldest = rows.rows[(y + height * (window.rows_radius + 1)) % height]
     line = min(max(y, 0), views.grey.shape[0] - 1)
-    left, right = views.left[line], views.right[line]
-    for k in range(first, end):
-        start = costs.shape[0] - 1 - k
-        _compare_gradients(left, right, start, window.gradient_cap, rows.pixels)
-        for plane in range(1, left.shape[0], PLANES):
-            _add_bits(left, right, plane, start, rows.pixels)
-        if window.row_shift == 0:
-            _sum_across(rows.pixels, window.radius, rows.across)
-        else:
-            _sum_far_across(rows.pixels, window, rows.wide, rows.across)
-        _exchange(rows.across, oldest[k - first], window, rows.sums[k - first], costs[k])
+    left, right, start = views.left[line], views.right[line], columns[0]
+    reach = columns[1] - start + 2 * window.radius
+    # Where candidate 0 stands in the right row.
+    place = start + costs.shape[0] - 1
+    _compare(left, right, start, place, reach, first, end, window.gradient_cap, rows.pixels)
+    for plane in range(1 + PLANES, left.shape[0], PLANES):
+        _add_bits(left, right, plane, start, place, reach, first, end, rows.pixels)
+    _exchange(rows.pixels, window, oldest, rows.sums, first, end, costs)
 
 
 @njit(cache=True, nogil=True)
-def _compare_gradients(
+def _compare(
     left: NDArray[np.uint8],
     right: NDArray[np.uint8],
     start: int,
+    place: int,
+    reach: int,
+    first: int,
+    end: int,
     gradient_cap: int,
     pixels: NDArray[np.uint8],
 ) -> None:
-    """Write how far the gradients of a row are apart."""
-    cap, others = np.uint8(gradient_cap), right[0, start:]
-    for x in range(left.shape[1]):
-        a, b = left[0, x], others[x]
-        pixels[x] = min(np.uint8(max(a, b) - min(a, b)), cap)
+    """Write how far gradients are apart, plus the bits of the first three planes that differ."""
+    cap = splat(np.uint8(gradient_cap))
+    for x in range(0, reach, LANES):
+        here, there = start + x, place + x
+        gradient, bits = load_row(left, 0, here), load_row(left, 1, here)
+        bits_2, bits_3 = load_row(left, 2, here), load_row(left, 3, here)
+        for k in range(first, end):
+            other = load_row(right, 0, there - k)
+            apart = least(distance(gradient, other), cap)
+            one = differing_bits(bits, load_row(right, 1, there - k))
+            two = differing_bits(bits_2, load_row(right, 2, there - k))
+            three = differing_bits(bits_3, load_row(right, 3, there - k))
+            store_row(pixels, k - first, x, apart + one + two + three)
 
 
 @njit(cache=True, nogil=True)
@@ -253,70 +263,62 @@ def _add_bits(
     right: NDArray[np.uint8],
     plane: int,
     start: int,
+    place: int,
+    reach: int,
+    first: int,
+    end: int,
     pixels: NDArray[np.uint8],
 ) -> None:
-    """Add the number of bits of three planes that differ."""
-    first, second, third = (
-        right[plane, start:],
-        right[plane + 1, start:],
-        right[plane + 2, start:],
-    )
-    for x in range(left.shape[1]):
-        a = count_bits(np.uint8(left[plane, x] ^ first[x]))
-        b = count_bits(np.uint8(left[plane + 1, x] ^ second[x]))
-        c = count_bits(np.uint8(left[plane + 2, x] ^ third[x]))
-        pixels[x] = np.uint8(np.uint8(pixels[x] + a) + np.uint8(b + c))
+    """Add the bits of three more planes that differ."""
+    for x in range(0, reach, LANES):
+        for k in range(first, end):
+            cost, there = load_row(pixels, k - first, x), place + x - k
+            for n in range(plane, plane + PLANES):
+                bits = differing_bits(load_row(left, n, start + x), load_row(right, n, there))
+                cost = cost + bits
+            store_row(pixels, k - first, x, cost)
 
 
 @njit(cache=True, nogil=True)
-def _sum_across(pixels: NDArray[np.uint8], radius: int, across: NDArray[np.uint8]) -> None:
+def _sum_across(pixels: NDArray[np.uint8], n: int, x: int, radius: int) -> Lanes:
     """Sum the costs over the window's width."""
-    if radius == 2:
-        for x in range(across.size):
-            outer, inner = (
-                np.uint8(pixels[x] + pixels[x + 4]),
-                np.uint8(pixels[x + 1] + pixels[x + 3]),
-            )
-            across[x] = np.uint8(np.uint8(outer + inner) + pixels[x + 2])
-        return
-    for x in range(across.size):
-        across[x] = pixels[x + radius]
-    for d in range(radius):
-        end = 2 * radius - d
-        for x in range(across.size):
-            across[x] = np.uint8(across[x] + np.uint8(pixels[x + d] + pixels[x + end]))
+    total = load_row(pixels, n, x)
+    for d in range(x + 1, x + 2 * radius + 1):
+        total = total + load_row(pixels, n, d)
+    return total
 
 
 @njit(cache=True, nogil=True)
 def _sum_far_across(
-    pixels: NDArray[np.uint8],
-    window: Window,
-    wide: NDArray[np.uint16],
-    across: NDArray[np.uint8],
-) -> None:
+    pixels: NDArray[np.uint8], n: int, x: int, window: Window, sums: NDArray[np.uint16]
+) -> Lanes:
     """The same for windows whose sums need their lowest bits cut."""
-    wide[:] = np.uint16(0)
-    for d in range(2 * window.radius + 1):
-        for x in range(wide.size):
-            wide[x] = np.uint16(wide[x] + np.uint16(pixels[x + d]))
-    shift = np.uint16(window.row_shift)
-    for x in range(wide.size):
-        across[x] = np.uint8(np.uint16(wide[x] >> shift))
+    total = fit(load_row(pixels, n, x), sums)
+    for d in range(x + 1, x + 2 * window.radius + 1):
+        total = total + fit(load_row(pixels, n, d), sums)
+    return narrow(total >> splat(np.uint16(window.row_shift)))
 
 
 @njit(cache=True, nogil=True)
 def _exchange(
-    across: NDArray[np.uint8],
-    oldest: NDArray[np.uint8],
+    pixels: NDArray[np.uint8],
     window: Window,
+    oldest: NDArray[np.uint8],
     sums: NDArray[np.uint16],
+    first: int,
+    end: int,
     costs: NDArray[np.uint8],
 ) -> None:
-    """Take the oldest row out of the sums of a candidate and another in; write the scaled sums."""
-    factor, shift = np.uint16(window.factor), np.uint16(window.shift)
-    for x in range(across.size):
-        rest = np.uint16(sums[x] - np.uint16(oldest[x]))
-        total = np.uint16(rest + np.uint16(across[x]))
-        sums[x] = total
-        oldest[x] = across[x]
-        costs[x] = np.uint8(np.uint16(np.uint16(total * factor) >> shift))
+    """Take the oldest row out of the sums of a block and another in; write the scaled sums."""
+    factor, shift = splat(np.uint16(window.factor)), splat(np.uint16(window.shift))
+    for n in range(end - first):
+        for x in range(0, costs.shape[1], LANES):
+            if window.row_shift == 0:
+                across = _sum_across(pixels, n, x, window.radius)
+            else:
+                across = _sum_far_across(pixels, n, x, window, sums)
+            out = load_row(oldest, n, x)
+            store_row(oldest, n, x, across)
+            total = load_row(sums, n, x) - fit(out, sums) + fit(across, sums)
+            store_row(sums, n, x, total)
+            store_row(costs, first + n, x, narrow(total * factor >> shift))

@@ -12,169 +12,216 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.lanes import LANES, least, load_row, splat, store_row, where_less
 from recon.kernels.minima import NO_COST, Minima
-from recon.kernels.path_costs import aligned
+from recon.kernels.path_costs import aligned, padded
 
 NONE: Final = 255
 """Stands for the cost of a candidate that does not exist; real costs stay below it."""
 
+MARGIN: Final = LANES
+"""Columns on each side of a row of costs, where no candidate exists."""
+
 BLOCK: Final = 256
-"""So many candidates are told apart by the lower byte of a key."""
+"""So many candidates are told apart by a byte."""
 
 PARTS: Final = 8
 """What `Minima.costs` count of one step of these costs."""
 
+LOWEST, WHICH, BEFORE, AFTER, ASIDE, EARLIER, LAST, PRIOR, SETTLED = range(9)
+"""What is known of a column: its lowest cost, the place of that candidate in its block, the costs
+before and after it, the lowest two or more candidates away, the lowest but for the last, the last,
+the lowest before the last, the lowest of the blocks before."""
 
-class Best(NamedTuple):
-    """Room for the choice of a row of C columns and P candidates.
+
+class Band(NamedTuple):
+    """Columns of the left view.
 
     Attributes:
-        keys: uint16 (C + P), of each column 256 times the lowest cost among a block of candidates,
-            plus its place in the block.
-        left: uint8 (C), lowest cost in the left view.
-        left_which: uint16 (C), its candidate.
-        aside: uint8 (C), lowest cost two or more candidates away.
-        right: uint8 (C + P), lowest cost in the right view; right column ``x - minimum - k``
-            stands at ``x - k + P``.
-        right_which: uint16 (C + P), its candidate.
+        start: The first whose costs there are.
+        end: The column after the last.
+        first: The first that is wanted.
+        last: The column after the last.
     """
 
-    keys: NDArray[np.uint16]
+    start: int
+    end: int
+    first: int
+    last: int
+
+
+class Best(NamedTuple):
+    """Room for the choice of rows of bands of C columns, of a picture of W columns.
+
+    Attributes:
+        left: uint8 (9, C), what is known of the columns of the left view, `LOWEST` to `SETTLED`.
+        left_which: uint16 (C), candidate of the lowest cost.
+        right: uint8 (9, at least W), the same of the right view, of which some is used.
+        right_lowest: uint8 (N, at least W), lowest cost of N rows of the right view, among the
+            bands that were done.
+    """
+
     left: NDArray[np.uint8]
     left_which: NDArray[np.uint16]
-    aside: NDArray[np.uint8]
     right: NDArray[np.uint8]
-    right_which: NDArray[np.uint16]
+    right_lowest: NDArray[np.uint8]
 
 
-def empty_best(columns: int, candidates: int) -> Best:
-    """Room for `choose_rows`."""
+def empty_best(columns: int, width: int, rows: int) -> Best:
+    """Room for `choose_row`, for so many rows."""
+    right_lowest = aligned((rows, padded(width)))
+    right_lowest[:] = NONE
     return Best(
-        aligned((columns + candidates,), np.uint16),
-        aligned((columns,)),
+        aligned((9, columns)),
         aligned((columns,), np.uint16),
-        aligned((columns,)),
-        aligned((columns + candidates,)),
-        aligned((columns + candidates,), np.uint16),
+        aligned((9, padded(width))),
+        right_lowest,
     )
 
 
 @njit(cache=True, nogil=True)
-def choose_rows(
+def choose_row(
     costs: NDArray[np.uint8],
-    ndisp: int,
     minimum: int,
-    first: int,
-    end: int,
+    y: int,
+    place: int,
+    band: Band,
     best: Best,
     minima: Minima,
 ) -> None:
-    """Choose the best candidate of each pixel of some rows, in both views.
+    """Choose the best candidate of each pixel of a row of a band, in both views.
 
     Candidates whose right pixel lies outside the picture do not exist; of equal costs the
-    smaller candidate wins.
+    smaller candidate wins. The bands of a row are done from left to right.
 
     Args:
-        costs: uint8 (N, P, C), costs of the candidates, below `NONE`; row ``y`` is at place
-            ``y % N``. Where a candidate does not exist, `NONE` is written.
-        ndisp: Number of candidates, at most P.
+        costs: uint8 (P, MARGIN + C + MARGIN), costs of the candidates, below `NONE`; the margins
+            are `NONE`. Where a candidate does not exist or is not wanted, `NONE` is written.
         minimum: Disparity of candidate 0, pixels.
-        first: First row to do.
-        end: The row after the last.
-        best: Room.
-        minima: Written: the rows; costs are multiplied by `PARTS`.
+        y: The row.
+        place: The row, of those that ``best`` is for.
+        band: The columns.
+        best: Room, and what is known of the right view.
+        minima: Written: what is wanted of the row; costs are multiplied by `PARTS`. Right winners
+            are kept unless they are beaten.
     """
-    for y in range(first, end):
-        _choose_row(costs[y % costs.shape[0]], ndisp, minimum, y, best, minima)
-
-
-@njit(cache=True, nogil=True)
-def _choose_row(
-    costs: NDArray[np.uint8], ndisp: int, minimum: int, y: int, best: Best, minima: Minima
-) -> None:
-    width = minima.winner.shape[1]
+    ndisp, width = costs.shape[0], minima.winner.shape[1]
     for k in range(ndisp):
-        _close(costs, k, max(0, k + minimum), min(width, width + k + minimum))
-    _choose(costs, ndisp, 0, best.keys, best.left, best.left_which)
-    _choose(costs, ndisp, 1, best.keys, best.right, best.right_which)
-    best.aside[:] = np.uint8(NONE)
-    for k in range(ndisp):
-        _take_aside(costs, k, best.left_which, best.aside)
-    _write_row(costs, ndisp, y, best, minima)
-    for x in range(width):
-        place = x + minimum + costs.shape[0]
-        inside = 0 <= place < best.right.size
-        minima.right_winner[y, x] = best.right_which[place] if inside else np.uint16(ndisp)
-
-
-@njit(cache=True, nogil=True)
-def _close(costs: NDArray[np.uint8], k: int, first: int, end: int) -> None:
-    """Mark the columns where a candidate does not exist."""
-    for x in range(min(first, costs.shape[1])):
-        costs[k, x] = np.uint8(NONE)
-    for x in range(max(end, 0), costs.shape[1]):
-        costs[k, x] = np.uint8(NONE)
-
-
-@njit(cache=True, nogil=True)
-def _choose(
-    costs: NDArray[np.uint8],
-    ndisp: int,
-    view: int,
-    keys: NDArray[np.uint16],
-    lowest: NDArray[np.uint8],
-    which: NDArray[np.uint16],
-) -> None:
-    """Find the lowest costs of the left view (0) or the right one (1), and their candidates."""
-    lowest[:] = np.uint8(NONE)
-    which[:] = np.uint16(ndisp)
+        start, end = max(band.first, k + minimum), min(band.last, width + k + minimum)
+        _close(costs[k, MARGIN:-MARGIN], start - band.start, end - band.start)
+    columns, which = band.end - band.start, minima.right_winner[y]
+    best.left[:] = np.uint8(NONE)
+    best.left_which[:] = np.uint16(ndisp)
+    best.right[LOWEST] = best.right[SETTLED] = best.right_lowest[place]
     for first in range(0, ndisp, BLOCK):
-        keys[:] = np.uint16(NO_COST)
-        for k in range(first, min(first + BLOCK, ndisp)):
-            _take(costs, k, k - first, keys[view * (costs.shape[0] - k) :])
-        for x in range(lowest.size):
-            cost = np.uint8(keys[x] >> np.uint16(8))
-            place = np.uint16(np.uint16(keys[x] & np.uint16(BLOCK - 1)) + np.uint16(first))
-            which[x] = place if cost < lowest[x] else which[x]
-            lowest[x] = min(lowest[x], cost)
+        end = min(first + BLOCK, ndisp)
+        _search_left(costs, first, end, best.left)
+        _settle(best.left, first, best.left_which[:columns])
+        _search_right(costs, minimum, first, end, band, best.right)
+        _settle(best.right, first, which)
+    best.right_lowest[place] = best.right[LOWEST]
+    _write_row(best, ndisp, y, band, minima)
 
 
 @njit(cache=True, nogil=True)
-def _take(costs: NDArray[np.uint8], k: int, place: int, keys: NDArray[np.uint16]) -> None:
-    """Compare a candidate with the best so far: of equal costs the smaller place has the key."""
-    index, eight = np.uint16(place), np.uint16(8)
-    for x in range(costs.shape[1]):
-        key = np.uint16(np.uint16(np.uint16(costs[k, x]) << eight) | index)
-        keys[x] = min(keys[x], key)
+def _close(costs: NDArray[np.uint8], first: int, end: int) -> None:
+    """Mark the columns where a candidate does not exist or is not wanted."""
+    costs[: min(first, costs.size)] = np.uint8(NONE)
+    costs[max(end, 0) :] = np.uint8(NONE)
 
 
 @njit(cache=True, nogil=True)
-def _take_aside(
-    costs: NDArray[np.uint8], k: int, which: NDArray[np.uint16], aside: NDArray[np.uint8]
+def _search_left(costs: NDArray[np.uint8], first: int, end: int, known: NDArray[np.uint8]) -> None:
+    """Compare the candidates of a block with the best before, and keep what is around it."""
+    one = splat(np.uint8(1))
+    for x in range(0, costs.shape[1] - 2 * MARGIN, LANES):
+        lowest, which, index = (
+            load_row(known, LOWEST, x),
+            load_row(known, WHICH, x),
+            splat(np.uint8(0)),
+        )
+        before, after, aside = (
+            load_row(known, BEFORE, x),
+            load_row(known, AFTER, x),
+            load_row(known, ASIDE, x),
+        )
+        earlier, last, prior = (
+            load_row(known, EARLIER, x),
+            load_row(known, LAST, x),
+            load_row(known, PRIOR, x),
+        )
+        for k in range(first, end):
+            cost = load_row(costs, k, x + MARGIN)
+            # Beside the best that was found last is not aside of it.
+            aside = where_less(last, prior, aside, least(aside, cost))
+            aside = where_less(cost, lowest, earlier, aside)
+            after = where_less(last, prior, cost, after)
+            before = where_less(cost, lowest, last, before)
+            which = where_less(cost, lowest, index, which)
+            earlier, last, prior = least(earlier, last), cost, lowest
+            lowest, index = least(lowest, cost), index + one
+        store_row(known, LOWEST, x, lowest)
+        store_row(known, WHICH, x, which)
+        store_row(known, BEFORE, x, before)
+        store_row(known, AFTER, x, after)
+        store_row(known, ASIDE, x, aside)
+        store_row(known, EARLIER, x, earlier)
+        store_row(known, LAST, x, last)
+        store_row(known, PRIOR, x, prior)
+
+
+@njit(cache=True, nogil=True)
+def _search_right(
+    costs: NDArray[np.uint8],
+    minimum: int,
+    first: int,
+    end: int,
+    band: Band,
+    known: NDArray[np.uint8],
 ) -> None:
-    """Compare a candidate with the best so far that is not beside the winner."""
-    after = np.uint16(k + 1)
-    for x in range(costs.shape[1]):
-        cost, other = costs[k, x], aside[x]
-        # Above the winner plus one the difference wraps round to a large number.
-        far = np.uint16(after - which[x]) > np.uint16(2)
-        aside[x] = min(other, cost) if far else other
+    """Compare the candidates of a block with the best before, for columns of the right view."""
+    one, columns = splat(np.uint8(1)), costs.shape[1] - 2 * MARGIN
+    nearest = max(band.first - minimum - end + 1, 0) // LANES * LANES
+    farthest = min(band.last - minimum - first, known.shape[1])
+    for x in range(nearest, farthest, LANES):
+        ahead = x + minimum - band.start
+        start, stop = max(first, 1 - LANES - ahead), min(end, columns - ahead)
+        lowest, which = load_row(known, LOWEST, x), load_row(known, WHICH, x)
+        index = splat(np.uint8(start - first))
+        for k in range(start, stop):
+            cost = load_row(costs, k, MARGIN + ahead + k)
+            which = where_less(cost, lowest, index, which)
+            lowest, index = least(lowest, cost), index + one
+        store_row(known, LOWEST, x, lowest)
+        store_row(known, WHICH, x, which)
 
 
 @njit(cache=True, nogil=True)
-def _write_row(costs: NDArray[np.uint8], ndisp: int, y: int, best: Best, minima: Minima) -> None:
+def _settle(known: NDArray[np.uint8], first: int, which: NDArray[np.uint16]) -> None:
+    """Take over the candidates of a block that are better than those of the blocks before."""
+    lowest, settled, place = known[LOWEST], known[SETTLED], known[WHICH]
+    for x in range(which.size):
+        here = np.uint16(np.uint16(place[x]) + np.uint16(first))
+        which[x] = here if lowest[x] < settled[x] else which[x]
+        settled[x] = lowest[x]
+
+
+@njit(cache=True, nogil=True)
+def _write_row(best: Best, ndisp: int, y: int, band: Band, minima: Minima) -> None:
     """Write the winners of the left view, their costs and those around them."""
-    for x in range(minima.winner.shape[1]):
-        k = np.int64(best.left_which[x])
-        minima.winner[y, x] = np.uint16(k)
-        minima.costs[0, y, x] = _in_parts(best.left[x])
-        minima.costs[3, y, x] = _in_parts(best.aside[x])
-        minima.costs[1, y, x] = _in_parts(costs[k - 1, x] if 0 < k < ndisp else np.uint8(NONE))
-        minima.costs[2, y, x] = _in_parts(costs[k + 1, x] if k + 1 < ndisp else np.uint8(NONE))
+    winner, costs = minima.winner[y, band.first : band.last], minima.costs[:, y]
+    winner[:] = best.left_which[band.first - band.start : band.last - band.start]
+    for place, known in enumerate((LOWEST, BEFORE, AFTER, ASIDE)):
+        found = best.left[known, band.first - band.start : band.last - band.start]
+        _write_costs(found, costs[place, band.first : band.last])
+    last, after = np.uint16(ndisp - 1), costs[2, band.first : band.last]
+    for x in range(winner.size):
+        after[x] = after[x] if winner[x] < last else np.uint16(NO_COST)
 
 
 @njit(cache=True, nogil=True)
-def _in_parts(cost: np.uint8) -> np.uint16:
-    """A cost as `Minima` has it."""
-    parts: np.uint16 = np.uint16(np.uint16(cost) * np.uint16(PARTS))
-    return np.uint16(NO_COST) if cost == np.uint8(NONE) else parts
+def _write_costs(known: NDArray[np.uint8], costs: NDArray[np.uint16]) -> None:
+    """Write costs as `Minima` has them."""
+    for x in range(costs.size):
+        parts = np.uint16(np.uint16(known[x]) * np.uint16(PARTS))
+        costs[x] = np.uint16(NO_COST) if known[x] == np.uint8(NONE) else parts

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from recon.kernels.minima import Minima
 from recon.kernels.path_costs import Views, Window
+from recon.kernels.path_rows import Paths
 from recon.kernels.plane_minima import PARTS
 from recon.kernels.sad_reference import minima_reference
-from recon.kernels.semi_global import Paths
 
 Int64 = NDArray[np.int64]
 
@@ -23,7 +23,7 @@ def semi_global_minima_reference(views: Views, window: Window, paths: Paths) -> 
             path_reference(views.grey, costs, paths, dy, dx) for dx in (0, 1, -1)
         )
         sweeps.append(_mean(straight, _mean(left, right)))
-    return minima_reference(PARTS * _mean(*sweeps)[:, :, : paths.ndisp], paths.minimum)
+    return minima_reference(PARTS * _mean(*sweeps), paths.minimum)
 
 
 def _mean(a: Int64, b: Int64) -> Int64:
@@ -31,11 +31,10 @@ def _mean(a: Int64, b: Int64) -> Int64:
 
 
 def path_costs_reference(views: Views, window: Window, ndisp: int) -> Int64:
-    """int64 (H, W, P), the cost of each candidate at each pixel; the padding at the top."""
+    """int64 (H, W, P), the cost of each candidate at each pixel."""
     height, width = views.grey.shape
-    candidates = views.right.shape[2] - views.left.shape[2] + 1
-    x, k = np.arange(views.left.shape[2])[:, None], np.arange(candidates)
-    left, right = views.left[..., None], views.right[:, :, x - k + candidates - 1]
+    x, k = np.arange(views.left.shape[2])[:, None], np.arange(ndisp)
+    left, right = views.left[..., None], views.right[:, :, x - k + ndisp - 1]
     pixels = np.minimum(abs(left[:, 0].astype(np.int64) - right[:, 0]), window.gradient_cap)
     differ = left[:, 1:] ^ right[:, 1:]
     pixels = pixels + np.unpackbits(differ[..., None], axis=-1).sum(axis=(1, -1), dtype=np.int64)
@@ -44,7 +43,7 @@ def path_costs_reference(views: Views, window: Window, ndisp: int) -> Int64:
     sums, rows = np.zeros(across.shape, np.int64), np.arange(height)
     for dy in range(-window.rows_radius, window.rows_radius + 1):
         sums += across[np.clip(rows + dy, 0, height - 1)]
-    return np.where(k < ndisp, sums * window.factor >> window.shift, window.top)
+    return sums * window.factor >> window.shift
 
 
 def path_reference(grey: NDArray[np.uint8], costs: Int64, paths: Paths, dy: int, dx: int) -> Int64:

@@ -9,25 +9,24 @@ from typing import Final
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from recon.kernels.census import census_planes
+from recon.kernels.census import Look
 from recon.kernels.minima import empty_minima
 from recon.kernels.path_costs import (
-    TOGETHER,
     Views,
     Window,
-    left_planes,
-    padded,
-    right_planes,
+    empty_planes,
+    places_of,
     scaled_window,
+    write_views,
 )
+from recon.kernels.path_rows import Paths
 from recon.kernels.plane_minima import PARTS
 from recon.kernels.refine import REFINED_BYTES, Rules, refine_minima, refined_in
-from recon.kernels.semi_global import ROWS, Paths, empty_room, semi_global_minima
-from recon.matching.gradients import clipped_gradients, texture
+from recon.kernels.semi_global import band_columns, empty_room, room_bytes, semi_global_minima
+from recon.matching.gradients import texture
 from recon.matching.rooms import Loans, Rooms
 from recon.matching.search import FITS, MeasuredSettings, OddInt, finish
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
-from recon.structures.arrays import UInt8
 
 _LEVELS: Final = 250
 """Of the 255 that a path cost has; rounding needs the others."""
@@ -36,6 +35,9 @@ _ODDS: Final = 2.0
 """`Rules.odds` of means over paths, fitted on MiddEval3; 2003, 2005 and 2006 were held out."""
 
 _STRIP_ROWS: Final = 192
+
+_SIDE_OVERLAP: Final = 8
+"""Columns that a band of a strip shares: only slanted paths begin there, and 32 change nothing."""
 
 
 class SgmSettings(MeasuredSettings):
@@ -131,6 +133,7 @@ class SgmMatcher:
         self._settings = settings
         self._threads = max(1, threads or os.cpu_count() or 1)
         self._rooms = Rooms(empty_room, self._threads)
+        self._planes = Rooms(empty_planes, 1)
         self._minima = Rooms(empty_minima, 1)
         self._results = Loans(2)
 
@@ -142,38 +145,46 @@ class SgmMatcher:
         """
         s = self._settings
         ndisp = s.ndisp_within(pair.camera)
-        views, window = _views(pair, ndisp, s), _window(s)
-        levels = window.levels
-        paths, rules = _paths(s, ndisp, levels), _rules(s, ndisp, levels)
+        window, look, size = _window(s), _look(s), pair.left.shape
+        paths, rules = _paths(s, ndisp, window.levels), _rules(s, ndisp, window.levels)
         enough = texture(pair, (s.window_px, s.window_height_px), s.min_texture)
         results = self._results.lend(REFINED_BYTES * enough.size)
         refined = refined_in(results, *enough.shape)
 
-        def work(strip: range) -> None:
+        def prepare(strip: range) -> None:
+            places = places_of(window, ndisp, s.min_disparity_px)
+            write_views(pair.right, look, places, strip, views)
+
+        def search(strip: range) -> None:
             with self._rooms.borrow(pair.camera.width_px, paths) as room:
                 semi_global_minima(views, window, paths, strip, room, minima)
             refine_minima(minima, enough, rules, strip.start, strip.stop, refined)
 
-        strip_rows, at_once = self._strips(pair.camera, ndisp)
-        height = pair.camera.height_px
-        strips = [range(y, min(y + strip_rows, height)) for y in range(0, height, strip_rows)]
-        with self._minima.borrow(*enough.shape) as minima, ThreadPoolExecutor(at_once) as pool:
-            list(pool.map(work, strips))
+        strips, at_once = self._strips(pair.camera, paths)
+        with (
+            self._planes.borrow(*size, look.planes, window.radius, ndisp) as planes,
+            self._minima.borrow(*size) as minima,
+            ThreadPoolExecutor(at_once) as pool,
+        ):
+            views = Views(pair.left, *planes)
+            list(pool.map(prepare, strips))
+            list(pool.map(search, strips))
         return finish(refined, s)
 
-    def _strips(self, camera: RectifiedCamera, ndisp: int) -> tuple[int, int]:
-        """Rows of a strip, and how many strips may be worked on at once."""
+    def _strips(self, camera: RectifiedCamera, paths: Paths) -> tuple[list[range], int]:
+        """The strips of a picture, and how many may be worked on at once."""
         height = camera.height_px
         # An even number of strips, so that two cores end together.
         rows = -(-height // (2 * -(-height // (2 * _STRIP_ROWS))))
-        room_bytes = _room_bytes(camera.width_px, ndisp, self._settings.overlap_rows)
-        at_once = min(self._threads, (self._settings.memory_mb << 20) // room_bytes)
-        return rows, max(1, at_once)
+        bytes_each = room_bytes(band_columns(camera.width_px, paths), paths)
+        at_once = min(self._threads, (self._settings.memory_mb << 20) // bytes_each)
+        strips = [range(y, min(y + rows, height)) for y in range(0, height, rows)]
+        return strips, max(1, at_once)
 
 
-def _room_bytes(width: int, ndisp: int, overlap: int) -> int:
-    """What a `Room` takes: its costs, its means, and nine rows of paths."""
-    return padded(width) * padded(ndisp, TOGETHER) * (2 * ROWS + overlap + 9)
+def _look(settings: SgmSettings) -> Look:
+    s = settings
+    return Look(s.prefilter_cap, s.census_height_px // 2, s.census_px // 2)
 
 
 def _window(settings: SgmSettings) -> Window:
@@ -199,6 +210,7 @@ def _paths(settings: SgmSettings, ndisp: int, levels: float) -> Paths:
         large_at_edge=max(small, round(large * s.edge_penalty_share)),
         edge=s.edge_grey_levels,
         overlap=s.overlap_rows,
+        side_overlap=_SIDE_OVERLAP,
     )
 
 
@@ -215,19 +227,3 @@ def _rules(settings: SgmSettings, ndisp: int, levels: float) -> Rules:
         sigma_floor_px=s.sigma_floor_px,
         odds=_ODDS,
     )
-
-
-def _views(pair: RectifiedPair, ndisp: int, settings: SgmSettings) -> Views:
-    radius = settings.window_px // 2
-    right = _planes(pair.right, settings)
-    return Views(
-        grey=pair.left,
-        left=left_planes(_planes(pair.left, settings), radius),
-        right=right_planes(right, radius, ndisp, settings.min_disparity_px),
-    )
-
-
-def _planes(image: UInt8, settings: SgmSettings) -> list[UInt8]:
-    """Gradients and census, uint8 (H, W) each."""
-    census = census_planes(image, settings.census_height_px // 2, settings.census_px // 2)
-    return [clipped_gradients(image, settings.prefilter_cap), *census]

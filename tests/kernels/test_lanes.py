@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numba import njit
+from numba.core.errors import TypingError
 
 from recon.kernels import lanes
 from recon.kernels.lanes import LANES
@@ -57,6 +58,30 @@ def spread(a: Any, b: Any, out: Any) -> None:
     lanes.store(out, 0, lanes.spread(a, 3))
 
 
+@njit
+def compare_bytes(a: Any, b: Any, out: Any) -> None:
+    x, y = lanes.load(a, 2), lanes.load(b, 0)
+    lanes.store(out, 0, lanes.mean(x, y))
+    lanes.store(out, LANES, lanes.differing_bits(x, y))
+
+
+@njit
+def scale(a: Any, b: Any, out: Any) -> None:
+    product = lanes.load(a, 2) * lanes.load(b, 0)
+    lanes.store(out, 0, product)
+    lanes.store(out, LANES, product >> lanes.splat(np.uint16(3)))
+
+
+@njit
+def shorten(a: Any, b: Any, out: Any) -> None:
+    lanes.store(out, 2, lanes.narrow(lanes.load(a, 2)))
+
+
+@njit
+def move_rows(a: Any, b: Any, out: Any) -> None:
+    lanes.store_row(out, 2, 1, lanes.load_row(a, 1, 3))
+
+
 def assert_same(function: Callable[..., None], a: Any, b: Any, kind: Any) -> None:
     compiled, plain = np.zeros((2, 5 * LANES), kind)
     function(a, b, compiled)
@@ -84,6 +109,41 @@ def test_vectors_of_one_kind_do_as_numpy_does(
 @given(arrays(np.uint8))
 def test_bytes_are_widened_as_numpy_does(a: Any) -> None:
     assert_same(resize, a, a, np.uint16)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(arrays(np.uint8), arrays(np.uint8))
+def test_bytes_are_compared_as_numpy_does(a: Any, b: Any) -> None:
+    assert_same(compare_bytes, a, b, np.uint8)
+
+
+@settings(deadline=None)  # the first call compiles
+@given(arrays(np.uint16), arrays(np.uint16))
+def test_values_are_scaled_and_narrowed_as_numpy_does(a: Any, b: Any) -> None:
+    assert_same(scale, a, b, np.uint16)
+    assert_same(shorten, a, b, np.uint8)
+
+
+def test_means_are_rounded_up_and_bits_counted() -> None:
+    a, b = np.array([[0, 1, 255], [1, 1, 254]], np.uint8)
+    assert lanes.mean(a, b).tolist() == [1, 1, 255]
+    assert lanes.differing_bits(a, b).tolist() == [1, 0, 1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rows_are_read_and_written_where_they_are(kind: Any) -> None:
+    a, out = np.arange(2 * (LANES + 5), dtype=kind).reshape(2, -1), np.zeros((3, LANES + 2), kind)
+    move_rows(a, a, out)
+    np.testing.assert_array_equal(out[2, 1:-1], a[1, 3 : 3 + LANES])
+    assert np.count_nonzero(out) == LANES
+
+
+def test_rows_that_are_not_contiguous_are_refused_by_the_compiler() -> None:
+    if not hasattr(move_rows, "py_func"):
+        pytest.skip("the compiler is switched off")
+    a, out = np.zeros((2, 2 * LANES + 10), np.uint8), np.zeros((3, LANES + 2), np.uint8)
+    with pytest.raises(TypingError):
+        move_rows(a[:, ::2], a, out)
 
 
 @settings(deadline=None)  # the first call compiles

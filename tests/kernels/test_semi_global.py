@@ -11,30 +11,40 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from recon.kernels.census import census_planes
+from recon.kernels.census import Look
 from recon.kernels.minima import Minima, empty_minima
-from recon.kernels.path_costs import Views, Window, left_planes, right_planes, scaled_window
-from recon.kernels.semi_global import ROWS, Paths, empty_room, semi_global_minima
+from recon.kernels.path_costs import (
+    Views,
+    Window,
+    empty_planes,
+    places_of,
+    scaled_window,
+    write_views,
+)
+from recon.kernels.path_rows import Paths
+from recon.kernels.semi_global import ROWS, Room, empty_room, room_bytes, semi_global_minima
 from recon.kernels.semi_global_reference import semi_global_minima_reference
 
 Image = NDArray[np.uint8]
 
 
 def make_views(left: Image, right: Image, window: Window, paths: Paths) -> Views:
-    return Views(
-        grey=left,
-        left=left_planes([left, *census_planes(left, 1, 2)], window.radius),
-        right=right_planes(
-            [right, *census_planes(right, 1, 2)], window.radius, paths.ndisp, paths.minimum
-        ),
-    )
+    look = Look(127, 1, 2)
+    views = Views(left, *empty_planes(*left.shape, look.planes, window.radius, paths.ndisp))
+    places = places_of(window, paths.ndisp, paths.minimum)
+    write_views(right, look, places, range(len(left)), views)
+    return views
 
 
-def search(views: Views, window: Window, paths: Paths, strips: int = 1) -> Minima:
+def search(
+    views: Views, window: Window, paths: Paths, strips: int = 1, columns: int | None = None
+) -> Minima:
     minima = empty_minima(*views.grey.shape)
     edges = np.linspace(0, len(views.grey), strips + 1).astype(int).tolist()
     for first, end in itertools.pairwise(edges):
         room = empty_room(views.grey.shape[1], paths)
+        if columns:
+            room = Room(np.zeros(room_bytes(columns, paths), np.uint8), columns)
         semi_global_minima(views, window, paths, range(first, end), room, minima)
     return minima
 
@@ -70,6 +80,7 @@ def windows(draw: st.DrawFn) -> tuple[Window, Paths]:
         large_at_edge=small,
         edge=draw(st.sampled_from([0, 12, 255])),
         overlap=100,
+        side_overlap=100,
     )
     return window, paths
 
@@ -96,7 +107,10 @@ def test_strips_that_overlap_wholly_do_not_change_the_result(
 @pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
 def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
     grey = np.zeros(shape, np.uint8)
-    paths, window = Paths(4, 0, 10, 50, 20, 12, overlap=4), scaled_window(2, 2, 16, 30, 3.0)
+    paths, window = (
+        Paths(4, 0, 10, 50, 20, 12, overlap=4, side_overlap=4),
+        scaled_window(2, 2, 16, 30, 3.0),
+    )
     minima = search(make_views(grey, grey, window, paths), window, paths)
     assert (minima.winner == 0).all()
     assert (minima.right_winner == 0).all()
@@ -106,7 +120,10 @@ def test_few_rows_of_overlap_change_little() -> None:
     rng = np.random.default_rng(0)
     left = rng.integers(0, 256, (80, 60), dtype=np.uint8)
     right = np.roll(left, -5, axis=1)
-    paths, window = Paths(16, 0, 10, 50, 20, 12, overlap=8), scaled_window(1, 1, 16, 30, 3.0)
+    paths, window = (
+        Paths(16, 0, 10, 50, 20, 12, overlap=8, side_overlap=8),
+        scaled_window(1, 1, 16, 30, 3.0),
+    )
     views = make_views(left, right, window, paths)
     whole, strips = search(views, window, paths), search(views, window, paths, strips=4)
     assert (whole.winner == strips.winner).mean() > 0.99
@@ -118,11 +135,27 @@ def test_a_picture_of_several_blocks_equals_the_twin(shape: tuple[int, int], ove
     """Paths from above go on from block to block; those from below reach through all below."""
     rng = np.random.default_rng(1)
     left, right = rng.integers(0, 256, (2, *shape), dtype=np.uint8)
-    paths = Paths(9, -2, 10, 50, 20, 12, overlap=max(overlap, shape[0]))
+    paths = Paths(9, -2, 10, 50, 20, 12, overlap=max(overlap, shape[0]), side_overlap=70)
     window = scaled_window(1, 2, 16, 30, 3.0)
     views = make_views(left, right, window, paths)
     expected = semi_global_minima_reference(views, window, paths)
     assert_equal(search(views, window, paths, strips=2), expected)
+
+
+@pytest.mark.parametrize("minimum", [-70, 0, 3])
+def test_bands_that_overlap_by_as_many_columns_as_there_are_rows_equal_the_twin(
+    minimum: int,
+) -> None:
+    """So far do slanted paths reach; the right view is put together from all bands."""
+    rng = np.random.default_rng(2)
+    left, right = rng.integers(0, 256, (2, 9, 300), dtype=np.uint8)
+    right[:, :200] = left[:, 20:220]
+    paths = Paths(70, minimum, 10, 50, 20, 12, overlap=9, side_overlap=9)
+    window = scaled_window(2, 2, 16, 30, 3.0)
+    views = make_views(left, right, window, paths)
+    expected = semi_global_minima_reference(views, window, paths)
+    assert_equal(search(views, window, paths, columns=64), expected)
+    assert_equal(search(views, window, paths, strips=2, columns=128), expected)
 
 
 @given(st.integers(0, 15), st.integers(0, 15), st.integers(1, 207), st.floats(0.05, 6.0))
