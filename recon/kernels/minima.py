@@ -53,10 +53,12 @@ def claim_right(ndisp: int, minimum: int, y: int, minima: Minima) -> None:
             ``right_winner``.
     """
     best = np.full(minima.winner.shape[1], NO_COST, np.uint16)
-    minima.right_winner[y] = ndisp
+    winners, costs, claims = minima.winner[y], minima.costs[0, y], minima.right_winner[y]
+    claims[:] = ndisp
     for x in range(best.size):
-        k = np.int64(minima.winner[y, x])
-        cost = minima.costs[0, y, x]
-        if k < ndisp and cost < best[x - minimum - k]:
-            best[x - minimum - k] = cost
-            minima.right_winner[y, x - minimum - k] = k
+        k = np.int64(winners[x])
+        if k < ndisp:
+            # Unsigned: an index that cannot be negative needs no check.
+            right = np.uint64(x - minimum - k)
+            if costs[x] < best[right]:
+                best[right], claims[right] = costs[x], k
