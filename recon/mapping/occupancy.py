@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,14 @@ from pydantic import Field
 from recon.errors import MappingError
 from recon.kernels import clamped, raycast, voxels
 from recon.mapping.occupancy_part import OccupancyPart
+from recon.mapping.surface_points import points_of, sum_points
 from recon.settings import Settings
 from recon.structures import OccupancyVoxels, PointCloud
 from recon.structures.arrays import Float32, Float64, Int32
+
+_FIRST_POINTS: Final = 1 << 12
+_LEAST_SIGMA_CELLS: Final = 0.1
+"""No point is more certain than this: a mean of many is not weighed down by one."""
 
 
 class OccupancySettings(Settings):
@@ -55,6 +60,11 @@ class OccupancySettings(Settings):
         le=16,
         description="Points of a frame are averaged in cubes so many times finer than a voxel.",
     )
+    thin_surfaces: bool = Field(
+        default=True,
+        description="Voxels that the surface of the points around them does not cross are "
+        "undecided, however often they were hit.",
+    )
     keep_rays: bool = Field(
         default=True,
         description="Keep the rays of every frame in the run's folder, for recon occupancy.",
@@ -77,6 +87,7 @@ class OccupancyBuilder:
         self._T_map_world = np.asarray(T_map_world, dtype=np.float64)
         self._map = clamped.make_clamped(256)
         self._evidence = raycast.make_blocks(256)
+        self._points = voxels.make_sums(_FIRST_POINTS, 0)
 
     def integrate(self, cloud: PointCloud, T_world_camera: NDArray[Any]) -> None:
         """Add what one frame saw.
@@ -94,6 +105,8 @@ class OccupancyBuilder:
         rays = self._rays(cloud, self._T_map_world @ T_world_camera)
         s = self._settings
         self._evidence = raycast.cast_rays(self._evidence, rays, s.spread_sigmas)
+        if s.thin_surfaces:
+            self._points = voxels.add_points(self._points, _hits(rays), 1.0, 0)
         low, high = _log_odds(s.min_probability), _log_odds(s.max_probability)
         self._map = clamped.add_evidence(self._map, self._evidence, low, high)
 
@@ -103,21 +116,26 @@ class OccupancyBuilder:
 
     def part(self) -> OccupancyPart:
         """What was observed since the start, or since the last `take`."""
-        return OccupancyPart(clamped.observed_rows(self._map))
+        points = points_of(self._points) if self._settings.thin_surfaces else None
+        return OccupancyPart(clamped.observed_rows(self._map), points)
 
     def take(self) -> OccupancyPart:
         """The part so far, which the builder forgets: the next part begins."""
         part, self._map = self.part(), clamped.make_clamped(256)
+        self._points = voxels.make_sums(_FIRST_POINTS, 0)
         return part
 
     def resume(self, part: OccupancyPart) -> None:
         """Go on after a part that was taken from another builder."""
         self._map = clamped.chain_rows(clamped.make_clamped(256), part.rows)
+        if part.points is not None:
+            self._points = sum_points([part.points])
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the blocks observed so far; the same after `resume` as before."""
-        return int(self._map.used[0]) * self._map.cells[:1].nbytes
+        """Bytes of the blocks and points so far; the same after `resume` as before."""
+        points = int(self._points.used[0]) * sum(a[:1].nbytes for a in self._points[1:-1])
+        return int(self._map.used[0]) * self._map.cells[:1].nbytes + points
 
     def _rays(self, cloud: PointCloud, T_map_camera: Float64) -> raycast.Rays:
         """One ray per voxel in which enough points end; lengths in voxels."""
@@ -143,6 +161,15 @@ class OccupancyBuilder:
             hit=np.float32(_log_odds(s.hit_probability)) * confidence * hit,
             miss=np.float32(_log_odds(s.miss_probability)) * confidence,
         )
+
+
+def _hits(rays: raycast.Rays) -> voxels.VoxelPoints:
+    """The ends of the rays that hit something, precise ones with more weight."""
+    hit = np.flatnonzero(rays.hit > 0)
+    weights = 1.0 / (rays.sigma[hit] ** 2 + _LEAST_SIGMA_CELLS**2)
+    return voxels.VoxelPoints(
+        rays.ends[hit], weights.astype(np.float32), np.zeros((len(hit), 0), np.float32)
+    )
 
 
 def _reduce(

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.kernels import clamped, raycast, voxels
+from recon.mapping.surface_points import SurfacePoints, join_points
 from recon.structures import OccupancyVoxels
-from recon.structures.arrays import Float64, Int32
+from recon.structures.arrays import Float32, Float64, Int32
+
+_UNSURE: Final = np.float32(0.01)
+"""Log-odds of a voxel that was hit, though the surface is likely in another: hardly above even."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,9 +24,11 @@ class OccupancyPart:
 
     Attributes:
         rows: `recon.kernels.clamped.CellRows`, cells in map axes.
+        points: Where its hits lie; None = not kept, surfaces are as thick as they were hit.
     """
 
     rows: clamped.CellRows
+    points: SurfacePoints | None = None
 
     def __len__(self) -> int:
         return len(self.rows.cells)
@@ -32,15 +38,23 @@ class OccupancyPart:
         """int32 (B, 3), indices of the blocks of 8×8×8 cells."""
         return voxels.unpack_keys(self.rows.blocks)
 
+    @property
+    def cells(self) -> Int32:
+        """int32 (N, 3), indices of the observed cells."""
+        edge = raycast.BLOCK_EDGE
+        corner = np.repeat(self.blocks * edge, np.diff(self.rows.starts), axis=0)
+        local = np.stack(np.unravel_index(self.rows.cells, (edge, edge, edge)), axis=1)
+        return (corner + local).astype(np.int32)
+
     def select(self, which: NDArray[Any]) -> OccupancyPart:
         """The blocks of a boolean mask (B,)."""
         sizes = np.diff(self.rows.starts)
         cells = np.repeat(which, sizes)
         starts = np.concatenate([[0], np.cumsum(sizes[which])]).astype(np.int64)
+        blocks = self.rows.blocks[which]
         return OccupancyPart(
-            clamped.CellRows(
-                self.rows.blocks[which], starts, self.rows.cells[cells], self.rows.values[cells]
-            )
+            clamped.CellRows(blocks, starts, self.rows.cells[cells], self.rows.values[cells]),
+            None if self.points is None else self.points.in_blocks(blocks),
         )
 
     def moved(self, T_new_map: Float64, resolution_m: float) -> OccupancyPart:
@@ -48,25 +62,38 @@ class OccupancyPart:
         T_cells = T_new_map.copy()
         T_cells[:3, 3] /= resolution_m
         blocks = clamped.chain_rows(clamped.make_clamped(1), self.rows)
-        moved = OccupancyPart(clamped.observed_rows(clamped.move_blocks(blocks, T_cells)))
+        moved = OccupancyPart(
+            clamped.observed_rows(clamped.move_blocks(blocks, T_cells)),
+            None if self.points is None else self.points.moved(T_cells),
+        )
         return moved.select(np.diff(moved.rows.starts) > 0)
 
     def voxels(self, resolution_m: float) -> OccupancyVoxels:
-        """The log-odds of a drive that consists of this part alone."""
-        edge = raycast.BLOCK_EDGE
-        corner = np.repeat(self.blocks * edge, np.diff(self.rows.starts), axis=0)
-        local = np.stack(np.unravel_index(self.rows.cells, (edge, edge, edge)), axis=1)
+        """The log-odds of a drive that consists of this part alone.
+
+        A voxel that was hit is undecided where the surface of the points around it does not
+        cross it: the surface then lies in the voxel before or behind.
+        """
         change, low, high = self.rows.values.T
-        return OccupancyVoxels(
-            keys=(corner + local).astype(np.int32),
-            log_odds=np.minimum(np.maximum(change, low), high),
-            resolution_m=resolution_m,
-        )
+        cells, log_odds = self.cells, np.minimum(np.maximum(change, low), high)
+        if self.points is not None:
+            log_odds = _thinned(cells, log_odds, self.points)
+        return OccupancyVoxels(keys=cells, log_odds=log_odds, resolution_m=resolution_m)
+
+
+def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints) -> Float32:
+    """Log-odds (N,) of cells (N, 3), no more than unsure where no surface crosses."""
+    hit = np.flatnonzero(log_odds > _UNSURE)
+    log_odds[hit[~points.cross(cells[hit])]] = _UNSURE
+    return log_odds
 
 
 def join_occupancy(parts: Iterable[OccupancyPart]) -> OccupancyPart:
     """Parts that follow one another in time, as one."""
-    blocks = clamped.make_clamped(1)
+    blocks, points = clamped.make_clamped(1), []
     for part in parts:
         blocks = clamped.chain_rows(blocks, part.rows)
-    return OccupancyPart(clamped.observed_rows(blocks))
+        points.append(part.points)
+    known = [part for part in points if part is not None]
+    joined = join_points(known) if known and len(known) == len(points) else None
+    return OccupancyPart(clamped.observed_rows(blocks), joined)

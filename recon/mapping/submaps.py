@@ -19,6 +19,7 @@ from recon.mapping.fused import FusionSettings, MapBuilder
 from recon.mapping.fused_part import FusedPart
 from recon.mapping.occupancy import OccupancyBuilder, OccupancySettings
 from recon.mapping.occupancy_part import OccupancyPart
+from recon.mapping.surface_points import SurfacePoints
 from recon.settings import Settings
 from recon.structures import PointCloud
 from recon.structures.arrays import Float64
@@ -69,7 +70,7 @@ class Submap:
 
     def to_tree(self) -> dict[str, Any]:
         """Everything, as a tree of arrays and plain values."""
-        fused, rows = self.fused, self.occupancy.rows
+        fused, rows, points = self.fused, self.occupancy.rows, self.occupancy.points
         return {
             "index": self.index,
             "first_frame": self.first_frame,
@@ -82,18 +83,23 @@ class Submap:
                 "known": list(fused.known),
             },
             "occupancy": rows._asdict(),
+            "points": None if points is None else {"keys": points.keys, "sums": points.sums},
         }
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Submap:
         """What `to_tree` gave."""
         fused = {**tree["fused"], "known": tuple(tree["fused"]["known"])}
+        points = tree["points"]
         return cls(
             tree["index"],
             tree["first_frame"],
             tree["frames"],
             FusedPart(**fused),
-            OccupancyPart(clamped.CellRows(**tree["occupancy"])),
+            OccupancyPart(
+                clamped.CellRows(**tree["occupancy"]),
+                None if points is None else SurfacePoints(**points),
+            ),
         )
 
 

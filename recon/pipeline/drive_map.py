@@ -199,7 +199,7 @@ class DriveMap:
 
     def _reach_of(self, submap: Submap) -> _Reach:
         cells, blocks = submap.fused.cells[:, [0, 2]], submap.occupancy.blocks[:, :2]
-        columns = submap.occupancy.voxels(self._config.occupancy.resolution_m).keys[:, :2]
+        columns = submap.occupancy.cells[:, :2]
         low, high = (
             (columns.min(axis=0), columns.max(axis=0) + 1) if len(columns) else ((0, 0),) * 2
         )
