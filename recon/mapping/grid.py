@@ -43,6 +43,13 @@ class GridSettings(Settings):
     min_blob_cells: int = Field(
         3, ge=1, description="Connected blocked cells fewer than this are taken for noise."
     )
+    joined_cells: int = Field(
+        3,
+        ge=0,
+        le=100,
+        description="Cells that were hit, but not surely, belong to an obstacle that they hang "
+        "together with over so many cells, unless they touch a free one.",
+    )
 
 
 def flatten(
@@ -52,8 +59,9 @@ def flatten(
 
     A cell is occupied where an occupied voxel lies in the height band above the ground of that
     place. It is free where nothing is occupied and a free voxel lies low enough. That the ground
-    was seen is no proof: it is also seen below a parked car. Everything else, and every cell
-    without a known ground, is unknown.
+    was seen is no proof: it is also seen below a parked car. Where voxels in the band were hit,
+    but none surely, it belongs to the obstacle beside it if nothing free is beside it: no ray
+    came out between the two. Everything else, and every cell without a known ground, is unknown.
 
     Args:
         voxels: The observed voxels, map axes.
@@ -80,16 +88,19 @@ def flatten(
     height = (voxels.keys[:, 2] + 0.5) * voxels.resolution_m - floor[cell]
 
     def any_in(which: Bool, least: int = 1) -> Bool:
-        return np.bincount(cell[which], minlength=rows * columns) >= least
+        found = np.bincount(cell[which], minlength=rows * columns) >= least
+        return np.asarray(found.reshape(rows, columns))
 
     s = settings
     full = voxels.log_odds >= _log_odds(s.occupied_probability)
     empty = voxels.log_odds <= _log_odds(s.free_probability)
     in_band = (height >= s.min_height_m) & (height <= s.max_height_m)
-    blocked = any_in(full & in_band, s.min_voxels)
-    seen = any_in(empty & (height >= 0) & (height <= s.free_height_m))
-    blocked = _without_small_blobs(blocked.reshape(rows, columns), s.min_blob_cells)
-    cells = np.where(seen.reshape(rows, columns), np.int8(FREE), np.int8(UNKNOWN))
+    blocked = _without_small_blobs(any_in(full & in_band, s.min_voxels), s.min_blob_cells)
+    free = any_in(empty & (height >= 0) & (height <= s.free_height_m)) & ~blocked
+    unsure = any_in((voxels.log_odds > 0) & in_band) & ~free & ~_beside(free)
+    for _ in range(s.joined_cells):
+        blocked |= unsure & _beside(blocked)
+    cells = np.where(free, np.int8(FREE), np.int8(UNKNOWN))
     cells[blocked] = OCCUPIED
     origin = (float(low[0]) * voxels.resolution_m, float(low[1]) * voxels.resolution_m)
     return OccupancyGrid(cells.astype(np.int8), voxels.resolution_m, origin)
@@ -114,6 +125,12 @@ def _floor(
     row, column = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
     xy = (np.stack([column, row], axis=1) + low + 0.5) * resolution_m
     return ground.height_at(xy)
+
+
+def _beside(cells: Bool) -> Bool:
+    """The cells of a mask, and those that share a side with one."""
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    return np.asarray(cv2.dilate(cells.astype(np.uint8), cross) > 0)
 
 
 def _without_small_blobs(blocked: Bool, least: int) -> Bool:

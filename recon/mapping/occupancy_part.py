@@ -84,6 +84,8 @@ class OccupancyPart:
 def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints) -> Float32:
     """Log-odds (N,) of cells (N, 3), no more than unsure where no surface crosses."""
     hit = np.flatnonzero(log_odds > _UNSURE)
+    # What was hit and then looked through is no surface: a car that drove off, an outlier.
+    points = points.select(np.isin(points.keys, voxels.pack_keys(cells[hit])))
     log_odds[hit[~points.cross(cells[hit])]] = _UNSURE
     return log_odds
 

@@ -84,7 +84,9 @@ class DriveMap:
         filters = config.map_filters
         margin_m = max(_MARGIN_M, 2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
         self._margin_voxels = math.ceil(margin_m / config.fusion.voxel_m)
-        self._margin_blocks = math.ceil(config.grid.min_blob_cells / BLOCK_EDGE)
+        # A cell depends on those joined to it, their blob, and the points and free cells beside.
+        beyond = config.grid.min_blob_cells + config.grid.joined_cells + 2
+        self._margin_blocks = math.ceil(beyond / BLOCK_EDGE)
         self._reach = self._fitting_reach()
         shared = frozenset(KNOWABLE).intersection(*(reach.known for reach in self._reach))
         # What one submap does not know, the map does not know: all tiles have the same fields.
@@ -134,7 +136,7 @@ class DriveMap:
             yield tile, voxels
 
     def occupancy_of(self, tile: Tile) -> OccupancyVoxels:
-        """The observed voxels of a tile, and of as many cells around it as small blobs have."""
+        """The observed voxels of a tile, and of the cells around it that they depend on."""
         edge, margin = self._blocks_per_tile, self._margin_blocks
         low, high = np.array(tile) * edge - margin, (np.array(tile) + 1) * edge + margin
         near = self._near(tile, lambda reach: reach.occupancy)
