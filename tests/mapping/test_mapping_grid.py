@@ -107,6 +107,35 @@ def test_ground_seen_below_an_unknown_body_is_not_free() -> None:
     assert _cell(grid, 3.0, 1.0) == UNKNOWN
 
 
+def test_what_was_hit_behind_a_wall_belongs_to_it() -> None:
+    # The wall at x = 2 is sure; behind it the hits of an uncertain depth, then nothing.
+    wall = (_box((2, 0, -1.0), (2.2, 4, -0.6)), 2.0)
+    behind = (_box((2.2, 0, -1.0), (3.4, 4, -0.6)), 0.01)
+    voxels = _voxels(*_road((0, 0), (2, 4)), wall, behind)
+    cells = [_cell(_flatten(voxels, _ground(), joined_cells=n), 2.5, 2.0) for n in (0, 1, 2)]
+    assert cells == [UNKNOWN, UNKNOWN, OCCUPIED]
+    # It goes on for so many cells, 3 by default, and no farther.
+    assert (_flatten(voxels, _ground()).cells[10] == OCCUPIED).sum() == 4
+
+
+def test_what_was_hit_before_a_wall_does_not_make_it_thicker() -> None:
+    wall = (_box((2.4, 0, -1.0), (2.6, 4, -0.6)), 2.0)
+    before = (_box((2.0, 0, -1.0), (2.4, 4, -0.6)), 0.01)
+    grid = _flatten(_voxels(*_road((0, 0), (2, 4)), wall, before), _ground())
+    # The cell beside the free road may hold nothing; the next one touches no free cell.
+    row = grid.cells[10]
+    assert row[9:13].tolist() == [FREE, UNKNOWN, OCCUPIED, OCCUPIED]
+    free = (_box((2.0, 0, -1.0), (2.4, 4, -0.8)), -1.0)
+    grid = _flatten(_voxels(*_road((0, 0), (2, 4)), wall, free), _ground())
+    assert grid.cells[10, 9:13].tolist() == [FREE, FREE, FREE, OCCUPIED]
+
+
+def test_uncertain_hits_alone_make_no_obstacle() -> None:
+    undecided = (_box((2, 0, -1.0), (4, 4, -0.6)), 0.1)
+    grid = _flatten(_voxels(*_road((0, 0), (2, 4)), undecided), _ground())
+    assert (grid.cells != OCCUPIED).all()
+
+
 def test_undecided_voxels_are_dropped() -> None:
     voxels = OccupancyVoxels(
         np.arange(15, dtype=np.int32).reshape(5, 3),

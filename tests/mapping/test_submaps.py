@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,7 @@ from recon.mapping import (
 )
 from recon.mapping.axes import AXES_MAP_WORLD
 from recon.mapping.fused_part import join_fused
-from recon.mapping.occupancy_part import join_occupancy
+from recon.mapping.occupancy_part import OccupancyPart, join_occupancy
 from recon.structures import PointCloud
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
@@ -46,6 +48,18 @@ def _frames() -> list[Frame]:
         there = PointCloud(apply(T, xyz).astype(np.float32), frame="world", **fields)
         frames.append((there, here, T))
     return frames
+
+
+def _noisy(frames: list[Frame]) -> list[Frame]:
+    """The frames with depths as wrong as they say."""
+    rng = np.random.default_rng(1)
+    noisy = []
+    for there, here, T in frames:
+        assert here.sigma_m is not None
+        scale = 1 + here.sigma_m * rng.normal(size=len(here)) / here.xyz[:, 2]
+        xyz = here.xyz * scale[:, None].astype(np.float32)
+        noisy.append((there, replace(here, xyz=xyz), T))
+    return noisy
 
 
 def _builder(**settings: float) -> SubmapBuilder:
@@ -122,6 +136,48 @@ def test_a_builder_goes_on_from_the_state_of_another() -> None:
         np.testing.assert_array_equal(ours.fused.information, theirs.fused.information)
         for mine, other in zip(ours.occupancy.rows, theirs.occupancy.rows, strict=True):
             np.testing.assert_array_equal(mine, other)
+        assert ours.occupancy.points is not None and theirs.occupancy.points is not None
+        np.testing.assert_array_equal(ours.occupancy.points.keys, theirs.occupancy.points.keys)
+        np.testing.assert_array_equal(ours.occupancy.points.sums, theirs.occupancy.points.sums)
+
+
+def _occupied(part: OccupancyPart) -> np.ndarray:
+    """Centres of the voxels that are surely occupied, metres."""
+    voxels = part.voxels(OCCUPANCY.resolution_m)
+    return voxels.centres_m[voxels.log_odds > 0.2]
+
+
+def test_the_points_of_submaps_add_up_to_those_of_the_whole_drive() -> None:
+    whole = OccupancyBuilder(OCCUPANCY, T_MAP_WORLD)
+    for _, here, T in _frames():
+        whole.integrate(here, T)
+    parts = [submap.occupancy for submap in _submaps(_builder(length_m=5.0), _frames())]
+    ours, theirs = join_occupancy(parts).points, whole.part().points
+    assert ours is not None and theirs is not None
+    np.testing.assert_array_equal(ours.keys, theirs.keys)
+    # float32 sums in another order.
+    np.testing.assert_allclose(ours.sums, theirs.sums, rtol=1e-4, atol=1e-2)
+    without = replace(parts[1], points=None)
+    assert join_occupancy([parts[0], without]).points is None
+
+
+def test_a_corrected_submap_keeps_its_wall_thin() -> None:
+    [submap] = _submaps(_builder(length_m=1000.0), _noisy(_frames()))
+    T = make_transform(exp_so3(np.array([0.0, 0.2, 0.0])), np.array([0.7, -0.2, 3.0]))
+    motion = SubmapMotion(T, T_MAP_WORLD, FUSION.voxel_m, OCCUPANCY.resolution_m)
+    places = _occupied(submap.moved(motion).occupancy)
+    back = apply(np.linalg.inv(motion.T_corrected_map), places)
+    assert len(places) > 0.8 * len(_occupied(submap.occupancy))
+    # A voxel that a plane crosses has its centre at most half a diagonal from it.
+    assert (np.abs(back[:, 1] + 2.03) < 0.18).mean() > 0.99
+
+
+def test_a_submap_comes_back_from_its_tree() -> None:
+    [submap] = _submaps(_builder(length_m=1000.0), _frames())
+    again = Submap.from_tree(submap.to_tree())
+    assert again.occupancy.points is not None and submap.occupancy.points is not None
+    np.testing.assert_array_equal(again.occupancy.points.sums, submap.occupancy.points.sums)
+    np.testing.assert_array_equal(_occupied(again.occupancy), _occupied(submap.occupancy))
 
 
 def test_a_corrected_submap_has_its_points_where_the_correction_puts_them() -> None:
