@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -52,6 +53,23 @@ class GridSettings(Settings):
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What the voxels of each column say; all bool (rows, columns).
+
+    Attributes:
+        blocked: Surely occupied in the height band.
+        seen_through: Free, low enough.
+        hit: Hit in the band, surely or not.
+        low_hit: The same, as low as what frees.
+    """
+
+    blocked: Bool
+    seen_through: Bool
+    hit: Bool
+    low_hit: Bool
+
+
 def flatten(
     voxels: OccupancyVoxels, ground: GroundSurface, settings: GridSettings
 ) -> OccupancyGrid:
@@ -61,7 +79,8 @@ def flatten(
     place. It is free where nothing is occupied and a free voxel lies low enough. That the ground
     was seen is no proof: it is also seen below a parked car. Where voxels in the band were hit,
     but none surely, it belongs to the obstacle beside it if nothing free is beside it: no ray
-    came out between the two. Everything else, and every cell without a known ground, is unknown.
+    came out between the two; and it is not free if it lies beside an obstacle and was hit as low
+    as it is free. Everything else, and every cell without a known ground, is unknown.
 
     Args:
         voxels: The observed voxels, map axes.
@@ -92,18 +111,30 @@ def flatten(
         return np.asarray(found.reshape(rows, columns))
 
     s = settings
+    hit = (height >= s.min_height_m) & (height <= s.max_height_m) & (voxels.log_odds > 0)
+    low_air = (height >= 0) & (height <= s.free_height_m)
     full = voxels.log_odds >= _log_odds(s.occupied_probability)
     empty = voxels.log_odds <= _log_odds(s.free_probability)
-    in_band = (height >= s.min_height_m) & (height <= s.max_height_m)
-    blocked = _without_small_blobs(any_in(full & in_band, s.min_voxels), s.min_blob_cells)
-    free = any_in(empty & (height >= 0) & (height <= s.free_height_m)) & ~blocked
-    unsure = any_in((voxels.log_odds > 0) & in_band) & ~free & ~_beside(free)
+    found = _Found(
+        blocked=any_in(hit & full, s.min_voxels),
+        seen_through=any_in(empty & low_air),
+        hit=any_in(hit),
+        low_hit=any_in(hit & low_air),
+    )
+    origin = (float(low[0]) * voxels.resolution_m, float(low[1]) * voxels.resolution_m)
+    return OccupancyGrid(_decide(found, s), voxels.resolution_m, origin)
+
+
+def _decide(found: _Found, s: GridSettings) -> NDArray[np.int8]:
+    """int8 (rows, columns), what each cell is."""
+    blocked = _without_small_blobs(found.blocked, s.min_blob_cells)
+    free = found.seen_through & ~blocked & ~(found.low_hit & _beside(blocked))
+    unsure = found.hit & ~free & ~_beside(free)
     for _ in range(s.joined_cells):
         blocked |= unsure & _beside(blocked)
     cells = np.where(free, np.int8(FREE), np.int8(UNKNOWN))
     cells[blocked] = OCCUPIED
-    origin = (float(low[0]) * voxels.resolution_m, float(low[1]) * voxels.resolution_m)
-    return OccupancyGrid(cells.astype(np.int8), voxels.resolution_m, origin)
+    return np.asarray(cells, dtype=np.int8)
 
 
 def drop_undecided(voxels: OccupancyVoxels, settings: GridSettings) -> OccupancyVoxels:

@@ -130,6 +130,17 @@ def test_what_was_hit_before_a_wall_does_not_make_it_thicker() -> None:
     assert grid.cells[10, 9:13].tolist() == [FREE, FREE, FREE, OCCUPIED]
 
 
+def test_a_cell_beside_an_obstacle_that_was_hit_low_is_not_free() -> None:
+    wall = (_box((2.4, 0, -1.0), (2.6, 4, -0.6)), 2.0)
+    low, high = ((_box((2.0, 0, z), (2.4, 4, z + 0.2)), 0.1) for z in (-1.0, -0.4))
+    road = _road((0, 0), (2.4, 4))
+    grids = [_flatten(_voxels(*road, wall, hit), _ground()) for hit in (low, high)]
+    assert [grid.cells[10, 9:13].tolist() for grid in grids] == [
+        [FREE, FREE, UNKNOWN, OCCUPIED],
+        [FREE, FREE, FREE, OCCUPIED],
+    ]
+
+
 def test_uncertain_hits_alone_make_no_obstacle() -> None:
     undecided = (_box((2, 0, -1.0), (4, 4, -0.6)), 0.1)
     grid = _flatten(_voxels(*_road((0, 0), (2, 4)), undecided), _ground())

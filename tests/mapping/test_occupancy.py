@@ -137,9 +137,9 @@ def test_a_wall_seen_often_is_thin_and_has_no_holes() -> None:
         for cells in (thin, thick)
     ]
     assert layers[0].count(60) == 18 * 18
-    # Measured 1.5 and 4.1 voxels thick, for errors of 1.4 voxels at first and 0.4 at last.
+    # Measured 1.5 and 6.0 voxels thick, for errors of 1.4 voxels at first and 0.4 at last.
     assert len(layers[0]) < 1.7 * 18 * 18
-    assert len(layers[1]) > 3.5 * 18 * 18
+    assert len(layers[1]) > 5 * 18 * 18
     # What is thinned away is undecided, and frees nothing.
     free = [{cell for cell, value in cells.items() if value < 0} for cells in (thin, thick)]
     assert free[0] == free[1]

@@ -136,7 +136,8 @@ def test_a_builder_goes_on_from_the_state_of_another() -> None:
         np.testing.assert_array_equal(ours.fused.information, theirs.fused.information)
         for mine, other in zip(ours.occupancy.rows, theirs.occupancy.rows, strict=True):
             np.testing.assert_array_equal(mine, other)
-        assert ours.occupancy.points is not None and theirs.occupancy.points is not None
+        assert ours.occupancy.points is not None
+        assert theirs.occupancy.points is not None
         np.testing.assert_array_equal(ours.occupancy.points.keys, theirs.occupancy.points.keys)
         np.testing.assert_array_equal(ours.occupancy.points.sums, theirs.occupancy.points.sums)
 
@@ -153,7 +154,8 @@ def test_the_points_of_submaps_add_up_to_those_of_the_whole_drive() -> None:
         whole.integrate(here, T)
     parts = [submap.occupancy for submap in _submaps(_builder(length_m=5.0), _frames())]
     ours, theirs = join_occupancy(parts).points, whole.part().points
-    assert ours is not None and theirs is not None
+    assert ours is not None
+    assert theirs is not None
     np.testing.assert_array_equal(ours.keys, theirs.keys)
     # float32 sums in another order.
     np.testing.assert_allclose(ours.sums, theirs.sums, rtol=1e-4, atol=1e-2)
@@ -175,7 +177,8 @@ def test_a_corrected_submap_keeps_its_wall_thin() -> None:
 def test_a_submap_comes_back_from_its_tree() -> None:
     [submap] = _submaps(_builder(length_m=1000.0), _frames())
     again = Submap.from_tree(submap.to_tree())
-    assert again.occupancy.points is not None and submap.occupancy.points is not None
+    assert again.occupancy.points is not None
+    assert submap.occupancy.points is not None
     np.testing.assert_array_equal(again.occupancy.points.sums, submap.occupancy.points.sums)
     np.testing.assert_array_equal(_occupied(again.occupancy), _occupied(submap.occupancy))
 
