@@ -27,6 +27,18 @@ class _Runs(NamedTuple):
     sizes: NDArray[np.int32]
 
 
+class _Row(NamedTuple):
+    """The runs of a row.
+
+    Attributes:
+        runs: int32 (W,), the run of each pixel that has a value.
+        breaks: uint8 (W,), 1 where a pixel does not go on with the run of the one before.
+    """
+
+    runs: NDArray[np.int32]
+    breaks: NDArray[np.uint8]
+
+
 @njit(cache=True, nogil=True)
 def find_speckles(
     values: NDArray[np.float32], largest_step: float, smallest_size: int
@@ -51,14 +63,16 @@ def find_speckles(
     height, width = values.shape
     block = np.empty((values.size, 4), np.int32)
     runs = _Runs(block[:, 0], block[:, 1], block[:, 2], block[:, 3])
-    # Of each column: its run in the row above and in this one.
-    above, here = np.empty(width, np.int32), np.empty(width, np.int32)
-    count = 0
+    above = _Row(np.empty(width, np.int32), np.empty(width, np.uint8))
+    here = _Row(np.empty(width, np.int32), np.empty(width, np.uint8))
+    touches, joins = np.empty(width, np.uint8), np.empty(width, np.uint8)
+    count, step = 0, np.float32(largest_step)
     for y in range(height):
         above, here = here, above
-        count = _cut_row(values, y, np.float32(largest_step), runs, count, here)
+        count = _cut_row(values[y], y * width, step, runs, count, here)
         if y > 0:
-            _join_rows(values, y, np.float32(largest_step), runs.parents, above, here)
+            _mark_touching(values[y], values[y - 1], step, touches)
+            _join_rows(touches, runs.parents, above, here, joins)
     small = np.zeros((height, width), np.bool_)
     _mark_small(runs, count, smallest_size, small.reshape(-1))
     return small
@@ -66,45 +80,54 @@ def find_speckles(
 
 @njit(cache=True, nogil=True)
 def _cut_row(
-    values: NDArray[np.float32],
-    y: int,
-    step: np.float32,
-    runs: _Runs,
-    count: int,
-    here: NDArray[np.int32],
+    row: NDArray[np.float32], place: int, step: np.float32, runs: _Runs, count: int, here: _Row
 ) -> int:
     """Append the runs of a row to the ``count`` there are; return how many there are then."""
-    row, place = values[y], y * values.shape[1]
-    previous = np.float32(np.nan)
-    for x in range(row.size):
-        value, continues = row[x], abs(row[x] - previous) <= step
-        previous = value
-        if np.isnan(value):
-            continue
-        if not continues:
-            runs.starts[count], runs.parents[count], runs.sizes[count] = place + x, count, 0
+    breaks, width = here.breaks, row.size
+    _mark_touching(row[1:], row, step, breaks[1:])
+    for x in range(1, width):
+        breaks[x] = np.uint8(1) - breaks[x]
+    breaks[0], x = 1, 0
+    while x < width:
+        start = x
+        x += 1
+        while x < width and breaks[x] == 0:
+            x += 1
+        if not np.isnan(row[start]):
+            here.runs[start:x] = count
+            runs.starts[count], runs.ends[count] = place + start, place + x
+            runs.parents[count], runs.sizes[count] = count, 0
             count += 1
-        runs.ends[count - 1], here[x] = place + x + 1, count - 1
     return count
 
 
 @njit(cache=True, nogil=True)
-def _join_rows(
-    values: NDArray[np.float32],
-    y: int,
-    step: np.float32,
-    parents: NDArray[np.int32],
-    above: NDArray[np.int32],
-    here: NDArray[np.int32],
+def _mark_touching(
+    one: NDArray[np.float32], other: NDArray[np.float32], step: np.float32, marks: NDArray[np.uint8]
 ) -> None:
-    """Join the runs of row ``y`` with those of the row above."""
-    last_here, last_above = -1, -1
-    for x in range(here.size):
-        # Along two runs that touch, one join does. No comparison with NaN is true.
-        touch = abs(values[y, x] - values[y - 1, x]) <= step
-        if touch and (here[x] != last_here or above[x] != last_above):
-            last_here, last_above = here[x], above[x]
-            _join(parents, last_here, last_above)
+    """Mark the pixels whose values differ by a step or less. No comparison with NaN is true."""
+    for x in range(one.size):
+        marks[x] = np.uint8(1) if abs(one[x] - other[x]) <= step else np.uint8(0)
+
+
+@njit(cache=True, nogil=True)
+def _join_rows(
+    touches: NDArray[np.uint8],
+    parents: NDArray[np.int32],
+    above: _Row,
+    here: _Row,
+    joins: NDArray[np.uint8],
+) -> None:
+    """Join the runs of a row with those of the row above, where their pixels touch."""
+    # Along two runs that touch, one join does: where either begins, or where they begin to touch.
+    before, begins, begins_above = touches[:-1], here.breaks[1:], above.breaks[1:]
+    joins[0], last = touches[0], joins[1:]
+    for x in range(last.size):
+        goes_on = before[x] & ~(begins[x] | begins_above[x])
+        last[x] = touches[x + 1] & ~goes_on
+    for x in range(joins.size):
+        if joins[x] != 0:
+            _join(parents, here.runs[x], above.runs[x])
 
 
 @njit(cache=True, nogil=True)

@@ -25,7 +25,10 @@ def clipped_gradients(image: UInt8, cap: int) -> UInt8:
     Returns:
         uint8 (H, W), ``cap`` where there is none.
     """
-    return np.asarray(np.clip(_sobel(image), -cap, cap) + cap, dtype=np.uint8)
+    gradients = _sobel(image)
+    np.clip(gradients, -cap, cap, out=gradients)
+    gradients += cap
+    return gradients.astype(np.uint8)
 
 
 def texture(pair: RectifiedPair, window: tuple[int, int], least: float) -> Float32:
