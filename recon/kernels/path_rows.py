@@ -3,7 +3,7 @@
 All paths come from the row before, never along the row: every pixel of a row is a lane of its own,
 no minimum is taken across lanes, and no pixel waits for its neighbour. Means of two, rounded up,
 take the place of sums: one instruction each, and bytes suffice. The straight path counts twice a
-diagonal. The loops are written for `recon.kernels.lanes`; a path from the left is followed from
+slanted one. The loops are written for `recon.kernels.lanes`; a path from the left is followed from
 the right end of a row to its left end, and one from the right the other way, so that the next row
 can be written over the one before.
 """
@@ -24,6 +24,10 @@ DOWN, UP, ASIDE = range(3)
 
 STRAIGHT, FROM_LEFT, FROM_RIGHT = range(3)
 """Where paths come from."""
+
+SLANT: Final = 2
+"""Columns by which paths from the left and from the right step with each row: where no path goes
+along the rows, flatter ones are of more use than diagonals."""
 
 TOGETHER: Final = 16
 """Candidates that are done before the next columns: what they share stays in registers."""
@@ -101,9 +105,9 @@ def advance(
         stage: DOWN, UP or ASIDE.
     """
     lowest, now = row.lowest[0], row.lowest[1]
-    width, columns = grey.size, costs.shape[1]
-    for n, side in enumerate((0, -1, 1)):
-        first, end = max(-side, 0), min(width - side, width)
+    width, columns, beyond = grey.size, costs.shape[1], MARGIN + grey.size
+    for n, side in enumerate((0, -SLANT, SLANT)):
+        first, end = max(-side, 0), max(min(width - side, width), 0)
         beside = lowest[n, MARGIN + first + side : MARGIN + end + side]
         others = before[first + side : end + side]
         _set_limits(grey[first:end], others, beside, paths, row.limits[n, first:end])
@@ -114,8 +118,8 @@ def advance(
         _advance_from_right(costs, first, end, paths.small, row)
         _advance_others(costs, first, end, paths.small, row, means, stage)
         # Beyond the last column paths begin.
-        row.costs[FROM_RIGHT, first + 1 : end + 1, MARGIN + width] = np.uint8(0)
-    now[FROM_RIGHT, MARGIN + width] = np.uint8(0)
+        row.costs[FROM_RIGHT, first + 1 : end + 1, beyond : beyond + SLANT] = np.uint8(0)
+    now[FROM_RIGHT, beyond : beyond + SLANT] = np.uint8(0)
     lowest[:] = now
 
 
@@ -152,7 +156,7 @@ def _advance_from_right(
     path, lowest, now = row.costs[FROM_RIGHT], row.lowest[0], row.lowest[1]
     penalty = splat(np.uint8(small))
     for x in range(0, costs.shape[1], LANES):
-        here, there = x + MARGIN, x + MARGIN + 1
+        here, there = x + MARGIN, x + MARGIN + SLANT
         low, limit = load_row(lowest, FROM_RIGHT, there), load_row(row.limits, FROM_RIGHT, x)
         fresh, below = load_row(now, FROM_RIGHT, here), load_row(row.below, FROM_RIGHT, x)
         same = load_row(path, first + 1, there)
@@ -179,7 +183,7 @@ def _advance_others(
     left, straight, right = row.costs[FROM_LEFT], row.costs[STRAIGHT], row.costs[FROM_RIGHT]
     lowest, now, penalty = row.lowest[0], row.lowest[1], splat(np.uint8(small))
     for x in range(costs.shape[1] - LANES, -1, -LANES):
-        here, there = x + MARGIN, x + MARGIN - 1
+        here, there = x + MARGIN, x + MARGIN - SLANT
         low, limit = load_row(lowest, FROM_LEFT, there), load_row(row.limits, FROM_LEFT, x)
         fresh, below = load_row(now, FROM_LEFT, here), load_row(row.below, FROM_LEFT, x)
         same = load_row(left, first + 1, there)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from recon.kernels.minima import Minima
 from recon.kernels.path_costs import Views, Window
-from recon.kernels.path_rows import Paths
+from recon.kernels.path_rows import SLANT, Paths
 from recon.kernels.plane_minima import PARTS
 from recon.kernels.sad_reference import minima_reference
 
@@ -20,7 +20,7 @@ def semi_global_minima_reference(views: Views, window: Window, paths: Paths) -> 
     sweeps = []
     for dy in (1, -1):
         straight, left, right = (
-            path_reference(views.grey, costs, paths, dy, dx) for dx in (0, 1, -1)
+            path_reference(views.grey, costs, paths, dy, dx) for dx in (0, SLANT, -SLANT)
         )
         sweeps.append(_mean(straight, _mean(left, right)))
     return minima_reference(PARTS * _mean(*sweeps), paths.minimum)

@@ -31,12 +31,12 @@ from recon.structures import Disparity, RectifiedCamera, RectifiedPair
 _LEVELS: Final = 250
 """Of the 255 that a path cost has; rounding needs the others."""
 
-_ODDS: Final = 2.0
+_ODDS: Final = 2.4
 """`Rules.odds` of means over paths, fitted on MiddEval3; 2003, 2005 and 2006 were held out."""
 
 _STRIP_ROWS: Final = 192
 
-_SIDE_OVERLAP: Final = 8
+_SIDE_OVERLAP: Final = 16
 """Columns that a band of a strip shares: only slanted paths begin there, and 32 change nothing."""
 
 

@@ -143,14 +143,14 @@ def test_a_picture_of_several_blocks_equals_the_twin(shape: tuple[int, int], ove
 
 
 @pytest.mark.parametrize("minimum", [-70, 0, 3])
-def test_bands_that_overlap_by_as_many_columns_as_there_are_rows_equal_the_twin(
+def test_bands_that_overlap_as_far_as_slanted_paths_reach_equal_the_twin(
     minimum: int,
 ) -> None:
-    """So far do slanted paths reach; the right view is put together from all bands."""
+    """They step by two columns a row; the right view is put together from all bands."""
     rng = np.random.default_rng(2)
     left, right = rng.integers(0, 256, (2, 9, 300), dtype=np.uint8)
     right[:, :200] = left[:, 20:220]
-    paths = Paths(70, minimum, 10, 50, 20, 12, overlap=9, side_overlap=9)
+    paths = Paths(70, minimum, 10, 50, 20, 12, overlap=9, side_overlap=18)
     window = scaled_window(2, 2, 16, 30, 3.0)
     views = make_views(left, right, window, paths)
     expected = semi_global_minima_reference(views, window, paths)
