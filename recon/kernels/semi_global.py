@@ -119,7 +119,8 @@ def semi_global_minima(
     Candidate ``k`` of a pixel is the disparity ``minimum + k``. Its cost is the mean of the costs
     of the paths that end there. Those from above begin at the border of the picture or ``overlap``
     rows above the strip, those from below ``overlap`` rows below each block, those from the side
-    at the border of the picture or ``side_overlap`` columns beside each band.
+    at the border of the picture or ``side_overlap`` columns beside each band (`SLANT` of them are
+    one step).
 
     Args:
         views: What is compared.
