@@ -45,7 +45,7 @@ class GridSettings(Settings):
         3, ge=1, description="Connected blocked cells fewer than this are taken for noise."
     )
     joined_cells: int = Field(
-        3,
+        2,
         ge=0,
         le=100,
         description="Cells that were hit, but not surely, belong to an obstacle that they hang "

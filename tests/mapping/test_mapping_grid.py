@@ -114,8 +114,8 @@ def test_what_was_hit_behind_a_wall_belongs_to_it() -> None:
     voxels = _voxels(*_road((0, 0), (2, 4)), wall, behind)
     cells = [_cell(_flatten(voxels, _ground(), joined_cells=n), 2.5, 2.0) for n in (0, 1, 2)]
     assert cells == [UNKNOWN, UNKNOWN, OCCUPIED]
-    # It goes on for so many cells, 3 by default, and no farther.
-    assert (_flatten(voxels, _ground()).cells[10] == OCCUPIED).sum() == 4
+    # It goes on for so many cells, and no farther.
+    assert (_flatten(voxels, _ground(), joined_cells=3).cells[10] == OCCUPIED).sum() == 4
 
 
 def test_what_was_hit_before_a_wall_does_not_make_it_thicker() -> None:
