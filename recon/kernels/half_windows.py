@@ -2,13 +2,8 @@
 
 A window is made of an upper and a lower half that share the middle row. The lower half of a row is
 the upper half of a row further down: it is summed up once and kept in a ring of rows. Its sums over
-one column move down by one row in and one row out; the half moves to the right by one column in and
-one column out.
-
-The candidates of a pixel lie side by side, in places 0 to N - 1, a multiple of `LANES`: place ``n``
-is candidate ``n - abs(lean)``, so that a leaning half finds candidates before the first and after
-the last. Both moves so are a few vector instructions for `LANES` candidates, with the half of the
-pixel before still in its register.
+one column move down by one row in and one row out; those over its columns are put together from
+sums of two and of four.
 """
 
 from __future__ import annotations
@@ -19,30 +14,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.kernels.lanes import (
-    LANES,
-    Lanes,
-    distance,
-    fit,
-    least,
-    load,
-    splat,
-    spread,
-    store,
-    widen_signed,
-)
-from recon.kernels.minima import NO_COST
-from recon.kernels.path_costs import aligned
+from recon.kernels.lanes import LANES, distance, fit, least, load, splat, store
+from recon.kernels.tiles import GROUP, Offer
 
-_CACHE_BYTES: Final = 512 * 1024
+_CACHE_BYTES: Final = 1024 * 1024
 """What the ring of half windows may take of a core's own cache (1 MB on most machines of today)."""
 
-_FOURFOLD: Final = np.uint32(0x01010101)
-"""A byte times this is that byte four times."""
+_CHUNK: Final = 16
+"""Candidates whose columns are put together at a time: their sums stay in the first cache."""
 
-RUN: Final = 48
-"""Columns of a row whose halves are summed up, and chosen from, before the next: they stay in the
-first cache."""
+BLOCK: Final = 1024
+"""Most columns of a block."""
 
 
 class Search(NamedTuple):
@@ -70,67 +52,63 @@ class Views(NamedTuple):
     """Both pictures, continued by their border pixels.
 
     Attributes:
-        left: uint32 (H, C), each grey level as four equal bytes (see `spread`); column ``c`` is
-            column ``c - radius - 1`` of the picture.
-        right: uint8 (H, C - 1 + N), mirrored, so that candidates lie side by side; place ``n`` of
-            left column ``c`` is column ``C - 1 - c + n``.
+        left: uint8 (H, C); column ``c`` is column ``c - radius`` of the picture.
+        right: uint8 (H, C + n - 1), n = ndisp + 2·abs(lean); column ``c`` sees candidate
+            ``k`` at column ``c + n - 1 - abs(lean) - k``.
         width: Columns of the picture.
     """
 
-    left: NDArray[np.uint32]
+    left: NDArray[np.uint8]
     right: NDArray[np.uint8]
     width: int
-
-
-class Row(NamedTuple):
-    """One row of `Views`."""
-
-    left: NDArray[np.uint32]
-    right: NDArray[np.uint8]
 
 
 class Room(NamedTuple):
     """Memory to work in; what the kernel finds there does not matter.
 
     Attributes:
-        columns: uint8 or uint16 ((block + 2·radius + 1)·N,), of each column: sums over one column
-            of a half.
-        carried: uint16 (N,), the half windows of the last column done.
-        halves: uint16 (rows_radius + 1, at least block·N), a ring of rows; of each column: sums
-            over a half.
-        none: uint16 (LANES,), `NO_COST`. From memory, because compilers make a register of ones
-            out of the register itself: then no pixel starts before the last one is done.
-        places: Places of a column, N.
-        block: Columns done at a time.
+        columns: uint8 or uint16 (n·S + ...,), sums over one column of a half, place by place.
+        pairs: uint8 or uint16 (CHUNK·S + ...,), sums over two columns.
+        fours: uint16 (CHUNK·S + ...,), sums over four columns.
+        halves: uint16 (rows_radius + 1, n·S), a ring of rows: sums over a half.
+        alive: bool (n,), whether the column sums of a place are kept up.
+        runs: int64 (N, 2), first place and the one after the last of each run of them that is
+            summed up; those behind are empty.
+        offers: As ``runs``, the candidates that are offered.
+        found: uint16 (5·LANES,), what is found in the last columns of a picture.
+        stride: Columns of a block with those that its windows reach over, S.
     """
 
     columns: NDArray[Any]
-    carried: NDArray[np.uint16]
+    pairs: NDArray[Any]
+    fours: NDArray[np.uint16]
     halves: NDArray[np.uint16]
-    none: NDArray[np.uint16]
-    places: int
-    block: int
+    alive: NDArray[np.bool_]
+    runs: NDArray[np.int64]
+    offers: NDArray[np.int64]
+    found: NDArray[np.uint16]
+    stride: int
 
 
 class Halves(NamedTuple):
-    """Both halves of the windows of a row, summed up: uint16, N of each column of a block.
+    """Both halves of the windows of a row, summed up.
 
     Attributes:
-        upper: The rows above a pixel and its own.
-        lower: Its own and those below.
-        places: Places of a column, N.
+        upper: uint16 (n·S,), the rows above a pixel and its own.
+        lower: uint16 (n·S,), its own and those below.
+        stride: Columns of a block with those its windows reach over, S.
     """
 
     upper: NDArray[np.uint16]
     lower: NDArray[np.uint16]
-    places: int
+    stride: int
 
 
-def empty_views(search: Search, height: int, width: int) -> Views:
-    """Arrays for `lay_out` to write to."""
-    columns = width + 2 * search.radius + 1
-    right = np.empty((height, columns - 1 + _places(search)), np.uint8)
-    return Views(np.empty((height, columns), np.uint32), right, width)
+def empty_views(search: Search, block: int, height: int, width: int) -> Views:
+    """Arrays for `lay_out` to write to, where so many columns are done at a time."""
+    columns = width + _stride(search, block)
+    right = np.empty((height, columns + _places(search) - 1), np.uint8)
+    return Views(np.empty((height, columns), np.uint8), right, width)
 
 
 @njit(cache=True, nogil=True)
@@ -152,144 +130,187 @@ def lay_out(
         end: The row after the last.
         views: Written: the rows.
     """
-    width, left_at = views.width, search.radius + 1
-    # Mirrored, the picture's last column comes first.
-    right_at = views.left.shape[1] - width - left_at - search.minimum + abs(search.lean)
-    mirrored = np.empty(width, np.uint8)
+    places = views.right.shape[1] - views.left.shape[1] + 1
+    right_at = search.radius + search.minimum - abs(search.lean) + places - 1
     for y in range(first, end):
-        for x in range(width):
-            mirrored[x] = right[y, np.uint64(width - 1 - x)]
-        _continue(left[y], left_at, _FOURFOLD, views.left[y])
-        _continue(mirrored, right_at, np.uint8(1), views.right[y])
+        _continue(left[y], search.radius, views.left[y])
+        _continue(right[y], right_at, views.right[y])
 
 
 @njit(cache=True, nogil=True)
-def _continue(pixels: NDArray[np.uint8], at: int, factor: Any, view: NDArray[Any]) -> None:
-    """Write a row of pixels to ``at`` and on, continued by its ends, all times a factor."""
+def _continue(pixels: NDArray[np.uint8], at: int, view: NDArray[np.uint8]) -> None:
+    """Write a row of pixels to ``at`` and on, continued by its ends."""
     start = min(max(at, 0), view.size)
     end = min(max(at + pixels.size, start), view.size)
-    view[:start] = pixels[0] * factor
-    view[end:] = pixels[-1] * factor
+    view[:start] = pixels[0]
+    view[end:] = pixels[-1]
     shown, inside = pixels[start - at :], view[start:end]
     for c in range(inside.size):
-        inside[c] = shown[c] * factor
+        inside[c] = shown[c]
 
 
-def make_room(search: Search, width: int) -> Room:
-    """Memory for one thread's search in pictures of a width."""
-    places, rows = _places(search), search.rows_radius + 1
-    widest = max(_CACHE_BYTES // (2 * rows * places), RUN)
-    block = -(-width // -(-width // widest))
-    # The difference of two sums over a column is to fit into a signed byte.
-    narrow = np.uint8 if rows * search.cost_cap <= 127 else np.uint16
-    # The last vector of the last column may reach over its end.
+def make_room(search: Search, block: int) -> Room:
+    """Memory for one thread's search, so many columns at a time."""
+    places, stride = _places(search), _stride(search, block)
+    rows = search.rows_radius + 1
+    narrow = [np.uint8 if n * rows * search.cost_cap <= 255 else np.uint16 for n in (1, 2)]
+    # What is read beyond the end becomes sums that nobody reads.
+    beyond = 2 * search.radius + 1 + LANES
     return Room(
-        columns=aligned(((block + 2 * search.radius + 1) * places,), narrow),
-        carried=aligned((places,), np.uint16),
-        halves=aligned((rows, (block + 1) * places), np.uint16),
-        none=np.full(LANES, NO_COST, np.uint16),
-        places=places,
-        block=block,
+        columns=np.zeros(places * stride + beyond, narrow[0]),
+        pairs=np.zeros(_CHUNK * stride + beyond, narrow[1]),
+        fours=np.zeros(_CHUNK * stride + beyond, np.uint16),
+        halves=np.empty((rows, places * stride), np.uint16),
+        alive=np.zeros(places, np.bool_),
+        runs=np.zeros((-(-search.ndisp // (2 * GROUP)) + 1, 2), np.int64),
+        offers=np.zeros((-(-search.ndisp // (2 * GROUP)) + 1, 2), np.int64),
+        found=np.empty(5 * LANES, np.uint16),
+        stride=stride,
     )
 
 
+def widest_block(search: Search, width: int) -> int:
+    """Columns to do at a time where every candidate is searched: as many as the cache holds."""
+    bytes_per_column = 2 * (search.rows_radius + 1) * _places(search)
+    widest = max(_CACHE_BYTES // bytes_per_column, 64 + 2 * search.radius)
+    blocks = -(-width // min(widest - 2 * search.radius, BLOCK))
+    return _stride(search, -(-width // blocks)) - 2 * search.radius
+
+
 def _places(search: Search) -> int:
-    return -(-(search.ndisp + 2 * abs(search.lean)) // LANES) * LANES
+    return search.ndisp + 2 * abs(search.lean)
+
+
+def _stride(search: Search, block: int) -> int:
+    """Columns of a block with those that its windows reach over, a multiple of 32."""
+    return -(-(block + 2 * search.radius) // 32) * 32
 
 
 @njit(cache=True, nogil=True)
-def existing(search: Search, width: int, x: int) -> tuple[int, int]:
-    """The first candidate whose right pixel lies in the picture, and the one after the last."""
-    right = x - search.minimum
-    end = max(min(right + 1, search.ndisp), 0)
-    return min(max(right + 1 - width, 0), end), end
+def next_half(views: Views, search: Search, first: int, y: int, x0: int, room: Room) -> Halves:
+    """Sum up the half window below row ``y``; give the halves above and below it."""
+    rows, start = search.rows_radius + 1, first - search.rows_radius
+    last = views.left.shape[0] - 1
+    come, gone = min(max(y + rows - 1, 0), last), min(max(y - 1, 0), last)
+    lower = room.halves[(y - start) % rows]
+    for run in range(room.runs.shape[0]):
+        n0, n1 = room.runs[run]
+        if n0 == n1:
+            break
+        _exchange_row(views, n0, n1, search.cost_cap, come, gone, x0, room)
+        for n in range(n0, n1, _CHUNK):
+            at, stop = n * room.stride, min(n + _CHUNK, n1) * room.stride
+            _sum_columns(room, at, stop, 2 * search.radius + 1, lower)
+    # The half above row y is that below row y - rows_radius, the oldest of the ring.
+    upper = room.halves[(y - start + 1) % rows]
+    return Halves(upper, lower, room.stride)
 
 
 @njit(cache=True, nogil=True)
-def fill_columns(views: Views, search: Search, y: int, x0: int, room: Room) -> None:
-    """Sum up the columns of a block, as `sum_halves` wants them before row ``y``."""
-    columns, width = room.columns, min(room.block, views.width - x0)
-    cap, columns[:] = splat(np.uint8(search.cost_cap)), 0
-    for row in range(y - 1, y + search.rows_radius):
-        pixels = _row(views, row)
-        for c in range(width + 2 * search.radius + 1):
-            for n in range(0, room.places, LANES):
-                at = c * room.places + n
-                plus = _costs(pixels, x0 + c, n, cap)
-                store(columns, at, load(columns, at) + fit(plus, columns))
-
-
-@njit(cache=True, nogil=True)
-def sum_halves(
-    views: Views,
-    search: Search,
-    y: int,
-    x0: int,
-    start: int,
-    end: int,
-    room: Room,
-    halves: NDArray[np.uint16],
+def enlist(
+    views: Views, search: Search, now: Offer, soon: Offer, y: int, x0: int, room: Room
 ) -> None:
-    """Sum up the lower halves of the windows of a row, for a run of the columns of a block.
+    """From row ``y`` on offer some candidates, and sum up these and those offered soon.
 
     Args:
         views: The pictures.
         search: What is searched.
-        y: The row, the one after that of the call before.
+        now: bool (G,), the groups of candidates that are offered in row ``y``.
+        soon: bool (G,), those offered when the half below row ``y`` will be an upper one.
+        y: The row whose half window comes next.
         x0: First column of the block.
-        start: First column of the run, counted from that of the block.
-        end: The column after the last.
-        room: Its columns and what it carried are read and written.
-        halves: Written.
+        room: Changed.
     """
-    reach, window, places = 2 * abs(search.lean), 2 * search.radius + 1, room.places
-    columns, cap = room.columns, splat(np.uint8(search.cost_cap))
-    come, gone = _row(views, y + search.rows_radius), _row(views, y - 1)
-    # Places from `begun` on had no candidate that exists so far.
-    begun = existing(search, views.width, x0 + start - 1)[1] + reach if start > 0 else 0
-    lowest = existing(search, views.width, x0 + start)[0] // LANES * LANES
-    highest = existing(search, views.width, x0 + end - 1)[1] + reach
-    for n in range(lowest, highest, LANES):
-        half = load(room.carried, n)
-        if n >= begun:
-            half = splat(np.uint16(0))
-            for c in range(start, start + window):
-                half = half + fit(_exchange(come, gone, x0, c, n, places, cap, columns), halves)
-        for c in range(start, end):
-            entered = _exchange(come, gone, x0, c + window, n, places, cap, columns)
-            half = half + widen_signed(entered - load(columns, c * places + n))
-            store(halves, c * places + n, half)
-        store(room.carried, n, half)
+    _list_runs(now, now, search.ndisp, 0, room.offers)
+    _list_runs(now, soon, search.ndisp, 2 * abs(search.lean), room.runs)
+    _begin(views, search, y - 1, x0, room)
 
 
 @njit(cache=True, nogil=True)
-def _exchange(
-    come: Row,
-    gone: Row,
+def _list_runs(now: Offer, soon: Offer, ndisp: int, more: int, runs: NDArray[np.int64]) -> None:
+    """Write the runs of what is offered now or soon, each with so many more places behind."""
+    count = 0
+    runs[:] = 0
+    for group in range(now.size):
+        if now[group] or soon[group]:
+            start, end = group * GROUP, min((group + 1) * GROUP, ndisp) + more
+            if count == 0 or runs[count - 1, 1] < start:
+                runs[count, 0] = start
+                count += 1
+            runs[count - 1, 1] = end
+
+
+@njit(cache=True, nogil=True)
+def _begin(views: Views, search: Search, y: int, x0: int, room: Room) -> None:
+    """Sum up the columns of those candidates of the runs that were not kept up, for row ``y``."""
+    last, before = views.left.shape[0] - 1, 0
+    for run in range(room.runs.shape[0]):
+        n0, n1 = room.runs[run]
+        for n in range(n0, n1):
+            if not room.alive[n]:
+                room.columns[n * room.stride : (n + 1) * room.stride] = 0
+                for row in range(y, y + search.rows_radius + 1):
+                    at = min(max(row, 0), last)
+                    _add_row(views, n, search.cost_cap, at, x0, room)
+        # Between the runs nothing is kept up.
+        room.alive[before : max(n0, before)] = False
+        room.alive[n0:n1] = True
+        before = max(n1, before)
+    room.alive[before:] = False
+
+
+@njit(cache=True, nogil=True)
+def _add_row(views: Views, n: int, cost_cap: int, y: int, x0: int, room: Room) -> None:
+    """Add the costs of the pixels of row ``y`` to the column sums of place ``n``."""
+    sums, left, right = room.columns, views.left[y], views.right[y]
+    cap, shift = splat(np.uint8(cost_cap)), x0 + room.alive.size - 1 - n
+    for c in range(0, room.stride, LANES):
+        plus = least(distance(load(left, x0 + c), load(right, shift + c)), cap)
+        at = n * room.stride + c
+        store(sums, at, load(sums, at) + fit(plus, sums))
+
+
+@njit(cache=True, nogil=True)
+def _exchange_row(
+    views: Views,
+    n0: int,
+    n1: int,
+    cost_cap: int,
+    come: int,
+    gone: int,
     x0: int,
-    c: int,
-    n: int,
-    places: int,
-    cap: Lanes,
-    columns: NDArray[Any],
-) -> Lanes:
-    """Move the sums over a column down by one row, in places ``n`` and on; give them."""
-    at = c * places + n
-    minus, plus = _costs(gone, x0 + c, n, cap), _costs(come, x0 + c, n, cap)
-    sums = load(columns, at) - fit(minus, columns) + fit(plus, columns)
-    store(columns, at, sums)
-    return sums
+    room: Room,
+) -> None:
+    """Take the costs of row ``gone`` out of the column sums and add those of row ``come``."""
+    sums, stride, cap = room.columns, room.stride, splat(np.uint8(cost_cap))
+    right, right_gone = views.right[come], views.right[gone]
+    for c in range(x0, x0 + stride, LANES):
+        left, left_gone = load(views.left[come], c), load(views.left[gone], c)
+        at, other = n0 * stride + c - x0, c + room.alive.size - 1 - n0
+        for _ in range(n1 - n0):
+            plus = least(distance(left, load(right, other)), cap)
+            minus = least(distance(left_gone, load(right_gone, other)), cap)
+            store(sums, at, load(sums, at) - fit(minus, sums) + fit(plus, sums))
+            at, other = at + stride, other - 1
 
 
 @njit(cache=True, nogil=True)
-def _costs(row: Row, c: int, n: int, cap: Lanes) -> Lanes:
-    """The costs of pixel ``c`` of a row in places ``n`` and on."""
-    right = load(row.right, row.left.size - 1 - c + n)
-    return least(distance(spread(row.left, c), right), cap)
+def _sum_columns(room: Room, first: int, end: int, window: int, sums: NDArray[np.uint16]) -> None:
+    """Write the sums over ``window`` neighbours, an odd number, to ``sums``, (n·S,).
 
-
-@njit(cache=True, nogil=True)
-def _row(views: Views, y: int) -> Row:
-    """A row of both pictures, which go on above and below."""
-    row = min(max(y, 0), views.left.shape[0] - 1)
-    return Row(views.left[row], views.right[row])
+    Places lie one behind the other: the last sums of each run into the next, and nobody reads them.
+    """
+    values, pairs, fours = room.columns, room.pairs, room.fours
+    for i in range(0, end - first, LANES):
+        pair = fit(load(values, first + i), pairs) + fit(load(values, first + i + 1), pairs)
+        store(pairs, i, pair)
+    for i in range(0, end - first, LANES):
+        store(fours, i, fit(load(pairs, i), fours) + fit(load(pairs, i + 2), fours))
+    whole, odd = window // 4, window % 4 == 3
+    for i in range(0, end - first, LANES):
+        total = fit(load(values, first + i + window - 1), sums)
+        if odd:
+            total = total + fit(load(pairs, i + window - 3), sums)
+        for n in range(whole):
+            total = total + load(fours, i + 4 * n)
+        store(sums, first + i, total)

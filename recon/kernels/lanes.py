@@ -59,14 +59,6 @@ def splat(value: np.uint8 | np.uint16) -> Lanes:
     return np.full(LANES, value)
 
 
-def spread(fourfold: NDArray[np.uint32], at: int) -> Lanes:
-    """A byte in each lane, from an array where each value is that byte four times.
-
-    Unlike a single byte, four are spread on their way from memory.
-    """
-    return np.repeat(fourfold[at : at + 1], LANES // 4).view(np.uint8)
-
-
 def ramp(first: np.uint16) -> Lanes:
     """``first``, ``first + 1`` and so on."""
     return np.arange(LANES, dtype=np.uint16) + first
@@ -75,11 +67,6 @@ def ramp(first: np.uint16) -> Lanes:
 def least(a: Lanes, b: Lanes) -> Lanes:
     """The smaller value of each lane."""
     return np.minimum(a, b)
-
-
-def most(a: Lanes, b: Lanes) -> Lanes:
-    """The larger value of each lane."""
-    return np.maximum(a, b)
 
 
 def distance(a: Lanes, b: Lanes) -> Lanes:
@@ -98,6 +85,11 @@ def differing_bits(a: Lanes, b: Lanes) -> Lanes:
     return np.asarray(bits.sum(axis=1, dtype=np.uint8))
 
 
+def where_equal(a: Lanes, b: Lanes, then: Lanes, otherwise: Lanes) -> Lanes:
+    """``then`` in the lanes where ``a == b``."""
+    return np.where(a == b, then, otherwise)
+
+
 def where_less(a: Lanes, b: Lanes, then: Lanes, otherwise: Lanes) -> Lanes:
     """``then`` in the lanes where ``a < b``."""
     return np.where(a < b, then, otherwise)
@@ -111,22 +103,6 @@ def fit(lanes: Lanes, array: NDArray[Any]) -> Lanes:
 def narrow(lanes: Lanes) -> Lanes:
     """The lower bytes of uint16."""
     return lanes.astype(np.uint8)
-
-
-def widen_signed(lanes: Lanes) -> Lanes:
-    """Bytes that stand for -128 to 127, as uint16 that wraps; uint16 as it is."""
-    return lanes.view(np.int8).astype(np.uint16) if lanes.dtype == np.uint8 else lanes
-
-
-def lowest(lanes: Lanes) -> Any:
-    """The smallest value."""
-    return lanes.min()
-
-
-def lowest_pair(first: Lanes, second: Lanes) -> tuple[Any, Any]:
-    """The smallest value of ``first``, uint16, and the smallest of ``second`` among its lanes."""
-    smallest = first.min()
-    return smallest, second[first == smallest].min()
 
 
 class _Vector(types.Type):  # type: ignore[misc]
@@ -210,15 +186,7 @@ _binary(operator.rshift, lambda builder, a, b: builder.lshr(a, b))
 _binary(mean, _write_mean)
 _binary(differing_bits, _write_differing)
 _binary(least, _intrinsic("umin"))
-_binary(most, _intrinsic("umax"))
 _binary(distance, _write_distance)
-
-
-def _write_lowest(builder: Any, lanes: Any) -> Any:
-    value = lanes.type.element
-    name = f"llvm.vector.reduce.umin.v{lanes.type.count}i{value.width}"
-    kind = ir.FunctionType(value, [lanes.type])
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [lanes])
 
 
 def _write_splat(builder: Any, value: Any, lanes: int) -> Any:
@@ -298,10 +266,10 @@ def _ramp(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.add(start, ir.Constant(_llvm(16), list(range(LANES))))
 
 
-@_compile(spread, lambda fourfold, at: _Vector(types.uint8))
-def _spread(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    four = builder.load(_address(context, builder, signature, arguments, ir.IntType(32)))
-    return builder.bitcast(_write_splat(builder, four, LANES // 4), _llvm(8))
+@_compile(where_equal, lambda a, b, then, otherwise: then)
+def _where_equal(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    a, b, then, otherwise = arguments
+    return builder.select(builder.icmp_unsigned("==", a, b), then, otherwise)
 
 
 @_compile(where_less, lambda a, b, then, otherwise: then)
@@ -318,28 +286,3 @@ def _fit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 @_compile(narrow, lambda lanes: _Vector(types.uint8))
 def _narrow(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.trunc(arguments[0], _llvm(8))
-
-
-@_compile(widen_signed, lambda lanes: _Vector(types.uint16))
-def _widen_signed(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return builder.sext(arguments[0], _llvm(16))
-
-
-@_compile(lowest, lambda lanes: lanes.element)
-def _lowest(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return _write_lowest(builder, arguments[0])
-
-
-@_compile(lowest_pair, lambda first, second: types.UniTuple(types.uint16, 2))
-def _lowest_pair(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    # Values of 32 bits with the first as upper half; in the order that an "unpack" makes of parts
-    # of 128 bits, because the minimum does not care and any other order takes more instructions.
-    first, second = arguments
-    parts = range(0, LANES, 8)
-    order = [part + half + i for half in (0, 4) for part in parts for i in range(4)]
-    mixed = ir.Constant(_llvm(32, 2 * LANES), [n for i in order for n in (i, LANES + i)])
-    pairs = builder.bitcast(builder.shuffle_vector(second, first, mixed), _llvm(32))
-    pair = _write_lowest(builder, pairs)
-    halves = builder.lshr(pair, pair.type(16)), pair
-    values = [builder.trunc(half, ir.IntType(16)) for half in halves]
-    return context.make_tuple(builder, signature.return_type, values)

@@ -97,7 +97,7 @@ def refine_minima(
 
     The first of these that applies is the reason of a pixel: no candidate, or one that ends at
     the border of the right picture (BORDER); too little texture (LOW_TEXTURE); the minimum at
-    an end of the range (OUT_OF_RANGE); the right view disagrees, and finds no pixel here
+    an end of what was searched (OUT_OF_RANGE); the right view disagrees, and finds no pixel here
     (OCCLUDED) or does (LEFT_RIGHT); a second best that is too good (AMBIGUOUS).
 
     The sub-pixel offset is that of two equally steep lines (EQUIANGULAR, the shape of a sum of
@@ -208,7 +208,9 @@ def _judge(
         seen = (to_left[x] | middle[x] | to_right[x]) != 0
         differs = np.uint8(LEFT_RIGHT) if seen else np.uint8(OCCLUDED)
         code = differs if apart[x] > largest else code
-        at_end = winner[x] == 0 or winner[x] == last
+        place = x - rules.minimum - np.int32(winner[x])
+        inside = place > 0 and place < winner.size - 1
+        at_end = winner[x] == 0 or winner[x] == last or inside
         ends = np.uint8(OUT_OF_RANGE) if at_end else np.uint8(BORDER)
         code = ends if max(cost_before[x], cost_after[x]) == NO_COST else code
         code = np.uint8(LOW_TEXTURE) if texture[x] < least_texture else code

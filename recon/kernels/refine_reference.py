@@ -51,16 +51,18 @@ def _reasons(minima: Minima, texture: NDArray[np.float32], rules: Rules) -> NDAr
     k = minima.winner.astype(np.int64)
     best, before, after, second = minima.costs.astype(np.int64)
     width = k.shape[1]
-    place = np.clip(np.arange(width) - rules.minimum - k, 0, width - 1)
+    right = np.arange(width) - rules.minimum - k
+    place = np.clip(right, 0, width - 1)
     other = np.take_along_axis(minima.right_winner.astype(np.int64), place, axis=1)
     differs = (rules.left_right >= 0) & (np.abs(other - k) > rules.left_right)
+    inside = (right > 0) & (right < width - 1)
     claimed = _claimed(minima.right_winner, rules)
     ends = np.maximum(before, after) == NO_COST
     close = 100 * second <= best * (100 + rules.uniqueness)
     cases = [
         ((k == rules.ndisp) | np.isnan(texture), BORDER),
         (texture < rules.texture, LOW_TEXTURE),
-        (ends & ((k == 0) | (k == rules.ndisp - 1)), OUT_OF_RANGE),
+        (ends & ((k == 0) | (k == rules.ndisp - 1) | inside), OUT_OF_RANGE),
         (ends, BORDER),
         (differs & claimed, LEFT_RIGHT),
         (differs, OCCLUDED),

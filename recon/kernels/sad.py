@@ -1,10 +1,9 @@
 """Sums of absolute differences over a window, and the best candidate of each pixel.
 
-How it is fast: the candidates of a pixel lie side by side, and all that costs time is done for
-`LANES` of them by one instruction or two (`recon.kernels.lanes`). A window is made of two halves
-(`recon.kernels.half_windows`), each summed up once for two rows. The least cost is kept of each
-lane while the costs are made, so they are never written down; only at the end the lanes of a pixel
-are compared. Rows are done in blocks of columns whose halves stay in a core's own cache.
+How it is fast: every loop that costs time runs over neighbouring columns, in uint8 and uint16
+alone, for one candidate or eight at once, so that a vector instruction does 32 or 64 pixels. A
+window is made of two halves (`recon.kernels.half_windows`), each summed up once for two rows.
+Blocks of columns are so narrow that all this stays in a core's own cache.
 
 Two halves that are moved against each other make a window that leans: beside the upright window
 it costs one more addition, not one more search.
@@ -19,38 +18,40 @@ stereo", IEEE Intelligent Vehicles, 2015 (several windows).
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.kernels.half_windows import (
-    RUN,
-    Halves,
-    Room,
-    Search,
-    Views,
-    existing,
-    fill_columns,
-    sum_halves,
-)
+from recon.kernels.half_windows import Halves, Room, Search, Views, enlist, next_half
 from recon.kernels.lanes import (
     LANES,
     Lanes,
     least,
     load,
-    lowest,
-    lowest_pair,
-    most,
     ramp,
     splat,
+    store,
+    where_equal,
     where_less,
 )
 from recon.kernels.minima import NO_COST, Minima, claim_right
+from recon.kernels.tiles import Tiles
+
+Found: TypeAlias = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
+"""What is found so far in `LANES` columns; see `_weigh`."""
 
 
 @njit(cache=True, nogil=True)
 def sad_minima(
-    views: Views, search: Search, first: int, end: int, room: Room, minima: Minima
+    views: Views,
+    search: Search,
+    tiles: Tiles,
+    first: int,
+    end: int,
+    room: Room,
+    minima: Minima,
 ) -> None:
     """Find the best candidate of each pixel of some rows.
 
@@ -59,122 +60,176 @@ def sad_minima(
     so it counts twice), the pictures continued by their border pixels; with a lean it is the
     smaller of that and of the same sum where the upper half takes candidate ``k - lean`` and the
     lower ``k + lean``, as on the ground under a camera. Candidates whose right pixel lies outside
-    the picture do not exist. Of equal costs the smaller disparity wins. The costs before and
-    after the best are those of the window that won, the upright one if both did. A pixel of the
+    the picture do not exist, nor those that a tile is not offered. Of equal costs the smaller
+    disparity wins. The costs before and after the best are those of the window that won, the
+    upright one if both did. A pixel of the
     right view is matched to the left pixel that chose it at the least cost.
 
     Args:
         views: The pictures, from `lay_out`.
         search: What is searched.
+        tiles: Which candidates are offered where.
         first: First row to do.
         end: The row after the last. The rows of a call depend on no other call.
         room: Memory from `make_room`; not shared with another thread.
         minima: Written: the rows ``first`` to ``end - 1``.
     """
-    start, none = first - search.rows_radius, load(room.none, 0)
-    for x0 in range(0, views.width, room.block):
-        width = min(room.block, views.width - x0)
-        fill_columns(views, search, start, x0, room)
-        for y in range(start, end):
-            lower = room.halves[(y - start) % len(room.halves)]
-            # The half above row y is that below row y - rows_radius, the oldest of the ring.
-            upper = room.halves[(y - start + 1) % len(room.halves)]
-            halves = Halves(upper, lower, room.places)
-            for c in range(0, width, RUN):
-                stop = min(c + RUN, width)
-                sum_halves(views, search, y, x0, c, stop, room, lower)
-                if y >= first:
-                    _choose(halves, search, none, y, x0, c, stop, minima)
-                    _look_beside(halves, search, y, x0, c, stop, minima)
+    reach, height = search.rows_radius, tiles.height
+    for column in range(tiles.offered.shape[1]):
+        x0 = column * tiles.width
+        x1 = min(x0 + tiles.width, views.width)
+        room.alive[:] = False
+        for y in range(first - reach, end):
+            if y == first - reach or y % height == 0 or (y + reach) % height == 0:
+                now = tiles.offered[max(y, first) // height, column]
+                soon = tiles.offered[min(y + reach, end - 1) // height, column]
+                enlist(views, search, now, soon, y, x0, room)
+            halves = next_half(views, search, first, y, x0, room)
+            if y >= first:
+                _choose(halves, search, room, y, x0, x1, minima)
     for y in range(first, end):
         claim_right(search.ndisp, search.minimum, y, minima)
 
 
 @njit(cache=True, nogil=True)
 def _choose(
+    halves: Halves, search: Search, room: Room, y: int, x0: int, x1: int, minima: Minima
+) -> None:
+    """Choose among the candidates of columns ``x0`` to ``x1 - 1`` of row ``y``."""
+    winner, best, second = minima.winner[y], minima.costs[0, y], minima.costs[3, y]
+    before, after = minima.costs[1, y], minima.costs[2, y]
+    for x in range(x0, x1, LANES):
+        found = _search(halves, search, room.offers, x, x - x0, winner.size)
+        if x + LANES <= winner.size:
+            store(winner, x, found[0])
+            store(best, x, found[1])
+            store(before, x, found[2])
+            store(after, x, found[3])
+            store(second, x, found[4])
+        else:
+            row = room.found
+            for n in range(5):
+                store(row, n * LANES, found[n])
+            for c in range(winner.size - x):
+                winner[x + c], best[x + c], before[x + c] = (
+                    row[c],
+                    row[LANES + c],
+                    row[2 * LANES + c],
+                )
+                after[x + c], second[x + c] = row[3 * LANES + c], row[4 * LANES + c]
+
+
+@njit(cache=True, nogil=True)
+def _search(
+    halves: Halves, search: Search, offers: NDArray[np.int64], x: int, column: int, width: int
+) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes]:
+    """What is found in columns ``x`` and on: winner, and the four costs of `Minima`."""
+    # Candidate k exists in the columns from x + k + ahead to x + k + ahead + width - 1.
+    ahead = search.minimum - x
+    none = splat(np.uint16(NO_COST))
+    found = splat(np.uint16(search.ndisp)), none, none, none, none, none, none, none
+    for run in range(offers.shape[0]):
+        k0, k1 = max(offers[run, 0], 1 - ahead - width), min(offers[run, 1], LANES - ahead)
+        if k0 >= k1:
+            continue
+        if k1 - 1 + ahead > 0 or k0 + ahead + width < LANES:
+            found = _offer_some(halves, search.lean, k0, k1, ahead, width, column, found)
+        else:
+            found = _offer_all(halves, search.lean, k0, k1, column, found)
+    winner, best, second, upright = found[0], found[1], found[2], found[3]
+    before = where_less(best, upright, found[5], found[4])
+    after = where_less(best, upright, found[7], found[6])
+    return winner, best, before, after, second
+
+
+@njit(cache=True, nogil=True)
+def _offer_all(
+    halves: Halves, search_lean: int, k0: int, k1: int, column: int, found: Found
+) -> Found:
+    """Offer the candidates of a run where all of them exist."""
+    upper, lower, stride = halves.upper, halves.lower, halves.stride
+    lean = search_lean * stride
+    none, one = splat(np.uint16(NO_COST)), splat(np.uint16(1))
+    upright_last = leaning_last = none
+    prior, number = found[1], splat(np.uint16(k0))
+    at = (k0 + abs(search_lean)) * stride + column
+    for _ in range(k1 - k0):
+        upright = load(upper, at) + load(lower, at)
+        leaning = load(upper, at - lean) + load(lower, at + lean)
+        best = found[1]
+        found = _weigh(upright, leaning, upright_last, leaning_last, number, prior, found)
+        prior, upright_last, leaning_last = best, upright, leaning
+        number, at = number + one, at + stride
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _offer_some(
     halves: Halves,
-    search: Search,
-    none: Lanes,
-    y: int,
-    x0: int,
-    start: int,
-    end: int,
-    minima: Minima,
-) -> None:
-    """Write the best candidate, its cost and the second best cost, of columns of a block."""
-    width, lean = minima.winner.shape[1], search.lean
-    step, one, three = splat(np.uint16(LANES)), splat(np.uint16(1)), splat(np.uint16(3))
-    for c in range(start, end):
-        x, at = np.uint64(x0 + c), c * halves.places + abs(lean)
-        first, stop = existing(search, width, x0 + c)
-        k, best, which, second = first // LANES * LANES, none, none, none
-        numbers = ramp(np.uint16(k))
-        if k < first:
-            cost = _close(_costs(halves, at + k, lean), none, k, first, stop)
-            best, which, second = _offer(cost, numbers, best, which, second)
-            k, numbers = k + LANES, numbers + step
-        while k + LANES <= stop:
-            cost = _costs(halves, at + k, lean)
-            best, which, second = _offer(cost, numbers, best, which, second)
-            k, numbers = k + LANES, numbers + step
-        if k < stop:
-            cost = _close(_costs(halves, at + k, lean), none, k, first, stop)
-            best, which, second = _offer(cost, numbers, best, which, second)
-        lowest_cost, winner = lowest_pair(best, which)
-        # Candidates of one lane are far from each other: where its best is the winner, or beside
-        # it, its second best is two or more away.
-        near = which + one - splat(winner)
-        minima.winner[y, x] = winner if lowest_cost != NO_COST else search.ndisp
-        minima.costs[0, y, x] = lowest_cost
-        minima.costs[3, y, x] = lowest(where_less(near, three, second, best))
+    search_lean: int,
+    k0: int,
+    k1: int,
+    ahead: int,
+    width: int,
+    column: int,
+    found: Found,
+) -> Found:
+    """Offer the candidates of a run, each to those columns where it exists."""
+    upper, lower, stride = halves.upper, halves.lower, halves.stride
+    lean = search_lean * stride
+    none, columns = splat(np.uint16(NO_COST)), ramp(np.uint16(0))
+    upright_last = leaning_last = none
+    prior = found[1]
+    for k in range(k0, k1):
+        at = (k + abs(search_lean)) * stride + column
+        start, end = max(k + ahead, 0), min(k + ahead + width, LANES)
+        place, many = columns - splat(np.uint16(start)), splat(np.uint16(end - start))
+        upright = load(upper, at) + load(lower, at)
+        leaning = load(upper, at - lean) + load(lower, at + lean)
+        upright = where_less(place, many, upright, none)
+        leaning = where_less(place, many, leaning, none)
+        best, number = found[1], splat(np.uint16(k))
+        found = _weigh(upright, leaning, upright_last, leaning_last, number, prior, found)
+        prior, upright_last, leaning_last = best, upright, leaning
+    return found
 
 
 @njit(cache=True, nogil=True)
-def _offer(
-    cost: Lanes, numbers: Lanes, best: Lanes, which: Lanes, second: Lanes
-) -> tuple[Lanes, Lanes, Lanes]:
-    """What is known of each lane once a candidate of it is offered."""
-    which = where_less(cost, best, numbers, which)
-    return least(best, cost), which, least(second, most(best, cost))
+def _weigh(
+    upright: Lanes,
+    leaning: Lanes,
+    upright_last: Lanes,
+    leaning_last: Lanes,
+    number: Lanes,
+    prior: Lanes,
+    found: Found,
+) -> Found:
+    """What is found once a candidate is offered.
 
-
-@njit(cache=True, nogil=True)
-def _costs(halves: Halves, at: int, lean: int) -> Lanes:
-    """The costs of neighbouring candidates: each that of the better of its two windows."""
-    upper, lower = halves.upper, halves.lower
-    upright = load(upper, at) + load(lower, at)
-    return least(upright, load(upper, at - lean) + load(lower, at + lean))
-
-
-@njit(cache=True, nogil=True)
-def _close(costs: Lanes, none: Lanes, k: int, first: int, end: int) -> Lanes:
-    """The costs of candidates ``k`` and on, of which those from ``first`` to ``end - 1`` exist."""
-    places = ramp(np.uint16(k)) - splat(np.uint16(first))
-    return where_less(places, splat(np.uint16(end - first)), costs, none)
-
-
-@njit(cache=True, nogil=True)
-def _look_beside(
-    halves: Halves, search: Search, y: int, x0: int, start: int, end: int, minima: Minima
-) -> None:
-    """Write the costs before and after each best, from the window that won: a fit mixes no two."""
-    upper, lower, lean = halves.upper, halves.lower, search.lean
-    for c in range(start, end):
-        x, before, after = np.uint64(x0 + c), np.uint16(NO_COST), np.uint16(NO_COST)
-        first, stop = existing(search, minima.winner.shape[1], x0 + c)
-        k = np.int64(minima.winner[y, x])
-        if k < search.ndisp:
-            at = c * halves.places + abs(lean) + k
-            own = lean if minima.costs[0, y, x] < _cost(upper, lower, at, 0) else 0
-            if k > first:
-                before = _cost(upper, lower, at - 1, own)
-            if k + 1 < stop:
-                after = _cost(upper, lower, at + 1, own)
-        minima.costs[1, y, x], minima.costs[2, y, x] = before, after
-
-
-@njit(cache=True, nogil=True)
-def _cost(upper: NDArray[np.uint16], lower: NDArray[np.uint16], at: int, lean: int) -> np.uint16:
-    """The cost of the window whose halves lean by so many places; unsigned needs no checks."""
-    cost: np.uint16 = np.uint16(upper[np.uint64(at - lean)] + lower[np.uint64(at + lean)])
-    return cost
+    Args:
+        upright: Its costs.
+        leaning: Those of the leaning window.
+        upright_last: Costs of the candidate before; `NO_COST` = was not offered.
+        leaning_last: Those of the leaning window.
+        number: Which it is.
+        prior: The least cost of all candidates but the one before.
+        found: The best of the candidates offered so far, its cost, the least cost of those two or
+            more away from it, and of its upright window; the costs before the best and after it,
+            each of the upright window and of the leaning one.
+    """
+    winner, best, second, upright_best, up_before, lean_before, up_after, lean_after = found
+    none, last = splat(np.uint16(NO_COST)), number - splat(np.uint16(1))
+    cost = least(upright, leaning)
+    up_after = where_equal(winner, last, upright, up_after)
+    lean_after = where_equal(winner, last, leaning, lean_after)
+    second = where_equal(winner, last, second, least(second, cost))
+    return (
+        where_less(cost, best, number, winner),
+        least(best, cost),
+        where_less(cost, best, prior, second),
+        where_less(cost, best, upright, upright_best),
+        where_less(cost, best, upright_last, up_before),
+        where_less(cost, best, leaning_last, lean_before),
+        where_less(cost, best, none, up_after),
+        where_less(cost, best, none, lean_after),
+    )

@@ -7,16 +7,19 @@ from numpy.typing import NDArray
 
 from recon.kernels.half_windows import Search
 from recon.kernels.minima import NO_COST, Minima
+from recon.kernels.tiles import Tiles
+from recon.kernels.tiles_reference import offered_reference
 
 
 def sad_minima_reference(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search
+    left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search, tiles: Tiles
 ) -> Minima:
     """All rows of `recon.kernels.sad.sad_minima`, from pictures (H, W)."""
     upright = window_costs_reference(left, right, search._replace(lean=0))
     leaning = window_costs_reference(left, right, search)
     lowest = np.minimum(upright, leaning)
-    minima = minima_reference(lowest, search.minimum)
+    offered = offered_reference(tiles, left.shape, search.ndisp)
+    minima = minima_reference(np.where(offered, lowest, NO_COST), search.minimum)
     k = np.minimum(minima.winner, search.ndisp - 1).astype(np.int64)[:, :, None]
     own = np.where(np.take_along_axis(leaning < upright, k, axis=2), leaning, upright)
     for n, step in ((1, -1), (2, 1)):
@@ -62,13 +65,13 @@ def claim_right_reference(minima: Minima, search: Search) -> NDArray[np.uint16]:
 
 
 def minima_reference(costs: NDArray[np.int64], minimum: int) -> Minima:
-    """The minima of costs (H, W, ndisp) in both views."""
+    """The minima of costs (H, W, ndisp) in both views; `NO_COST` = not offered."""
     width, ndisp = costs.shape[1:]
     k = np.arange(ndisp)
     x = np.arange(width)[:, None]
-    inside = (x - minimum - k >= 0) & (x - minimum - k < width)
+    inside = (x - minimum - k >= 0) & (x - minimum - k < width) & (costs < NO_COST)
     open_costs = np.where(inside, costs, NO_COST)
-    winner = np.where(inside.any(axis=1), open_costs.argmin(axis=2), ndisp)
+    winner = np.where(inside.any(axis=2), open_costs.argmin(axis=2), ndisp)
     picked = np.stack(
         [
             _cost_at(open_costs, winner),

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
-from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from recon.kernels.half_windows import Search, empty_views, lay_out, make_room
-from recon.kernels.minima import empty_minima
-from recon.kernels.refine import REFINED_BYTES, Rules, refine_minima, refined_in
-from recon.kernels.sad import sad_minima
+from recon.kernels.half_windows import Search
+from recon.kernels.refine import Rules
+from recon.kernels.tiles import Tiles, offer_supported
 from recon.matching.fill import fill_holes
 from recon.matching.gradients import clipped_gradients, texture
-from recon.matching.rooms import Loans, Rooms
+from recon.matching.half_size import (
+    LEAST_NDISP,
+    divided,
+    half_rules,
+    half_search,
+    halve,
+    no_texture_asked,
+    support,
+    undivided,
+)
 from recon.matching.search import (
     FITS,
     MeasuredSettings,
@@ -31,8 +37,9 @@ from recon.matching.search import (
     UniquenessPercent,
     finish,
 )
+from recon.matching.strips import StripSearch
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
-from recon.structures.arrays import Float32, UInt8
+from recon.structures.arrays import UInt8
 
 
 class SadSettings(MeasuredSettings):
@@ -67,6 +74,18 @@ class SadSettings(MeasuredSettings):
     )
     uniqueness_percent: UniquenessPercent = 2
     min_texture: MinTexture = 0.1
+    half_size_first: bool = Field(
+        default=True,
+        description="Match the pictures at half size first, and search each tile only among the "
+        "disparities found there.",
+    )
+    least_support: float = Field(
+        default=0.03,
+        ge=0.0,
+        le=1.0,
+        description="Least share of a tile's matches at half size that eight disparities must "
+        "have to be searched there.",
+    )
     median_px: Literal[0, 3, 5] = Field(
         default=0,
         description="Each disparity becomes the median of a square of this width around it, holes "
@@ -94,10 +113,9 @@ class SadMatcher:
     def __init__(self, settings: SadSettings, threads: int | None = None) -> None:
         self._settings = settings
         self._threads = max(1, threads or os.cpu_count() or 1)
-        self._rooms = Rooms(make_room, self._threads)
-        self._views = Rooms(empty_views, 1)
-        self._minima = Rooms(empty_minima, 1)
-        self._results = Loans(2)
+        prefilter = partial(_prefiltered, settings=settings)
+        self._full = StripSearch(prefilter, self._threads)
+        self._half = StripSearch(prefilter, self._threads)
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair.
@@ -106,46 +124,27 @@ class SadMatcher:
             MatchingError: No disparity of the range lies within the picture.
         """
         search, rules = self._plan(pair.camera)
-        s, (height, width) = self._settings, pair.left.shape
-        results = self._results.lend(REFINED_BYTES * height * width)
-        refined = refined_in(results, height, width)
-
-        def lay(first: int, end: int) -> None:
-            lay_out(left, right, search, first, end, views)
-
-        def strip(first: int, end: int) -> None:
-            with self._rooms.borrow(search, width) as room:
-                sad_minima(views, search, first, end, room, minima)
-            refine_minima(minima, enough, rules, first, end, refined)
-
-        def prefilter() -> tuple[UInt8, UInt8]:
-            return _prefiltered(pair.left, s), _prefiltered(pair.right, s)
-
-        def judge() -> Float32:
-            return texture(pair, (s.window_px, s.window_height_px), s.min_texture)
-
-        with (
-            ThreadPoolExecutor(self._threads) as pool,
-            self._views.borrow(search, height, width) as views,
-            self._minima.borrow(height, width) as minima,
-        ):
-            enough, (left, right) = self._together(pool, judge, prefilter)
-            self._together(pool, *self._in_strips(lay, height))
-            self._together(pool, *self._in_strips(strip, height))
+        s = self._settings
+        with ThreadPoolExecutor(self._threads) as pool:
+            enough = partial(texture, pair, (s.window_px, s.window_height_px), s.min_texture)
+            tiles = self._tiles(pool, pair, search)
+            refined = self._full.find(pool, (pair.left, pair.right), search, tiles, rules, enough)
         return _smoothed(finish(refined, s), s.median_px)
 
-    def _in_strips(self, work: Callable[[int, int], None], rows: int) -> list[Callable[[], None]]:
-        """The work on all rows, in one strip per thread."""
-        edges = np.linspace(0, rows, min(self._threads, rows) + 1).astype(int).tolist()
-        return [partial(work, first, end) for first, end in itertools.pairwise(edges)]
-
-    def _together(self, pool: Executor, *jobs: Callable[[], Any]) -> list[Any]:
-        """Do jobs at the same time, one of them in this thread: to hand it over takes time."""
-        if self._threads == 1:
-            return [job() for job in jobs]
-        handed_over = [pool.submit(job) for job in jobs[:-1]]
-        last = jobs[-1]()
-        return [*(job.result() for job in handed_over), last]
+    def _tiles(self, pool: Executor, pair: RectifiedPair, search: Search) -> Tiles:
+        """Which candidates are offered where."""
+        if not self._settings.half_size_first or search.ndisp < LEAST_NDISP:
+            return undivided(search, pair.left.shape)
+        halved = half_search(search)
+        views = halve(pair.left), halve(pair.right)
+        shape = views[0].shape
+        asked = partial(no_texture_asked, shape, pair.valid)
+        whole, rules = undivided(halved, shape), half_rules(halved)
+        found = self._half.find(pool, views, halved, whole, rules, asked)
+        tiles = divided(search, pair.left.shape)
+        wanted = support(self._settings.least_support)
+        offer_supported(found.values, search.minimum, search.ndisp, wanted, tiles)
+        return tiles
 
     def _plan(self, camera: RectifiedCamera) -> tuple[Search, Rules]:
         s = self._settings

@@ -33,29 +33,21 @@ def subtract(a: Any, b: Any, out: Any) -> None:
 def compare(a: Any, b: Any, out: Any) -> None:
     x, y = lanes.load(a, 2), lanes.load(b, 0)
     lanes.store(out, 0, lanes.least(x, y))
-    lanes.store(out, LANES, lanes.most(x, y))
+    lanes.store(out, LANES, lanes.where_equal(x, y, x, lanes.splat(a[0])))
     lanes.store(out, 2 * LANES, lanes.distance(x, y))
     lanes.store(out, 3 * LANES, lanes.where_less(x, y, y, x))
-    out[4 * LANES] = lanes.lowest(x)
 
 
 @njit
 def resize(a: Any, b: Any, out: Any) -> None:
     x = lanes.load(a, 2)
     lanes.store(out, 0, lanes.fit(x, out))
-    lanes.store(out, LANES, lanes.widen_signed(x))
-    lanes.store(out, 2 * LANES, lanes.fit(lanes.splat(a[0]), out))
+    lanes.store(out, LANES, lanes.fit(lanes.splat(a[0]), out))
 
 
 @njit
-def pair(a: Any, b: Any, out: Any) -> None:
-    out[0], out[1] = lanes.lowest_pair(lanes.load(a, 2), lanes.load(b, 0))
+def number(a: Any, b: Any, out: Any) -> None:
     lanes.store(out, LANES, lanes.ramp(a[0]))
-
-
-@njit
-def spread(a: Any, b: Any, out: Any) -> None:
-    lanes.store(out, 0, lanes.spread(a, 3))
 
 
 @njit
@@ -147,22 +139,6 @@ def test_rows_that_are_not_contiguous_are_refused_by_the_compiler() -> None:
 
 
 @settings(deadline=None)  # the first call compiles
-@given(arrays(np.uint16), arrays(np.uint16))
-def test_pairs_are_compared_as_numpy_does(a: Any, b: Any) -> None:
-    assert_same(pair, a, b, np.uint16)
-
-
-def test_the_lowest_pair_is_decided_by_its_first_value() -> None:
-    first, second = np.full(LANES, 9, np.uint16), np.zeros(LANES, np.uint16)
-    first[[3, 30]], second[[3, 30]] = 2, (60000, 40000)
-    assert lanes.lowest_pair(first, second) == (2, 40000)
-
-
-@settings(deadline=None)  # the first call compiles
-@given(st.integers(0, 255))
-def test_four_equal_bytes_fill_a_vector(value: int) -> None:
-    fourfold = np.arange(8, dtype=np.uint32)
-    fourfold[3] = value * 0x01010101
-    out = np.zeros(LANES, np.uint8)
-    spread(fourfold, fourfold, out)
-    assert (out == value).all()
+@given(arrays(np.uint16))
+def test_numbers_follow_each_other_as_in_numpy(a: Any) -> None:
+    assert_same(number, a, a, np.uint16)

@@ -11,25 +11,31 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from recon.kernels.half_windows import RUN, Search, empty_views, lay_out, make_room
+from recon.kernels.half_windows import Search, empty_views, lay_out, make_room, widest_block
 from recon.kernels.lanes import LANES
 from recon.kernels.minima import NO_COST, Minima, empty_minima
 from recon.kernels.sad import sad_minima
 from recon.kernels.sad_reference import sad_minima_reference
+from recon.kernels.tiles import Tiles, make_tiles
 
 Image = NDArray[np.uint8]
 
 
+def everything(shape: tuple[int, int], search: Search) -> Tiles:
+    return make_tiles(shape, (shape[0], widest_block(search, shape[1])), search.ndisp)
+
+
 def search_all(
-    left: Image, right: Image, search: Search, strips: int = 1, block: int | None = None
+    left: Image, right: Image, search: Search, tiles: Tiles | None = None, strips: int = 1
 ) -> Minima:
     minima = empty_minima(*left.shape)
-    views, room = empty_views(search, *left.shape), make_room(search, left.shape[1])
-    room = room._replace(block=block or room.block)
+    tiles = tiles or everything(left.shape, search)
+    views = empty_views(search, tiles.width, *left.shape)
     lay_out(left, right, search, 0, len(left), views)
+    room = make_room(search, tiles.width)
     edges = np.linspace(0, len(left), strips + 1).astype(int)
     for first, end in itertools.pairwise(edges):
-        sad_minima(views, search, int(first), int(end), room, minima)
+        sad_minima(views, search, tiles, int(first), int(end), room, minima)
     return minima
 
 
@@ -39,8 +45,10 @@ def assert_equal(found: Minima, expected: Minima) -> None:
 
 
 @st.composite
-def pairs(draw: st.DrawFn) -> tuple[Image, Image]:
-    shape = draw(st.tuples(st.integers(1, 9), st.integers(1, 13)))
+def pairs(
+    draw: st.DrawFn, rows: tuple[int, int] = (1, 9), columns: tuple[int, int] = (1, 13)
+) -> tuple[Image, Image]:
+    shape = draw(st.tuples(st.integers(*rows), st.integers(*columns)))
     # Few grey levels make ties, many make overflows.
     levels = draw(st.sampled_from([1, 3, 255]))
     grey = hnp.arrays(np.uint8, shape, elements=st.integers(0, levels))
@@ -61,7 +69,27 @@ searches = st.builds(
 @settings(deadline=None)  # the first call compiles
 @given(pairs(), searches)
 def test_search_equals_its_twin(pair: tuple[Image, Image], search: Search) -> None:
-    assert_equal(search_all(*pair, search), sad_minima_reference(*pair, search))
+    tiles = everything(pair[0].shape, search)
+    assert_equal(search_all(*pair, search), sad_minima_reference(*pair, search, tiles))
+
+
+@st.composite
+def tilings(draw: st.DrawFn, shape: tuple[int, int], search: Search) -> Tiles:
+    height = draw(st.integers(max(search.rows_radius, 1), 9))
+    size = (height, draw(st.integers(1, 40)))
+    tiles = make_tiles(shape, size, search.ndisp)
+    return tiles._replace(offered=draw(hnp.arrays(np.bool_, tiles.offered.shape)))
+
+
+@settings(deadline=None)  # the first call compiles
+@given(st.data(), pairs((1, 14), (1, 40)), searches, st.integers(1, 3))
+def test_what_is_not_offered_is_as_if_it_did_not_exist(
+    data: st.DataObject, pair: tuple[Image, Image], search: Search, strips: int
+) -> None:
+    search = search._replace(ndisp=data.draw(st.integers(1, 28)))
+    tiles = data.draw(tilings(pair[0].shape, search))
+    found = search_all(*pair, search, tiles, min(strips, len(pair[0])))
+    assert_equal(found, sad_minima_reference(*pair, search, tiles))
 
 
 @settings(deadline=None)  # the first call compiles
@@ -69,20 +97,20 @@ def test_search_equals_its_twin(pair: tuple[Image, Image], search: Search) -> No
 def test_strips_do_not_change_the_result(
     pair: tuple[Image, Image], search: Search, strips: int
 ) -> None:
-    assert_equal(search_all(*pair, search, strips), search_all(*pair, search))
+    assert_equal(search_all(*pair, search, None, strips), search_all(*pair, search))
 
 
 @pytest.mark.parametrize("lean", [0, 1, -2])
 @pytest.mark.parametrize(("ndisp", "minimum"), [(64, 0), (65, -40), (33, 20), (100, 60)])
-def test_wide_pictures_are_searched_in_runs_and_vectors(
-    ndisp: int, minimum: int, lean: int
-) -> None:
+def test_wide_pictures_are_searched_in_vectors(ndisp: int, minimum: int, lean: int) -> None:
     rng = np.random.default_rng(ndisp + lean)
     # Few grey levels, so that vectors and runs have equal costs to decide between.
-    left, right = rng.integers(0, 4, (2, 5, 2 * RUN + 35), dtype=np.uint8)
+    left, right = rng.integers(0, 4, (2, 5, 3 * LANES + 35), dtype=np.uint8)
     search = Search(ndisp, minimum, 2, 1, cost_cap=2, lean=lean)
     assert ndisp + 2 * abs(lean) > LANES
-    assert_equal(search_all(left, right, search), sad_minima_reference(left, right, search))
+    tiles = everything(left.shape, search)
+    expected = sad_minima_reference(left, right, search, tiles)
+    assert_equal(search_all(left, right, search), expected)
 
 
 @settings(deadline=None)  # the first call compiles
@@ -90,8 +118,9 @@ def test_wide_pictures_are_searched_in_runs_and_vectors(
 def test_blocks_do_not_change_the_result(
     pair: tuple[Image, Image], search: Search, block: int
 ) -> None:
-    fewer = min(block, pair[0].shape[1])
-    assert_equal(search_all(*pair, search, block=fewer), search_all(*pair, search))
+    shape = pair[0].shape
+    narrow = make_tiles(shape, (shape[0], block), search.ndisp)
+    assert_equal(search_all(*pair, search, narrow), search_all(*pair, search))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
@@ -99,7 +128,7 @@ def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]
     grey = np.zeros(shape, np.uint8)
     search = Search(ndisp=4, minimum=0, radius=3, rows_radius=3, cost_cap=31, lean=0)
     minima = search_all(grey, grey, search)
-    assert_equal(minima, sad_minima_reference(grey, grey, search))
+    assert_equal(minima, sad_minima_reference(grey, grey, search, everything(shape, search)))
     assert (minima.winner == 0).all()
 
 
