@@ -4,6 +4,11 @@ A window is made of an upper and a lower half that share the middle row. The low
 the upper half of a row further down: it is summed up once and kept in a ring of rows. Its sums over
 one column move down by one row in and one row out; those over its columns are put together from
 sums of two and of four.
+
+Sums lie place by place, with the columns of a block side by side. Place ``n`` is candidate
+``n - abs(lean)``, so that a leaning half finds candidates before the first and after the last.
+Only places that are wanted are summed up; the rows of a place that is wanted anew begin early
+enough for the first window that needs them.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Sums of absolute differences over a window, and the best candidate of each pixel.
 
-How it is fast: every loop that costs time runs over neighbouring columns, in uint8 and uint16
-alone, for one candidate or eight at once, so that a vector instruction does 32 or 64 pixels. A
-window is made of two halves (`recon.kernels.half_windows`), each summed up once for two rows.
-Blocks of columns are so narrow that all this stays in a core's own cache.
+How it is fast: a tile of the picture is offered only some candidates (`recon.kernels.tiles`). What
+costs time is done for `LANES` neighbouring columns at once (`recon.kernels.lanes`), with what is
+found so far in registers. A window is made of two halves (`recon.kernels.half_windows`), each
+summed up once for two rows, in blocks of columns that stay in a core's own cache.
 
 Two halves that are moved against each other make a window that leans: beside the upright window
 it costs one more addition, not one more search.
