@@ -122,24 +122,22 @@ def lay_out(
     right: NDArray[np.uint8],
     search: Search,
     first: int,
-    end: int,
     views: Views,
 ) -> None:
     """Lay out some rows of both pictures as the search reads them.
 
     Args:
-        left: uint8 (H, W).
-        right: uint8 (H, W).
+        left: uint8 (N, W), those rows.
+        right: uint8 (N, W).
         search: What will be searched.
-        first: First row to do.
-        end: The row after the last.
+        first: Where in the picture the first of them lies.
         views: Written: the rows.
     """
     places = views.right.shape[1] - views.left.shape[1] + 1
     right_at = search.radius + search.minimum - abs(search.lean) + places - 1
-    for y in range(first, end):
-        _continue(left[y], search.radius, views.left[y])
-        _continue(right[y], right_at, views.right[y])
+    for n in range(len(left)):
+        _continue(left[n], search.radius, views.left[first + n])
+        _continue(right[n], right_at, views.right[first + n])
 
 
 @njit(cache=True, nogil=True)

@@ -118,7 +118,8 @@ def refine_minima(
 
     Args:
         minima: What the search found.
-        texture: float32 (H, W), in the unit of ``rules.texture``; NaN = no picture there (BORDER).
+        texture: float32 (end - first, W), of those rows, in the unit of ``rules.texture``; NaN = no
+            picture there (BORDER).
         rules: What is asked for.
         first: First row to do.
         end: The row after the last.
@@ -137,7 +138,7 @@ def refine_minima(
     for y in range(first, end):
         _mark_chosen(minima.right_winner[y], rules, chosen)
         _compare_views(minima.winner[y], minima.right_winner[y], rules, apart)
-        _judge(minima, texture[y], chosen, apart, rules, y, refined.reason[y])
+        _judge(minima, texture[y - first], chosen, apart, rules, y, refined.reason[y])
         _measure(minima, rules, y, refined)
 
 

@@ -15,49 +15,63 @@ _GAIN_OF_SOBEL: Final = 8.0
 """A 3×3 Sobel filter answers a slope of one grey level per pixel with 8."""
 
 
-def clipped_gradients(image: UInt8, cap: int) -> UInt8:
-    """Horizontal gradients in Sobel units, clipped to plus or minus ``cap``.
+def clipped_gradients(image: UInt8, cap: int, rows: range) -> UInt8:
+    """Horizontal gradients of some rows in Sobel units, clipped to plus or minus ``cap``.
 
     Args:
         image: uint8 (H, W).
         cap: At most 127.
+        rows: N rows in a row.
 
     Returns:
-        uint8 (H, W), ``cap`` where there is none.
+        uint8 (N, W), ``cap`` where there is none.
     """
-    gradients = _sobel(image)
+    gradients = _sobel(image, rows)
     np.clip(gradients, -cap, cap, out=gradients)
     gradients += cap
     return gradients.astype(np.uint8)
 
 
-def texture(pair: RectifiedPair, window: tuple[int, int], least: float) -> Float32:
+def texture(pair: RectifiedPair, window: tuple[int, int], least: float, rows: range) -> Float32:
     """Mean size of the horizontal gradient in the window around each pixel of the left view.
 
     Args:
         pair: The pictures.
         window: Width and height of the window, pixels.
         least: What will be asked of it; if that is nothing it is not computed, but 0.
+        rows: N rows in a row.
 
     Returns:
-        float32 (H, W), grey levels per pixel; NaN = no picture.
+        float32 (N, W) of those rows, grey levels per pixel; NaN = no picture.
     """
-    mean = np.zeros(pair.left.shape, np.float32)
+    width, reach = pair.left.shape[1], window[1] // 2
+    mean = np.zeros((len(rows), width), np.float32)
     if least > 0:
-        sizes = _sobel(pair.left)
-        mean = cv2.boxFilter(
+        sizes = _sobel(pair.left, _around(rows, reach, len(pair.left)))
+        sums = cv2.boxFilter(
             np.abs(sizes, out=sizes).view(np.uint16),
             cv2.CV_32F,
             window,
             normalize=False,
             borderType=cv2.BORDER_REPLICATE,
         )
+        above = min(reach, rows.start)
+        mean = sums[above : above + len(rows)]
         mean *= np.float32(1 / (_GAIN_OF_SOBEL * window[0] * window[1]))
     if pair.valid is not None:
-        mean[~pair.valid] = np.nan
+        mean[~pair.valid[rows.start : rows.stop]] = np.nan
     return np.asarray(mean, dtype=np.float32)
 
 
-def _sobel(image: UInt8) -> NDArray[np.int16]:
-    gradient = cv2.Sobel(image, cv2.CV_16S, 1, 0, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(gradient, dtype=np.int16)
+def _around(rows: range, reach: int, height: int) -> range:
+    """Rows, and those around them that the picture has."""
+    return range(max(rows.start - reach, 0), min(rows.stop + reach, height))
+
+
+def _sobel(image: UInt8, rows: range) -> NDArray[np.int16]:
+    seen = _around(rows, 1, len(image))
+    gradient = cv2.Sobel(
+        image[seen.start : seen.stop], cv2.CV_16S, 1, 0, borderType=cv2.BORDER_REPLICATE
+    )
+    above = rows.start - seen.start
+    return np.asarray(gradient[above : above + len(rows)], dtype=np.int16)

@@ -41,11 +41,11 @@ def halve(image: UInt8) -> UInt8:
     return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def no_texture_asked(shape: tuple[int, int], valid: Bool | None) -> Float32:
-    """float32 (h, w), 0 and where there is no picture NaN, as the checks of matches take it."""
-    texture = np.zeros(shape, np.float32)
+def no_texture_asked(width: int, valid: Bool | None, rows: range) -> Float32:
+    """float32 (N, w) of N rows: 0, and where there is no picture NaN, as the checks take it."""
+    texture = np.zeros((len(rows), width), np.float32)
     if valid is not None:
-        texture[~valid[::2, ::2]] = np.nan
+        texture[~valid[2 * rows.start : 2 * rows.stop : 2, ::2]] = np.nan
     return texture
 
 

@@ -138,7 +138,7 @@ class SadMatcher:
         halved = half_search(search)
         views = halve(pair.left), halve(pair.right)
         shape = views[0].shape
-        asked = partial(no_texture_asked, shape, pair.valid)
+        asked = partial(no_texture_asked, shape[1], pair.valid)
         whole, rules = undivided(halved, shape), half_rules(halved)
         found = self._half.find(pool, views, halved, whole, rules, asked)
         tiles = divided(search, pair.left.shape)
@@ -176,8 +176,8 @@ def _smoothed(disparity: Disparity, median_px: int) -> Disparity:
     return replace(disparity, values=values)
 
 
-def _prefiltered(image: UInt8, settings: SadSettings) -> UInt8:
-    """What the windows compare: uint8 (H, W)."""
+def _prefiltered(image: UInt8, rows: range, settings: SadSettings) -> UInt8:
+    """What the windows compare in N rows: uint8 (N, W)."""
     if settings.prefilter == "none":
-        return image
-    return clipped_gradients(image, settings.prefilter_cap)
+        return image[rows.start : rows.stop]
+    return clipped_gradients(image, settings.prefilter_cap, rows)

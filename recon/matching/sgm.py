@@ -147,9 +147,8 @@ class SgmMatcher:
         ndisp = s.ndisp_within(pair.camera)
         window, look, size = _window(s), _look(s), pair.left.shape
         paths, rules = _paths(s, ndisp, window.levels), _rules(s, ndisp, window.levels)
-        enough = texture(pair, (s.window_px, s.window_height_px), s.min_texture)
-        results = self._results.lend(REFINED_BYTES * enough.size)
-        refined = refined_in(results, *enough.shape)
+        results = self._results.lend(REFINED_BYTES * pair.left.size)
+        refined = refined_in(results, *size)
 
         def prepare(strip: range) -> None:
             places = places_of(window, ndisp, s.min_disparity_px)
@@ -158,6 +157,7 @@ class SgmMatcher:
         def search(strip: range) -> None:
             with self._rooms.borrow(pair.camera.width_px, paths) as room:
                 semi_global_minima(views, window, paths, strip, room, minima)
+            enough = texture(pair, (s.window_px, s.window_height_px), s.min_texture, strip)
             refine_minima(minima, enough, rules, strip.start, strip.stop, refined)
 
         strips, at_once = self._strips(pair.camera, paths)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from concurrent.futures import Executor
-from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -23,11 +21,11 @@ class StripSearch:
     """Searches pictures of one size, one strip of rows per thread.
 
     Args:
-        prefilter: What is compared of a picture, uint8 (H, W).
+        prefilter: What is compared of some rows of a picture, uint8 (N, W).
         threads: Strips worked on at once. The result does not depend on it.
     """
 
-    def __init__(self, prefilter: Callable[[UInt8], UInt8], threads: int) -> None:
+    def __init__(self, prefilter: Callable[[UInt8, range], UInt8], threads: int) -> None:
         self._prefilter = prefilter
         self._threads = threads
         self._rooms = Rooms(make_room, threads)
@@ -42,7 +40,7 @@ class StripSearch:
         search: Search,
         tiles: Tiles,
         rules: Rules,
-        texture: Callable[[], Float32],
+        texture: Callable[[range], Float32],
     ) -> Refined:
         """Search, check and refine.
 
@@ -52,41 +50,34 @@ class StripSearch:
             search: What is searched.
             tiles: Which candidates are offered where.
             rules: What the checks ask for.
-            texture: float32 (H, W), of the left picture, made meanwhile.
+            texture: float32 (N, W), of some rows of the left picture.
         """
         height, width = pictures[0].shape
         results = self._results.lend(REFINED_BYTES * height * width)
         refined = refined_in(results, height, width)
 
-        def lay(first: int, end: int) -> None:
-            lay_out(left, right, search, first, end, views)
+        def lay(strip: range) -> None:
+            left, right = (self._prefilter(picture, strip) for picture in pictures)
+            lay_out(left, right, search, strip.start, views)
 
-        def prefilter() -> list[UInt8]:
-            return [self._prefilter(picture) for picture in pictures]
-
-        def strip(first: int, end: int) -> None:
+        def look(strip: range) -> None:
             with self._rooms.borrow(search, tiles.width) as room:
-                sad_minima(views, search, tiles, first, end, room, minima)
-            refine_minima(minima, enough, rules, first, end, refined)
+                sad_minima(views, search, tiles, strip.start, strip.stop, room, minima)
+            refine_minima(minima, texture(strip), rules, strip.start, strip.stop, refined)
 
         with (
             self._views.borrow(search, tiles.width, height, width) as views,
             self._minima.borrow(height, width) as minima,
         ):
-            enough, (left, right) = self._together(pool, texture, prefilter)
-            self._together(pool, *self._in_strips(lay, height))
-            self._together(pool, *self._in_strips(strip, height))
+            for work in (lay, look):
+                self._in_strips(pool, work, height)
         return refined
 
-    def _in_strips(self, work: Callable[[int, int], None], rows: int) -> list[Callable[[], None]]:
-        """The work on all rows, in one strip per thread."""
+    def _in_strips(self, pool: Executor, work: Callable[[range], None], rows: int) -> None:
+        """Work on all rows, in one strip per thread; the last in this: to hand over takes time."""
         edges = np.linspace(0, rows, min(self._threads, rows) + 1).astype(int).tolist()
-        return [partial(work, first, end) for first, end in itertools.pairwise(edges)]
-
-    def _together(self, pool: Executor, *jobs: Callable[[], Any]) -> list[Any]:
-        """Do jobs at the same time, one of them in this thread: to hand it over takes time."""
-        if self._threads == 1:
-            return [job() for job in jobs]
-        handed_over = [pool.submit(job) for job in jobs[:-1]]
-        last = jobs[-1]()
-        return [*(job.result() for job in handed_over), last]
+        *strips, last = itertools.starmap(range, itertools.pairwise(edges))
+        handed_over = [pool.submit(work, strip) for strip in strips]
+        work(last)
+        for job in handed_over:
+            job.result()

@@ -45,7 +45,8 @@ class Disparity:
         freeze(self, "values", np.float32, (None, None))
         for name, dtype in (("confidence", "f4"), ("sigma_px", "f4"), ("reason", "u1")):
             freeze(self, name, dtype, self.values.shape)
-        if not np.array_equal(self.valid, self.reason == Reason.VALID):
+        # Beside a member of an enumeration numpy would compare in 64 bits, in ten times as long.
+        if not np.array_equal(self.valid, self.reason == np.uint8(Reason.VALID)):
             raise ShapeError("Disparity.reason is VALID where values is NaN, or the reverse")
 
     @property

@@ -31,7 +31,7 @@ def search_all(
     minima = empty_minima(*left.shape)
     tiles = tiles or everything(left.shape, search)
     views = empty_views(search, tiles.width, *left.shape)
-    lay_out(left, right, search, 0, len(left), views)
+    lay_out(left, right, search, 0, views)
     room = make_room(search, tiles.width)
     edges = np.linspace(0, len(left), strips + 1).astype(int)
     for first, end in itertools.pairwise(edges):
