@@ -68,20 +68,28 @@ def make_tiles(shape: tuple[int, int], size: tuple[int, int], ndisp: int) -> Til
 
 @njit(cache=True, nogil=True)
 def offer_supported(
-    halved: NDArray[np.float32], minimum: int, ndisp: int, support: Support, tiles: Tiles
+    halved: NDArray[np.float32],
+    minimum: int,
+    ndisp: int,
+    support: Support,
+    first: int,
+    end: int,
+    tiles: Tiles,
 ) -> None:
-    """Offer each tile those groups of candidates that matches at half size support.
+    """Offer the tiles of some rows those groups of candidates that matches at half size support.
 
     Args:
         halved: float32 (h, w), disparities of the pictures at half size; NaN = no match.
         minimum: Disparity of candidate 0 at full size.
         ndisp: Number of candidates at full size.
         support: What it takes.
+        first: First row of tiles to do.
+        end: The row after the last.
         tiles: ``offered`` is written.
     """
     counts = np.empty(ndisp, np.int64)
-    rows, columns, groups = tiles.offered.shape
-    for i in range(rows):
+    _, columns, groups = tiles.offered.shape
+    for i in range(first, end):
         y0, y1 = _reach(i, tiles.height, support.margin_y, halved.shape[0])
         for j in range(columns):
             x0, x1 = _reach(j, tiles.width, support.margin_x, halved.shape[1])

@@ -37,7 +37,7 @@ from recon.matching.search import (
     UniquenessPercent,
     finish,
 )
-from recon.matching.strips import StripSearch
+from recon.matching.strips import StripSearch, in_strips
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import UInt8
 
@@ -143,7 +143,12 @@ class SadMatcher:
         found = self._half.find(pool, views, halved, whole, rules, asked)
         tiles = divided(search, pair.left.shape)
         wanted = support(self._settings.least_support)
-        offer_supported(found.values, search.minimum, search.ndisp, wanted, tiles)
+        values, minimum, ndisp = found.values, search.minimum, search.ndisp
+
+        def offer(rows: range) -> None:
+            offer_supported(values, minimum, ndisp, wanted, rows.start, rows.stop, tiles)
+
+        in_strips(pool, self._threads, offer, len(tiles.offered))
         return tiles
 
     def _plan(self, camera: RectifiedCamera) -> tuple[Search, Rules]:

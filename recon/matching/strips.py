@@ -70,14 +70,23 @@ class StripSearch:
             self._minima.borrow(height, width) as minima,
         ):
             for work in (lay, look):
-                self._in_strips(pool, work, height)
+                in_strips(pool, self._threads, work, height)
         return refined
 
-    def _in_strips(self, pool: Executor, work: Callable[[range], None], rows: int) -> None:
-        """Work on all rows, in one strip per thread; the last in this: to hand over takes time."""
-        edges = np.linspace(0, rows, min(self._threads, rows) + 1).astype(int).tolist()
-        *strips, last = itertools.starmap(range, itertools.pairwise(edges))
-        handed_over = [pool.submit(work, strip) for strip in strips]
-        work(last)
-        for job in handed_over:
-            job.result()
+
+def in_strips(pool: Executor, threads: int, work: Callable[[range], None], rows: int) -> None:
+    """Work on all rows, in one strip per thread.
+
+    Args:
+        pool: Where to work on all strips but the last, which is left to the thread that calls:
+            to hand work over takes time.
+        threads: Most strips.
+        work: What to do with some rows.
+        rows: How many there are, at least 1.
+    """
+    edges = np.linspace(0, rows, min(threads, rows) + 1).astype(int).tolist()
+    *strips, last = itertools.starmap(range, itertools.pairwise(edges))
+    handed_over = [pool.submit(work, strip) for strip in strips]
+    work(last)
+    for job in handed_over:
+        job.result()

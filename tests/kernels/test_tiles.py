@@ -17,7 +17,9 @@ LENIENT = Support(margin_x=0, margin_y=0, margin=0, matched=0.0, share=0.0, leas
 
 def offered(halved: Float32, support: Support, minimum: int = 0) -> Tiles:
     tiles = make_tiles((2 * halved.shape[0], 2 * halved.shape[1]), (8, 16), NDISP)
-    offer_supported(halved, minimum, NDISP, support, tiles)
+    rows = len(tiles.offered)
+    for first, end in ((0, rows // 2), (rows // 2, rows)):
+        offer_supported(halved, minimum, NDISP, support, first, end, tiles)
     return tiles
 
 
