@@ -69,6 +69,11 @@ def least(a: Lanes, b: Lanes) -> Lanes:
     return np.minimum(a, b)
 
 
+def most(a: Lanes, b: Lanes) -> Lanes:
+    """The larger value of each lane."""
+    return np.maximum(a, b)
+
+
 def distance(a: Lanes, b: Lanes) -> Lanes:
     """``|a - b|`` of each lane."""
     return np.maximum(a, b) - np.minimum(a, b)
@@ -105,6 +110,21 @@ def narrow(lanes: Lanes) -> Lanes:
     return lanes.astype(np.uint8)
 
 
+def put_before(lanes: Lanes, before: Lanes) -> Lanes:
+    """Each lane's neighbour below; that of the first lane is the last of ``before``."""
+    return np.concatenate((before[-1:], lanes[:-1]))
+
+
+def put_after(lanes: Lanes, after: Lanes) -> Lanes:
+    """Each lane's neighbour above; that of the last lane is the first of ``after``."""
+    return np.concatenate((lanes[1:], after[:1]))
+
+
+def spread_lowest(lanes: Lanes) -> Lanes:
+    """The smallest value, in each lane."""
+    return np.full_like(lanes, lanes.min())
+
+
 class _Vector(types.Type):  # type: ignore[misc]
     """What numba knows of a vector: the type of its values."""
 
@@ -118,14 +138,15 @@ class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
     """How a vector is held: as LLVM's vector."""
 
     def __init__(self, manager: Any, vector: _Vector) -> None:
-        super().__init__(manager, vector, _llvm(vector.element.bitwidth))
+        super().__init__(manager, vector, llvm_type(vector.element.bitwidth))
 
 
-def _llvm(bits: int, lanes: int = LANES) -> ir.VectorType:
+def llvm_type(bits: int, lanes: int = LANES) -> ir.VectorType:
+    """LLVM's type of a vector of so many bits a lane."""
     return ir.VectorType(ir.IntType(bits), lanes)
 
 
-def _compile(function: Callable[..., Any], typer: Callable[..., Any]) -> Callable[..., Any]:
+def compiled_as(function: Callable[..., Any], typer: Callable[..., Any]) -> Callable[..., Any]:
     """Decorate what writes LLVM instructions for a function of vectors.
 
     Args:
@@ -167,7 +188,7 @@ def _write_distance(builder: Any, a: Any, b: Any) -> Any:
 
 
 def _write_mean(builder: Any, a: Any, b: Any) -> Any:
-    wide = _llvm(16)
+    wide = llvm_type(16)
     one = ir.Constant(wide, [1] * LANES)
     total = builder.add(builder.add(builder.zext(a, wide), builder.zext(b, wide)), one)
     return builder.trunc(builder.lshr(total, one), a.type)
@@ -186,13 +207,14 @@ _binary(operator.rshift, lambda builder, a, b: builder.lshr(a, b))
 _binary(mean, _write_mean)
 _binary(differing_bits, _write_differing)
 _binary(least, _intrinsic("umin"))
+_binary(most, _intrinsic("umax"))
 _binary(distance, _write_distance)
 
 
 def _write_splat(builder: Any, value: Any, lanes: int) -> Any:
-    kind = _llvm(value.type.width, lanes)
+    kind = llvm_type(value.type.width, lanes)
     one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
-    return builder.shuffle_vector(one, one, ir.Constant(_llvm(32, lanes), [0] * lanes))
+    return builder.shuffle_vector(one, one, ir.Constant(llvm_type(32, lanes), [0] * lanes))
 
 
 def _address(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
@@ -201,7 +223,7 @@ def _address(context: Any, builder: Any, signature: Any, arguments: Any, kind: A
     return builder.bitcast(builder.gep(array.data, [arguments[1]]), kind.as_pointer())
 
 
-def _address_in_row(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
+def address_in_row(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
     """Where the second and third argument point to in the first, an array of rows."""
     rows = context.make_array(signature.args[0])(context, builder, arguments[0])
     n, at = (
@@ -212,37 +234,38 @@ def _address_in_row(context: Any, builder: Any, signature: Any, arguments: Any, 
     return builder.bitcast(builder.gep(rows.data, [start]), kind.as_pointer())
 
 
-def _type_in_row(rows: Any, n: Any, at: Any) -> Any:
+def type_in_row(rows: Any, n: Any, at: Any) -> Any:
+    """The type of a vector in an array of rows; None = the array does not fit."""
     # Of any other layout the address would be another one.
     fits = isinstance(rows, types.Array) and rows.ndim == 1 + 1 and rows.layout == "C"
     return _Vector(rows.dtype) if fits else None
 
 
 def _store_type(rows: Any, n: Any, at: Any, lanes: Any) -> Any:
-    return types.none if lanes == _type_in_row(rows, n, at) else None
+    return types.none if lanes == type_in_row(rows, n, at) else None
 
 
-@_compile(load_row, _type_in_row)
+@compiled_as(load_row, type_in_row)
 def _load_row(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    kind = _llvm(signature.return_type.element.bitwidth)
-    return builder.load(_address_in_row(context, builder, signature, arguments, kind), align=1)
+    kind = llvm_type(signature.return_type.element.bitwidth)
+    return builder.load(address_in_row(context, builder, signature, arguments, kind), align=1)
 
 
-@_compile(store_row, _store_type)
+@compiled_as(store_row, _store_type)
 def _store_row(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     lanes = arguments[3]
-    address = _address_in_row(context, builder, signature, arguments, lanes.type)
+    address = address_in_row(context, builder, signature, arguments, lanes.type)
     builder.store(lanes, address, align=1)
     return context.get_dummy_value()
 
 
-@_compile(load, lambda array, at: _Vector(array.dtype))
+@compiled_as(load, lambda array, at: _Vector(array.dtype))
 def _load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    kind = _llvm(signature.return_type.element.bitwidth)
+    kind = llvm_type(signature.return_type.element.bitwidth)
     return builder.load(_address(context, builder, signature, arguments, kind), align=1)
 
 
-@_compile(store, lambda array, at, lanes: types.none)
+@compiled_as(store, lambda array, at, lanes: types.none)
 def _store(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     lanes = arguments[2]
     address = _address(context, builder, signature, arguments, lanes.type)
@@ -255,34 +278,62 @@ def _vector_of(value: types.Integer) -> _Vector:
     return _Vector(value)
 
 
-@_compile(splat, _vector_of)
+@compiled_as(splat, _vector_of)
 def _splat(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return _write_splat(builder, arguments[0], LANES)
 
 
-@_compile(ramp, lambda first: _Vector(types.uint16))
+@compiled_as(ramp, lambda first: _Vector(types.uint16))
 def _ramp(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     start = _write_splat(builder, arguments[0], LANES)
-    return builder.add(start, ir.Constant(_llvm(16), list(range(LANES))))
+    return builder.add(start, ir.Constant(llvm_type(16), list(range(LANES))))
 
 
-@_compile(where_equal, lambda a, b, then, otherwise: then)
+@compiled_as(where_equal, lambda a, b, then, otherwise: then)
 def _where_equal(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     a, b, then, otherwise = arguments
     return builder.select(builder.icmp_unsigned("==", a, b), then, otherwise)
 
 
-@_compile(where_less, lambda a, b, then, otherwise: then)
+@compiled_as(where_less, lambda a, b, then, otherwise: then)
 def _where_less(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     a, b, then, otherwise = arguments
     return builder.select(builder.icmp_unsigned("<", a, b), then, otherwise)
 
 
-@_compile(fit, lambda lanes, array: _Vector(array.dtype))
+@compiled_as(fit, lambda lanes, array: _Vector(array.dtype))
 def _fit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return builder.zext(arguments[0], _llvm(signature.return_type.element.bitwidth))
+    return builder.zext(arguments[0], llvm_type(signature.return_type.element.bitwidth))
 
 
-@_compile(narrow, lambda lanes: _Vector(types.uint8))
+@compiled_as(narrow, lambda lanes: _Vector(types.uint8))
 def _narrow(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    return builder.trunc(arguments[0], _llvm(8))
+    return builder.trunc(arguments[0], llvm_type(8))
+
+
+@compiled_as(spread_lowest, lambda lanes: lanes)
+def _spread_lowest(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    # Turned by ever fewer lanes, within ever smaller parts, and never taken out of the register.
+    found, turn = arguments[0], LANES // 2
+    while turn:
+        order = [lane ^ turn for lane in range(LANES)]
+        found = _intrinsic("umin")(builder, found, shuffle(builder, found, found, order))
+        turn //= 2
+    return found
+
+
+def shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
+    """Lanes of two vectors: up to ``LANES - 1`` those of the first."""
+    return builder.shuffle_vector(a, b, ir.Constant(llvm_type(32), order))
+
+
+_binary(
+    put_before,
+    lambda builder, lanes, before: shuffle(
+        builder, before, lanes, list(range(LANES - 1, 2 * LANES - 1))
+    ),
+)
+_binary(
+    put_after,
+    lambda builder, lanes, after: shuffle(builder, lanes, after, list(range(1, LANES + 1))),
+)

@@ -1,11 +1,12 @@
 """Costs along paths, from one row of pixels to the next.
 
-All paths come from the row before, never along the row: every pixel of a row is a lane of its own,
-no minimum is taken across lanes, and no pixel waits for its neighbour. Means of two, rounded up,
-take the place of sums: one instruction each, and bytes suffice. The straight path counts twice a
-slanted one. The loops are written for `recon.kernels.lanes`; a path from the left is followed from
-the right end of a row to its left end, and one from the right the other way, so that the next row
-can be written over the one before.
+All these paths come from the row before: every pixel of a row is a lane of its own, no minimum is
+taken across lanes, and no pixel waits for its neighbour. Those along the row are followed by
+`recon.kernels.path_across`. Means of two, rounded up, take the place of sums: one instruction each,
+and bytes suffice. A straight path counts twice a diagonal, and one along the row twice that. The
+loops are written for `recon.kernels.lanes`; a path from the left is followed from the right end of
+a row to its left end, and one from the right the other way, so that the next row can be written
+over the one before.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ DOWN, UP, ASIDE = range(3)
 STRAIGHT, FROM_LEFT, FROM_RIGHT = range(3)
 """Where paths come from."""
 
-SLANT: Final = 2
-"""Columns by which paths from the left and from the right step with each row: where no path goes
-along the rows, flatter ones are of more use than diagonals."""
+SLANT: Final = 1
+"""Columns by which paths from the left and from the right step with each row. Where no path goes
+along the rows flatter ones are of more use, but with those diagonals are."""
 
 TOGETHER: Final = 16
 """Candidates that are done before the next columns: what they share stays in registers."""
@@ -90,6 +91,7 @@ def advance(
     paths: Paths,
     row: PathRow,
     means: NDArray[np.uint8],
+    across: NDArray[np.uint8],
     stage: int,
 ) -> None:
     """Advance the paths of a sweep by one row.
@@ -102,6 +104,7 @@ def advance(
         row: Read and written: the path costs.
         means: uint8 (P, MARGIN + C + MARGIN): their means are written (DOWN), or taken into what is
             written (UP), or neither (ASIDE).
+        across: uint8 (Q, C), means of the paths along the row, taken in as well (UP).
         stage: DOWN, UP or ASIDE.
     """
     lowest, now = row.lowest[0], row.lowest[1]
@@ -116,7 +119,7 @@ def advance(
     for first in range(0, costs.shape[0], TOGETHER):
         end = min(first + TOGETHER, costs.shape[0])
         _advance_from_right(costs, first, end, paths.small, row)
-        _advance_others(costs, first, end, paths.small, row, means, stage)
+        _advance_others(costs, first, end, paths.small, row, means, across, stage)
         # Beyond the last column paths begin.
         row.costs[FROM_RIGHT, first + 1 : end + 1, beyond : beyond + SLANT] = np.uint8(0)
     now[FROM_RIGHT, beyond : beyond + SLANT] = np.uint8(0)
@@ -140,7 +143,7 @@ def _set_limits(
 
 
 @njit(cache=True, nogil=True)
-def _onward(
+def onward(
     same: Lanes, below: Lanes, above: Lanes, penalty: Lanes, limit: Lanes, low: Lanes, cost: Lanes
 ) -> Lanes:
     """Cost of a path's next pixel: of the least of the ways to it, the least before taken off."""
@@ -162,7 +165,7 @@ def _advance_from_right(
         same = load_row(path, first + 1, there)
         for k in range(first, end):
             above = load_row(path, k + 2, there)
-            cost = _onward(same, below, above, penalty, limit, low, load_row(costs, k, x))
+            cost = onward(same, below, above, penalty, limit, low, load_row(costs, k, x))
             store_row(path, k + 1, here, cost)
             fresh, below, same = least(fresh, cost), same, above
         store_row(row.below, FROM_RIGHT, x, below)
@@ -177,6 +180,7 @@ def _advance_others(
     small: int,
     row: PathRow,
     means: NDArray[np.uint8],
+    across: NDArray[np.uint8],
     stage: int,
 ) -> None:
     """Advance the other two paths, from the right end of the row on, and write the means."""
@@ -193,14 +197,15 @@ def _advance_others(
         for k in range(first, end):
             above, above_0 = load_row(left, k + 2, there), load_row(straight, k + 2, here)
             pixel = load_row(costs, k, x)
-            cost = _onward(same, below, above, penalty, limit, low, pixel)
-            cost_0 = _onward(same_0, below_0, above_0, penalty, limit_0, low_0, pixel)
+            cost = onward(same, below, above, penalty, limit, low, pixel)
+            cost_0 = onward(same_0, below_0, above_0, penalty, limit_0, low_0, pixel)
             store_row(left, k + 1, here, cost)
             store_row(straight, k + 1, here, cost_0)
             if stage != ASIDE:
                 middle = mean(cost_0, mean(cost, load_row(right, k + 1, here)))
                 if stage == UP:
                     middle = mean(load_row(means, k, here), middle)
+                    middle = mean(load_row(across, k, x), middle)
                 store_row(means, k, here, middle)
             fresh, below, same = least(fresh, cost), same, above
             fresh_0, below_0, same_0 = least(fresh_0, cost_0), same_0, above_0

@@ -1,12 +1,12 @@
 """Semi-global matching: each pixel's candidates agree with those along paths to it.
 
-Two sweeps, one down and one up, follow half of the paths each. Of a path only the row before is
-kept, in uint8; its least cost is taken off at every step, so that no path cost exceeds the cost
-of a pixel plus the larger penalty. A strip of rows is done in bands of columns, and a band in
-blocks of rows, one after the other: the sweep down goes on from block to block, the sweep up
-starts some rows below each, and a band is a little wider than what is kept of it, so that paths
-have forgotten where they began. So what passes from one sweep to the other never leaves the cache:
-it is the memory, not the arithmetic, that this would wait for.
+Two sweeps, one down and one up, follow three paths each; the one that goes up follows the two along
+each row as well. Paths are kept in uint8; their least cost is taken off at every step, so that no
+path cost exceeds the cost of a pixel plus the larger penalty. A strip of rows is done in bands of
+columns, and a band in blocks of rows, one after the other: the sweep down goes on from block to
+block, the sweep up starts some rows below each, and a band is a little wider than what is kept of
+it, so that paths have forgotten where they began. So what passes from one sweep to the other never
+leaves the cache: it is the memory, not the arithmetic, that this would wait for.
 
 The twin in plain numpy is `recon.kernels.semi_global_reference.semi_global_minima_reference`.
 
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from recon.kernels.lanes import LANES
 from recon.kernels.minima import Minima
+from recon.kernels.path_across import Across, empty_across, follow_row
 from recon.kernels.path_costs import (
     CostRows,
     Views,
@@ -39,7 +40,7 @@ from recon.kernels.plane_minima import MARGIN, NONE, Band, Best, choose_row, emp
 ROWS: Final = 32
 """Rows of a block: many beside those that the sweep up starts below it."""
 
-ROOM_BYTES: Final = 5 << 20
+ROOM_BYTES: Final = 4 << 20
 """What passes from one sweep to the other should not take more, or it leaves the cache."""
 
 
@@ -64,12 +65,14 @@ class Bench(NamedTuple):
             margins are `NONE`.
         above: Paths from above.
         under: Paths from below.
+        across: Paths along the row.
     """
 
     costs: NDArray[np.uint8]
     means: NDArray[np.uint8]
     above: PathRow
     under: PathRow
+    across: Across
 
 
 def empty_room(width: int, paths: Paths) -> Room:
@@ -108,7 +111,9 @@ def _bench(room: Room, columns: int, paths: Paths) -> Bench:
         start += size
     costs, means = arrays[:2]
     means[..., :MARGIN] = means[..., -MARGIN:] = NONE
-    return Bench(costs, means, PathRow(*arrays[2:6]), PathRow(*arrays[6:]))
+    return Bench(
+        costs, means, PathRow(*arrays[2:6]), PathRow(*arrays[6:]), empty_across(columns, paths)
+    )
 
 
 def semi_global_minima(
@@ -118,9 +123,9 @@ def semi_global_minima(
 
     Candidate ``k`` of a pixel is the disparity ``minimum + k``. Its cost is the mean of the costs
     of the paths that end there. Those from above begin at the border of the picture or ``overlap``
-    rows above the strip, those from below ``overlap`` rows below each block, those from the side
-    at the border of the picture or ``side_overlap`` columns beside each band (`SLANT` of them are
-    one step).
+    rows above the strip, those from below ``overlap`` rows below each block, those along a row
+    and those from the side at the border of the picture or ``side_overlap`` columns beside each
+    band.
 
     Args:
         views: What is compared.
@@ -135,16 +140,18 @@ def semi_global_minima(
     best = empty_best(room.columns, width, len(strip))
     minima.right_winner[strip.start : strip.stop] = paths.ndisp
     bench = None
-    # With the window's sides, a band fills vectors of lanes.
-    columns = room.columns if room.columns >= width else room.columns - 2 * window.radius
-    for band in _bands(width, columns, paths.side_overlap):
+    for band in bands_of(width, room.columns, window, paths):
         if bench is None or padded(band.end - band.start) != bench.costs.shape[2]:
             bench = _bench(room, padded(band.end - band.start), paths)
         _search_band(views, window, paths, strip, band, bench, rows, best, minima)
 
 
-def _bands(width: int, columns: int, overlap: int) -> list[Band]:
-    """Divide the columns of a picture among bands of so many columns that overlap."""
+def bands_of(width: int, columns: int, window: Window, paths: Paths) -> list[Band]:
+    """Divide a picture of that width among bands that overlap, in a room for so many columns."""
+    if columns < width:
+        # With the window's sides, a band fills vectors of lanes.
+        columns -= 2 * window.radius
+    overlap = paths.side_overlap
     bands, first = [], 0
     while first < width:
         start = max(first - overlap, 0)
@@ -190,7 +197,7 @@ def _sweep_down(
     for y in range(first, end):
         costs, means = bench.costs[y % bench.costs.shape[0]], bench.means[y % ROWS]
         here, before = grey[y, band.start : band.end], grey[max(y - 1, 0), band.start : band.end]
-        advance(costs, here, before, paths, bench.above, means, DOWN)
+        advance(costs, here, before, paths, bench.above, means, bench.across.means, DOWN)
 
 
 @njit(cache=True, nogil=True)
@@ -212,6 +219,9 @@ def _sweep_up(
         costs, means = bench.costs[y % bench.costs.shape[0]], bench.means[y % ROWS]
         before = grey[min(y + 1, last), band.start : band.end]
         stage = UP if y < end else ASIDE
-        advance(costs, grey[y, band.start : band.end], before, paths, bench.under, means, stage)
+        here = grey[y, band.start : band.end]
+        if stage == UP:
+            follow_row(costs, here, paths, bench.across)
+        advance(costs, here, before, paths, bench.under, means, bench.across.means, stage)
         if stage == UP:
             choose_row(means, paths.minimum, y, place + y - first, band, best, minima)

@@ -8,22 +8,41 @@ from numpy.typing import NDArray
 from recon.kernels.minima import Minima
 from recon.kernels.path_costs import Views, Window
 from recon.kernels.path_rows import SLANT, Paths
-from recon.kernels.plane_minima import PARTS
+from recon.kernels.plane_minima import PARTS, Band
 from recon.kernels.sad_reference import minima_reference
 
 Int64 = NDArray[np.int64]
 
 
-def semi_global_minima_reference(views: Views, window: Window, paths: Paths) -> Minima:
-    """All rows of `recon.kernels.semi_global.semi_global_minima`, as one block."""
-    costs = path_costs_reference(views, window, paths.ndisp)
-    sweeps = []
-    for dy in (1, -1):
-        straight, left, right = (
-            path_reference(views.grey, costs, paths, dy, dx) for dx in (0, SLANT, -SLANT)
-        )
-        sweeps.append(_mean(straight, _mean(left, right)))
-    return minima_reference(PARTS * _mean(*sweeps), paths.minimum)
+def semi_global_minima_reference(
+    views: Views, window: Window, paths: Paths, bands: list[Band] | None = None
+) -> Minima:
+    """All rows of `recon.kernels.semi_global.semi_global_minima`, as one block.
+
+    Args:
+        views: As there.
+        window: As there.
+        paths: As there.
+        bands: How the columns are divided; None = not at all.
+    """
+    costs, width = path_costs_reference(views, window, paths.ndisp), views.grey.shape[1]
+    parts = [
+        _path_means(views.grey[:, start:end], costs[:, start:end], paths)[
+            :, first - start : last - start
+        ]
+        for start, end, first, last in bands or [Band(0, width, 0, width)]
+    ]
+    return minima_reference(PARTS * np.concatenate(parts, axis=1), paths.minimum)
+
+
+def _path_means(grey: NDArray[np.uint8], costs: Int64, paths: Paths) -> Int64:
+    """int64 (H, W, P), mean costs of the paths to each pixel."""
+
+    def along(dy: int, dx: int) -> Int64:
+        return path_reference(grey, costs, paths, dy, dx)
+
+    down, up = (_mean(along(dy, 0), _mean(along(dy, SLANT), along(dy, -SLANT))) for dy in (1, -1))
+    return _mean(_mean(along(0, 1), along(0, -1)), _mean(down, up))
 
 
 def _mean(a: Int64, b: Int64) -> Int64:

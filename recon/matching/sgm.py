@@ -37,7 +37,7 @@ _ODDS: Final = 2.4
 _STRIP_ROWS: Final = 192
 
 _SIDE_OVERLAP: Final = 16
-"""Columns that a band of a strip shares: only slanted paths begin there, and 32 change nothing."""
+"""Columns that a band of a strip shares: paths along the row and slanted ones begin there."""
 
 
 class SgmSettings(MeasuredSettings):
@@ -91,7 +91,7 @@ class SgmSettings(MeasuredSettings):
         default=0.25, ge=0.0, le=1.0, description="Share of large_penalty that is left there."
     )
     overlap_rows: int = Field(
-        default=16,
+        default=8,
         ge=0,
         le=1024,
         description="Rows that each strip of a picture shares with its neighbours.",

@@ -15,6 +15,7 @@ from numba.core.errors import TypingError
 
 from recon.kernels import lanes
 from recon.kernels.lanes import LANES
+from recon.kernels.squares import transpose
 
 KINDS = (np.uint8, np.uint16)
 
@@ -74,6 +75,19 @@ def move_rows(a: Any, b: Any, out: Any) -> None:
     lanes.store_row(out, 2, 1, lanes.load_row(a, 1, 3))
 
 
+@njit
+def move_block(a: Any, b: Any, out: Any) -> None:
+    transpose(a, 1, 2, out, 2, 3)
+
+
+@njit
+def look_beside(a: Any, b: Any, out: Any) -> None:
+    x, y = lanes.load(a, 2), lanes.load(b, 0)
+    lanes.store(out, 0, lanes.put_before(x, y))
+    lanes.store(out, LANES, lanes.put_after(x, y))
+    lanes.store(out, 2 * LANES, lanes.spread_lowest(x))
+
+
 def assert_same(function: Callable[..., None], a: Any, b: Any, kind: Any) -> None:
     compiled, plain = np.zeros((2, 5 * LANES), kind)
     function(a, b, compiled)
@@ -90,7 +104,7 @@ def arrays(kind: Any) -> st.SearchStrategy[Any]:
 @settings(deadline=None)  # the first call compiles
 @given(st.data())
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("function", [add, subtract, compare])
+@pytest.mark.parametrize("function", [add, subtract, compare, look_beside])
 def test_vectors_of_one_kind_do_as_numpy_does(
     function: Callable[..., None], kind: Any, data: st.DataObject
 ) -> None:
@@ -128,6 +142,20 @@ def test_rows_are_read_and_written_where_they_are(kind: Any) -> None:
     move_rows(a, a, out)
     np.testing.assert_array_equal(out[2, 1:-1], a[1, 3 : 3 + LANES])
     assert np.count_nonzero(out) == LANES
+
+
+def test_blocks_are_transposed_and_nothing_else_is_written() -> None:
+    a = np.random.default_rng(0).integers(1, 256, (LANES + 3, LANES + 7), dtype=np.uint8)
+    out = np.zeros((LANES + 4, LANES + 5), np.uint8)
+    move_block(a, a, out)
+    np.testing.assert_array_equal(out[2:-2, 3:-2], a[1:-2, 2:-5].T)
+    assert np.count_nonzero(out) == LANES**2
+
+
+def test_neighbours_of_the_ends_come_from_the_other_vector() -> None:
+    a, b = np.arange(LANES, dtype=np.uint8), np.arange(100, 100 + LANES, dtype=np.uint8)
+    assert lanes.put_before(a, b).tolist() == [99 + LANES, *range(LANES - 1)]
+    assert lanes.put_after(a, b).tolist() == [*range(1, LANES), 100]
 
 
 def test_rows_that_are_not_contiguous_are_refused_by_the_compiler() -> None:

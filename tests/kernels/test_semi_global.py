@@ -22,7 +22,14 @@ from recon.kernels.path_costs import (
     write_views,
 )
 from recon.kernels.path_rows import Paths
-from recon.kernels.semi_global import ROWS, Room, empty_room, room_bytes, semi_global_minima
+from recon.kernels.semi_global import (
+    ROWS,
+    Room,
+    bands_of,
+    empty_room,
+    room_bytes,
+    semi_global_minima,
+)
 from recon.kernels.semi_global_reference import semi_global_minima_reference
 
 Image = NDArray[np.uint8]
@@ -143,19 +150,22 @@ def test_a_picture_of_several_blocks_equals_the_twin(shape: tuple[int, int], ove
 
 
 @pytest.mark.parametrize("minimum", [-70, 0, 3])
-def test_bands_that_overlap_as_far_as_slanted_paths_reach_equal_the_twin(
-    minimum: int,
+@pytest.mark.parametrize("side_overlap", [0, 9])
+def test_bands_equal_the_twin_that_begins_paths_at_their_sides(
+    minimum: int, side_overlap: int
 ) -> None:
-    """They step by two columns a row; the right view is put together from all bands."""
+    """The right view is put together from all bands."""
     rng = np.random.default_rng(2)
     left, right = rng.integers(0, 256, (2, 9, 300), dtype=np.uint8)
     right[:, :200] = left[:, 20:220]
-    paths = Paths(70, minimum, 10, 50, 20, 12, overlap=9, side_overlap=18)
+    paths = Paths(70, minimum, 10, 50, 20, 12, overlap=9, side_overlap=side_overlap)
     window = scaled_window(2, 2, 16, 30, 3.0)
     views = make_views(left, right, window, paths)
-    expected = semi_global_minima_reference(views, window, paths)
-    assert_equal(search(views, window, paths, columns=64), expected)
-    assert_equal(search(views, window, paths, strips=2, columns=128), expected)
+    for strips, columns in ((1, 64), (2, 128)):
+        bands = bands_of(300, columns, window, paths)
+        expected = semi_global_minima_reference(views, window, paths, bands)
+        assert len(bands) > 1
+        assert_equal(search(views, window, paths, strips, columns), expected)
 
 
 @given(st.integers(0, 15), st.integers(0, 15), st.integers(1, 207), st.floats(0.05, 6.0))
