@@ -91,7 +91,7 @@ class SgmSettings(MeasuredSettings):
         default=0.25, ge=0.0, le=1.0, description="Share of large_penalty that is left there."
     )
     overlap_rows: int = Field(
-        default=8,
+        default=4,
         ge=0,
         le=1024,
         description="Rows that each strip of a picture shares with its neighbours.",
