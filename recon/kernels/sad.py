@@ -62,8 +62,8 @@ def sad_minima(
     lower ``k + lean``, as on the ground under a camera. Candidates whose right pixel lies outside
     the picture do not exist, nor those that a tile is not offered. Of equal costs the smaller
     disparity wins. The costs before and after the best are those of the window that won, the
-    upright one if both did. A pixel of the
-    right view is matched to the left pixel that chose it at the least cost.
+    upright one if both did. A pixel of the right view is matched to the left pixel that chose it
+    at the least cost.
 
     Args:
         views: The pictures, from `lay_out`.
@@ -107,16 +107,14 @@ def _choose(
             store(after, x, found[3])
             store(second, x, found[4])
         else:
-            row = room.found
+            row, rest = room.found, winner.size - x
             for n in range(5):
                 store(row, n * LANES, found[n])
-            for c in range(winner.size - x):
-                winner[x + c], best[x + c], before[x + c] = (
-                    row[c],
-                    row[LANES + c],
-                    row[2 * LANES + c],
-                )
-                after[x + c], second[x + c] = row[3 * LANES + c], row[4 * LANES + c]
+            winner[x:] = row[:rest]
+            best[x:] = row[LANES : LANES + rest]
+            before[x:] = row[2 * LANES : 2 * LANES + rest]
+            after[x:] = row[3 * LANES : 3 * LANES + rest]
+            second[x:] = row[4 * LANES : 4 * LANES + rest]
 
 
 @njit(cache=True, nogil=True)
