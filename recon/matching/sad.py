@@ -129,7 +129,8 @@ class SadMatcher:
             enough = partial(texture, pair, (s.window_px, s.window_height_px), s.min_texture)
             tiles = self._tiles(pool, pair, search)
             refined = self._full.find(pool, (pair.left, pair.right), search, tiles, rules, enough)
-        return _smoothed(finish(refined, s), s.median_px)
+            found = finish(refined, s, pool, self._threads)
+        return _smoothed(found, s.median_px)
 
     def _tiles(self, pool: Executor, pair: RectifiedPair, search: Search) -> Tiles:
         """Which candidates are offered where."""

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from typing import Annotated, Final, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from recon.errors import MatchingError
+from recon.kernels.opposite import average_opposite
 from recon.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA, Refined, reject
 from recon.kernels.speckle import find_speckles
+from recon.matching.strips import in_strips
 from recon.settings import Settings
 from recon.structures import Disparity, Reason, RectifiedCamera
+from recon.structures.arrays import Float32
 
 FITS: Final = {"none": NO_FIT, "equiangular": EQUIANGULAR, "parabola": PARABOLA}
 """The codes of `MeasuredSettings.subpixel`."""
+
+_SAME_SURFACE_PX: Final = 1.0
+"""Neighbours that differ by more are not averaged: between them may be a step of depth."""
 
 
 def _odd(value: int) -> int:
@@ -112,21 +120,43 @@ class MeasuredSettings(SearchSettings):
         le=2.0,
         description="Smallest standard deviation that a disparity is given.",
     )
+    average_px: OddInt = Field(
+        default=7,
+        ge=1,
+        le=31,
+        description="Each disparity becomes the mean of the pairs of opposite neighbours, in a "
+        "square of this width, that lie on its surface; odd. 1 = as measured.",
+    )
 
 
-def finish(refined: Refined, settings: SearchSettings) -> Disparity:
-    """The disparity of what was refined, without its small regions: their reason becomes SPECKLE.
+def finish(refined: Refined, settings: MeasuredSettings, pool: Executor, threads: int) -> Disparity:
+    """The disparity of what was refined: no small regions (reason SPECKLE), averaged.
 
     Args:
         refined: Overwritten; a copy of each array would cost more than the search for speckles.
-        settings: Says what a speckle is.
+        settings: Says what a speckle is, and what is averaged.
+        pool: Where to average.
+        threads: Strips of rows averaged at once. The result does not depend on it.
     """
     if settings.speckle_size_px >= 2:
         largest_step, size = settings.speckle_range_px, settings.speckle_size_px
         small = find_speckles(refined.values, largest_step, size)
         # A plain number: to look up what an enumeration is takes numba 0.2 ms.
         reject(small, int(Reason.SPECKLE), refined)
+    if settings.average_px > 1:
+        refined = refined._replace(values=_averaged(refined.values, settings, pool, threads))
     return Disparity(*refined)
+
+
+def _averaged(values: Float32, settings: MeasuredSettings, pool: Executor, threads: int) -> Float32:
+    """float32 (H, W), the values without the noise that they do not share with neighbours."""
+    averages, radius = np.empty_like(values), settings.average_px // 2
+
+    def average(rows: range) -> None:
+        average_opposite(values, radius, _SAME_SURFACE_PX, rows.start, rows.stop, averages)
+
+    in_strips(pool, threads, average, len(values))
+    return averages
 
 
 def usual_ndisp(width_px: int) -> int:

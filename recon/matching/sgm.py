@@ -169,7 +169,7 @@ class SgmMatcher:
             views = Views(pair.left, *planes)
             list(pool.map(prepare, strips))
             list(pool.map(search, strips))
-        return finish(refined, s)
+            return finish(refined, s, pool, at_once)
 
     def _strips(self, camera: RectifiedCamera, paths: Paths) -> tuple[list[range], int]:
         """The strips of a picture, and how many may be worked on at once."""
