@@ -41,10 +41,10 @@ def unrated_disparity(
     width = values.shape[1]
     with np.errstate(invalid="ignore"):
         there = np.arange(width, dtype=np.float32) - values
-        beside = (reason == Reason.VALID) & ((there < -0.5) | (there > width - 0.5))
+        beside = (reason == np.uint8(Reason.VALID)) & ((there < -0.5) | (there > width - 0.5))
     border = beside if pair.valid is None else beside | ~pair.valid
     told = np.where(border, np.uint8(Reason.BORDER), reason)
-    valid, nan = told == Reason.VALID, np.float32(np.nan)
+    valid, nan = told == np.uint8(Reason.VALID), np.float32(np.nan)
     return Disparity(
         values=np.where(valid, values, nan).astype(np.float32),
         confidence=np.where(valid, np.float32(settings.assumed_confidence), np.float32(0)),
