@@ -34,8 +34,8 @@ def average_opposite(
         largest_step: In the unit of ``values``.
         first: First row to average.
         end: Row after the last one.
-        averages: float32 (H, W), its rows ``first`` to ``end`` are written; NaN where the pixel
-            has no value.
+        averages: float32 (H, W), another array, whose rows ``first`` to ``end`` are written; NaN
+            where the pixel has no value.
     """
     height, width = values.shape
     step = np.float32(largest_step)

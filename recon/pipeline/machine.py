@@ -59,8 +59,9 @@ def available_cores() -> int:
 def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, in 10⁶ bytes."""
     # On Linux, what getrusage tells begins at the peak of whoever started the process.
-    if _STATUS.exists():
-        return int(_PEAK.search(_STATUS.read_text())[1]) * 1024 / 1e6  # type: ignore[index]
+    told = _PEAK.search(_STATUS.read_text()) if _STATUS.exists() else None
+    if told is not None:
+        return int(told[1]) * 1024 / 1e6
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
