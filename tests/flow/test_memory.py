@@ -85,15 +85,16 @@ def test_a_limit_that_cannot_be_held_is_one_line_and_the_run_can_be_resumed(
 
 
 @pytest.mark.slow
-def test_a_drive_four_times_as_long_takes_hardly_more_memory() -> None:
+def test_a_drive_twice_as_long_takes_hardly_more_memory() -> None:
     command = [sys.executable, str(BENCHMARK), "--json", "--width", "192"]
+    # What is kept of submaps and of places is full after some 500 frames.
     done = subprocess.run(
-        [*command, "--frames", "150", "--frames", "600"],
+        [*command, "--frames", "600", "--frames", "1200"],
         capture_output=True,
         text=True,
         check=False,
     )
     found = _summary(done)
     short, long = found["drives"]
-    assert long["voxels"] > 3 * short["voxels"]
-    assert long["peak_mb"] / short["peak_mb"] < 1.1
+    assert long["voxels"] > 1.9 * short["voxels"]
+    assert long["peak_mb"] / short["peak_mb"] < 1.05
