@@ -97,4 +97,4 @@ def test_a_drive_twice_as_long_takes_hardly_more_memory() -> None:
     found = _summary(done)
     short, long = found["drives"]
     assert long["voxels"] > 1.9 * short["voxels"]
-    assert long["peak_mb"] / short["peak_mb"] < 1.05
+    assert long["peak_mb"] / short["peak_mb"] < 1.1
