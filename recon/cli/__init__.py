@@ -28,22 +28,28 @@ app = typer.Typer(
     name="recon",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="Stereo reconstruction and mapping: from pairs of pictures to maps.",
+    help="Stereo reconstruction and mapping: from image pairs to maps.\n\nStart with recon demo, "
+    "which needs no data. recon COMMAND --help has examples.",
 )
-app.command()(demo)
-app.command()(pair)
-app.command("map")(map_)
-app.command()(occupancy)
-app.command()(mesh)
-app.command()(capture)
-app.command()(audit)
-app.command()(disparity)
-app.command()(paper)
-app.command()(board)
-app.command()(calibrate)
-app.command()(rectify)
-app.command()(doctor)
-app.add_typer(evaluate.app, name="evaluate")
+_START = "Getting started"
+_RECONSTRUCT = "Reconstruction and mapping"
+_CAMERAS = "Cameras and recordings"
+_EVALUATE = "Evaluation"
+
+app.command(rich_help_panel=_START)(demo)
+app.command(rich_help_panel=_START)(doctor)
+app.command(rich_help_panel=_RECONSTRUCT)(pair)
+app.command(rich_help_panel=_RECONSTRUCT)(disparity)
+app.command("map", rich_help_panel=_RECONSTRUCT)(map_)
+app.command(rich_help_panel=_RECONSTRUCT)(mesh)
+app.command(rich_help_panel=_RECONSTRUCT)(occupancy)
+app.command(rich_help_panel=_CAMERAS)(board)
+app.command(rich_help_panel=_CAMERAS)(calibrate)
+app.command(rich_help_panel=_CAMERAS)(rectify)
+app.command(rich_help_panel=_CAMERAS)(capture)
+app.command(rich_help_panel=_CAMERAS)(audit)
+app.add_typer(evaluate.app, name="evaluate", rich_help_panel=_EVALUATE)
+app.command(rich_help_panel=_EVALUATE)(paper)
 
 
 def _print_version(wanted: bool) -> None:
@@ -55,7 +61,10 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _root(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Version.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     """Hold the options of the program itself."""

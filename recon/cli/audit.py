@@ -25,7 +25,8 @@ from recon.cli.session import print_figures, print_json, session
 def audit(
     source: Annotated[Path, typer.Argument(help=SOURCES_HELP)],
     mend: Annotated[
-        Path | None, typer.Option(help="Write the calibration whose rows correspond to this file.")
+        Path | None,
+        typer.Option(help="Write a calibration with corrected row alignment to this file."),
     ] = None,
     kind: SourceKind = None,
     calib: Calib = None,
@@ -37,14 +38,14 @@ def audit(
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Look at a drive before a long run: good, usable or not usable, and why.
+    """Check a recording before a long run: good, usable or not usable, and why.
 
-    Rows, swapped eyes, late, frozen and repeating cameras, brightness, focus, baseline; and the
-    depth error to expect.
+    Looks at row alignment, swapped, delayed or frozen cameras, missing and
+    repeated frames, exposure, focus and baseline, and predicts the depth error.
 
     Examples:
       recon audit drive.bag --calib camchain.yaml
-      recon audit rides/today --mend mended.yaml && recon map rides/today --calib mended.yaml
+      recon audit rides/today --mend mended.yaml
     """
     with session():
         from recon.pipeline.audit_run import mend_calibration, run_audit

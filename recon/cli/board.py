@@ -16,31 +16,36 @@ def board(
         str | None,
         typer.Argument(
             metavar="BOARD",
-            help="chess:9x6:25mm (inner corners, side of a square), or "
-            "charuco:8x6:30mm:22mm:5x5_100 (squares, square, marker, dictionary).",
+            help="chess:9x6:25mm (inner corners, square size) or "
+            "charuco:8x6:30mm:22mm:5x5_100 (squares, square size, marker size, dictionary).",
         ),
     ] = None,
     same: Annotated[
-        str | None, typer.Option("--board", help="The same, spelt as for recon calibrate.")
+        str | None, typer.Option("--board", help="The board as an option, as in recon calibrate.")
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="A .pdf or .png file.")] = Path(
+    out: Annotated[Path, typer.Option("--out", "-o", help="PDF or PNG file to write.")] = Path(
         "board.pdf"
     ),
     paper: Annotated[
         str | None,
         typer.Option(
-            help="a4, a3, a2, a1, a0, letter, legal, tabloid or 600x400mm; without it the "
-            "smallest A paper that will do."
+            help="a4, a3, a2, a1, a0, letter, legal, tabloid, or a size such as 600x400mm.",
+            show_default="smallest A size that fits",
         ),
     ] = None,
     dpi: Annotated[
-        float, typer.Option(min=30, max=2400, help="Pixels per inch of a PNG, about.")
+        float,
+        typer.Option(min=30, max=2400, help="Approximate resolution of a PNG, in pixels per inch."),
     ] = 300.0,
     json: Json = False,
 ) -> None:
-    """Draw a calibration board to scale, to be printed at 100 %.
+    """Draw a calibration board to scale, for printing.
 
-    Example: recon board chess:9x6:25mm --out board.pdf --paper a4
+    Print it at 100 % and check the ruler on it before use.
+
+    Examples:
+      recon board chess:9x6:25mm --out board.pdf --paper a4
+      recon board charuco:8x6:30mm:22mm:5x5_100 --out charuco.png
     """
     wanted = pattern or same
     if wanted is None or (pattern and same):

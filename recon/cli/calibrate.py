@@ -31,31 +31,39 @@ class Form(str, Enum):
 
 def calibrate(
     left: Annotated[
-        str, typer.Argument(help='Left pictures: a folder, or a pattern in quotes, "left*.png".')
+        str,
+        typer.Argument(help='Left images: a folder, or a pattern in quotes such as "left*.png".'),
     ],
-    right: Annotated[str, typer.Argument(help="Right pictures, likewise.")],
+    right: Annotated[str, typer.Argument(help="Right images, likewise.")],
     board: Annotated[
         str,
         typer.Option(
-            help="chess:9x6:25mm (inner corners, side of a square), or "
-            "charuco:8x6:30mm:22mm:5x5_100 (squares, square, marker, dictionary)."
+            help="chess:9x6:25mm (inner corners, square size) or "
+            "charuco:8x6:30mm:22mm:5x5_100 (squares, square size, marker size, dictionary)."
         ),
     ],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Calibration file to write.")
     ] = None,
     form: Annotated[
-        Form, typer.Option("--format", "-f", help="Of that file; ros writes two, _left and _right.")
+        Form,
+        typer.Option(
+            "--format", "-f", help="Format of that file; ros writes two, _left and _right."
+        ),
     ] = Form.recon,
     model: Annotated[
         Model | None,
         typer.Option(
-            help="Lens: radtan (default), rational (wide), fisheye (150 degrees or more)."
+            help="Lens model: radtan, rational (wide angle) or fisheye (150 degrees or more).",
+            show_default="radtan",
         ),
     ] = None,
     report: Annotated[
         Path | None,
-        typer.Option(help="Folder of report, pictures, figures (outputs/calibrate/<UTC stamp>)."),
+        typer.Option(
+            help="Folder for the report, figures and pictures.",
+            show_default="outputs/calibrate/<UTC time stamp>",
+        ),
     ] = None,
     config: Config = None,
     set_: Set = None,
@@ -64,9 +72,14 @@ def calibrate(
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
-    """Calibrate two cameras from pictures of a board, and say what depth will be worth.
+    """Calibrate a stereo rig from images of a board, and predict its depth error.
 
-    Example: recon calibrate "left*.png" "right*.png" --board chess:9x6:25mm --out rig.yaml
+    Views that do not fit are dropped and named; intervals come from a bootstrap
+    over the views. How to take good images: docs/calibration.md.
+
+    Examples:
+      recon calibrate "left*.png" "right*.png" --board chess:9x6:25mm -o rig.yaml
+      recon calibrate left/ right/ --board charuco:8x6:30mm:22mm:5x5_100
     """
     del quiet  # there is no progress to hide; every command takes the option
     with session():

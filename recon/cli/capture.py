@@ -13,32 +13,36 @@ from recon.cli.session import print_figures, print_json, session
 
 def capture(
     left: Annotated[
-        str, typer.Argument(help="Left camera: 0, /dev/video0 or a video; or one with both views.")
+        str,
+        typer.Argument(help="Left camera (0, /dev/video0) or video, or one that has both views."),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="New folder for the pictures.")],
-    right: Annotated[str | None, typer.Argument(help="Right camera.")] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="New folder for the recording.")],
+    right: Annotated[str | None, typer.Argument(help="Right camera or video.")] = None,
     calib: Annotated[
-        Path | None, typer.Option("--calib", help="Calibration file, copied into the folder.")
+        Path | None, typer.Option("--calib", help="Calibration file to copy into the folder.")
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many pairs.")] = None,
-    seconds: Annotated[float | None, typer.Option(help="Stop after so long.")] = None,
-    size: Annotated[str | None, typer.Option(help="Frame size to ask for: 1280x720.")] = None,
-    rate: Annotated[float | None, typer.Option(help="Frames per second to ask for.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Stop after this many pairs.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Stop after this many seconds.")] = None,
+    size: Annotated[str | None, typer.Option(help="Requested image size, e.g. 1280x720.")] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Requested frame rate, in frames per second.")
+    ] = None,
     preview: Annotated[
-        int | None, typer.Option(min=1, help="Every n-th pair also replaces preview.jpg.")
+        int | None, typer.Option(min=1, help="Update preview.jpg every N pairs.")
     ] = None,
     config: Config = None,
     set_: Set = None,
     json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Record pairs from two cameras, or one that gives both views side by side.
+    """Record a drive from two cameras, or from one that has both views side by side.
 
-    Ctrl-C stops; what is recorded is whole at any moment, and `recon map` takes it.
+    Stop with Ctrl-C. The folder is valid at any moment, and recon map takes it
+    as it is.
 
     Examples:
       recon capture 0 2 --out rides/today --calib stereo.yaml --size 1280x720
-      recon capture /dev/video4 --seconds 60 --out rides/today --set capture.suffix=jpg
+      recon capture /dev/video4 --out rides/today --set capture.suffix=jpg
     """
     del quiet  # there is no progress to hide; every command takes the option
     with session():

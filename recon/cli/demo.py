@@ -12,8 +12,12 @@ from recon.cli.session import print_json, print_run, session
 
 def demo(
     out: Out = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Frames to render (40).")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Another seed, another street.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Number of frames.", show_default="40")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of the street.", show_default="0")
+    ] = None,
     mesh: Mesh = True,
     config: Config = None,
     set_: Set = None,
@@ -22,9 +26,13 @@ def demo(
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
-    """Render a street drive and map it; needs no data.
+    """Render a synthetic street drive, map it and compare the result with the truth.
 
-    Example: recon demo --frames 60 --out outputs/street
+    Needs no data. The results are those of recon map.
+
+    Examples:
+      recon demo
+      recon demo --frames 60 --seed 3 --out outputs/street
     """
     with session():
         from recon.pipeline.config import load_config

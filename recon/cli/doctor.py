@@ -9,11 +9,13 @@ from recon.cli.session import print_json, session
 
 
 def doctor(json: Json = False) -> None:
-    """Check Python, packages, system libraries, memory and folders.
+    """Check the installation: Python, packages, system libraries, memory, folders.
 
-    Exits with 1 where something is missing that runs need.
+    Exits with 1 if something is missing that runs need.
 
-    Example: recon doctor --json
+    Examples:
+      recon doctor
+      recon doctor --json
     """
     with session():
         from dataclasses import asdict

@@ -10,7 +10,7 @@ from recon.cli.evaluate_middlebury import middlebury
 from recon.cli.evaluate_occupancy import occupancy
 from recon.cli.evaluate_trajectory import trajectory
 
-app = typer.Typer(no_args_is_help=True, help="Compare results with truth.")
+app = typer.Typer(no_args_is_help=True, help="Compare results with ground truth.")
 app.command()(middlebury)
 app.command()(disparity)
 app.command()(trajectory)

@@ -12,23 +12,33 @@ from recon.cli.session import print_figures, print_json, session
 
 
 def disparity(
-    estimate: Annotated[Path, typer.Argument(help="PFM, or 16-bit PNG as KITTI's.")],
-    truth: Annotated[Path, typer.Argument(help="The true one, in either format.")],
+    estimate: Annotated[
+        Path, typer.Argument(help="Disparity map: PFM, or 16-bit PNG as used by KITTI.")
+    ],
+    truth: Annotated[Path, typer.Argument(help="Ground truth, in either format.")],
     mask: Annotated[
-        Path | None, typer.Option(help="Picture that is 255 where pixels are compared.")
+        Path | None, typer.Option(help="Image that is 255 at the pixels to compare.")
     ] = None,
     scale: Annotated[
         float,
-        typer.Option(min=1e-3, help="Figures in pixels so much finer: 4 for quarter-size maps."),
+        typer.Option(
+            min=1e-3,
+            help="Scale of the reported errors: 4 reports a quarter-size map at full size.",
+        ),
     ] = 1.0,
     confidence: Annotated[
-        Path | None, typer.Option(help="PFM of the map's confidence, to see whether it is true.")
+        Path | None, typer.Option(help="Confidence of the map (PFM), to be evaluated too.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Middlebury's figures and KITTI's D1 of one disparity map, as found and with holes filled.
+    """Compare a disparity map with ground truth: Middlebury's measures and KITTI's D1.
 
-    Example: recon evaluate disparity outputs/disparity/latest/disparity/disparity.pfm disp0GT.pfm
+    Reported for the pixels that have a value (sparse) and with holes filled
+    (dense).
+
+    Examples:
+      recon evaluate disparity disparity.pfm disp0GT.pfm
+      recon evaluate disparity disparity.pfm disp0GT.pfm --mask mask0nocc.png
     """
     with session():
         from recon.pipeline.evaluate_run import compare_disparities

@@ -27,31 +27,40 @@ class MapAlignment(str, Enum):
 
 
 def map_(
-    run: Annotated[Path, typer.Argument(help="A run's folder, or a PLY.")],
-    reference: Annotated[Path, typer.Argument(help="PLY that is taken as true.")],
+    run: Annotated[Path, typer.Argument(help="Folder of a run, or a PLY point cloud.")],
+    reference: Annotated[Path, typer.Argument(help="Reference point cloud (PLY).")],
     reference_frame: Annotated[
-        ReferenceFrame, typer.Option(help="Axes of REFERENCE: first left camera, or map.")
+        ReferenceFrame, typer.Option(help="Frame of REFERENCE: the first left camera, or the map.")
     ] = ReferenceFrame.camera,
     threshold: Annotated[
-        str, typer.Option(help="Metres below which a point is right; several, with commas.")
+        str,
+        typer.Option(
+            help="Distance in metres up to which a point counts as correct; several with commas."
+        ),
     ] = "0.2",
     align_to: Annotated[
         Path | None,
-        typer.Option(help="True poses (KITTI or TUM): the run's path is moved to lie closest."),
+        typer.Option(
+            help="Ground-truth poses (KITTI or TUM): align the path of the run, and the map with "
+            "it, to these first."
+        ),
     ] = None,
     align: Annotated[
-        MapAlignment, typer.Option(help="Lay the cloud onto the reference by ICP.")
+        MapAlignment, typer.Option(help="Align the cloud to the reference with ICP.")
     ] = MapAlignment.none,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for clouds coloured by error.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Precision, recall and F-score of a cloud against a reference cloud.
+    """Compare a map with a reference cloud: precision, recall and F-score.
+
+    Nothing is aligned unless asked for. With --out, writes both clouds coloured
+    by error.
 
     Examples:
       recon evaluate map outputs/map/latest lidar_map.ply --threshold 0.1,0.2,0.5
-      recon evaluate map outputs/map/latest lidar_map.ply --align-to poses.txt --out outputs/errors
+      recon evaluate map outputs/map/latest lidar_map.ply --align-to poses.txt
     """
     with session():
         from recon.pipeline.evaluate_map import MapFiles, run_evaluate_map

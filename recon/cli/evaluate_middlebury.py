@@ -22,22 +22,26 @@ class Range(str, Enum):
 def middlebury(
     folder: Annotated[
         Path,
-        typer.Argument(help="Folder of scenes of any year, at any depth, or one scene."),
+        typer.Argument(
+            help="A Middlebury scene, or a folder with scenes of any year at any depth."
+        ),
     ],
     matcher: Matcher = None,
     truth: Annotated[
         Path | None,
-        typer.Option(help="Scenes of another size whose truth is taken for those without."),
+        typer.Option(
+            help="Folder with the same scenes at another size, for those without ground truth."
+        ),
     ] = None,
     parallel: Annotated[
-        int, typer.Option(min=1, help="Scenes worked on at once. Above 1, seconds are no measure.")
+        int, typer.Option(min=1, help="Scenes to process at once. Above 1, the times mean nothing.")
     ] = 1,
     range_: Annotated[
         Range,
         typer.Option(
             "--range",
-            help="How far to search: as the scene says (or its truth, before 2014), or as found "
-            "from each pair, as where nothing is known.",
+            help="Disparity range: published with the scene (before 2014: from its ground "
+            "truth), or estimated from each pair.",
         ),
     ] = Range.scene,
     out: Out = None,
@@ -47,11 +51,13 @@ def middlebury(
     quiet: Quiet = False,
     threads: Threads = None,
 ) -> None:
-    """Score matchers on Middlebury scenes as the benchmark's own tools do.
+    """Score matchers on Middlebury scenes with the measures of the benchmark.
 
     Several matchers, separated by commas, are compared in one run.
 
-    Example: recon evaluate middlebury MiddEval3/trainingH --truth MiddEval3/trainingQ
+    Examples:
+      recon evaluate middlebury MiddEval3/trainingQ --matcher sad,sgm,opencv-sgbm
+      recon evaluate middlebury MiddEval3/trainingH --truth MiddEval3/trainingQ
     """
     with session():
         from recon.pipeline.config import load_config

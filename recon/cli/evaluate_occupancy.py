@@ -12,20 +12,22 @@ from recon.cli.session import print_figures, print_json, session
 
 
 def occupancy(
-    run: Annotated[Path, typer.Argument(help="Folder of a run of recon demo.")],
+    run: Annotated[Path, typer.Argument(help="Folder of a recon demo run.")],
     least_frames: Annotated[
-        int, typer.Option(min=1, help="Frames that must have seen what is compared.")
+        int, typer.Option(min=1, help="Compare only what at least this many frames saw.")
     ] = 3,
     picture: Annotated[
-        Path | None, typer.Option(help="PNG of the grid beside the truth, to look at.")
+        Path | None, typer.Option(help="PNG to draw: the grid with its errors in colour.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Precision and recall of occupied voxels, intersection over union of the grid.
+    """Compare voxels and grid of a demo run with the exact truth.
 
-    The street of the run is rendered again: its truth is exact.
+    Precision and recall of occupied voxels; intersection over union of the
+    grid.
 
-    Example: recon evaluate occupancy outputs/demo/latest --picture compared.png
+    Examples:
+      recon evaluate occupancy outputs/demo/latest --picture compared.png
     """
     with session():
         from recon.formats.image import write_image

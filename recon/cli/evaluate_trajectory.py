@@ -22,37 +22,50 @@ class Alignment(str, Enum):
 
 
 def trajectory(
-    estimate: Annotated[Path, typer.Argument(help="KITTI or TUM trajectory of a run.")],
-    truth: Annotated[Path, typer.Argument(help="The true one, in either format.")],
+    estimate: Annotated[Path, typer.Argument(help="Estimated trajectory, in KITTI or TUM format.")],
+    truth: Annotated[Path, typer.Argument(help="Ground truth, in either format.")],
     align: Annotated[
         Alignment,
-        typer.Option(help="Move the estimate: not, to the first pose, rigidly, or with scale."),
+        typer.Option(
+            help="Alignment of the estimate: none, at the first pose (origin), rigid (se3), or "
+            "rigid with scale (sim3)."
+        ),
     ] = Alignment.se3,
     lengths: Annotated[
         str | None,
-        typer.Option(help="Lengths of KITTI's segments in metres. [default: told by the path]"),
+        typer.Option(
+            help="Lengths of the segments in metres, e.g. 50,100.",
+            show_default="100 to 800, or shorter on short drives",
+        ),
     ] = None,
     step: Annotated[
-        int | None, typer.Option(help="Frames from segment to segment. [default: 10]")
+        int | None,
+        typer.Option(
+            help="Frames between the starts of segments.",
+            show_default="10, or 1 on short drives",
+        ),
     ] = None,
-    rpe_frames: Annotated[int, typer.Option(help="Frames apart for the RPE.")] = 1,
+    rpe_frames: Annotated[int, typer.Option(help="Frame distance of the RPE.")] = 1,
     times: Annotated[
-        Path | None, typer.Option(help="Seconds of the poses of a KITTI file, one a line.")
+        Path | None,
+        typer.Option(help="Times of the poses of a KITTI file, in seconds, one per line."),
     ] = None,
     tolerance: Annotated[
-        float, typer.Option(min=0, help="Seconds that the times of two poses may differ.")
+        float,
+        typer.Option(min=0, help="Largest time difference between two matched poses, in seconds."),
     ] = 0.01,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for a report and its figures.")
+        Path | None, typer.Option("--out", "-o", help="Folder for a report and its plots.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Relative errors by KITTI's segment rules, ATE and RPE; plots with --out.
+    """Compare a trajectory with ground truth: KITTI's relative errors, ATE and RPE.
 
-    Poses belong together by their times where both files tell them (TUM, --times), else in order.
+    Poses are matched by time where both files have times (TUM, or KITTI with
+    --times), else in order. With --out, writes a report with plots.
 
     Examples:
-      recon evaluate trajectory outputs/map/latest/trajectory_kitti.txt poses.txt --out outputs/path
+      recon evaluate trajectory trajectory_kitti.txt poses.txt --out outputs/path
       recon evaluate trajectory trajectory_tum.txt groundtruth.txt --align sim3
     """
     with session():

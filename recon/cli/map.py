@@ -47,19 +47,27 @@ def map_(
     tolerance: Tolerance = None,
     odometry: Annotated[
         OdometryName | None,
-        typer.Option(help="Visual prior with gated kiss-icp (fused, the default), or one alone."),
+        typer.Option(
+            help="fused: visual odometry, refined by kiss-icp where that helps; visual or kiss: "
+            "one of the two alone.",
+            show_default="fused",
+        ),
     ] = None,
     poses: Annotated[
-        Path | None, typer.Option(help="Known poses (KITTI or TUM) to use instead of odometry.")
+        Path | None, typer.Option(help="Known poses (KITTI or TUM), used instead of odometry.")
     ] = None,
     prior: Annotated[
         Path | None,
-        typer.Option(help="Path by wheels, IMU or GPS (TUM, clock of the pictures) to go by."),
+        typer.Option(
+            help="Trajectory from wheel odometry, an IMU or GNSS that guides the odometry (TUM "
+            "format, same clock as the images)."
+        ),
     ] = None,
     matcher: Matcher = None,
     mesh: Mesh = True,
     resume: Annotated[
-        Path | None, typer.Option(help="Go on with the killed run in this folder; no SOURCE.")
+        Path | None,
+        typer.Option(help="Continue the interrupted run in this folder; without SOURCE."),
     ] = None,
     memory_limit: MemoryLimit = None,
     config: Config = None,
@@ -69,14 +77,17 @@ def map_(
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
-    """Map a stereo drive: trajectory, fused cloud, Nav2 grid, OctoMap, mesh, report.
+    """Map a stereo drive: trajectory, point cloud, Nav2 grid, OctoMap, mesh, report.
+
+    The kind of source is detected from its files. Loops are closed, and frames
+    whose pose cannot be trusted are named and left out of the map.
 
     Examples:
       recon map ~/kitti/sequences/06 --out outputs/kitti06
-      recon map drive.bag --calib camchain.yaml --left /cam0/image_raw --right /cam1/image_raw
-      recon map drive.bag --calib camchain.yaml --prior wheels.txt --set odometry.prior.axes=body
-      recon map --resume outputs/kitti06
+      recon map drive.bag --calib camchain.yaml --left /cam0 --right /cam1
       recon map left.mp4 --right right.mp4 --calib stereo.yaml
+      recon map rides/today --prior wheels.txt --set odometry.prior.axes=body
+      recon map --resume outputs/kitti06
     """
     if source is None and resume is None:
         raise typer.BadParameter("give SOURCE, or --resume FOLDER")

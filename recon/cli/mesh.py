@@ -15,13 +15,16 @@ def mesh(
     source: Annotated[
         Path,
         typer.Argument(
-            metavar="CLOUD|RUN", help="PLY with points (normals and colours are used), or a run."
+            metavar="CLOUD|RUN",
+            help="PLY point cloud (normals and colours are used), or the folder of a run.",
         ),
     ],
     out: Out = None,
     formats: Annotated[
         list[str] | None,
-        typer.Option("--format", "-f", help="ply (the default), obj, stl or glb; may be repeated."),
+        typer.Option(
+            "--format", "-f", help="ply, obj, stl or glb. May be repeated.", show_default="ply"
+        ),
     ] = None,
     config: Config = None,
     set_: Set = None,
@@ -30,9 +33,11 @@ def mesh(
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
-    """Screened Poisson surface of a PLY cloud, trimmed to where there is data.
+    """Reconstruct a surface mesh from a PLY point cloud or from the map of a run.
 
-    The map of a run is meshed in tiles, and cut where its cameras looked through.
+    Screened Poisson reconstruction, trimmed where there are no points. The map
+    of a run is meshed in tiles, and surfaces in space that the cameras saw to
+    be free are removed.
 
     Examples:
       recon mesh cloud.ply --format obj --format glb

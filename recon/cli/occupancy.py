@@ -12,17 +12,21 @@ from recon.cli.session import print_json, print_run, session
 
 
 def occupancy(
-    run: Annotated[Path, typer.Argument(help="Folder of a run of recon map or recon demo.")],
+    run: Annotated[Path, typer.Argument(help="Folder of a recon map or recon demo run.")],
     out: Out = None,
     resolution: Annotated[
-        float | None, typer.Option(help="Edge of a cell in metres. [default: that of the run]")
+        float | None, typer.Option(help="Cell size in metres.", show_default="as in the run")
     ] = None,
     min_height: Annotated[
-        float | None, typer.Option(help="Lower end of the grid's height band, metres.")
+        float | None,
+        typer.Option(help="Lower end of the obstacle height band, in metres above ground."),
     ] = None,
-    max_height: Annotated[float | None, typer.Option(help="Upper end of the band.")] = None,
+    max_height: Annotated[
+        float | None, typer.Option(help="Upper end of the band, in metres.")
+    ] = None,
     max_range: Annotated[
-        float | None, typer.Option(help="Points farther away hit nothing, metres.")
+        float | None,
+        typer.Option(help="Ignore obstacles farther than this from the camera, in metres."),
     ] = None,
     config: Config = None,
     set_: Set = None,
@@ -31,11 +35,14 @@ def occupancy(
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
-    """Nav2 grid and OctoMap with other cells or heights, from what the run kept: no matching.
+    """Make another Nav2 grid and OctoMap of a run: cell size, height band, range.
+
+    Uses the rays that the run has kept in map/rays.bin, so that nothing is
+    matched again.
 
     Examples:
       recon occupancy outputs/map/latest --resolution 0.1
-      recon occupancy outputs/map/latest --min-height 0.5 --max-height 3.2 --out truck
+      recon occupancy outputs/map/latest --min-height 0.5 --max-height 3.2
     """
     del quiet  # there is no progress to hide; every command takes the option
     with session():

@@ -11,57 +11,86 @@ from recon.errors import SettingsError
 
 Out = Annotated[
     Path | None,
-    typer.Option("--out", "-o", help="Result folder (outputs/<command>/<UTC stamp>)."),
+    typer.Option(
+        "--out",
+        "-o",
+        help="Folder for the results.",
+        show_default="outputs/<command>/<UTC time stamp>",
+    ),
 ]
 Config = Annotated[
     Path | None,
-    typer.Option("--config", "-c", help="YAML file of settings, such as a run's config.yaml."),
+    typer.Option(
+        "--config", "-c", help="YAML file with settings, such as the config.yaml of a run."
+    ),
 ]
 Set = Annotated[
     list[str] | None,
-    typer.Option("--set", "-s", help="One setting, as key=value: matching.sad.window_px=9."),
+    typer.Option(
+        "--set", "-s", help="Change one setting, e.g. matching.sad.window_px=9. May be repeated."
+    ),
 ]
 Matcher = Annotated[
     str | None,
     typer.Option(
         "--matcher",
-        help="How to match: sad, sgm, opencv-bm, opencv-sgbm, onnx. [default: as configured]",
+        help="Matcher: sad, sgm, opencv-bm, opencv-sgbm or onnx.",
+        show_default="matching.matcher, sad unless changed",
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Also print seconds per stage.")]
-Mesh = Annotated[bool, typer.Option(help="Reconstruct a surface.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON and nothing else.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Do not show progress.")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Also print the time spent in each stage.")
+]
+Mesh = Annotated[bool, typer.Option(help="Reconstruct the surface mesh.")]
 Threads = Annotated[
     int | None,
-    typer.Option("--threads", min=1, help="Threads to use (all cores)."),
+    typer.Option(
+        "--threads",
+        min=1,
+        help="Number of threads. Does not change the results.",
+        show_default="all cores",
+    ),
 ]
 SOURCES_HELP = (
-    "KITTI drive (odometry or raw), EuRoC or TUM folder, left and right folders, video, "
-    "ROS bag or MCAP file, Middlebury scene."
+    "KITTI (odometry or raw), EuRoC or TUM sequence, folder with left and right images, video, "
+    "ROS bag, MCAP file, or Middlebury scene."
 )
 SourceArgument = Annotated[Path | None, typer.Argument(help=SOURCES_HELP)]
 SourceKind = Annotated[
     str | None,
     typer.Option(
         "--source",
-        help="What the source is: kitti, kitti-raw, euroc, tum, folders, video, bag, middlebury. "
-        "[default: told by its files]",
+        help="Kind of source: kitti, kitti-raw, euroc, tum, folders, video, bag or middlebury.",
+        show_default="detected from its files",
     ),
 ]
 Calib = Annotated[
-    Path | None, typer.Option("--calib", help="Calibration file. [default: that of the source]")
+    Path | None,
+    typer.Option(
+        "--calib", help="Calibration file.", show_default="the one that comes with the source"
+    ),
 ]
 LeftView = Annotated[
-    str | None, typer.Option("--left", help="Left folder or topic. [default: found by name]")
+    str | None,
+    typer.Option("--left", help="Left image folder or topic.", show_default="found by name"),
 ]
 RightView = Annotated[
     str | None,
-    typer.Option("--right", help="Right folder or topic; or the right video, SOURCE is the left."),
+    typer.Option(
+        "--right",
+        help="Right image folder or topic, or the right video where SOURCE is the left one.",
+        show_default="found by name",
+    ),
 ]
 Tolerance = Annotated[
     float | None,
-    typer.Option("--tolerance", help="Seconds that the stamps of a pair may differ. [0.01]"),
+    typer.Option(
+        "--tolerance",
+        help="Largest difference between the time stamps of a pair, in seconds.",
+        show_default="0.01",
+    ),
 ]
 
 
@@ -85,7 +114,8 @@ MemoryLimit = Annotated[
     str | None,
     typer.Option(
         "--memory-limit",
-        help="Most memory that the process may take, such as 2G or 1500M; what cannot keep to it "
-        "stops and can be resumed. [default: no limit]",
+        help="Memory limit of the process, e.g. 2G or 1500M. A run that exceeds it stops and can "
+        "be resumed.",
+        show_default="none",
     ),
 ]

@@ -10,12 +10,17 @@ import typer
 from recon.cli.options import Config, Json, Matcher, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
 
-Left = Annotated[Path, typer.Argument(help="Left picture.")]
-Right = Annotated[Path, typer.Argument(help="Right picture.")]
+Left = Annotated[Path, typer.Argument(help="Left image.")]
+Right = Annotated[Path, typer.Argument(help="Right image.")]
 Ndisp = Annotated[
-    int | None, typer.Option(min=1, help="Disparities to search (from the calibration).")
+    int | None,
+    typer.Option(
+        min=1,
+        help="Number of disparities to search.",
+        show_default="from the calibration, else estimated from the pair",
+    ),
 ]
-_CALIB_HELP = "Calibration: ours, KITTI, Middlebury, OpenCV, ROS CameraInfo or kalibr."
+_CALIB_HELP = "Calibration file: recon, KITTI, Middlebury, OpenCV, ROS CameraInfo or kalibr."
 
 
 def pair(
@@ -23,10 +28,11 @@ def pair(
     right: Right,
     calib: Annotated[Path, typer.Option(help=_CALIB_HELP)],
     unit_m: Annotated[
-        float, typer.Option(min=1e-6, help="Metres per unit of an OpenCV file: 0.001 for mm.")
+        float, typer.Option(min=1e-6, help="Metres per unit in an OpenCV file, e.g. 0.001 for mm.")
     ] = 1.0,
     truth: Annotated[
-        Path | None, typer.Option(help="True disparity (PFM or 16-bit PNG) to compare with.")
+        Path | None,
+        typer.Option(help="Ground-truth disparity (PFM or 16-bit PNG) to compare with."),
     ] = None,
     out: Out = None,
     matcher: Matcher = None,
@@ -38,9 +44,14 @@ def pair(
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
-    """Reconstruct one pair: disparity, depth, reasons, cloud, mesh, report.
+    """Reconstruct one stereo pair: disparity, depth, point cloud, mesh, report.
 
-    Example: recon pair im0.png im1.png --calib calib.txt --out outputs/motorcycle
+    The images may be raw or rectified; the calibration tells which. Pixels
+    without a disparity have a reason code.
+
+    Examples:
+      recon pair im0.png im1.png --calib calib.txt --out outputs/motorcycle
+      recon pair im0.png im1.png --calib calib.txt --truth disp0GT.pfm
     """
     del quiet  # there is no progress to hide; every command takes the option
     with session():
@@ -61,7 +72,8 @@ def disparity(
     left: Left,
     right: Right,
     calib: Annotated[
-        Path | None, typer.Option(help=_CALIB_HELP + " Without it the pair must be rectified.")
+        Path | None,
+        typer.Option(help=_CALIB_HELP + " Without one, the pair must be rectified already."),
     ] = None,
     out: Out = None,
     matcher: Matcher = None,
@@ -73,9 +85,13 @@ def disparity(
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
-    """Disparity of one pair: PFM, 16-bit PNG, colours, confidence, reasons.
+    """Compute the disparity of one pair: PFM, 16-bit PNG, confidence, reason codes.
 
-    Example: recon disparity left.png right.png --ndisp 128
+    Unlike recon pair it needs no calibration if the pair is rectified.
+
+    Examples:
+      recon disparity left.png right.png --ndisp 128
+      recon disparity raw_left.png raw_right.png --calib rig.yaml --matcher sgm
     """
     del quiet  # there is no progress to hide; every command takes the option
     with session():

@@ -15,13 +15,13 @@ def paper(
     scenes: Annotated[
         Path | None,
         typer.Argument(
-            help="Folder with ArtL, Jadeplant and Pipes at quarter size. "
-            "[$RECON_DATA/middlebury/MiddEval3/trainingQ]"
+            help="Folder with the Middlebury scenes ArtL, Jadeplant and Pipes at quarter size.",
+            show_default="$RECON_DATA/middlebury/MiddEval3/trainingQ",
         ),
     ] = None,
     as_printed: Annotated[
         bool,
-        typer.Option("--as-printed", help="Try the method as printed too, and compare the two."),
+        typer.Option("--as-printed", help="Also run the method as printed, and compare the two."),
     ] = False,
     out: Out = None,
     config: Config = None,
@@ -30,9 +30,14 @@ def paper(
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
-    """Repeat experiments 2 to 4 of the seed paper: maps, surfaces, clouds, curves, Table 1, report.
+    """Repeat experiments 2 to 4 of the paper that this project is based on.
 
-    Example: recon paper MiddEval3/trainingQ --as-printed --out outputs/paper-as-printed
+    Writes disparity and depth maps, surfaces, clouds, depth curves, Table 1 and
+    a report. What the paper misprints, and how it is corrected: docs/paper.md.
+
+    Examples:
+      recon paper MiddEval3/trainingQ
+      recon paper MiddEval3/trainingQ --as-printed --out outputs/paper-as-printed
     """
     with session():
         from recon.pipeline.config import PAIR_DEFAULTS, load_config

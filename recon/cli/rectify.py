@@ -13,18 +13,18 @@ from recon.cli.session import print_json, print_run, session
 
 def rectify(
     left: Annotated[
-        str, typer.Argument(help='Left picture, folder, or pattern in quotes: "left*.png".')
+        str, typer.Argument(help='Left image, folder, or pattern in quotes such as "left*.png".')
     ],
-    right: Annotated[str, typer.Argument(help="Right picture, folder or pattern.")],
+    right: Annotated[str, typer.Argument(help="Right image, folder or pattern.")],
     calib: Annotated[
         Path | None,
         typer.Option(
-            help="Calibration of the raw cameras. Without it: homographies from features, and "
-            "depth has no scale."
+            help="Calibration of the raw cameras. Without one, homographies are estimated from "
+            "image features, and depth has no scale."
         ),
     ] = None,
     unit_m: Annotated[
-        float, typer.Option(min=1e-6, help="Metres per unit of an OpenCV file: 0.001 for mm.")
+        float, typer.Option(min=1e-6, help="Metres per unit in an OpenCV file, e.g. 0.001 for mm.")
     ] = 1.0,
     out: Out = None,
     config: Config = None,
@@ -34,9 +34,14 @@ def rectify(
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
-    """Rectify a pair or two folders, by a calibration or by what the pictures show.
+    """Rectify a pair or two folders of images, with or without a calibration.
 
-    Example: recon rectify left/ right/ --calib rig.yaml --out rectified
+    Writes the rectified images, the remaining row error, and pictures with
+    epipolar lines.
+
+    Examples:
+      recon rectify left/ right/ --calib rig.yaml --out rectified
+      recon rectify left.png right.png
     """
     del quiet  # there is no progress to hide; every command takes the option
     with session():
