@@ -28,7 +28,7 @@ def follow(
         ends where the way there began.
 
     Ref:
-        Bouguet, "UInt8al implementation of the Lucas Kanade feature tracker", 2001;
+        Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2001;
         Kalal, Mikolajczyk, Matas, "Forward-backward error", ICPR 2010.
     """
     if not len(uv):
