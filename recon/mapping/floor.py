@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.kernels.voxels import pack_keys
 from recon.mapping.ground import GroundSettings
 from recon.structures import OccupancyVoxels, PointCloud
 from recon.structures.arrays import Bool, Float32, Int32
@@ -57,7 +58,7 @@ def _floors(voxels: OccupancyVoxels) -> Int32:
     """int32 (N, 3), the occupied voxels that are free above."""
     if len(voxels) == 0:
         return voxels.keys
-    packed = _pack(voxels.keys)
+    packed = pack_keys(voxels.keys)
     order = np.argsort(packed)
     packed, log_odds = packed[order], voxels.log_odds[order]
     full = np.flatnonzero(log_odds > _FULL)
@@ -87,9 +88,3 @@ def _columns(xyz: Float32, cell_m: float) -> NDArray[np.int64]:
     """One number for each point's cell of the ground."""
     cells = np.floor(xyz[:, :2].astype(np.float64) / cell_m).astype(np.int64)
     return np.asarray((cells[:, 0] << 32) + cells[:, 1])
-
-
-def _pack(keys: NDArray[Any]) -> NDArray[np.int64]:
-    """One number for each voxel, such that the next one up is the next number."""
-    wide = keys.astype(np.int64) + (1 << 20)
-    return np.asarray((wide[:, 0] << 42) | (wide[:, 1] << 21) | wide[:, 2])
