@@ -28,13 +28,14 @@ def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
     poses = trajectory.T_world_camera
     return np.stack(
         [
-            _between(poses[i], poses[j], float(share))
+            pose_between(poses[i], poses[j], float(share))
             for i, j, share in zip(before, after, shares, strict=True)
         ]
     )
 
 
-def _between(first: Float64, second: Float64, share: float) -> Float64:
+def pose_between(first: Float64, second: Float64, share: float) -> Float64:
+    """The pose (4, 4) at a share of the way from one to another, 0 to 1."""
     turn = log_so3(first[:3, :3].T @ second[:3, :3])
     position = (1 - share) * first[:3, 3] + share * second[:3, 3]
     return make_transform(first[:3, :3] @ exp_so3(share * turn), position)

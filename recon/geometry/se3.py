@@ -85,6 +85,27 @@ def log_so3(R: NDArray[Any]) -> Float64:
     return np.asarray(sign * math.atan2(sine, cosine) * axis)
 
 
+def as_step(T: NDArray[Any]) -> Float64:
+    """A rigid motion as a step: translation and rotation vector, radians; float64 (6,)."""
+    return np.concatenate([T[:3, 3], log_so3(T[:3, :3])])
+
+
+def as_transform(step: NDArray[Any]) -> Float64:
+    """The rigid motion (4, 4) of a step; inverse of `as_step`."""
+    return make_transform(exp_so3(step[3:]), step[:3])
+
+
+def step_jacobian(xyz: NDArray[Any]) -> Float64:
+    """Derivative (N, 3, 6) of points (N, 3) by a step of their frame: ``[I | -hat(xyz)]``."""
+    J = np.zeros((len(xyz), 3, 6))
+    J[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    x, y, z = xyz.T
+    J[:, 0, 4], J[:, 0, 5] = z, -y
+    J[:, 1, 3], J[:, 1, 5] = -z, x
+    J[:, 2, 3], J[:, 2, 4] = y, -x
+    return J
+
+
 def orthonormalise(T: NDArray[Any]) -> Float64:
     """The rigid transform nearest to ``T``: its rotation part made orthonormal again (SVD)."""
     U, _, Vt = np.linalg.svd(T[:3, :3])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.geometry.projection import project
-from recon.geometry.se3 import apply, exp_so3, invert, make_transform
+from recon.geometry.se3 import apply, as_transform, invert, make_transform, step_jacobian
 from recon.loops.settings import VerifySettings
 from recon.structures import RectifiedCamera
 from recon.structures.arrays import Bool, Float64
@@ -99,7 +99,7 @@ def refine(
     for _ in range(_STEPS):
         H, g = _normal_equations(first, last, T, camera, s)
         step = np.linalg.solve(H + 1e-9 * np.eye(6), -g)
-        T = T @ make_transform(exp_so3(step[3:]), step[:3])
+        T = T @ as_transform(step)
         if np.linalg.norm(step) < 1e-6:
             break
     H, _ = _normal_equations(first, last, T, camera, s)
@@ -138,26 +138,15 @@ def _normal_equations(
     H, g = np.zeros((6, 6)), np.zeros(6)
     # What the first frame sees of the last one's points: they move with the step.
     moved = apply(T, last.xyz)
-    turn = T[:3, :3] @ _step_jacobian(last.xyz)
+    turn = T[:3, :3] @ step_jacobian(last.xyz)
     # What the last frame sees of the first one's points: they move against it.
     back = apply(invert(T), first.xyz)
-    for xyz, d_xyz, seen in ((moved, turn, first.uvd), (back, -_step_jacobian(back), last.uvd)):
+    for xyz, d_xyz, seen in ((moved, turn, first.uvd), (back, -step_jacobian(back), last.uvd)):
         r, J = _residuals(xyz, d_xyz, seen, camera, s)
         weight = 1.0 / (1.0 + np.einsum("nk,nk->n", r, r) / _CAUCHY_SIGMAS**2)
         H += np.einsum("nki,n,nkj->ij", J, weight, J)
         g += np.einsum("nki,n,nk->i", J, weight, r)
     return H, g
-
-
-def _step_jacobian(xyz: Float64) -> Float64:
-    """Motion (N, 3, 6) of points under a step: ``[I | -hat(xyz)]``."""
-    J = np.zeros((len(xyz), 3, 6))
-    J[:, range(3), range(3)] = 1.0
-    x, y, z = xyz.T
-    J[:, 0, 4], J[:, 0, 5] = z, -y
-    J[:, 1, 3], J[:, 1, 5] = -z, x
-    J[:, 2, 3], J[:, 2, 4] = y, -x
-    return J
 
 
 def _residuals(

@@ -13,14 +13,8 @@ from numpy.typing import NDArray
 
 from recon.adapters.open3d_pose_graph import PoseEdge, optimise_poses
 from recon.errors import RegistrationError
-from recon.geometry.se3 import (
-    exp_so3,
-    hat,
-    invert,
-    log_so3,
-    make_transform,
-    orthonormalise,
-)
+from recon.geometry.interpolation import pose_between
+from recon.geometry.se3 import as_step, hat, invert, orthonormalise
 from recon.loops.drift import Drift, drift_over
 from recon.loops.settings import LoopSettings
 from recon.loops.verify import Loop
@@ -98,7 +92,7 @@ def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
     """Chi-square of an edge."""
     T = invert(T_world_node[edge.first]) @ T_world_node[edge.last]
     off = invert(edge.T_first_last) @ T
-    step = np.concatenate([off[:3, 3], log_so3(off[:3, :3])])
+    step = as_step(off)
     return float(step @ edge.information @ step)
 
 
@@ -196,13 +190,6 @@ def _bent(
         from_b = T_world_node[k + 1] @ invert(old[b]) @ old[frame]
         span = float(path_m[b] - path_m[a])
         share = float(path_m[frame] - path_m[a]) / span if span > 0 else 0.0
-        new[frame] = _between(from_a, from_b, share)
+        new[frame] = orthonormalise(pose_between(from_a, from_b, share))
     new[0] = old[0]
     return Trajectory(new, trajectory.timestamps_s)
-
-
-def _between(T_from: Float64, T_to: Float64, share: float) -> Float64:
-    """A pose on the way from one to another."""
-    turn = exp_so3(share * log_so3(T_from[:3, :3].T @ T_to[:3, :3]))
-    place = (1.0 - share) * T_from[:3, 3] + share * T_to[:3, 3]
-    return orthonormalise(make_transform(T_from[:3, :3] @ turn, place))

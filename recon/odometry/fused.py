@@ -7,18 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from recon.adapters.kiss_icp import IcpAlignment, KissIcp, KissIcpOptions
-from recon.geometry.se3 import apply, invert, orthonormalise
-from recon.odometry.gate import (
-    Correction,
-    Verdict,
-    as_step,
-    as_transform,
-    covariance_of,
-    icp_covariance,
-    icp_may_help,
-    judge,
-    step_covariance,
-)
+from recon.geometry.se3 import apply, as_step, as_transform, invert, orthonormalise
+from recon.odometry.covariance import covariance_of, step_covariance
+from recon.odometry.gate import Correction, Verdict, icp_covariance, icp_may_help, judge
 from recon.odometry.points import select_points
 from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.geometry.se3 import exp_so3, log_so3, make_transform
+from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.settings import GateSettings
 from recon.odometry.surfaces import Fit
 from recon.structures.arrays import Float64
@@ -84,26 +84,6 @@ def icp_covariance(fit: Fit, settings: GateSettings) -> Float64:
     """Covariance (6, 6) of ICP: from the surfaces it rests on, with a floor for their bias."""
     floor = step_covariance(settings.icp_floor_m, settings.icp_floor_deg)
     return covariance_of(settings.icp_independence * fit.information) + floor
-
-
-def covariance_of(information: Float64) -> Float64:
-    """Covariance (6, 6) of an information matrix; free directions get 100 m or rad."""
-    return np.asarray(np.linalg.inv(information + 1e-4 * np.eye(6)))
-
-
-def step_covariance(sigma_m: float, sigma_deg: float) -> Float64:
-    """Covariance (6, 6) of a step that is equally uncertain in all directions."""
-    return np.diag(np.repeat([sigma_m**2, np.deg2rad(sigma_deg) ** 2], 3))
-
-
-def as_step(T: Float64) -> Float64:
-    """A small rigid motion as translation and rotation vector (6,)."""
-    return np.concatenate([T[:3, 3], log_so3(T[:3, :3])])
-
-
-def as_transform(step: Float64) -> Float64:
-    """Inverse of `as_step`."""
-    return make_transform(exp_so3(step[3:]), step[:3])
 
 
 def _worthwhile(prior: Float64, both: Float64, news: Float64, min_share: float) -> Float64:

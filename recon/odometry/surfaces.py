@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.geometry.se3 import step_jacobian
+from recon.kernels.voxels import pack_keys
 from recon.structures.arrays import Bool, Float64
 
 MIN_POINTS = 10
@@ -85,7 +87,7 @@ def fit_surfaces(xyz: Float64, surfaces: Surfaces) -> Fit:
     near, information = xyz[flat], surfaces.information[cell[flat]]
     off = near - surfaces.means[cell[flat]]
     residual_m = float(np.median(_distance_m(off, information)))
-    J = _step_jacobian(near)
+    J = step_jacobian(near)
     total = np.einsum("nki,nkl,nlj->ij", J, information, J, optimize=True)
     return Fit(overlap, residual_m, total)
 
@@ -107,17 +109,6 @@ def _distance_m(off: Float64, information: Float64) -> Float64:
     return distance
 
 
-def _step_jacobian(xyz: Float64) -> Float64:
-    """Derivative (N, 3, 6) of points by a step of their frame: [I, -hat(xyz)]."""
-    J = np.zeros((len(xyz), 3, 6))
-    J[:, [0, 1, 2], [0, 1, 2]] = 1.0
-    x, y, z = xyz.T
-    J[:, 0, 4], J[:, 0, 5] = z, -y
-    J[:, 1, 3], J[:, 1, 5] = -z, x
-    J[:, 2, 3], J[:, 2, 4] = y, -x
-    return J
-
-
 def _look_up(xyz: Float64, surfaces: Surfaces) -> tuple[NDArray[np.int64], Bool]:
     """Index of the cell of each point, and whether there is one."""
     if not len(surfaces.keys):
@@ -128,10 +119,8 @@ def _look_up(xyz: Float64, surfaces: Surfaces) -> tuple[NDArray[np.int64], Bool]
 
 
 def _keys(xyz: Float64, edge_m: float) -> NDArray[np.int64]:
-    """Cell of each point as one number; 21 bits an axis are enough for a thousand kilometres."""
-    index = np.floor(xyz / edge_m).astype(np.int64) + (1 << 20)
-    keys: NDArray[np.int64] = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
-    return keys
+    """int64 (N,), the packed cell of each point."""
+    return pack_keys(np.floor(xyz / edge_m).astype(np.int64))
 
 
 def _sums(cell: NDArray[np.int64], values: Float64, cells: int) -> Float64:

@@ -8,10 +8,10 @@ import numpy as np
 
 from recon.adapters.opencv_features import match_features
 from recon.geometry.projection import project, unproject
-from recon.geometry.se3 import apply, invert
+from recon.geometry.se3 import apply, as_step, invert
 from recon.geometry.triangulation import depth_from_disparity
 from recon.odometry.corners import find_corners
-from recon.odometry.gate import as_step, covariance_of, step_covariance
+from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.motion import Motion
 from recon.odometry.pose import enough_agree, locate_camera
 from recon.odometry.prior import MotionPrior
@@ -242,7 +242,7 @@ class VisualOdometry:
         information = self._information(window, camera)
         newest = window.seen[-1]
         error = reprojection(window, camera)[newest, :2]
-        sigma = np.sqrt(np.diag(np.linalg.inv(information + 1e-4 * np.eye(6))))
+        sigma = np.sqrt(np.diag(covariance_of(information)))
         health = OdometryHealth(
             tracks=seen.tracks,
             inliers=int(newest.sum()),

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon.geometry.se3 import apply, exp_so3, invert, make_transform
+from recon.geometry.se3 import apply, as_transform, invert
 from recon.kernels import bundle
 from recon.odometry.settings import WindowSettings
 from recon.structures import RectifiedCamera
@@ -161,10 +161,7 @@ def _cost(window: TrackWindow, model: bundle.BundleModel) -> float:
 def _moved(window: TrackWindow, step_pose: Float64, step_point: Float64) -> TrackWindow:
     """A window after a step; that of a pose is a translation and a rotation in its own axes."""
     poses = np.stack(
-        [
-            T @ make_transform(exp_so3(step[3:]), step[:3])
-            for T, step in zip(window.T_world_camera, step_pose, strict=True)
-        ]
+        [T @ as_transform(step) for T, step in zip(window.T_world_camera, step_pose, strict=True)]
     )
     return replace(window, T_world_camera=poses, xyz_world=window.xyz_world + step_point)
 

@@ -8,12 +8,15 @@ from recon.geometry.quaternion import quaternion_from_rotation, rotation_from_qu
 from recon.geometry.se3 import (
     angle_rad,
     apply,
+    as_step,
+    as_transform,
     exp_so3,
     hat,
     invert,
     make_transform,
     orthonormalise,
     rotate,
+    step_jacobian,
 )
 
 VECTORS = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
@@ -86,6 +89,20 @@ def test_exp_of_the_opposite_turn_is_the_inverse(w: np.ndarray) -> None:
 @given(w=VECTORS, v=VECTORS)
 def test_hat_is_the_cross_product(w: np.ndarray, v: np.ndarray) -> None:
     np.testing.assert_allclose(hat(w) @ v, np.cross(w, v), **EXACT)
+
+
+@given(st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
+def test_steps_and_transforms_are_inverse(step: list[float]) -> None:
+    # sqrt(3)·1.5 < π, so the rotation vector is unique.
+    np.testing.assert_allclose(as_step(as_transform(np.array(step))), step, atol=1e-9)
+
+
+def test_the_jacobian_of_a_step_is_the_derivative_of_moved_points() -> None:
+    xyz, h = np.random.default_rng(3).normal(0.0, 5.0, (7, 3)), 1e-6
+    for axis, step in enumerate(h * np.eye(6)):
+        moved = (apply(as_transform(step), xyz) - apply(as_transform(-step), xyz)) / (2 * h)
+        # The third derivative, |xyz|·h², and rounding, |xyz|·2⁻⁵²/h: both far below 1e-7.
+        np.testing.assert_allclose(step_jacobian(xyz)[:, :, axis], moved, rtol=0, atol=1e-7)
 
 
 def test_angles_keep_their_precision_where_acos_loses_it() -> None:

@@ -5,14 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.odometry.gate import (
-    Correction,
-    as_step,
-    as_transform,
-    icp_covariance,
-    judge,
-    step_covariance,
-)
+from recon.odometry.covariance import step_covariance
+from recon.odometry.gate import Correction, icp_covariance, judge
 from recon.odometry.settings import GateSettings
 from recon.odometry.surfaces import Fit, describe_surfaces, fit_surfaces
 
@@ -110,9 +104,3 @@ def test_no_more_is_taken_than_is_offered(seed: int, scale: float) -> None:
     verdict = judge(Correction(step, Fit(0.9, 0.2, fit.information), fit), NOTHING, prior, GATE)
     both = prior + icp_covariance(fit, GATE)
     assert verdict.step @ np.linalg.solve(both, verdict.step) <= step @ np.linalg.solve(both, step)
-
-
-@given(step=st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
-def test_steps_and_transforms_are_inverse(step: list[float]) -> None:
-    # sqrt(3)·1.5 < π, so the rotation vector is unique.
-    np.testing.assert_allclose(as_step(as_transform(np.array(step))), step, atol=1e-9)
