@@ -22,23 +22,27 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.kernels.raycast import BLOCK_BITS, BLOCK_CELLS, BLOCK_EDGE, Blocks
+from recon.kernels.raycast import (
+    BLOCK_BITS,
+    BLOCK_CELLS,
+    BLOCK_EDGE,
+    Blocks,
+    block_key,
+    cell_in_block,
+)
 from recon.kernels.voxels import (
     EMPTY,
-    KEY_BITS,
-    KEY_LIMIT,
-    copy_rows,
     enter_keys,
     find,
-    find_or_add,
+    find_or_append,
     make_table,
-    pack_key,
     pack_keys,
+    reserve,
+    unpack_key,
     unpack_keys,
 )
 
 _LOW: Final = BLOCK_EDGE - 1
-_MASK: Final = (1 << KEY_BITS) - 1
 
 
 class ClampedBlocks(NamedTuple):
@@ -84,18 +88,6 @@ def make_clamped(rows: int) -> ClampedBlocks:
     )
 
 
-def reserve_clamped(blocks: ClampedBlocks, rows: int) -> ClampedBlocks:
-    """Room for ``rows`` blocks: the same, or twice as much (or more) with the same content."""
-    have, used = len(blocks.keys), int(blocks.used[0])
-    if rows <= have:
-        return blocks
-    larger = make_clamped(max(rows, 2 * have))
-    copy_rows(blocks[1:-1], larger[1:-1], used)
-    larger.used[0] = used
-    enter_keys(larger.table, larger.keys[:used])
-    return larger
-
-
 def add_evidence(
     blocks: ClampedBlocks, evidence: Blocks, lowest: float, highest: float
 ) -> ClampedBlocks:
@@ -110,7 +102,7 @@ def add_evidence(
     Returns:
         The stores that hold the map.
     """
-    blocks = reserve_clamped(blocks, int(blocks.used[0]) + int(evidence.used[0]))
+    blocks = reserve(blocks, int(blocks.used[0]) + int(evidence.used[0]), make_clamped)
     # Plain tuples: numba's cache on disk would remember the classes by name, and break when one
     # is renamed.
     _add_evidence(tuple(blocks), tuple(evidence), lowest, highest)
@@ -129,26 +121,35 @@ def _add_evidence(
     frame_table, frame_keys, changes, frame_used = evidence
     lo, hi = np.float32(lowest), np.float32(highest)
     for touched in range(frame_used[0]):
-        row = find_or_add(table, frame_keys[touched], used[0])
-        if row == used[0]:
-            keys[row] = frame_keys[touched]
-            used[0] += 1
+        row = find_or_append(table, keys, used, frame_keys[touched])
         for cell in range(BLOCK_CELLS):
             change = changes[touched, cell]
-            if change == 0:
-                continue
-            before = cells[row, cell, 0]
-            if np.isnan(before):
-                cells[row, cell, 0] = change
-                cells[row, cell, 1] = lo
-                cells[row, cell, 2] = hi
-            else:
-                cells[row, cell, 0] = before + change
-                cells[row, cell, 1] = min(max(cells[row, cell, 1] + change, lo), hi)
-                cells[row, cell, 2] = min(max(cells[row, cell, 2] + change, lo), hi)
-            changes[touched, cell] = 0
+            if change != 0:
+                _chain(cells, row, cell, change, lo, hi)
+                changes[touched, cell] = 0
     frame_table[:, 0] = EMPTY
     frame_used[0] = 0
+
+
+@njit(cache=True, nogil=True)
+def _chain(
+    cells: NDArray[np.float32],
+    row: int,
+    cell: int,
+    change: np.float32,
+    low: np.float32,
+    high: np.float32,
+) -> None:
+    """Let ``x → min(max(x + change, low), high)`` follow what was done to a cell before."""
+    before = cells[row, cell, 0]
+    if np.isnan(before):
+        cells[row, cell, 0] = change
+        cells[row, cell, 1] = low
+        cells[row, cell, 2] = high
+    else:
+        cells[row, cell, 0] = before + change
+        cells[row, cell, 1] = min(max(cells[row, cell, 1] + change, low), high)
+        cells[row, cell, 2] = min(max(cells[row, cell, 2] + change, low), high)
 
 
 def observed_rows(blocks: ClampedBlocks) -> CellRows:
@@ -173,7 +174,7 @@ def chain_rows(blocks: ClampedBlocks, rows: CellRows) -> ClampedBlocks:
     Returns:
         The stores that hold the map.
     """
-    blocks = reserve_clamped(blocks, int(blocks.used[0]) + len(rows.blocks))
+    blocks = reserve(blocks, int(blocks.used[0]) + len(rows.blocks), make_clamped)
     _chain_rows(tuple(blocks), tuple(rows))
     return blocks
 
@@ -184,22 +185,9 @@ def _chain_rows(blocks: tuple[NDArray[Any], ...], rows: tuple[NDArray[Any], ...]
     table, keys, cells, used = blocks
     new_blocks, starts, columns, values = rows
     for block in range(len(new_blocks)):
-        row = find_or_add(table, new_blocks[block], used[0])
-        if row == used[0]:
-            keys[row] = new_blocks[block]
-            used[0] += 1
+        row = find_or_append(table, keys, used, new_blocks[block])
         for n in range(starts[block], starts[block + 1]):
-            cell = columns[n]
-            change, low, high = values[n, 0], values[n, 1], values[n, 2]
-            before = cells[row, cell, 0]
-            if np.isnan(before):
-                cells[row, cell, 0] = change
-                cells[row, cell, 1] = low
-                cells[row, cell, 2] = high
-            else:
-                cells[row, cell, 0] = before + change
-                cells[row, cell, 1] = min(max(cells[row, cell, 1] + change, low), high)
-                cells[row, cell, 2] = min(max(cells[row, cell, 2] + change, low), high)
+            _chain(cells, row, columns[n], values[n, 0], values[n, 1], values[n, 2])
 
 
 def move_blocks(blocks: ClampedBlocks, T_new_old: NDArray[np.float64]) -> ClampedBlocks:
@@ -236,9 +224,7 @@ def _fill_moved(
     _, keys, new_cells, used = new
     last_key, last_row = -1, -1
     for row in range(used[0]):
-        bi = (keys[row] >> (2 * KEY_BITS)) - KEY_LIMIT
-        bj = ((keys[row] >> KEY_BITS) & _MASK) - KEY_LIMIT
-        bk = (keys[row] & _MASK) - KEY_LIMIT
+        bi, bj, bk = unpack_key(keys[row])
         for cell in range(BLOCK_CELLS):
             x = bi * BLOCK_EDGE + (cell >> (2 * BLOCK_BITS)) + 0.5
             y = bj * BLOCK_EDGE + ((cell >> BLOCK_BITS) & _LOW) + 0.5
@@ -247,11 +233,11 @@ def _fill_moved(
             i = math.floor(T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3])
             j = math.floor(T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3])
             k = math.floor(T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3])
-            key = pack_key(i >> BLOCK_BITS, j >> BLOCK_BITS, k >> BLOCK_BITS)
+            key = block_key(i, j, k)
             if key != last_key:
                 last_key, last_row = key, find(table, key)
             if last_row == EMPTY:
                 continue
-            place = ((i & _LOW) << (2 * BLOCK_BITS)) | ((j & _LOW) << BLOCK_BITS) | (k & _LOW)
+            place = cell_in_block(i, j, k)
             for n in range(3):
                 new_cells[row, cell, n] = old_cells[last_row, place, n]

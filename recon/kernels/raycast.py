@@ -24,13 +24,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.kernels.voxels import (
-    copy_rows,
-    enter_keys,
-    find_or_add,
-    make_table,
-    pack_key,
-)
+from recon.kernels.voxels import find_or_add, make_table, pack_key, reserve
 
 BLOCK_BITS: Final = 3
 BLOCK_EDGE: Final = 1 << BLOCK_BITS
@@ -194,16 +188,16 @@ def make_blocks(rows: int) -> Blocks:
     )
 
 
-def reserve_blocks(blocks: Blocks, rows: int) -> Blocks:
-    """Room for ``rows`` blocks: the same, or twice as much (or more) with the same content."""
-    have, used = len(blocks.keys), int(blocks.used[0])
-    if rows <= have:
-        return blocks
-    larger = make_blocks(max(rows, 2 * have))
-    copy_rows(blocks[1:-1], larger[1:-1], used)
-    larger.used[0] = used
-    enter_keys(larger.table, larger.keys[:used])
-    return larger
+@njit(cache=True, nogil=True)
+def block_key(i: int, j: int, k: int) -> int:
+    """Packed index of the block that a cell lies in."""
+    return int(pack_key(i >> BLOCK_BITS, j >> BLOCK_BITS, k >> BLOCK_BITS))
+
+
+@njit(cache=True, nogil=True)
+def cell_in_block(i: int, j: int, k: int) -> int:
+    """Column of a cell in the row of its block."""
+    return ((i & _LOW) << (2 * BLOCK_BITS)) | ((j & _LOW) << BLOCK_BITS) | (k & _LOW)
 
 
 def cast_rays(evidence: Blocks, rays: Rays, spread: float) -> Blocks:
@@ -229,7 +223,7 @@ def cast_rays(evidence: Blocks, rays: Rays, spread: float) -> Blocks:
         done = _cast_rays(tuple(evidence), tuple(rays), done, spread)
         if done == len(rays.ends):
             return evidence
-        evidence = reserve_blocks(evidence, len(evidence.keys) + 1)
+        evidence = reserve(evidence, len(evidence.keys) + 1, make_blocks)
 
 
 @njit(cache=True, nogil=True)
@@ -259,7 +253,7 @@ def _cast_rays(
             leave = min(next_x, next_y, next_z)
             touched = leave > near
             if touched or leave <= free:
-                key = pack_key(i >> BLOCK_BITS, j >> BLOCK_BITS, k >> BLOCK_BITS)
+                key = block_key(i, j, k)
                 if key != block:
                     if rows == len(keys):
                         used[0] = rows
@@ -269,7 +263,7 @@ def _cast_rays(
                         keys[row] = key
                         rows += 1
                     block = key
-                cell = ((i & _LOW) << (2 * BLOCK_BITS)) | ((j & _LOW) << BLOCK_BITS) | (k & _LOW)
+                cell = cell_in_block(i, j, k)
                 value = values[row, cell]
                 if not touched:
                     if value <= 0 and miss < value:

@@ -12,7 +12,9 @@ The twins in plain Python stand in `recon.kernels.voxels_reference`.
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
@@ -24,6 +26,9 @@ KEY_LIMIT: Final = 1 << (KEY_BITS - 1)
 EMPTY: Final = -1
 _MASK: Final = (1 << KEY_BITS) - 1
 _MIN_CAPACITY: Final = 1 << 10
+
+Store = TypeVar("Store", bound=tuple[NDArray[Any], ...])
+"""A named tuple of a hash, packed cells, what is stored under each, and the rows in use."""
 
 
 class VoxelSums(NamedTuple):
@@ -93,21 +98,27 @@ def make_sums(rows: int, values: int) -> VoxelSums:
 
 
 def reserve_sums(voxels: VoxelSums, rows: int) -> VoxelSums:
-    """Rows for ``rows`` voxels: the same ones, or twice as many (or more) with the same content."""
-    have, used = len(voxels.keys), int(voxels.used[0])
+    """As `reserve`, for sums."""
+    return reserve(voxels, rows, partial(make_sums, values=voxels.sums.shape[1] - 4))
+
+
+def reserve(store: Store, rows: int, make: Callable[[int], Store]) -> Store:
+    """The store if it has ``rows`` rows, else a copy with so many, or twice as many as before.
+
+    Args:
+        store: What may be full.
+        rows: How many rows are needed.
+        make: Makes an empty store with a number of rows.
+    """
+    have, used = len(store[1]), int(store[-1][0])
     if rows <= have:
-        return voxels
-    larger = make_sums(max(rows, 2 * have), voxels.sums.shape[1] - 4)
-    copy_rows(voxels[1:-1], larger[1:-1], used)
-    larger.used[0] = used
-    enter_keys(larger.table, larger.keys[:used])
+        return store
+    larger = make(max(rows, 2 * have))
+    for source, target in zip(store[1:-1], larger[1:-1], strict=True):
+        target[:used] = source[:used]
+    larger[-1][0] = used
+    enter_keys(larger[0], larger[1][:used])
     return larger
-
-
-def copy_rows(old: tuple[NDArray[Any], ...], new: tuple[NDArray[Any], ...], rows: int) -> None:
-    """Copy the first ``rows`` rows of each array to its larger successor."""
-    for source, target in zip(old, new, strict=True):
-        target[:rows] = source[:rows]
 
 
 def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -127,6 +138,13 @@ def pack_key(i: int, j: int, k: int) -> int:
     """One int64 of three cell indices in ``[-KEY_LIMIT, KEY_LIMIT)``; never negative."""
     high = (i + KEY_LIMIT) << (2 * KEY_BITS)
     return high | ((j + KEY_LIMIT) << KEY_BITS) | (k + KEY_LIMIT)
+
+
+@njit(cache=True, nogil=True)
+def unpack_key(key: int) -> tuple[int, int, int]:
+    """The three cell indices of a packed cell."""
+    i, j, k = key >> (2 * KEY_BITS), (key >> KEY_BITS) & _MASK, key & _MASK
+    return i - KEY_LIMIT, j - KEY_LIMIT, k - KEY_LIMIT
 
 
 @njit(cache=True, nogil=True)
@@ -164,6 +182,18 @@ def find(table: NDArray[np.int64], key: int) -> int:
             return int(table[place, 1])
         place = (place + 1) & mask
     return EMPTY
+
+
+@njit(cache=True, nogil=True)
+def find_or_append(
+    table: NDArray[np.int64], keys: NDArray[np.int64], used: NDArray[np.int64], key: int
+) -> int:
+    """Row of a packed cell; where it is new it gets the next row, which must exist."""
+    row: int = find_or_add(table, key, used[0])
+    if row == used[0]:
+        keys[row] = key
+        used[0] += 1
+    return row
 
 
 @njit(cache=True, nogil=True)
@@ -273,10 +303,7 @@ def _add_rows(
     """The loop of `add_rows`; there is room for every row."""
     table, keys, sums, information, _, frames, _, used = voxels
     for n in range(len(new_keys)):
-        row = find_or_add(table, new_keys[n], used[0])
-        if row == used[0]:
-            keys[row] = new_keys[n]
-            used[0] += 1
+        row = find_or_append(table, keys, used, new_keys[n])
         for c in range(sums.shape[1]):
             sums[row, c] += new_sums[n, c]
         information[row] += new_information[n]
