@@ -33,7 +33,7 @@ ABSOLUTE: Final = "absolute"
 AS_PRINTED: Final = "as_printed"
 TITLES: Final[Mapping[str, str]] = MappingProxyType(
     {
-        CORRECTED: "as it should be",
+        CORRECTED: "corrected",
         ABSOLUTE: "as printed, but absolute differences",
         AS_PRINTED: "as printed",
     }

@@ -24,8 +24,8 @@ from recon.structures import Disparity, RectifiedPair, TrajectoryMetrics
 FigureFormats = Mapping[str, tuple[str, str]]
 _NOT_TABULATED: Final = frozenset({"stages", "warnings"})
 _HOW_TO_TURN: Final = (
-    "Drag to turn, scroll to come closer, right button to move; a click in the legend shows or "
-    "hides a part."
+    "Drag to rotate, scroll to zoom, drag with the right button to pan; click in the legend to "
+    "show or hide a part."
 )
 
 
@@ -45,12 +45,12 @@ def stereo_blocks(pair: RectifiedPair, disparity: Disparity) -> list[Block]:
     depth_m = depth_from_disparity(disparity.values, pair.camera)
     return [
         FigureBlock(
-            "Input pair", pair_figure(pair), "Rectified: a point lies on the same row of both."
+            "Input pair", pair_figure(pair), "Rectified: a point is on the same row in both images."
         ),
         FigureBlock(
             "Disparity",
             disparity_figure(disparity, pair.camera),
-            f"Red is near, blue is far, dark is not known; {share} of the pixels have a value.",
+            f"Red is near, blue is far, black is unknown; {share} of the pixels have a value.",
             wide,
         ),
         FigureBlock(
@@ -59,11 +59,14 @@ def stereo_blocks(pair: RectifiedPair, disparity: Disparity) -> list[Block]:
         FigureBlock(
             "Why pixels have no disparity",
             reasons_figure(disparity),
-            "The first check that a pixel failed, and the share of all pixels.",
+            "The first check that each pixel failed, with its share of all pixels.",
             wide,
         ),
         FigureBlock(
-            "Confidence", confidence_figure(disparity), "How far each match can be trusted.", wide
+            "Confidence",
+            confidence_figure(disparity),
+            "Estimated probability that the match is correct.",
+            wide,
         ),
     ]
 
@@ -84,7 +87,7 @@ def run_blocks(summary: Mapping[str, Any]) -> list[Block]:
         name: float(s) for name, s in dict(summary.get("stages") or {}).items() if is_number(s)
     }
     if stages:
-        caption = "Wall-clock seconds of each stage; stages that run side by side count each."
+        caption = "Wall-clock time of each stage. Stages that run in parallel are all counted."
         blocks.append(FigureBlock("Time by stage", timing_figure(stages), caption, wide=False))
     rows = list(_rows(summary))
     if rows:
@@ -94,7 +97,7 @@ def run_blocks(summary: Mapping[str, Any]) -> list[Block]:
 
 def metrics_table(metrics: TrajectoryMetrics) -> TableBlock:
     """How far a path is from the true one."""
-    lengths = ", ".join(f"{length:g}" for length in metrics.segment_lengths_m)
+    lengths = ", ".join(f"{length:.3g}" for length in metrics.segment_lengths_m)
     return TableBlock(
         "Path against truth",
         ("figure", "value"),
@@ -115,13 +118,15 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _rows(summary: Mapping[str, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
+def _rows(summary: Mapping[Any, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
     """Names and texts of a nested mapping, one row for each leaf."""
     for key, value in summary.items():
         if not prefix and key in _NOT_TABULATED:
             continue
         if isinstance(value, Mapping):
             yield from _rows(value, f"{prefix}{key}.")
+        elif isinstance(value, Sequence) and any(isinstance(item, Mapping) for item in value):
+            yield from _rows(dict(enumerate(value)), f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", _text(value)
 
@@ -132,5 +137,5 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return ", ".join(_text(item) for item in value)
+        return ", ".join(_text(item) for item in value) or "none"
     return str(value)

@@ -80,26 +80,29 @@ def epipolar_pictures(run: CalibrationRun) -> tuple[bytes, bytes]:
 
 def _content(run: CalibrationRun, figures: Mapping[str, bytes]) -> ReportContent:
     s = run.summary
-    depth = "How depth in the middle of the picture may be off, in 95 of 100 such calibrations."
+    depth = (
+        "calibration: systematic error, rms over the image. interval: its 95 % interval in the "
+        "middle of the image. matching: error of a match that is off by 0.25 px."
+    )
     sections = (
         Section("Fit", [
             FigureBlock("Each view", figures["view_errors"],
-                        "Dashed: all corners of both pictures together."),
+                        "Dashed: rms over all corners of both images."),
             FigureBlock("Where the board was", figures["coverage"],
-                        "One colour for each view. Where no corner was, the lens is guessed."),
+                        "One colour per view. Where there are no corners, distortion is a guess."),
         ]),
         Section("Rectified", [
             FigureBlock("Epipolar lines, as recorded", figures["epipolar_raw"],
-                        "A point of one picture lies on the line of its colour in the other."),
+                        "A point in one image lies on the line of its colour in the other."),
             FigureBlock("Epipolar lines, rectified", figures["epipolar_rectified"],
-                        "Rows of the left picture, drawn through both."),
+                        "Rows of the left image, drawn across both."),
             FigureBlock("Row errors", figures["row_errors"],
-                        "Over all corners of all views; a matcher wants less than half a pixel.",
+                        "Over all corners of all views; a matcher needs less than half a pixel.",
                         wide=False),
         ]),
-        Section("What it is worth", [
+        Section("Expected depth error", [
             FigureBlock("Depth error", figures["depth_error"],
-                        "The larger of the two lines decides.", wide=False),
+                        "The larger of the two lines dominates.", wide=False),
             TableBlock("Depth error in cm", ("depth", "calibration", "interval", "matching"),
                        _depth_rows(s), depth),
         ]),
@@ -111,9 +114,9 @@ def _content(run: CalibrationRun, figures: Mapping[str, bytes]) -> ReportContent
         command=command_line(),
         warnings=s["warnings"],
         figures=[
-            ("Error of corners", f"{s['stereo_rms_px']:.3f} px"),
+            ("Reprojection error (rms)", f"{s['stereo_rms_px']:.3f} px"),
             ("Row error, rectified", f"{s['epipolar_px']:.3f} px"),
-            ("Baseline", f"{s['baseline_m']:.5g} m"),
+            ("Baseline", f"{s['baseline_m']:.4g} m"),
             ("Focal length", f"{s['focal_px']:.2f} px"),
         ],
         sections=sections,

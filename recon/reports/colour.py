@@ -49,6 +49,7 @@ REASON_LABELS: Final[Mapping[Reason, str]] = MappingProxyType(
         Reason.EDGE: "flying edge",
     }
 )
+_GRID_PICTURE_PX: Final = 1500
 GRID_FREE: Final[Rgb] = (247, 249, 250)
 GRID_OCCUPIED: Final[Rgb] = (24, 28, 34)
 GRID_UNKNOWN: Final[Rgb] = (190, 197, 204)
@@ -132,12 +133,14 @@ def colour_grid_errors(grid: OccupancyGrid, truth: OccupancyTruth) -> UInt8:
         uint8 (rows, columns, 3) RGB, row 0 = the largest y. Right cells are almost white (free)
         or almost black; an obstacle that is called free is red, one that is not known blue, an
         invented one orange, free ground that is not known green; what was not seen is grey.
+        A cell is a square of whole pixels, so that a small grid can be looked at too.
     """
     cells = grid_on_truth(grid, truth)
     picture = np.full((*cells.shape, 3), GRID_NOT_COUNTED, dtype=np.uint8)
     for (true, found), colour in GRID_ERRORS.items():
         picture[truth.seen & (truth.grid.cells == true) & (cells == found)] = colour
-    return picture[::-1]
+    side = max(1, _GRID_PICTURE_PX // max(picture.shape[:2]))
+    return np.asarray(picture[::-1].repeat(side, axis=0).repeat(side, axis=1))
 
 
 def colour_values(

@@ -6,6 +6,7 @@ import base64
 import gzip
 import io
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -260,19 +261,25 @@ def _framed(title: str, caption: str, inside: str, *, wide: bool) -> str:
 def _picture(block: FigureBlock) -> str:
     kind, small = _smaller(block.png)
     data = base64.b64encode(small).decode("ascii")
-    return f'<img alt="{escape(block.title)}" src="data:image/{kind};base64,{data}">'
+    image = f'<img alt="{escape(block.title)}" src="data:image/{kind};base64,{data}">'
+    return f'<div class="scroll">{image}</div>'
 
 
 def _table(block: TableBlock) -> str:
-    titles = "".join(f'<th scope="col">{escape(title)}</th>' for title in block.header)
+    titles = "".join(f'<th scope="col">{_breakable(title)}</th>' for title in block.header)
     head = f"<thead><tr>{titles}</tr></thead>" if titles else ""
     rows = "".join(f"<tr>{_row(row)}</tr>" for row in block.rows)
     return f'<div class="scroll"><table>{head}<tbody>{rows}</tbody></table></div>'
 
 
 def _row(cells: Sequence[str]) -> str:
-    first = "".join(f'<th scope="row">{escape(cell)}</th>' for cell in cells[:1])
+    first = "".join(f'<th scope="row">{_breakable(cell)}</th>' for cell in cells[:1])
     return first + "".join(f"<td>{escape(cell)}</td>" for cell in cells[1:])
+
+
+def _breakable(name: str) -> str:
+    """The name of a figure, which a narrow page may break between its words alone."""
+    return re.sub(r"([._])(?=[a-z])", r"\1<wbr>", escape(name))
 
 
 def _scene(block: SceneBlock, name: str) -> str:

@@ -41,6 +41,10 @@ from recon.structures import (
 from recon.structures.arrays import Float64
 
 _MAX_NOTES: Final = 20
+_NOTES_CAPTION: Final = (
+    "Why a correction by ICP was not applied (usual where the visual estimate is good), or why a "
+    "pose is not trusted."
+)
 _FIGURES: Final[FigureFormats] = MappingProxyType(
     {
         "fps": ("Mapping rate", "{:.1f} fps"),
@@ -145,7 +149,9 @@ def _map_blocks(inputs: MapReportInputs) -> list[Block]:
     if inputs.truth is not None:
         paths.append(("true path", _in_map_axes(inputs.truth, inputs.T_map_world)))
     scene = Scene(np.eye(4), inputs.cloud, inputs.mesh, paths)
-    blocks = scene_blocks(scene, "The fused cloud in map axes, with the path of the camera.")
+    blocks = scene_blocks(
+        scene, "The fused point cloud in the map frame, with the path of the camera."
+    )
     if inputs.grid is not None:
         caption = (
             f"Seen from above, cells of {inputs.grid.resolution_m:g} m; "
@@ -166,9 +172,9 @@ def _occupancy_table(found: Mapping[str, Any] | None) -> list[Block]:
     ]
     caption = (
         f"Of what at least {found['least_frames']} frames saw, in cells of "
-        f"{found['resolution_m']:g} m."
+        f"{found['resolution_m']:g} m. Shares: 1 is best, for the last row 0."
     )
-    head = ("figure", "within one cell", "the very cell")
+    head = ("figure", "within one cell", "exact cell")
     return [TableBlock("Occupancy against truth", head, rows, caption)]
 
 
@@ -183,16 +189,16 @@ def _in_map_axes(path: Trajectory, T_map_world: Float64) -> Float64:
 def _path_blocks(inputs: MapReportInputs) -> list[Block]:
     drawn = trajectory_figure(inputs.trajectory, inputs.truth, inputs.T_map_world, inputs.health)
     blocks: list[Block] = [
-        FigureBlock("Path from above", drawn, "Map axes; both axes have the same scale.")
+        FigureBlock("Path from above", drawn, "In the map frame; both axes have the same scale.")
     ]
     if inputs.loops is not None and inputs.loops.closure.closed:
         blocks.append(_loops_block(inputs.loops, inputs.T_map_world))
     if inputs.truth is not None:
         error = path_error_figure(inputs.trajectory, inputs.truth, inputs.health)
-        caption = "Both paths start at the same pose, so all drift shows."
+        caption = "Both paths start at the same pose, so this is the accumulated drift."
         blocks.append(FigureBlock("Error along the path", error, caption))
     if inputs.health:
-        caption = "What each pose rests on; frames whose pose is not trusted are shaded red."
+        caption = "What each pose is based on; frames whose pose is not trusted are shaded red."
         blocks.append(FigureBlock("Health of the odometry", health_figure(inputs.health), caption))
     return blocks + _tables(inputs)
 
@@ -203,9 +209,8 @@ def _loops_block(loops: DriveLoops, T_map_world: Float64) -> Block:
     drawn = loops_figure(loops.odometry, loops.closure.trajectory, pairs, T_map_world)
     moved = f"{float(loops.corrections_m.max()):.2f} m"
     caption = (
-        f"{len(closed)} times the camera came back to a place, out of {loops.keyframes} that were "
-        f"remembered. Closing them moved the path by up to {moved}; each red line is the gap "
-        "between where odometry saw one place."
+        f"{len(closed)} loops were closed, with {loops.keyframes} keyframes. That moved the path "
+        f"by up to {moved}. Each red line joins the two positions that odometry gave to one place."
     )
     return FigureBlock("Loops", drawn, caption)
 
@@ -221,6 +226,7 @@ def _tables(inputs: MapReportInputs) -> list[Block]:
     ]
     if notes:
         shown = notes[:_MAX_NOTES]
-        caption = f"The first {len(shown)} of {len(notes)}." if len(notes) > len(shown) else ""
+        first = f" The first {len(shown)} of {len(notes)}." if len(notes) > len(shown) else ""
+        caption = f"{_NOTES_CAPTION}{first}"
         tables.append(TableBlock("Notes of the odometry", ("frame", "note"), shown, caption))
     return tables

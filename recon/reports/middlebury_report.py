@@ -22,6 +22,11 @@ _WIDTH_PX: Final = 300
 
 _GAP_PX: Final = 6
 _MANY_COLUMNS: Final = 7
+_HOW_TO_READ: Final = (
+    "bad and invalid in per cent of the pixels; avgerr, rms and a50 to a99 in pixels of the full "
+    "size. nonocc: pixels that both cameras see; all: occluded ones too. dense: with holes filled; "
+    "sparse: only pixels with a value. ece, ause and sigma: docs/evaluation.md."
+)
 
 
 def middlebury_report(
@@ -41,13 +46,14 @@ def middlebury_report(
     ]
     scenes = next(iter(summary["matchers"].values()))["scenes"]
     sections = (
-        Section("Tables", tables, "Errors are in pixels of the full size."),
+        Section("Tables", tables, _HOW_TO_READ),
         Section("Confidence", _confidence_blocks(summary)),
         Section("Scenes", [_scene_block(name, summary, directory) for name in scenes]),
     )
     return ReportContent(
         title=f"Middlebury: {', '.join(summary['matchers'])}",
-        subtitle=f"{len(scenes)} scenes of {summary['folder']}, {summary['seconds']:.0f} s",
+        subtitle=f"{len(scenes)} scene{'s' * (len(scenes) > 1)} of {summary['folder']}, "
+        f"{summary['seconds']:.0f} s",
         command=command,
         warnings=summary["warnings"],
         figures=list(_figures(summary)),
@@ -75,15 +81,15 @@ def _confidence_blocks(summary: Mapping[str, Any]) -> list[Block]:
         FigureBlock(
             "Reliability",
             reliability_figure(rated),
-            "Right is what is off by no more than a pixel of the map. Above the dashed line "
-            "pixels are right more often than the matcher says. Matchers that do not rate their "
-            "matches are left out.",
+            "A pixel is right if it is off by at most one pixel of the map. Above the dashed line, "
+            "pixels are right more often than the confidence says. Matchers without a confidence "
+            "are left out.",
             wide=False,
         ),
         FigureBlock(
             "Sparsification",
             sparsification_figure(rated),
-            "The nearer to the dotted line, the better the confidence sorts.",
+            "The closer to the dotted line, the better the confidence ranks the errors.",
             wide=False,
         ),
     ]
@@ -96,7 +102,7 @@ def _scene_block(scene: str, summary: Mapping[str, Any], directory: RunDirectory
     Image.fromarray(np.concatenate(_spaced(rows, 0), axis=0)).save(buffer, "PNG")
     caption = (
         f"From top to bottom: {', '.join(summary['matchers'])}. Left the disparity, right its "
-        "error: blue is right, red is off by 4 full-size pixels or more, dark is not known."
+        "error: blue is right, red is off by 4 full-size pixels or more, black is unknown."
     )
     return FigureBlock(scene, buffer.getvalue(), caption, wide=False)
 

@@ -61,7 +61,7 @@ def paper_report(run: PaperRun, command: str = "") -> ReportContent:
         Section("Run", run_blocks(_of_the_run(run))),
     ]
     return ReportContent(
-        title="The seed paper's experiments 2 to 4",
+        title="Experiments 2 to 4 of the paper",
         subtitle=f"Middlebury scenes of {run.folder.name or run.folder}; {tried}",
         command=command,
         warnings=run.warnings,
@@ -117,7 +117,7 @@ def _experiment_section(result: ExperimentResult, bad_px: float) -> Section:
         FigureBlock(
             "Input pair",
             pair_figure(result.methods[0].pair),
-            "Rectified: a point lies on the same row of both.",
+            "Rectified: a point is on the same row in both images.",
         ),
         _methods_table(result),
     ]
@@ -128,8 +128,8 @@ def _experiment_section(result: ExperimentResult, bad_px: float) -> Section:
             "The effect of the patch size",
             patches_figure(result.patches, bad_px),
             "Against the truth, at pixels seen by both cameras; the last panel counts all pixels. "
-            "Shares are of all compared pixels, with or without a value. As it should be: "
-            "the matcher sad with a window of that size, and its checks, which leave out doubts.",
+            "Shares are of all compared pixels, with or without a value. Corrected: the matcher "
+            "sad with a window of that size and its checks, which reject doubtful pixels.",
         )
     )
     blocks.append(_curve_block(result))
@@ -183,7 +183,7 @@ def _map_blocks(result: ExperimentResult, one: MethodResult) -> list[Block]:
         FigureBlock(
             f"Disparity map, {title}",
             disparity_figure(one.disparity, one.pair.camera),
-            "Red is near, dark is not known.",
+            "Red is near, black is unknown.",
             wide,
         ),
         FigureBlock(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from recon.geometry.se3 import angle_rad, apply, invert
@@ -44,7 +45,7 @@ def trajectory_figure(
     T_map_world: NDArray[Any],
     health: Sequence[OdometryHealth] = (),
 ) -> bytes:
-    """The path seen from above, in map axes; poses that rest on no measurement are marked.
+    """The path seen from above, in map axes; poses that are not trusted are marked.
 
     Args:
         estimate: The path that was found.
@@ -63,7 +64,7 @@ def trajectory_figure(
     mark_ends(axes, paths[0])
     bad = _bad_frames(health, len(estimate))
     if len(bad):
-        label = f"not measured ({len(bad)})"
+        label = f"not trusted ({len(bad)})"
         axes.plot(*paths[0][bad].T, "x", color=BAD, markersize=8, markeredgewidth=2, label=label)
     style_plot(axes, _X_LABEL, _Y_LABEL)
     axes.set_aspect("equal", adjustable="datalim")
@@ -224,13 +225,14 @@ def mark_ends(axes: Axes, path: NDArray[Any]) -> None:
         axes.plot(*path[-1], "s", color=ESTIMATE, markersize=7, markeredgecolor="white", zorder=5)
         # One above and one below: a drive may end where it began.
         for place, text, up in ((path[0], "start", 9), (path[-1], "end", -18)):
-            axes.annotate(
+            label = axes.annotate(
                 text, place, textcoords="offset points", xytext=(0, up), ha="center", color=INK
             )
+            label.set_path_effects([withStroke(linewidth=3, foreground="white")])
 
 
 def _bad_frames(health: Sequence[OdometryHealth], poses: int) -> NDArray[np.intp]:
-    """Indices of the poses that rest on no measurement."""
+    """Indices of the poses that are not trusted."""
     records = health[:poses]
     return np.flatnonzero([not record.ok for record in records])
 

@@ -228,7 +228,7 @@ def _layout(eye: Float64, box: Float64) -> Json:
             "y": 0.0,
             "yanchor": "bottom",
             "itemsizing": "constant",
-            "bgcolor": "rgba(0,0,0,0)",
+            "bgcolor": "rgba(20,24,29,0.8)",
         },
         "uirevision": "kept",  # another colouring does not turn the view back
         "scene": {"aspectmode": "manual", "aspectratio": aspect, "camera": camera, **axes},

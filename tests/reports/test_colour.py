@@ -15,11 +15,19 @@ from recon.reports.colour import (
     colour_disparity,
     colour_error,
     colour_grid,
+    colour_grid_errors,
     colour_reasons,
     scale_colours,
     value_range,
 )
-from recon.structures import OccupancyGrid, Reason
+from recon.structures import (
+    FREE,
+    OCCUPIED,
+    OccupancyGrid,
+    OccupancyTruth,
+    Reason,
+    RectifiedCamera,
+)
 
 
 def test_lowest_and_highest_disparity_get_the_ends_of_the_scale() -> None:
@@ -87,3 +95,22 @@ def test_grid_is_drawn_with_its_largest_y_on_top() -> None:
     picture = colour_grid(grid)
     np.testing.assert_array_equal(picture[0], [GRID_UNKNOWN, GRID_UNKNOWN])
     np.testing.assert_array_equal(picture[1], [GRID_FREE, GRID_OCCUPIED])
+
+
+def test_each_cell_of_a_small_grid_is_large_enough_to_be_seen() -> None:
+    cells = np.array([[FREE, OCCUPIED], [OCCUPIED, FREE]], dtype=np.int8)
+    grid = OccupancyGrid(cells, resolution_m=0.2, origin_m=(0.0, 0.0))
+    truth = OccupancyTruth(
+        grid=grid,
+        seen=np.ones((2, 2), dtype=np.bool_),
+        keys=np.zeros((0, 3), dtype=np.int32),
+        frames=np.zeros(0, dtype=np.int32),
+        camera=RectifiedCamera(100.0, 49.5, 49.5, 49.5, 0.5, 100, 100),
+        T_map_camera=np.eye(4)[None],
+        range_m=20.0,
+        least_frames=3,
+    )
+    picture = colour_grid_errors(grid, truth)
+    side = picture.shape[0] // 2
+    assert side > 100
+    np.testing.assert_array_equal(picture[::side, ::side], colour_grid(grid))

@@ -29,7 +29,7 @@ NASTY = "<script>alert('x')</script> & \"quoted\""
 class Loads(HTMLParser):
     """Collects what a page would load, its text, and the elements that stay open."""
 
-    VOID = frozenset({"meta", "img", "br", "link", "input"})
+    VOID = frozenset({"meta", "img", "br", "wbr", "link", "input"})
 
     def __init__(self) -> None:
         super().__init__()
@@ -183,3 +183,9 @@ def test_sections_without_content_are_left_out() -> None:
 
 def test_same_content_gives_the_same_page() -> None:
     assert render_html(full_report()) == render_html(full_report())
+
+
+def test_a_long_name_in_a_table_is_broken_between_its_words_alone() -> None:
+    table = TableBlock("t", ("figure",), (("trajectory.ate_max_m", "0.05"),))
+    page = render_html(ReportContent("t", sections=(Section("s", (table,)),)))
+    assert "trajectory.<wbr>ate_<wbr>max_<wbr>m</th><td>0.05</td>" in page

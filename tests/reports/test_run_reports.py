@@ -9,6 +9,7 @@ from recon.loops.graph import Closure
 from recon.loops.verify import Loop
 from recon.odometry.protocol import OdometryHealth
 from recon.pipeline.drive_loops import DriveLoops
+from recon.reports.blocks import run_blocks
 from recon.reports.html import FigureBlock, ReportContent, SceneBlock, TableBlock, render_html
 from recon.reports.map_report import MapReportInputs, map_report
 from recon.reports.pair_report import PairReportInputs, pair_report
@@ -175,3 +176,13 @@ def test_truth_of_another_size_gives_no_error_map(
     assert "Disparity error" not in blocks(
         pair_report(PairReportInputs("x", pair, disparity, truth))
     )
+
+
+def test_figures_of_each_part_are_rows_of_their_own() -> None:
+    (table,) = run_blocks({"by_length": [{"length_m": 50.0, "segments": 15}], "views_dropped": []})
+    assert isinstance(table, TableBlock)
+    assert list(table.rows) == [
+        ("by_length.0.length_m", "50"),
+        ("by_length.0.segments", "15"),
+        ("views_dropped", "none"),
+    ]
