@@ -147,8 +147,8 @@ class RichProgress:
     def _state(self, result: FrameResult) -> str:
         valid = f"{100 * result.valid_share:.0f} % valid"
         if not result.health.ok:
-            return f"{valid} [bold red]pose not measured[/]"
-        lost = f" [yellow]({self._lost} not measured)[/]" if self._lost else ""
+            return f"{valid} [bold red]pose not trusted[/]"
+        lost = f" [yellow]({self._lost} not trusted)[/]" if self._lost else ""
         return f"{valid} [green]tracking, {result.health.inliers} inliers[/]{lost}"
 
 

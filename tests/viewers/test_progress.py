@@ -66,7 +66,7 @@ def test_bar_shows_frames_rate_and_lost_poses() -> None:
     shown = stream.getvalue()
     assert "3/3" in shown
     assert "4.0 fps" in shown  # 0.25 s each
-    assert "1 not measured" in shown
+    assert "1 not trusted" in shown
     assert "drive [1]" in shown  # a name is no markup
     assert "mesh" in shown
 
