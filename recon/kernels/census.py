@@ -1,6 +1,7 @@
-"""What is compared of two pictures: gradients, and the census: which neighbours are darker.
+"""Descriptors of pixels: the horizontal gradient and the census transform.
 
-The census stays what it is under any change of brightness that keeps the order of grey levels.
+The census, one bit per neighbour that is darker, is invariant under any change of brightness that
+keeps the order of grey levels.
 
 Ref: R. Zabih, J. Woodfill, "Non-parametric local transforms for computing visual
 correspondence", ECCV 1994.
@@ -17,16 +18,16 @@ from numpy.typing import NDArray
 from recon.kernels.lanes import LANES, load_row, splat, store_row, where_less
 
 PLANES: Final = 3
-"""Planes of bits come in threes: 5 by 5 has three, and fewer loops are faster ones."""
+"""Planes of bits come in threes, which one loop compares: a census of 5 by 5 needs three."""
 
 
-class Look(NamedTuple):
-    """What is looked at.
+class Descriptor(NamedTuple):
+    """How pixels are described.
 
     Attributes:
         cap: Horizontal gradients (Sobel units) are clipped to plus or minus this; at most 127.
-        rows_radius: Rows above and below that the census compares.
-        radius: Columns to each side that it compares.
+        rows_radius: Half height of the census, pixels.
+        radius: Half width of the census, pixels.
     """
 
     cap: int
@@ -35,7 +36,7 @@ class Look(NamedTuple):
 
     @property
     def planes(self) -> int:
-        """How many planes that makes: one of gradients, and those of bits, three at least."""
+        """Number of planes: one of gradients, and three or more of bits."""
         neighbours = (2 * self.rows_radius + 1) * (2 * self.radius + 1) - 1
         return 1 + PLANES * max(1, -(-neighbours // (8 * PLANES)))
 
@@ -43,7 +44,7 @@ class Look(NamedTuple):
 @njit(cache=True, nogil=True)
 def write_planes(
     grey: NDArray[np.uint8],
-    look: Look,
+    descriptor: Descriptor,
     place: int,
     first: int,
     end: int,
@@ -56,14 +57,14 @@ def write_planes(
 
     Args:
         grey: uint8 (H, W); continued by its border pixels.
-        look: What is looked at.
-        place: Where column 0 of the picture stands, which may be outside.
+        descriptor: How pixels are described.
+        place: Column of the planes that holds column 0 of the picture; may lie outside them.
         first: First row to do.
         end: The row after the last.
-        planes: Written: uint8 (H, ``look.planes``, R), the rows.
+        planes: Written: uint8 (H, ``descriptor.planes``, R), the rows.
     """
     height, width = grey.shape
-    rows_radius, radius = max(look.rows_radius, 1), max(look.radius, 1)
+    rows_radius, radius = max(descriptor.rows_radius, 1), max(descriptor.radius, 1)
     # Row y is at place y % N of the rows around, column x at radius + x.
     around = np.empty((2 * rows_radius + 1, radius + width + radius + LANES), np.uint8)
     row = np.empty((planes.shape[1], width + LANES), np.uint8)
@@ -71,15 +72,15 @@ def write_planes(
         line = min(max(y + rows_radius, 0), height - 1)
         _continue(grey[line], radius, around[(y + rows_radius) % around.shape[0]])
         if y >= first:
-            _write_gradient(around, y, radius, look.cap, row[0, :width])
-            _write_census(around, y, radius, look, width, row)
+            _write_gradient(around, y, radius, descriptor.cap, row[0, :width])
+            _write_census(around, y, radius, descriptor, width, row)
             for n in range(row.shape[0]):
                 _continue(row[n, :width], place, planes[y, n])
 
 
 @njit(cache=True, nogil=True)
 def _continue(row: NDArray[np.uint8], place: int, longer: NDArray[np.uint8]) -> None:
-    """Place a row in a longer one, which its first and its last value fill up."""
+    """Copy a row into a longer one from ``place`` on, continued by its end values."""
     start = min(max(place, 0), longer.size)
     end = min(max(place + row.size, 0), longer.size)
     longer[:start] = row[0]
@@ -110,7 +111,7 @@ def _write_census(
     around: NDArray[np.uint8],
     y: int,
     radius: int,
-    look: Look,
+    descriptor: Descriptor,
     width: int,
     planes: NDArray[np.uint8],
 ) -> None:
@@ -120,9 +121,9 @@ def _write_census(
     for x in range(0, width, LANES):
         middle = load_row(around, y % rows, radius + x)
         n, bits, bit = 0, none, first
-        for dy in range(-look.rows_radius, look.rows_radius + 1):
+        for dy in range(-descriptor.rows_radius, descriptor.rows_radius + 1):
             line = (y + dy) % rows
-            for dx in range(-look.radius, look.radius + 1):
+            for dx in range(-descriptor.radius, descriptor.radius + 1):
                 if dy != 0 or dx != 0:
                     neighbour = load_row(around, line, radius + dx + x)
                     bits, bit = where_less(neighbour, middle, bits + bit, bits), bit + bit
@@ -134,20 +135,20 @@ def _write_census(
             store_row(planes, n // 8 + 1, x, bits)
 
 
-def planes_reference(grey: NDArray[np.uint8], look: Look) -> NDArray[np.uint8]:
-    """The plain-numpy twin of `write_planes`: uint8 (``look.planes``, H, W)."""
+def planes_reference(grey: NDArray[np.uint8], descriptor: Descriptor) -> NDArray[np.uint8]:
+    """The plain-numpy twin of `write_planes`: uint8 (``descriptor.planes``, H, W)."""
     height, width = grey.shape
     around = np.pad(grey.astype(np.int64), 1, mode="edge")
     slopes = around[:, 2:] - around[:, :-2]
     gradient = slopes[:-2] + 2 * slopes[1:-1] + slopes[2:]
-    planes = np.zeros((look.planes, height, width), np.uint8)
-    planes[0] = np.clip(gradient, -look.cap, look.cap) + look.cap
-    around = np.pad(grey, ((look.rows_radius,) * 2, (look.radius,) * 2), mode="edge")
+    planes = np.zeros((descriptor.planes, height, width), np.uint8)
+    planes[0] = np.clip(gradient, -descriptor.cap, descriptor.cap) + descriptor.cap
+    around = np.pad(grey, ((descriptor.rows_radius,) * 2, (descriptor.radius,) * 2), mode="edge")
     bits = [
         around[dy : dy + height, dx : dx + width] < grey
-        for dy in range(2 * look.rows_radius + 1)
-        for dx in range(2 * look.radius + 1)
-        if (dy, dx) != (look.rows_radius, look.radius)
+        for dy in range(2 * descriptor.rows_radius + 1)
+        for dx in range(2 * descriptor.radius + 1)
+        if (dy, dx) != (descriptor.rows_radius, descriptor.radius)
     ]
     if bits:
         packed = np.packbits(np.stack(bits), axis=0, bitorder="little")

@@ -1,13 +1,13 @@
-"""Sums of absolute differences over half windows, one row after the other.
+"""Sums of absolute differences over half windows, row by row.
 
-A window is made of an upper and a lower half that share the middle row. The lower half of a row is
-the upper half of a row further down: it is summed up once and kept in a ring of rows. Its sums over
-one column move down by one row in and one row out; those over its columns are put together from
-sums of two and of four.
+A window consists of an upper and a lower half that share the middle row. The lower half of a row is
+the upper half of a row further down, so it is summed once and kept in a ring of rows. Column sums
+are updated from row to row, one pixel in and one out; sums over the width are put together from
+sums of two and of four columns.
 
-Sums lie place by place, with the columns of a block side by side. Place ``n`` is candidate
+Sums are stored place by place, with the columns of a block side by side. Place ``n`` is candidate
 ``n - abs(lean)``, so that a leaning half finds candidates before the first and after the last.
-Only places that are wanted are summed up; the rows of a place that is wanted anew begin early
+Only the places of offered candidates are summed. Where one is offered again, its sums start early
 enough for the first window that needs them.
 """
 
@@ -23,10 +23,10 @@ from recon.kernels.lanes import LANES, distance, fit, least, load, splat, store
 from recon.kernels.tiles import GROUP, Offer
 
 _CACHE_BYTES: Final = 1024 * 1024
-"""What the ring of half windows may take of a core's own cache (1 MB on most machines of today)."""
+"""Size of the ring of half windows: what a core's own (L2) cache commonly holds."""
 
 _CHUNK: Final = 16
-"""Candidates whose columns are put together at a time: their sums stay in the first cache."""
+"""Candidates whose columns are summed at a time: their sums stay in the L1 cache."""
 
 BLOCK: Final = 1024
 """Most columns of a block."""
@@ -68,20 +68,20 @@ class Views(NamedTuple):
     width: int
 
 
-class Room(NamedTuple):
-    """Memory to work in; what the kernel finds there does not matter.
+class Scratch(NamedTuple):
+    """Scratch memory; its content does not matter.
 
     Attributes:
         columns: uint8 or uint16 (n·S + ...,), sums over one column of a half, place by place.
         pairs: uint8 or uint16 (CHUNK·S + ...,), sums over two columns.
         fours: uint16 (CHUNK·S + ...,), sums over four columns.
         halves: uint16 (rows_radius + 1, n·S), a ring of rows: sums over a half.
-        alive: bool (n,), whether the column sums of a place are kept up.
-        runs: int64 (N, 2), first place and the one after the last of each run of them that is
-            summed up; those behind are empty.
+        alive: bool (n,), whether the column sums of a place are up to date.
+        runs: int64 (N, 2), first place and the one after the last of each run of places that are
+            summed; unused rows are 0.
         offers: As ``runs``, the candidates that are offered.
-        found: uint16 (5·LANES,), what is found in the last columns of a picture.
-        stride: Columns of a block with those that its windows reach over, S.
+        found: uint16 (5·LANES,), results of the last vector of a row, which may be cut short.
+        stride: Columns of a block including those that only its windows reach, S.
     """
 
     columns: NDArray[Any]
@@ -96,12 +96,12 @@ class Room(NamedTuple):
 
 
 class Halves(NamedTuple):
-    """Both halves of the windows of a row, summed up.
+    """Sums over both halves of the windows of a row.
 
     Attributes:
-        upper: uint16 (n·S,), the rows above a pixel and its own.
-        lower: uint16 (n·S,), its own and those below.
-        stride: Columns of a block with those its windows reach over, S.
+        upper: uint16 (n·S,), over the rows above a pixel and its own.
+        lower: uint16 (n·S,), over its own row and those below.
+        stride: As in `Scratch`, S.
     """
 
     upper: NDArray[np.uint16]
@@ -110,7 +110,7 @@ class Halves(NamedTuple):
 
 
 def empty_views(search: Search, block: int, height: int, width: int) -> Views:
-    """Arrays for `lay_out` to write to, where so many columns are done at a time."""
+    """Memory for `lay_out` to write to, where ``block`` columns are done at a time."""
     columns = width + _stride(search, block)
     right = np.empty((height, columns + _places(search) - 1), np.uint8)
     return Views(np.empty((height, columns), np.uint8), right, width)
@@ -124,13 +124,13 @@ def lay_out(
     first: int,
     views: Views,
 ) -> None:
-    """Lay out some rows of both pictures as the search reads them.
+    """Copy some rows of both pictures to where the search reads them.
 
     Args:
-        left: uint8 (N, W), those rows.
+        left: uint8 (N, W), the rows.
         right: uint8 (N, W).
         search: What will be searched.
-        first: Where in the picture the first of them lies.
+        first: Number of the first of them in the picture.
         views: Written: the rows.
     """
     places = views.right.shape[1] - views.left.shape[1] + 1
@@ -142,7 +142,7 @@ def lay_out(
 
 @njit(cache=True, nogil=True)
 def _continue(pixels: NDArray[np.uint8], at: int, view: NDArray[np.uint8]) -> None:
-    """Write a row of pixels to ``at`` and on, continued by its ends."""
+    """Copy a row into a longer one from ``at`` on, continued by its end values."""
     start = min(max(at, 0), view.size)
     end = min(max(at + pixels.size, start), view.size)
     view[:start] = pixels[0]
@@ -152,14 +152,14 @@ def _continue(pixels: NDArray[np.uint8], at: int, view: NDArray[np.uint8]) -> No
         inside[c] = shown[c]
 
 
-def make_room(search: Search, block: int) -> Room:
-    """Memory for one thread's search, so many columns at a time."""
+def empty_scratch(search: Search, block: int) -> Scratch:
+    """Memory for one thread's search, ``block`` columns at a time."""
     places, stride = _places(search), _stride(search, block)
     rows = search.rows_radius + 1
     narrow = [np.uint8 if n * rows * search.cost_cap <= 255 else np.uint16 for n in (1, 2)]
-    # What is read beyond the end becomes sums that nobody reads.
+    # The last vectors read beyond the end; their sums are not used.
     beyond = 2 * search.radius + 1 + LANES
-    return Room(
+    return Scratch(
         columns=np.zeros(places * stride + beyond, narrow[0]),
         pairs=np.zeros(_CHUNK * stride + beyond, narrow[1]),
         fours=np.zeros(_CHUNK * stride + beyond, np.uint16),
@@ -185,35 +185,37 @@ def _places(search: Search) -> int:
 
 
 def _stride(search: Search, block: int) -> int:
-    """Columns of a block with those that its windows reach over, a multiple of 32."""
+    """Columns of a block including those that only its windows reach, a multiple of 32."""
     return -(-(block + 2 * search.radius) // 32) * 32
 
 
 @njit(cache=True, nogil=True)
-def next_half(views: Views, search: Search, first: int, y: int, x0: int, room: Room) -> Halves:
-    """Sum up the half window below row ``y``; give the halves above and below it."""
+def next_half(
+    views: Views, search: Search, first: int, y: int, x0: int, scratch: Scratch
+) -> Halves:
+    """Sum the half window below row ``y``; return it with the half above."""
     rows, start = search.rows_radius + 1, first - search.rows_radius
     last = views.left.shape[0] - 1
     come, gone = min(max(y + rows - 1, 0), last), min(max(y - 1, 0), last)
-    lower = room.halves[(y - start) % rows]
-    for run in range(room.runs.shape[0]):
-        n0, n1 = room.runs[run]
+    lower = scratch.halves[(y - start) % rows]
+    for run in range(scratch.runs.shape[0]):
+        n0, n1 = scratch.runs[run]
         if n0 == n1:
             break
-        _exchange_row(views, n0, n1, search.cost_cap, come, gone, x0, room)
+        _slide_row(views, n0, n1, search.cost_cap, come, gone, x0, scratch)
         for n in range(n0, n1, _CHUNK):
-            at, stop = n * room.stride, min(n + _CHUNK, n1) * room.stride
-            _sum_columns(room, at, stop, 2 * search.radius + 1, lower)
+            at, stop = n * scratch.stride, min(n + _CHUNK, n1) * scratch.stride
+            _sum_columns(scratch, at, stop, 2 * search.radius + 1, lower)
     # The half above row y is that below row y - rows_radius, the oldest of the ring.
-    upper = room.halves[(y - start + 1) % rows]
-    return Halves(upper, lower, room.stride)
+    upper = scratch.halves[(y - start + 1) % rows]
+    return Halves(upper, lower, scratch.stride)
 
 
 @njit(cache=True, nogil=True)
 def enlist(
-    views: Views, search: Search, now: Offer, soon: Offer, y: int, x0: int, room: Room
+    views: Views, search: Search, now: Offer, soon: Offer, y: int, x0: int, scratch: Scratch
 ) -> None:
-    """From row ``y`` on offer some candidates, and sum up these and those offered soon.
+    """From row ``y`` on offer some candidates, and sum these and those offered soon.
 
     Args:
         views: The pictures.
@@ -222,16 +224,16 @@ def enlist(
         soon: bool (G,), those offered when the half below row ``y`` will be an upper one.
         y: The row whose half window comes next.
         x0: First column of the block.
-        room: Changed.
+        scratch: Changed.
     """
-    _list_runs(now, now, search.ndisp, 0, room.offers)
-    _list_runs(now, soon, search.ndisp, 2 * abs(search.lean), room.runs)
-    _begin(views, search, y - 1, x0, room)
+    _list_runs(now, now, search.ndisp, 0, scratch.offers)
+    _list_runs(now, soon, search.ndisp, 2 * abs(search.lean), scratch.runs)
+    _begin(views, search, y - 1, x0, scratch)
 
 
 @njit(cache=True, nogil=True)
 def _list_runs(now: Offer, soon: Offer, ndisp: int, more: int, runs: NDArray[np.int64]) -> None:
-    """Write the runs of what is offered now or soon, each with so many more places behind."""
+    """Write the runs of what is offered now or soon, each ``more`` places longer."""
     count = 0
     runs[:] = 0
     for group in range(now.size):
@@ -244,37 +246,37 @@ def _list_runs(now: Offer, soon: Offer, ndisp: int, more: int, runs: NDArray[np.
 
 
 @njit(cache=True, nogil=True)
-def _begin(views: Views, search: Search, y: int, x0: int, room: Room) -> None:
-    """Sum up the columns of those candidates of the runs that were not kept up, for row ``y``."""
+def _begin(views: Views, search: Search, y: int, x0: int, scratch: Scratch) -> None:
+    """Bring the column sums of the runs up to date for row ``y``."""
     last, before = views.left.shape[0] - 1, 0
-    for run in range(room.runs.shape[0]):
-        n0, n1 = room.runs[run]
+    for run in range(scratch.runs.shape[0]):
+        n0, n1 = scratch.runs[run]
         for n in range(n0, n1):
-            if not room.alive[n]:
-                room.columns[n * room.stride : (n + 1) * room.stride] = 0
+            if not scratch.alive[n]:
+                scratch.columns[n * scratch.stride : (n + 1) * scratch.stride] = 0
                 for row in range(y, y + search.rows_radius + 1):
                     at = min(max(row, 0), last)
-                    _add_row(views, n, search.cost_cap, at, x0, room)
-        # Between the runs nothing is kept up.
-        room.alive[before : max(n0, before)] = False
-        room.alive[n0:n1] = True
+                    _add_row(views, n, search.cost_cap, at, x0, scratch)
+        # Between the runs no sums are updated.
+        scratch.alive[before : max(n0, before)] = False
+        scratch.alive[n0:n1] = True
         before = max(n1, before)
-    room.alive[before:] = False
+    scratch.alive[before:] = False
 
 
 @njit(cache=True, nogil=True)
-def _add_row(views: Views, n: int, cost_cap: int, y: int, x0: int, room: Room) -> None:
+def _add_row(views: Views, n: int, cost_cap: int, y: int, x0: int, scratch: Scratch) -> None:
     """Add the costs of the pixels of row ``y`` to the column sums of place ``n``."""
-    sums, left, right = room.columns, views.left[y], views.right[y]
-    cap, shift = splat(np.uint8(cost_cap)), x0 + room.alive.size - 1 - n
-    for c in range(0, room.stride, LANES):
+    sums, left, right = scratch.columns, views.left[y], views.right[y]
+    cap, shift = splat(np.uint8(cost_cap)), x0 + scratch.alive.size - 1 - n
+    for c in range(0, scratch.stride, LANES):
         plus = least(distance(load(left, x0 + c), load(right, shift + c)), cap)
-        at = n * room.stride + c
+        at = n * scratch.stride + c
         store(sums, at, load(sums, at) + fit(plus, sums))
 
 
 @njit(cache=True, nogil=True)
-def _exchange_row(
+def _slide_row(
     views: Views,
     n0: int,
     n1: int,
@@ -282,14 +284,14 @@ def _exchange_row(
     come: int,
     gone: int,
     x0: int,
-    room: Room,
+    scratch: Scratch,
 ) -> None:
-    """Take the costs of row ``gone`` out of the column sums and add those of row ``come``."""
-    sums, stride, cap = room.columns, room.stride, splat(np.uint8(cost_cap))
+    """Subtract the costs of row ``gone`` from the column sums and add those of row ``come``."""
+    sums, stride, cap = scratch.columns, scratch.stride, splat(np.uint8(cost_cap))
     right, right_gone = views.right[come], views.right[gone]
     for c in range(x0, x0 + stride, LANES):
         left, left_gone = load(views.left[come], c), load(views.left[gone], c)
-        at, other = n0 * stride + c - x0, c + room.alive.size - 1 - n0
+        at, other = n0 * stride + c - x0, c + scratch.alive.size - 1 - n0
         for _ in range(n1 - n0):
             plus = least(distance(left, load(right, other)), cap)
             minus = least(distance(left_gone, load(right_gone, other)), cap)
@@ -298,12 +300,14 @@ def _exchange_row(
 
 
 @njit(cache=True, nogil=True)
-def _sum_columns(room: Room, first: int, end: int, window: int, sums: NDArray[np.uint16]) -> None:
+def _sum_columns(
+    scratch: Scratch, first: int, end: int, window: int, sums: NDArray[np.uint16]
+) -> None:
     """Write the sums over ``window`` neighbours, an odd number, to ``sums``, (n·S,).
 
-    Places lie one behind the other: the last sums of each run into the next, and nobody reads them.
+    Places follow one another in memory: the last sums of each reach into the next, and are unused.
     """
-    values, pairs, fours = room.columns, room.pairs, room.fours
+    values, pairs, fours = scratch.columns, scratch.pairs, scratch.fours
     for i in range(0, end - first, LANES):
         pair = fit(load(values, first + i), pairs) + fit(load(values, first + i + 1), pairs)
         store(pairs, i, pair)

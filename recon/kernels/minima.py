@@ -1,7 +1,6 @@
-"""The best candidate of each pixel of a row of costs, in the left view and in the right.
+"""What a search finds: the best candidate of each pixel, in the left view and in the right.
 
-Both come from the same costs, which are read once more while they are still in the cache: so a
-left-right check costs one pass instead of a second search.
+Both views are found from the same costs, so a left-right check needs no second search.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ class Minima(NamedTuple):
 
 def empty_minima(height: int, width: int) -> Minima:
     """Arrays for a search to write to."""
-    # One block, for which the system gives large pages: many small ones cost more than a search.
+    # One block, so that the system uses large pages: faulting in small ones outlasts a search.
     block = np.empty((6, height, width), np.uint16)
     return Minima(winner=block[0], costs=block[1:5], right_winner=block[5])
 
@@ -42,8 +41,8 @@ def empty_minima(height: int, width: int) -> Minima:
 def claim_right(ndisp: int, minimum: int, y: int, minima: Minima) -> None:
     """Match each pixel of row ``y`` of the right view to the left pixel that chose it best.
 
-    The left pixel of the least cost gets it, of equal ones the leftmost. Weaker than a search of
-    the right view among all costs, but it costs a hundredth of that.
+    The left pixel of the least cost gets it, of equal ones the leftmost. The check is weaker than
+    with a search of the right view among all costs, but takes a hundredth of the time.
 
     Args:
         ndisp: Number of candidates.

@@ -1,8 +1,8 @@
-"""Costs of all candidates of a row: gradients and census over a window, in uint8.
+"""Matching costs of all candidates of a row: gradients and census over a window, in uint8.
 
-One row is an array (candidates, W): the pixels of a candidate lie side by side, in the left view
-as in the right, so that vector registers are filled along the row and need no padding but at its
-end. The sums over a window's width are kept for as many rows as the window is high.
+A row of costs is an array (candidates, W). The pixels of a candidate lie side by side, in the left
+view as in the right, so vector registers are filled along the row and only its end needs padding.
+Sums over the window's width are kept for as many rows as the window is high.
 
 The twin in plain numpy is `recon.kernels.semi_global_reference.path_costs_reference`.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.kernels.census import PLANES, Look, write_planes
+from recon.kernels.census import PLANES, Descriptor, write_planes
 from recon.kernels.lanes import (
     LANES,
     Lanes,
@@ -33,16 +33,17 @@ ALIGNMENT: Final = 64
 """Bytes of a cache line."""
 
 BLOCK: Final = 16
-"""Candidates whose rows are kept at a time."""
+"""Candidates done at a time: their rows of the window stay in the cache."""
 
 
 class Views(NamedTuple):
-    """What is compared.
+    """Both pictures, as the costs compare them.
 
     Attributes:
         grey: uint8 (H, W), the left picture.
-        left: uint8 (H, 1 + B, R), its gradients and census, from column ``-radius`` on.
-        right: uint8 (H, 1 + B, R + P - 1), those of the right picture; `places_of` says where.
+        left: uint8 (H, 1 + B, R), its planes: the gradient, and B planes of census bits. Columns
+            are shifted by `column_offsets`.
+        right: uint8 (H, 1 + B, R + P - 1), those of the right picture.
     """
 
     grey: NDArray[np.uint8]
@@ -51,15 +52,18 @@ class Views(NamedTuple):
 
 
 class Window(NamedTuple):
-    """What a cost sums up: `scaled_window` makes one.
+    """The window that costs are summed over, and how sums are scaled to uint8.
+
+    The sum over the width is shifted right by ``row_shift``; the sum of those over the height is
+    multiplied by ``factor`` and shifted right by ``shift``. `scaled_window` chooses the three.
 
     Attributes:
         radius: Half width of the window, pixels: it is ``2·radius + 1`` wide.
         rows_radius: Half height of the window, pixels.
         gradient_cap: Largest difference of gradients that counts.
-        row_shift: Bits that the sum over the window's width loses, to fit into uint8.
-        factor: The sum over its height, times this, fits into uint16 ...
-        shift: ... and loses so many bits.
+        row_shift: Bits; the shifted sum over the width fits into uint8.
+        factor: The sum over the height times this fits into uint16.
+        shift: Bits.
         top: The largest cost; at most 253.
     """
 
@@ -79,12 +83,12 @@ class Window(NamedTuple):
 
 
 class CostRows(NamedTuple):
-    """Room for the rows around the present one.
+    """Scratch memory for the sums over a window of C columns.
 
     Attributes:
         pixels: uint8 (BLOCK, R + LANES), costs of single pixels.
-        rows: uint8 (2·rows_radius + 1, BLOCK, C), sums over the window's width, for its rows.
-        sums: uint16 (BLOCK, C), their sums.
+        rows: uint8 (2·rows_radius + 1, BLOCK, C), a ring: sums over the width, of each row.
+        sums: uint16 (BLOCK, C), sums of those over the height.
     """
 
     pixels: NDArray[np.uint8]
@@ -93,22 +97,22 @@ class CostRows(NamedTuple):
 
 
 def padded(number: int, multiple: int = LANES) -> int:
-    """The next multiple."""
+    """The number, rounded up to a multiple."""
     return -(-number // multiple) * multiple
 
 
 def aligned(shape: tuple[int, ...], kind: type[np.uint8 | np.uint16] = np.uint8) -> NDArray[Any]:
-    """Zeros that start where a vector register's load crosses no cache line."""
+    """Zeros that start at a cache line, so that loads of whole vectors cross none."""
     size = int(np.prod(shape)) * np.dtype(kind).itemsize
-    room = np.zeros(size + ALIGNMENT, np.uint8)
-    start = -room.ctypes.data % ALIGNMENT
-    return room[start : start + size].view(kind).reshape(shape)
+    memory = np.zeros(size + ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % ALIGNMENT
+    return memory[start : start + size].view(kind).reshape(shape)
 
 
 def scaled_window(
     radius: int, rows_radius: int, gradient_cap: int, largest: int, levels: float
 ) -> Window:
-    """The window whose costs are about ``levels`` times the mean cost of a pixel.
+    """A window whose costs are about ``levels`` times the mean cost of its pixels.
 
     Args:
         radius: As in `Window`.
@@ -121,7 +125,7 @@ def scaled_window(
     row_shift = max(0, (width * largest).bit_length() - 8)
     most = (width * largest >> row_shift) * height
     top = largest * levels
-    # The largest scale that 16 bits hold.
+    # The finest scale that 16 bits hold.
     shift = max(0, int(np.log2(65535 / top)))
     factor = max(1, int(top * 2**shift / most))
     return Window(
@@ -132,40 +136,44 @@ def scaled_window(
 def empty_planes(
     height: int, width: int, planes: int, radius: int, ndisp: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Room for what is compared, ``planes`` of each picture: `Views.left` and `Views.right`."""
-    # What is read of a row, wherever a band of the picture begins.
+    """Memory for `Views.left` and `Views.right`, with so many planes each."""
+    # A band may start at any column, and its last vector reads beyond its end.
     reach = padded(width + 2 * radius) + LANES
     left, right = (height, planes, reach), (height, planes, reach + ndisp - 1)
     return np.empty(left, np.uint8), np.empty(right, np.uint8)
 
 
 def write_views(
-    right: NDArray[np.uint8], look: Look, places: tuple[int, int], rows: range, views: Views
+    right: NDArray[np.uint8],
+    descriptor: Descriptor,
+    offsets: tuple[int, int],
+    rows: range,
+    views: Views,
 ) -> None:
-    """Write what is compared of some rows.
+    """Write the planes of some rows of both pictures.
 
     Args:
-        right: uint8 (H, W), the right picture; that on the left is in ``views``.
-        look: What is looked at.
-        places: Where column 0 of each picture stands, from `places_of`.
+        right: uint8 (H, W), the right picture; the left one is in ``views``.
+        descriptor: How pixels are described.
+        offsets: From `column_offsets`.
         rows: The rows.
         views: Written.
     """
-    write_planes(views.grey, look, places[0], rows.start, rows.stop, views.left)
-    write_planes(right, look, places[1], rows.start, rows.stop, views.right)
+    write_planes(views.grey, descriptor, offsets[0], rows.start, rows.stop, views.left)
+    write_planes(right, descriptor, offsets[1], rows.start, rows.stop, views.right)
 
 
-def places_of(window: Window, ndisp: int, minimum: int) -> tuple[int, int]:
-    """Where column 0 of the left and the right picture stand in their planes.
+def column_offsets(window: Window, ndisp: int, minimum: int) -> tuple[int, int]:
+    """Column of the planes that holds column 0 of the picture, of the left and the right one.
 
-    What column ``x`` of the left ones is compared with as candidate ``k`` stands in the right ones
-    at ``x - k + P - 1``.
+    Column ``x`` of the left planes is compared, as candidate ``k``, with column ``x - k + P - 1``
+    of the right ones.
     """
     return window.radius, ndisp - 1 + window.radius + minimum
 
 
 def empty_cost_rows(columns: int, window: Window) -> CostRows:
-    """Room for `write_costs`; columns is a multiple of `LANES`."""
+    """Memory for `write_costs`; columns is a multiple of `LANES`."""
     return CostRows(
         aligned((BLOCK, padded(columns + 2 * window.radius) + LANES)),
         aligned((2 * window.rows_radius + 1, BLOCK, columns)),
@@ -183,10 +191,16 @@ def write_costs(
     rows: CostRows,
     costs: NDArray[np.uint8],
 ) -> None:
-    """Write the costs (N, P, C) of some columns of the rows from ``top`` until before ``bottom``.
+    """Write the costs of some columns of rows ``top`` to ``bottom - 1``.
 
-    Row ``y`` goes to place ``y % N``. A block of candidates is done at a time, so that the rows of
-    a window stay in the cache.
+    Args:
+        views: The pictures.
+        window: What a cost sums up.
+        columns: First column and the one after the last.
+        top: First row.
+        bottom: The row after the last.
+        rows: Memory to work in.
+        costs: Written: uint8 (N, P, C), a ring; row ``y`` goes to ``costs[y % N]``.
     """
     if top >= bottom:
         return
@@ -196,7 +210,7 @@ def write_costs(
         rows.sums[:] = np.uint16(0)
         end = min(first + block, ndisp)
         for y in range(top - window.rows_radius, bottom + window.rows_radius):
-            # The first rows are written over.
+            # Until the window is full, costs are written that the next rows overwrite.
             middle = max(y - window.rows_radius, top) % costs.shape[0]
             _write_block(views, window, columns, first, end, y, rows, costs[middle])
 
@@ -212,22 +226,21 @@ def _write_block(
     rows: CostRows,
     costs: NDArray[np.uint8],
 ) -> None:
-    """Take row ``y`` (clamped to the picture) into the sums, the oldest out, and write costs.
+    """Move the window down to row ``y`` (clamped to the picture), and write its costs (P, C).
 
-    After ``2·rows_radius + 1`` calls for successive rows, the costs (P, C) are those of the row in
-    their middle.
+    After ``2·rows_radius + 1`` calls for successive rows, they are those of the middle row.
     """
     height = 2 * window.rows_radius + 1
     oldest = rows.rows[(y + height * (window.rows_radius + 1)) % height]
     line = min(max(y, 0), views.grey.shape[0] - 1)
     left, right, start = views.left[line], views.right[line], columns[0]
     reach = columns[1] - start + 2 * window.radius
-    # Where candidate 0 stands in the right row.
+    # Candidate 0 of the first column.
     place = start + costs.shape[0] - 1
     _compare(left, right, start, place, reach, first, end, window.gradient_cap, rows.pixels)
     for plane in range(1 + PLANES, left.shape[0], PLANES):
         _add_bits(left, right, plane, start, place, reach, first, end, rows.pixels)
-    _exchange(rows.pixels, window, oldest, rows.sums, first, end, costs)
+    _slide_window(rows.pixels, window, oldest, rows.sums, first, end, costs)
 
 
 @njit(cache=True, nogil=True)
@@ -242,7 +255,7 @@ def _compare(
     gradient_cap: int,
     pixels: NDArray[np.uint8],
 ) -> None:
-    """Write how far gradients are apart, plus the bits of the first three planes that differ."""
+    """Write the differences of gradients plus the differing bits of the first census planes."""
     cap = splat(np.uint8(gradient_cap))
     for x in range(0, reach, LANES):
         here, there = start + x, place + x
@@ -269,7 +282,7 @@ def _add_bits(
     end: int,
     pixels: NDArray[np.uint8],
 ) -> None:
-    """Add the bits of three more planes that differ."""
+    """Add the differing bits of the next `PLANES` census planes."""
     for x in range(0, reach, LANES):
         for k in range(first, end):
             cost, there = load_row(pixels, k - first, x), place + x - k
@@ -281,7 +294,7 @@ def _add_bits(
 
 @njit(cache=True, nogil=True)
 def _sum_across(pixels: NDArray[np.uint8], n: int, x: int, radius: int) -> Lanes:
-    """Sum the costs over the window's width."""
+    """Sum the costs over the window's width; the sums fit into uint8."""
     total = load_row(pixels, n, x)
     for d in range(x + 1, x + 2 * radius + 1):
         total = total + load_row(pixels, n, d)
@@ -289,10 +302,10 @@ def _sum_across(pixels: NDArray[np.uint8], n: int, x: int, radius: int) -> Lanes
 
 
 @njit(cache=True, nogil=True)
-def _sum_far_across(
+def _sum_across_wide(
     pixels: NDArray[np.uint8], n: int, x: int, window: Window, sums: NDArray[np.uint16]
 ) -> Lanes:
-    """The same for windows whose sums need their lowest bits cut."""
+    """The same in uint16, shifted to fit into uint8."""
     total = fit(load_row(pixels, n, x), sums)
     for d in range(x + 1, x + 2 * window.radius + 1):
         total = total + fit(load_row(pixels, n, d), sums)
@@ -300,7 +313,7 @@ def _sum_far_across(
 
 
 @njit(cache=True, nogil=True)
-def _exchange(
+def _slide_window(
     pixels: NDArray[np.uint8],
     window: Window,
     oldest: NDArray[np.uint8],
@@ -309,14 +322,14 @@ def _exchange(
     end: int,
     costs: NDArray[np.uint8],
 ) -> None:
-    """Take the oldest row out of the sums of a block and another in; write the scaled sums."""
+    """Replace the oldest row of a block's sums by the newest; write the scaled sums."""
     factor, shift = splat(np.uint16(window.factor)), splat(np.uint16(window.shift))
     for n in range(end - first):
         for x in range(0, costs.shape[1], LANES):
             if window.row_shift == 0:
                 across = _sum_across(pixels, n, x, window.radius)
             else:
-                across = _sum_far_across(pixels, n, x, window, sums)
+                across = _sum_across_wide(pixels, n, x, window, sums)
             out = load_row(oldest, n, x)
             store_row(oldest, n, x, across)
             total = load_row(sums, n, x) - fit(out, sums) + fit(across, sums)

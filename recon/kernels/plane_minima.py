@@ -1,7 +1,7 @@
-"""The best candidate of each pixel of a row, from costs that lie candidate by candidate.
+"""The best candidate of each pixel of a row, from costs (candidates, W) in uint8.
 
-The same choice as `recon.kernels.minima` makes, for rows (candidates, W) of uint8: every pixel is
-a lane, and a candidate is compared with the best so far of all of them.
+Every pixel is a lane: one candidate of many pixels at a time is compared with the best so far of
+each.
 """
 
 from __future__ import annotations
@@ -23,25 +23,29 @@ MARGIN: Final = LANES
 """Columns on each side of a row of costs, where no candidate exists."""
 
 BLOCK: Final = 256
-"""So many candidates are told apart by a byte."""
+"""Candidates that a byte can number."""
 
 PARTS: Final = 8
-"""What `Minima.costs` count of one step of these costs."""
+"""Units of `Minima.costs` per unit of these costs."""
 
-LOWEST, WHICH, BEFORE, AFTER, ASIDE, EARLIER, LAST, PRIOR, SETTLED = range(9)
-"""What is known of a column: its lowest cost, the place of that candidate in its block, the costs
-before and after it, the lowest two or more candidates away, the lowest but for the last, the last,
-the lowest before the last, the lowest of the blocks before."""
+LOWEST, WHICH, BEFORE, AFTER, SECOND, LAST, PRIOR, SETTLED = range(8)
+"""Rows of what is known of a column.
+
+LOWEST is the lowest cost so far and WHICH the number of its candidate in the block; BEFORE and
+AFTER are the costs of the candidates beside it, SECOND the lowest cost two or more candidates away.
+LAST is the cost of the last candidate, and PRIOR the lowest cost before that one. SETTLED is the
+lowest cost of the earlier blocks.
+"""
 
 
 class Band(NamedTuple):
-    """Columns of the left view.
+    """Columns of the left view that are done together.
 
     Attributes:
-        start: The first whose costs there are.
-        end: The column after the last.
-        first: The first that is wanted.
-        last: The column after the last.
+        start: The first column with costs.
+        end: The column after the last with costs.
+        first: The first column that is kept; the others are overlap.
+        last: The column after the last that is kept.
     """
 
     start: int
@@ -51,14 +55,15 @@ class Band(NamedTuple):
 
 
 class Best(NamedTuple):
-    """Room for the choice of rows of bands of C columns, of a picture of W columns.
+    """The best so far, for bands of C columns of a picture of W columns.
 
     Attributes:
-        left: uint8 (9, C), what is known of the columns of the left view, `LOWEST` to `SETTLED`.
+        left: uint8 (8, C), what is known of the columns of the left view, `LOWEST` to `SETTLED`.
         left_which: uint16 (C), candidate of the lowest cost.
-        right: uint8 (9, at least W), the same of the right view, of which some is used.
-        right_lowest: uint8 (N, at least W), lowest cost of N rows of the right view, among the
-            bands that were done.
+        right: uint8 (8, at least W), as ``left`` for the right view; only `LOWEST`, `WHICH` and
+            `SETTLED` are used.
+        right_lowest: uint8 (N, at least W), lowest cost in N rows of the right view over the bands
+            done so far.
     """
 
     left: NDArray[np.uint8]
@@ -68,13 +73,13 @@ class Best(NamedTuple):
 
 
 def empty_best(columns: int, width: int, rows: int) -> Best:
-    """Room for `choose_row`, for so many rows."""
+    """Memory for `choose_row`, for so many rows."""
     right_lowest = aligned((rows, padded(width)))
     right_lowest[:] = NONE
     return Best(
-        aligned((9, columns)),
+        aligned((8, columns)),
         aligned((columns,), np.uint16),
-        aligned((9, padded(width))),
+        aligned((8, padded(width))),
         right_lowest,
     )
 
@@ -96,14 +101,14 @@ def choose_row(
 
     Args:
         costs: uint8 (P, MARGIN + C + MARGIN), costs of the candidates, below `NONE`; the margins
-            are `NONE`. Where a candidate does not exist or is not wanted, `NONE` is written.
+            are `NONE`. Overwritten with `NONE` where a candidate does not exist or is not kept.
         minimum: Disparity of candidate 0, pixels.
         y: The row.
-        place: The row, of those that ``best`` is for.
+        place: Its number among the rows of ``best.right_lowest``.
         band: The columns.
-        best: Room, and what is known of the right view.
-        minima: Written: what is wanted of the row; costs are multiplied by `PARTS`. Right winners
-            are kept unless they are beaten.
+        best: Memory to work in, and what earlier bands found in the right view.
+        minima: Written: the kept columns of the row, costs multiplied by `PARTS`. Right winners
+            stay unless they are beaten.
     """
     ndisp, width = costs.shape[0], minima.winner.shape[1]
     for k in range(ndisp):
@@ -125,14 +130,14 @@ def choose_row(
 
 @njit(cache=True, nogil=True)
 def _close(costs: NDArray[np.uint8], first: int, end: int) -> None:
-    """Mark the columns where a candidate does not exist or is not wanted."""
+    """Mark the columns outside ``first`` to ``end - 1``."""
     costs[: min(first, costs.size)] = np.uint8(NONE)
     costs[max(end, 0) :] = np.uint8(NONE)
 
 
 @njit(cache=True, nogil=True)
 def _search_left(costs: NDArray[np.uint8], first: int, end: int, known: NDArray[np.uint8]) -> None:
-    """Compare the candidates of a block with the best before, and keep what is around it."""
+    """Compare a block of candidates with the best so far, and note the costs around it."""
     one = splat(np.uint8(1))
     for x in range(0, costs.shape[1] - 2 * MARGIN, LANES):
         lowest, which, index = (
@@ -140,32 +145,27 @@ def _search_left(costs: NDArray[np.uint8], first: int, end: int, known: NDArray[
             load_row(known, WHICH, x),
             splat(np.uint8(0)),
         )
-        before, after, aside = (
+        before, after, second = (
             load_row(known, BEFORE, x),
             load_row(known, AFTER, x),
-            load_row(known, ASIDE, x),
+            load_row(known, SECOND, x),
         )
-        earlier, last, prior = (
-            load_row(known, EARLIER, x),
-            load_row(known, LAST, x),
-            load_row(known, PRIOR, x),
-        )
+        last, prior = load_row(known, LAST, x), load_row(known, PRIOR, x)
         for k in range(first, end):
             cost = load_row(costs, k, x + MARGIN)
-            # Beside the best that was found last is not aside of it.
-            aside = where_less(last, prior, aside, least(aside, cost))
-            aside = where_less(cost, lowest, earlier, aside)
+            # Where the last candidate is the best so far, this one is beside it: no second best.
+            second = where_less(last, prior, second, least(second, cost))
+            second = where_less(cost, lowest, prior, second)
             after = where_less(last, prior, cost, after)
             before = where_less(cost, lowest, last, before)
             which = where_less(cost, lowest, index, which)
-            earlier, last, prior = least(earlier, last), cost, lowest
+            last, prior = cost, lowest
             lowest, index = least(lowest, cost), index + one
         store_row(known, LOWEST, x, lowest)
         store_row(known, WHICH, x, which)
         store_row(known, BEFORE, x, before)
         store_row(known, AFTER, x, after)
-        store_row(known, ASIDE, x, aside)
-        store_row(known, EARLIER, x, earlier)
+        store_row(known, SECOND, x, second)
         store_row(known, LAST, x, last)
         store_row(known, PRIOR, x, prior)
 
@@ -179,7 +179,7 @@ def _search_right(
     band: Band,
     known: NDArray[np.uint8],
 ) -> None:
-    """Compare the candidates of a block with the best before, for columns of the right view."""
+    """Compare a block of candidates with the best so far, for columns of the right view."""
     one, columns = splat(np.uint8(1)), costs.shape[1] - 2 * MARGIN
     nearest = max(band.first - minimum - end + 1, 0) // LANES * LANES
     farthest = min(band.last - minimum - first, known.shape[1])
@@ -198,7 +198,7 @@ def _search_right(
 
 @njit(cache=True, nogil=True)
 def _settle(known: NDArray[np.uint8], first: int, which: NDArray[np.uint16]) -> None:
-    """Take over the candidates of a block that are better than those of the blocks before."""
+    """Take over the winners of a block that beat those of the blocks before."""
     lowest, settled, place = known[LOWEST], known[SETTLED], known[WHICH]
     for x in range(which.size):
         here = np.uint16(np.uint16(place[x]) + np.uint16(first))
@@ -211,7 +211,7 @@ def _write_row(best: Best, ndisp: int, y: int, band: Band, minima: Minima) -> No
     """Write the winners of the left view, their costs and those around them."""
     winner, costs = minima.winner[y, band.first : band.last], minima.costs[:, y]
     winner[:] = best.left_which[band.first - band.start : band.last - band.start]
-    for place, known in enumerate((LOWEST, BEFORE, AFTER, ASIDE)):
+    for place, known in enumerate((LOWEST, BEFORE, AFTER, SECOND)):
         found = best.left[known, band.first - band.start : band.last - band.start]
         _write_costs(found, costs[place, band.first : band.last])
     last, after = np.uint16(ndisp - 1), costs[2, band.first : band.last]

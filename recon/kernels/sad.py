@@ -1,15 +1,14 @@
 """Sums of absolute differences over a window, and the best candidate of each pixel.
 
-How it is fast: a tile of the picture is offered only some candidates (`recon.kernels.tiles`). What
-costs time is done for `LANES` neighbouring columns at once (`recon.kernels.lanes`), with what is
-found so far in registers. A window is made of two halves (`recon.kernels.half_windows`), each
-summed up once for two rows, in blocks of columns that stay in a core's own cache.
+Why it is fast: a tile of the picture is offered only some candidates (`recon.kernels.tiles`). The
+inner loops work on `LANES` neighbouring columns at once (`recon.kernels.lanes`), with the best so
+far in registers. A window consists of two halves (`recon.kernels.half_windows`), each of which is
+summed once for two rows, in blocks of columns that stay in a core's own cache.
 
-Two halves that are moved against each other make a window that leans: beside the upright window
-it costs one more addition, not one more search.
+Two halves that are shifted against each other make a leaning window, which costs one more addition
+than the upright one, not another search.
 
-The twin in plain numpy, `recon.kernels.sad_reference.sad_minima_reference`, says what the
-results are.
+The twin in plain numpy is `recon.kernels.sad_reference.sad_minima_reference`.
 
 Ref: K. Mühlmann et al., "Calculating dense disparity maps from color stereo images, an efficient
 implementation", IJCV 47, 2002; N. Einecke, J. Eggert, "A multi-block-matching approach for
@@ -24,7 +23,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from recon.kernels.half_windows import Halves, Room, Search, Views, enlist, next_half
+from recon.kernels.half_windows import Halves, Scratch, Search, Views, enlist, next_half
 from recon.kernels.lanes import (
     LANES,
     Lanes,
@@ -40,7 +39,7 @@ from recon.kernels.minima import NO_COST, Minima, claim_right
 from recon.kernels.tiles import Tiles
 
 Found: TypeAlias = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
-"""What is found so far in `LANES` columns; see `_weigh`."""
+"""The best so far in `LANES` columns; see `_weigh`."""
 
 
 @njit(cache=True, nogil=True)
@@ -50,7 +49,7 @@ def sad_minima(
     tiles: Tiles,
     first: int,
     end: int,
-    room: Room,
+    scratch: Scratch,
     minima: Minima,
 ) -> None:
     """Find the best candidate of each pixel of some rows.
@@ -71,35 +70,35 @@ def sad_minima(
         tiles: Which candidates are offered where.
         first: First row to do.
         end: The row after the last. The rows of a call depend on no other call.
-        room: Memory from `make_room`; not shared with another thread.
+        scratch: Memory from `empty_scratch`; not shared with another thread.
         minima: Written: the rows ``first`` to ``end - 1``.
     """
     reach, height = search.rows_radius, tiles.height
     for column in range(tiles.offered.shape[1]):
         x0 = column * tiles.width
         x1 = min(x0 + tiles.width, views.width)
-        room.alive[:] = False
+        scratch.alive[:] = False
         for y in range(first - reach, end):
             if y == first - reach or y % height == 0 or (y + reach) % height == 0:
                 now = tiles.offered[max(y, first) // height, column]
                 soon = tiles.offered[min(y + reach, end - 1) // height, column]
-                enlist(views, search, now, soon, y, x0, room)
-            halves = next_half(views, search, first, y, x0, room)
+                enlist(views, search, now, soon, y, x0, scratch)
+            halves = next_half(views, search, first, y, x0, scratch)
             if y >= first:
-                _choose(halves, search, room, y, x0, x1, minima)
+                _choose(halves, search, scratch, y, x0, x1, minima)
     for y in range(first, end):
         claim_right(search.ndisp, search.minimum, y, minima)
 
 
 @njit(cache=True, nogil=True)
 def _choose(
-    halves: Halves, search: Search, room: Room, y: int, x0: int, x1: int, minima: Minima
+    halves: Halves, search: Search, scratch: Scratch, y: int, x0: int, x1: int, minima: Minima
 ) -> None:
     """Choose among the candidates of columns ``x0`` to ``x1 - 1`` of row ``y``."""
     winner, best, second = minima.winner[y], minima.costs[0, y], minima.costs[3, y]
     before, after = minima.costs[1, y], minima.costs[2, y]
     for x in range(x0, x1, LANES):
-        found = _search(halves, search, room.offers, x, x - x0, winner.size)
+        found = _search(halves, search, scratch.offers, x, x - x0, winner.size)
         if x + LANES <= winner.size:
             store(winner, x, found[0])
             store(best, x, found[1])
@@ -107,7 +106,7 @@ def _choose(
             store(after, x, found[3])
             store(second, x, found[4])
         else:
-            row, rest = room.found, winner.size - x
+            row, rest = scratch.found, winner.size - x
             for n in range(5):
                 store(row, n * LANES, found[n])
             winner[x:] = row[:rest]
@@ -121,7 +120,7 @@ def _choose(
 def _search(
     halves: Halves, search: Search, offers: NDArray[np.int64], x: int, column: int, width: int
 ) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes]:
-    """What is found in columns ``x`` and on: winner, and the four costs of `Minima`."""
+    """Search a vector of columns from ``x`` on: winners, and the four costs of `Minima`."""
     # Candidate k exists in the columns from x + k + ahead to x + k + ahead + width - 1.
     ahead = search.minimum - x
     none = splat(np.uint16(NO_COST))
@@ -202,18 +201,18 @@ def _weigh(
     prior: Lanes,
     found: Found,
 ) -> Found:
-    """What is found once a candidate is offered.
+    """Update the best so far by one candidate.
 
     Args:
         upright: Its costs.
         leaning: Those of the leaning window.
         upright_last: Costs of the candidate before; `NO_COST` = was not offered.
         leaning_last: Those of the leaning window.
-        number: Which it is.
-        prior: The least cost of all candidates but the one before.
-        found: The best of the candidates offered so far, its cost, the least cost of those two or
-            more away from it, and of its upright window; the costs before the best and after it,
-            each of the upright window and of the leaning one.
+        number: Its number.
+        prior: The lowest cost of all candidates before the previous one.
+        found: The best so far: its number, its cost, the lowest cost two or more candidates away,
+            its cost by the upright window; the costs of the candidate before it and of the one
+            after it, each by the upright and by the leaning window.
     """
     winner, best, second, upright_best, up_before, lean_before, up_after, lean_after = found
     none, last = splat(np.uint16(NO_COST)), number - splat(np.uint16(1))

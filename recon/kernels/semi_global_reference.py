@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from recon.kernels.minima import Minima
 from recon.kernels.path_costs import Views, Window
-from recon.kernels.path_rows import SLANT, Paths
+from recon.kernels.path_rows import Paths
 from recon.kernels.plane_minima import PARTS, Band
 from recon.kernels.sad_reference import minima_reference
 
@@ -41,7 +41,7 @@ def _path_means(grey: NDArray[np.uint8], costs: Int64, paths: Paths) -> Int64:
     def along(dy: int, dx: int) -> Int64:
         return path_reference(grey, costs, paths, dy, dx)
 
-    down, up = (_mean(along(dy, 0), _mean(along(dy, SLANT), along(dy, -SLANT))) for dy in (1, -1))
+    down, up = (_mean(along(dy, 0), _mean(along(dy, 1), along(dy, -1))) for dy in (1, -1))
     return _mean(_mean(along(0, 1), along(0, -1)), _mean(down, up))
 
 

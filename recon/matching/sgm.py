@@ -1,4 +1,4 @@
-"""The semi-global matcher: gradients and census in small windows, agreed along paths."""
+"""The semi-global matcher: gradients and census in small windows, aggregated along paths."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from typing import Final
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from recon.kernels.census import Look
+from recon.kernels.census import Descriptor
 from recon.kernels.minima import empty_minima
 from recon.kernels.path_costs import (
     Views,
     Window,
+    column_offsets,
     empty_planes,
-    places_of,
     scaled_window,
     write_views,
 )
 from recon.kernels.path_rows import Paths
 from recon.kernels.plane_minima import PARTS
 from recon.kernels.refine import REFINED_BYTES, Rules, refine_minima, refined_in
-from recon.kernels.semi_global import band_columns, empty_room, room_bytes, semi_global_minima
+from recon.kernels.semi_global import band_columns, empty_scratch, scratch_bytes, semi_global_minima
 from recon.matching.gradients import texture
-from recon.matching.rooms import Loans, Rooms
+from recon.matching.scratch import ResultPool, ScratchPool
 from recon.matching.search import FITS, MeasuredSettings, OddInt, finish
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
 
 _LEVELS: Final = 250
-"""Of the 255 that a path cost has; rounding needs the others."""
+"""Largest path cost before rounding, which needs the rest of a byte."""
 
 _ODDS: Final = 2.4
-"""`Rules.odds` of means over paths, fitted on MiddEval3; 2003, 2005 and 2006 were held out."""
+"""`Rules.odds` of this matcher, fitted on MiddEval3; 2003, 2005 and 2006 were held out."""
 
 _STRIP_ROWS: Final = 192
 
 _SIDE_OVERLAP: Final = 16
-"""Columns that a band of a strip shares: paths along the row and slanted ones begin there."""
+"""Columns that neighbouring bands share: horizontal and diagonal paths start there."""
 
 
 class SgmSettings(MeasuredSettings):
@@ -119,7 +119,7 @@ class SgmSettings(MeasuredSettings):
 
 
 class SgmMatcher:
-    """Lets neighbours agree on disparities, and checks what they agree on; a `Matcher`.
+    """Aggregates costs along paths through the picture, and checks the result; a `Matcher`.
 
     Every pixel is searched, those at the left border as far as the right picture reaches.
 
@@ -132,10 +132,10 @@ class SgmMatcher:
     def __init__(self, settings: SgmSettings, threads: int | None = None) -> None:
         self._settings = settings
         self._threads = max(1, threads or os.cpu_count() or 1)
-        self._rooms = Rooms(empty_room, self._threads)
-        self._planes = Rooms(empty_planes, 1)
-        self._minima = Rooms(empty_minima, 1)
-        self._results = Loans(2)
+        self._scratch = ScratchPool(empty_scratch, self._threads)
+        self._planes = ScratchPool(empty_planes, 1)
+        self._minima = ScratchPool(empty_minima, 1)
+        self._results = ResultPool(2)
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair.
@@ -145,24 +145,24 @@ class SgmMatcher:
         """
         s = self._settings
         ndisp = s.ndisp_within(pair.camera)
-        window, look, size = _window(s), _look(s), pair.left.shape
+        window, descriptor, size = _window(s), _descriptor(s), pair.left.shape
         paths, rules = _paths(s, ndisp, window.levels), _rules(s, ndisp, window.levels)
         results = self._results.lend(REFINED_BYTES * pair.left.size)
         refined = refined_in(results, *size)
 
         def prepare(strip: range) -> None:
-            places = places_of(window, ndisp, s.min_disparity_px)
-            write_views(pair.right, look, places, strip, views)
+            offsets = column_offsets(window, ndisp, s.min_disparity_px)
+            write_views(pair.right, descriptor, offsets, strip, views)
 
         def search(strip: range) -> None:
-            with self._rooms.borrow(pair.camera.width_px, paths) as room:
-                semi_global_minima(views, window, paths, strip, room, minima)
+            with self._scratch.borrow(pair.camera.width_px, paths) as scratch:
+                semi_global_minima(views, window, paths, strip, scratch, minima)
             enough = texture(pair, (s.window_px, s.window_height_px), s.min_texture, strip)
             refine_minima(minima, enough, rules, strip.start, strip.stop, refined)
 
         strips, at_once = self._strips(pair.camera, paths)
         with (
-            self._planes.borrow(*size, look.planes, window.radius, ndisp) as planes,
+            self._planes.borrow(*size, descriptor.planes, window.radius, ndisp) as planes,
             self._minima.borrow(*size) as minima,
             ThreadPoolExecutor(at_once) as pool,
         ):
@@ -174,17 +174,17 @@ class SgmMatcher:
     def _strips(self, camera: RectifiedCamera, paths: Paths) -> tuple[list[range], int]:
         """The strips of a picture, and how many may be worked on at once."""
         height = camera.height_px
-        # An even number of strips, so that two cores end together.
+        # An even number of strips keeps two cores busy to the end.
         rows = -(-height // (2 * -(-height // (2 * _STRIP_ROWS))))
-        bytes_each = room_bytes(band_columns(camera.width_px, paths), paths)
+        bytes_each = scratch_bytes(band_columns(camera.width_px, paths), paths)
         at_once = min(self._threads, (self._settings.memory_mb << 20) // bytes_each)
         strips = [range(y, min(y + rows, height)) for y in range(0, height, rows)]
         return strips, max(1, at_once)
 
 
-def _look(settings: SgmSettings) -> Look:
+def _descriptor(settings: SgmSettings) -> Descriptor:
     s = settings
-    return Look(s.prefilter_cap, s.census_height_px // 2, s.census_px // 2)
+    return Descriptor(s.prefilter_cap, s.census_height_px // 2, s.census_px // 2)
 
 
 def _window(settings: SgmSettings) -> Window:

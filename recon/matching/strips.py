@@ -1,4 +1,4 @@
-"""The search of a pair of pictures strip by strip, in memory that is kept."""
+"""Local search of a pair of pictures in strips of rows, one per thread."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from concurrent.futures import Executor
 
 import numpy as np
 
-from recon.kernels.half_windows import Search, empty_views, lay_out, make_room
+from recon.kernels.half_windows import Search, empty_scratch, empty_views, lay_out
 from recon.kernels.minima import empty_minima
 from recon.kernels.refine import REFINED_BYTES, Refined, Rules, refine_minima, refined_in
 from recon.kernels.sad import sad_minima
 from recon.kernels.tiles import Tiles
-from recon.matching.rooms import Loans, Rooms
+from recon.matching.scratch import ResultPool, ScratchPool
 from recon.structures.arrays import Float32, UInt8
 
 
 class StripSearch:
-    """Searches pictures of one size, one strip of rows per thread.
+    """Searches pairs of pictures, one strip of rows per thread, and keeps its memory between pairs.
 
     Args:
-        prefilter: What is compared of some rows of a picture, uint8 (N, W).
+        prefilter: Gives what windows compare in some rows of a picture, uint8 (N, W).
         threads: Strips worked on at once. The result does not depend on it.
     """
 
     def __init__(self, prefilter: Callable[[UInt8, range], UInt8], threads: int) -> None:
         self._prefilter = prefilter
         self._threads = threads
-        self._rooms = Rooms(make_room, threads)
-        self._views = Rooms(empty_views, 1)
-        self._minima = Rooms(empty_minima, 1)
-        self._results = Loans(2)
+        self._scratch = ScratchPool(empty_scratch, threads)
+        self._views = ScratchPool(empty_views, 1)
+        self._minima = ScratchPool(empty_minima, 1)
+        self._results = ResultPool(2)
 
     def find(
         self,
@@ -50,27 +50,27 @@ class StripSearch:
             search: What is searched.
             tiles: Which candidates are offered where.
             rules: What the checks ask for.
-            texture: float32 (N, W), of some rows of the left picture.
+            texture: Gives the texture of some rows of the left picture, float32 (N, W).
         """
         height, width = pictures[0].shape
         results = self._results.lend(REFINED_BYTES * height * width)
         refined = refined_in(results, height, width)
 
-        def lay(strip: range) -> None:
+        def prepare(strip: range) -> None:
             left, right = (self._prefilter(picture, strip) for picture in pictures)
             lay_out(left, right, search, strip.start, views)
 
-        def look(strip: range) -> None:
-            with self._rooms.borrow(search, tiles.width) as room:
-                sad_minima(views, search, tiles, strip.start, strip.stop, room, minima)
+        def search_strip(strip: range) -> None:
+            with self._scratch.borrow(search, tiles.width) as scratch:
+                sad_minima(views, search, tiles, strip.start, strip.stop, scratch, minima)
             refine_minima(minima, texture(strip), rules, strip.start, strip.stop, refined)
 
         with (
             self._views.borrow(search, tiles.width, height, width) as views,
             self._minima.borrow(height, width) as minima,
         ):
-            for work in (lay, look):
-                in_strips(pool, self._threads, work, height)
+            in_strips(pool, self._threads, prepare, height)
+            in_strips(pool, self._threads, search_strip, height)
         return refined
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from recon.kernels.half_windows import Search, empty_views, lay_out, make_room, widest_block
+from recon.kernels.half_windows import Search, empty_scratch, empty_views, lay_out, widest_block
 from recon.kernels.lanes import LANES
 from recon.kernels.minima import NO_COST, Minima, empty_minima
 from recon.kernels.sad import sad_minima
@@ -32,10 +32,10 @@ def search_all(
     tiles = tiles or everything(left.shape, search)
     views = empty_views(search, tiles.width, *left.shape)
     lay_out(left, right, search, 0, views)
-    room = make_room(search, tiles.width)
+    scratch = empty_scratch(search, tiles.width)
     edges = np.linspace(0, len(left), strips + 1).astype(int)
     for first, end in itertools.pairwise(edges):
-        sad_minima(views, search, tiles, int(first), int(end), room, minima)
+        sad_minima(views, search, tiles, int(first), int(end), scratch, minima)
     return minima
 
 

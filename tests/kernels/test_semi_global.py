@@ -11,23 +11,23 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from recon.kernels.census import Look
+from recon.kernels.census import Descriptor
 from recon.kernels.minima import Minima, empty_minima
 from recon.kernels.path_costs import (
     Views,
     Window,
+    column_offsets,
     empty_planes,
-    places_of,
     scaled_window,
     write_views,
 )
 from recon.kernels.path_rows import Paths
 from recon.kernels.semi_global import (
     ROWS,
-    Room,
+    Scratch,
     bands_of,
-    empty_room,
-    room_bytes,
+    empty_scratch,
+    scratch_bytes,
     semi_global_minima,
 )
 from recon.kernels.semi_global_reference import semi_global_minima_reference
@@ -36,10 +36,10 @@ Image = NDArray[np.uint8]
 
 
 def make_views(left: Image, right: Image, window: Window, paths: Paths) -> Views:
-    look = Look(127, 1, 2)
-    views = Views(left, *empty_planes(*left.shape, look.planes, window.radius, paths.ndisp))
-    places = places_of(window, paths.ndisp, paths.minimum)
-    write_views(right, look, places, range(len(left)), views)
+    descriptor = Descriptor(127, 1, 2)
+    views = Views(left, *empty_planes(*left.shape, descriptor.planes, window.radius, paths.ndisp))
+    offsets = column_offsets(window, paths.ndisp, paths.minimum)
+    write_views(right, descriptor, offsets, range(len(left)), views)
     return views
 
 
@@ -49,10 +49,10 @@ def search(
     minima = empty_minima(*views.grey.shape)
     edges = np.linspace(0, len(views.grey), strips + 1).astype(int).tolist()
     for first, end in itertools.pairwise(edges):
-        room = empty_room(views.grey.shape[1], paths)
+        scratch = empty_scratch(views.grey.shape[1], paths)
         if columns:
-            room = Room(np.zeros(room_bytes(columns, paths), np.uint8), columns)
-        semi_global_minima(views, window, paths, range(first, end), room, minima)
+            scratch = Scratch(np.zeros(scratch_bytes(columns, paths), np.uint8), columns)
+        semi_global_minima(views, window, paths, range(first, end), scratch, minima)
     return minima
 
 

@@ -1,7 +1,7 @@
-"""Memory that a matcher works in, kept from one pair to the next.
+"""Memory that a matcher keeps from one pair to the next.
 
-A system hands out memory page by page, and clears each: for pictures that takes longer than some
-searches.
+The system clears new memory page by page when it is first touched: for pictures that takes longer
+than some searches.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from recon.structures.arrays import UInt8
 T = TypeVar("T")
 
 
-class Rooms(Generic[T]):
-    """Lends rooms of one kind; threads may borrow at the same time.
+class ScratchPool(Generic[T]):
+    """Lends scratch memory of one kind, also to several threads at once.
 
     Args:
-        make: Makes a room of a size, when there is none to lend.
-        most: So many are kept.
+        make: Makes scratch memory of a size, when there is none to lend.
+        most: How many pieces are kept.
     """
 
     def __init__(self, make: Callable[..., T], most: int) -> None:
@@ -32,45 +32,45 @@ class Rooms(Generic[T]):
 
     @contextmanager
     def borrow(self, *size: Hashable) -> Iterator[T]:
-        """Lend a room for a while; what it holds at first does not matter.
+        """Lend scratch memory for a ``with`` block; its content is undefined.
 
         Args:
-            size: What ``make`` takes. A room of another size is given up.
+            size: Arguments of ``make``. A kept piece of another size is given up.
         """
         try:
-            kept, room = self._free.pop()
+            kept, scratch = self._free.pop()
         except IndexError:
             kept = None
         if kept != size:
-            room = self._make(*size)
-        yield room
-        # Not after an error: somebody may still work in it.
-        self._free.append((size, room))
+            scratch = self._make(*size)
+        yield scratch
+        # Not after an error: another thread may still work in it.
+        self._free.append((size, scratch))
 
 
-class Loans:
-    """Lends memory for results, which comes back by itself when nobody holds the result any more.
+class ResultPool:
+    """Lends memory for results, which returns when the last reference to it is gone.
 
     Args:
-        most: So many blocks that came back are kept.
+        most: How many returned blocks are kept.
     """
 
     def __init__(self, most: int) -> None:
         self._free: deque[UInt8] = deque(maxlen=most)
 
     def lend(self, size_bytes: int) -> UInt8:
-        """uint8 (size_bytes,), lent for as long as it or a view of it is held."""
+        """uint8 (size_bytes,), lent as long as it or a view of it is referenced."""
         try:
             block = self._free.pop()
         except IndexError:
             block = np.empty(0, np.uint8)
         if block.size != size_bytes:
             block = np.empty(size_bytes, np.uint8)
-        return np.asarray(_Loan(block, self._free))
+        return np.asarray(_Lent(block, self._free))
 
 
-class _Loan:
-    """What an array on loan, and so each view of it, keeps alive."""
+class _Lent:
+    """The base of a lent array and of its views: its deletion returns the memory."""
 
     def __init__(self, block: UInt8, free: deque[UInt8]) -> None:
         self.__array_interface__ = block.__array_interface__
