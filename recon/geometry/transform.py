@@ -1,4 +1,4 @@
-"""Clouds and meshes from one frame to another."""
+"""Clouds from one frame to another."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from recon.geometry.se3 import apply, rotate
-from recon.structures import Frame, PointCloud, TriangleMesh
+from recon.structures import Frame, PointCloud
 
 
 def transform_cloud(cloud: PointCloud, T: NDArray[Any], *, frame: Frame) -> PointCloud:
@@ -21,9 +21,3 @@ def transform_cloud(cloud: PointCloud, T: NDArray[Any], *, frame: Frame) -> Poin
     """
     normals = None if cloud.normals is None else rotate(T, cloud.normals)
     return replace(cloud, xyz=apply(T, cloud.xyz), normals=normals, frame=frame)
-
-
-def transform_mesh(mesh: TriangleMesh, T: NDArray[Any]) -> TriangleMesh:
-    """Move a mesh by a rigid transform (4, 4); faces and colours stay."""
-    normals = None if mesh.normals is None else rotate(T, mesh.normals)
-    return replace(mesh, vertices=apply(T, mesh.vertices), normals=normals)

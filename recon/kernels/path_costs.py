@@ -96,9 +96,9 @@ class CostRows(NamedTuple):
     sums: NDArray[np.uint16]
 
 
-def padded(number: int, multiple: int = LANES) -> int:
-    """The number, rounded up to a multiple."""
-    return -(-number // multiple) * multiple
+def padded(number: int) -> int:
+    """The number, rounded up to whole vectors."""
+    return -(-number // LANES) * LANES
 
 
 def aligned(shape: tuple[int, ...], kind: type[np.uint8 | np.uint16] = np.uint8) -> NDArray[Any]:

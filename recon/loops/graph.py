@@ -33,14 +33,11 @@ class Closure:
         trajectory: The path, bent so that the loops close; the very same where none does.
         closed: The loops that it closes.
         refused: The loops that the rest of the graph contradicts.
-        bend_chi2: Mean misfit of the odometry, per step between nodes; 0 without loops, infinite
-            where the graph has no solution.
     """
 
     trajectory: Trajectory
     closed: tuple[Loop, ...]
     refused: tuple[Loop, ...]
-    bend_chi2: float
 
     def correction(self, odometry: Trajectory, frame: int) -> Float64:
         """``T_corrected_world`` (4, 4) of what was mapped around a frame by odometry."""
@@ -68,23 +65,22 @@ def close_loops(
         Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
     """
     if not loops:
-        return Closure(trajectory, (), (), 0.0)
+        return Closure(trajectory, (), ())
     nodes = _nodes(path_m, settings)
     steps = _odometry_edges(trajectory, path_m, nodes, settings)
     ties = [_loop_edge(loop, trajectory, path_m, nodes, settings) for loop in loops]
     try:
         poses, weights = _solve(trajectory.T_world_camera[nodes], steps, ties, settings)
     except RegistrationError:  # a map of the drive as odometry saw it is better than none
-        return Closure(trajectory, (), tuple(loops), math.inf)
+        return Closure(trajectory, (), tuple(loops))
     bend_chi2 = float(np.mean([misfit(edge, poses) for edge in steps]))
     kept = weights >= _KEPT
     if bend_chi2 > settings.graph.max_bend_chi2 or not kept.any():
-        return Closure(trajectory, (), tuple(loops), bend_chi2)
+        return Closure(trajectory, (), tuple(loops))
     return Closure(
         _bent(trajectory, path_m, nodes, poses),
         tuple(loop for loop, keep in zip(loops, kept, strict=True) if keep),
         tuple(loop for loop, keep in zip(loops, kept, strict=True) if not keep),
-        bend_chi2,
     )
 
 

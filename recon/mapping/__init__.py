@@ -1,7 +1,7 @@
 """From posed clouds to a fused cloud, 3-D occupancy and a flat grid."""
 
 from recon.mapping.axes import AxesSettings, GroundPlane, estimate_ground, map_axes
-from recon.mapping.floor import add_floor, add_floors, find_floors
+from recon.mapping.floor import add_floors, find_floors
 from recon.mapping.fused import FusionSettings, MapBuilder, fusion_range_m
 from recon.mapping.grid import GridSettings, drop_undecided, flatten
 from recon.mapping.ground import (
@@ -28,7 +28,6 @@ __all__ = [
     "SubmapBuilder",
     "SubmapMotion",
     "SubmapSettings",
-    "add_floor",
     "add_floors",
     "drop_undecided",
     "estimate_camera_height",

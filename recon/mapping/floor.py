@@ -27,13 +27,8 @@ def find_floors(voxels: OccupancyVoxels) -> Float32:
     return ((_floors(voxels) + 0.5) * voxels.resolution_m).astype(np.float32)
 
 
-def add_floor(cloud: PointCloud, voxels: OccupancyVoxels, settings: GroundSettings) -> PointCloud:
-    """A cloud to look for ground in, as `add_floors` gives it, with the floors of voxels."""
-    return add_floors(cloud, find_floors(voxels), settings)
-
-
 def add_floors(cloud: PointCloud, floors: Float32, settings: GroundSettings) -> PointCloud:
-    """A cloud to look for ground in: its points, and floors of voxels where it has too few.
+    """A cloud to look for ground in: its points, and floors where it has too few.
 
     Args:
         cloud: The fused cloud in map axes.

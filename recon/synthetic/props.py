@@ -120,18 +120,6 @@ def tree(rng: np.random.Generator) -> TriangleSoup:
     return merge(parts)
 
 
-def hedge(length_m: float, rng: np.random.Generator) -> TriangleSoup:
-    """A row of low bushes along x."""
-    part = int(rng.integers(1, 2**30))
-    leaves = Paint(Material.LEAVES, (0.24, 0.36, 0.16), part)
-    balls = []
-    for k, x in enumerate(np.arange(0.0, length_m, 0.7)):
-        radii = rng.uniform([0.55, 0.4, 0.55], [0.75, 0.5, 0.8])
-        ball = bumpy_ball(radii, leaves, bump=0.2, wavelength=0.3, seed=part + k)
-        balls.append(move(ball, _at(float(x), 0.0, 0.5)))
-    return merge(balls)
-
-
 def lamp_post(side: float, rng: np.random.Generator) -> TriangleSoup:
     """A post of 6 m with an arm over the road, which lies towards ``-side``."""
     paint = Paint(Material.METAL, (0.30, 0.33, 0.32), int(rng.integers(1, 2**30)))

@@ -17,9 +17,10 @@ from recon.geometry.se3 import apply
 from recon.geometry.transform import transform_cloud
 from recon.mapping import (
     GroundSettings,
-    add_floor,
+    add_floors,
     drop_undecided,
     estimate_ground_surface,
+    find_floors,
     flatten,
 )
 from recon.pipeline.cloud_sample import CloudSample
@@ -74,7 +75,7 @@ def test_the_grid_of_tiles_is_that_of_the_whole(
     config = mapped.config
     cloud = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
-    floor = add_floor(cloud, mapped.voxels, config.ground)
+    floor = add_floors(cloud, find_floors(mapped.voxels), config.ground)
     ground = estimate_ground_surface(floor, path_m, config.ground)
     whole = flatten(mapped.voxels, ground, config.grid)
     written = write_map(mapped, folder, Stopwatch()).grid

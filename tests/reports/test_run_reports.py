@@ -101,11 +101,11 @@ def test_loops_that_were_closed_and_that_were_not_are_in_the_report(
     moved[:, 0, 3] += np.linspace(0.0, 2.5, len(moved))
     bent = replace(trajectory, T_world_camera=moved)
     right, wrong = (Loop(0, last, np.eye(4), np.eye(6), 50, 0.9) for last in (9, 10))
-    loops = DriveLoops(trajectory, Closure(bent, (right,), (wrong,), 1.0), 11, 3, {})
+    loops = DriveLoops(trajectory, Closure(bent, (right,), (wrong,)), 11, 3, {})
     report = map_report(replace(drive, loops=loops))
     assert dict(report.figures)["Loops closed, path moved by"] == "1 of 3, 2.50 m"
     assert isinstance(blocks(report)["Loops"], FigureBlock)
-    unclosed = DriveLoops(trajectory, Closure(trajectory, (), (wrong,), 9.0), 11, 3, {})
+    unclosed = DriveLoops(trajectory, Closure(trajectory, (), (wrong,)), 11, 3, {})
     report = map_report(replace(drive, loops=unclosed))
     assert dict(report.figures)["Loops closed, path moved by"] == "0 of 3, 0.00 m"
     assert "Loops" not in blocks(report)
