@@ -16,7 +16,7 @@ class CalibrationSettings(Settings):
 
     model: LensKind = Field(
         default="radtan",
-        description="radtan = radial and tangential (most lenses), rational = wide lenses, "
+        description="Radtan = radial and tangential (most lenses), rational = wide lenses, "
         "fisheye = by angle (150 degrees and more).",
     )
     radial_terms: Literal[2, 3] = Field(

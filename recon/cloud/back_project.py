@@ -16,20 +16,20 @@ from recon.structures import Disparity, PointCloud, RectifiedCamera, RectifiedPa
 class CloudSettings(Settings):
     """Which pixels become points."""
 
-    min_range_m: float = Field(default=0.1, ge=0, description="nearest depth kept")
+    min_range_m: float = Field(default=0.1, ge=0, description="Nearest depth kept.")
     max_range_m: float | None = Field(
-        default=30.0, gt=0, description="farthest depth kept; null = no limit"
+        default=30.0, gt=0, description="Farthest depth kept; null = no limit."
     )
     max_relative_sigma: float | None = Field(
-        default=0.1, gt=0, description="largest sigma_z / Z kept; null = no limit"
+        default=0.1, gt=0, description="Largest sigma_z / Z kept; null = no limit."
     )
-    min_confidence: float = Field(default=0.0, ge=0, le=1, description="least confidence kept")
-    stride: int = Field(default=1, ge=1, le=16, description="every n-th row and column is used")
+    min_confidence: float = Field(default=0.0, ge=0, le=1, description="Least confidence kept.")
+    stride: int = Field(default=1, ge=1, le=16, description="Every n-th row and column is used.")
     normals_radius_px: int | None = Field(
         default=3,
         ge=1,
         le=20,
-        description="half width of the window that gives a point its normal; null = no normals",
+        description="Half width of the window that gives a point its normal; null = no normals.",
     )
 
 

@@ -14,22 +14,22 @@ from recon.structures.arrays import Float32, UInt8
 class EdgeSettings(Settings):
     """Which pixels count as hanging between two surfaces."""
 
-    enabled: bool = Field(default=True, description="remove flying edges at all")
-    radius_px: int = Field(default=2, ge=1, le=5, description="half width of the window looked at")
+    enabled: bool = Field(default=True, description="Whether flying edges are removed.")
+    radius_px: int = Field(default=2, ge=1, le=5, description="Half width of the window.")
     max_gradient: float = Field(
         default=1.0,
         gt=0,
         le=10,
-        description="largest disparity gradient of a surface that can be matched, pixels per pixel",
+        description="Largest disparity gradient of a matchable surface, pixels per pixel.",
     )
     tolerance_px: float = Field(
-        default=0.5, ge=0, le=10, description="matching noise allowed on top of the gradient"
+        default=0.5, ge=0, le=10, description="Matching noise allowed on top of the gradient."
     )
     min_support: float = Field(
         default=0.36,
         ge=0,
         le=1,
-        description="share of the window that must lie on the surface of its centre",
+        description="Share of the window that must lie on the surface of its centre.",
     )
 
 

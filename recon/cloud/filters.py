@@ -26,20 +26,24 @@ class FilterSettings(Settings):
     """
 
     voxel_m: float | None = Field(
-        default=0.1, gt=0, description="edge of the voxels that points are averaged in"
+        default=0.1, gt=0, description="Edge of the voxels that points are averaged in."
     )
     statistical_neighbours: int | None = Field(
-        default=None, ge=1, le=1000, description="neighbours of the statistical outlier filter"
+        default=None, ge=1, le=1000, description="Neighbours of the statistical outlier filter."
     )
     statistical_sigmas: float = Field(
-        default=2.0, gt=0, description="its limit, in standard deviations of the mean distance"
+        default=2.0,
+        gt=0,
+        description="Limit of that filter, in standard deviations of the mean distance.",
     )
     radius_m: float | None = Field(
-        default=None, gt=0, description="radius in which a point needs neighbours"
+        default=None, gt=0, description="Radius of the radius outlier filter."
     )
-    radius_neighbours: int = Field(default=4, ge=1, description="how many it needs")
+    radius_neighbours: int = Field(
+        default=4, ge=1, description="Neighbours that a point needs within that radius."
+    )
     normals_neighbours: int | None = Field(
-        default=None, ge=3, le=1000, description="estimate normals anew from that many points"
+        default=None, ge=3, le=1000, description="Estimate new normals from so many points."
     )
 
 

@@ -48,16 +48,18 @@ class TrajectoryRules(Settings):
 
     alignment: Literal["none", "origin", "se3", "sim3"] = Field(
         default="se3",
-        description="what is done to the estimate first: nothing, moved to the true first pose, "
-        "moved as a whole to lie closest, or also scaled",
+        description="What is done to the estimate first: nothing, moved to the true first pose, "
+        "moved as a whole to lie closest, or also scaled.",
     )
     lengths_m: tuple[Annotated[float, Field(gt=0)], ...] | None = Field(
-        default=None, min_length=1, description="lengths of the segments; null = chosen by the path"
+        default=None,
+        min_length=1,
+        description="Lengths of the segments; null = chosen by the path.",
     )
     step_frames: int | None = Field(
-        default=None, ge=1, description="a segment starts at every such frame; null = by the path"
+        default=None, ge=1, description="A segment starts at every such frame; null = by the path."
     )
-    rpe_frames: int = Field(default=1, ge=1, description="frames apart for the RPE")
+    rpe_frames: int = Field(default=1, ge=1, description="Frames apart for the RPE.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,50 +33,55 @@ class MeshSettings(Settings):
         default=None,
         ge=4,
         le=12,
-        description="octree depth; null = chosen by cell_spacings, up to max_depth",
+        description="Octree depth; null = chosen by cell_spacings, up to max_depth.",
     )
     cell_spacings: float = Field(
         default=1.5,
         gt=0,
         le=20,
-        description="widest octree cell, in point spacings; noise in smaller cells becomes ripples",
+        description="Widest octree cell, in point spacings; noise in smaller ones becomes ripples.",
     )
-    max_depth: int = Field(default=10, ge=4, le=12, description="limit of a depth chosen so")
+    max_depth: int = Field(
+        default=10, ge=4, le=12, description="Largest depth that is chosen automatically."
+    )
     samples_per_node: float = Field(
-        default=1.5, ge=1, le=50, description="points that an octree cell should hold"
+        default=1.5, ge=1, le=50, description="Points that an octree cell should hold."
     )
     point_weight: float = Field(
-        default=4.0, ge=0, description="weight of the points against their normals"
+        default=4.0, ge=0, description="Weight of the points against their normals."
     )
     trim_density_quantile: float = Field(
-        default=0.01, ge=0, lt=1, description="share of the vertices cut off as least supported"
+        default=0.01, ge=0, lt=1, description="Share of the vertices cut off as least supported."
     )
     max_distance_spacings: float | None = Field(
         default=2.0,
         gt=0,
-        description="farthest a vertex may lie from the points, in local point spacings; "
-        "null = keep all",
+        description="Farthest a vertex may lie from the points, in local point spacings; "
+        "null = keep all.",
     )
     min_component_faces: int = Field(
-        default=100, ge=1, description="connected pieces with fewer faces are dropped"
+        default=100, ge=1, description="Connected pieces with fewer faces are dropped."
     )
     target_faces: int | None = Field(
-        default=None, ge=4, description="simplify to about so many faces; null = do not"
+        default=None, ge=4, description="Simplify to about so many faces; null = do not."
     )
     normals_neighbours: int = Field(
-        default=20, ge=3, le=1000, description="neighbours for normals where the cloud has none"
+        default=20, ge=3, le=1000, description="Neighbours for normals where the cloud has none."
     )
     tile_m: float = Field(
-        default=50.0, gt=0, description="edge of the tiles in which the map of a drive is meshed"
+        default=50.0, gt=0, description="Edge of the tiles in which the map of a drive is meshed."
     )
     overlap_m: float = Field(
-        default=3.0, ge=0, description="what the surface of a tile sees beyond its border"
+        default=3.0,
+        ge=0,
+        description="Margin around a tile whose points its surface is fitted to as well.",
     )
     seam_m: float = Field(
-        default=0.15, ge=0, description="widest gap that is closed where two tiles meet"
+        default=0.15, ge=0, description="Widest gap that is closed where two tiles meet."
     )
     free_space: bool = Field(
-        default=True, description="cut off what hangs where the cameras of a drive looked through"
+        default=True,
+        description="Cut off what hangs in space that the cameras of a drive looked through.",
     )
 
 

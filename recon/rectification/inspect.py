@@ -29,21 +29,23 @@ class InspectionSettings(Settings):
     """When a pair is said not to be rectified."""
 
     every: int | None = Field(
-        default=50, ge=1, description="Every n-th frame is inspected; null = none"
+        default=50, ge=1, description="Every n-th frame is inspected; null = none."
     )
-    features: int = Field(default=1000, ge=50, le=20000, description="Features per picture at most")
+    features: int = Field(
+        default=1000, ge=50, le=20000, description="Features per picture at most."
+    )
     min_features: int = Field(
-        default=40, ge=8, description="Fewer matched features tell nothing about a pair"
+        default=40, ge=8, description="Fewer matched features tell nothing about a pair."
     )
     warn_row_px: float = Field(
-        default=1.0, gt=0.0, description="Median row error that is warned of"
+        default=1.0, gt=0.0, description="Median row error that is warned of."
     )
     swapped_share: float = Field(
         default=0.8,
         gt=0.5,
         le=1.0,
         description="Share of near features with negative disparity from which eyes count as "
-        "swapped",
+        "swapped.",
     )
 
 

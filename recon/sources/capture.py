@@ -45,7 +45,7 @@ class CaptureSettings(Settings):
         default="left-right", description="Where the views are in the frames of a single device."
     )
     suffix: Literal["png", "jpg"] = Field(
-        default="png", description="png = lossless; jpg where the disk is too slow."
+        default="png", description="Png = lossless; jpg where the disk is too slow."
     )
     preview_every: int | None = Field(
         default=None, ge=1, description="Every n-th pair also replaces preview.jpg. none = none."
