@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import difflib
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -34,17 +35,40 @@ class Settings(BaseModel):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            raise settings_error(error, where=where) from error
+            raise settings_error(error, where=where, names=setting_names(cls)) from error
 
 
-def settings_error(error: ValidationError, *, where: str | None = None) -> SettingsError:
-    """Tell pydantic's first complaint in one line."""
+def setting_names(settings: type[BaseModel]) -> Iterator[str]:
+    """The dotted names of all settings below a model, and of the models among them."""
+    for name, field in settings.model_fields.items():
+        yield name
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from (f"{name}.{below}" for below in setting_names(field.annotation))
+
+
+def settings_error(
+    error: ValidationError, *, where: str | None = None, names: Iterator[str] = iter(())
+) -> SettingsError:
+    """Tell pydantic's first complaint in one line.
+
+    Args:
+        error: What pydantic raised.
+        where: Named in the error.
+        names: Dotted names of the settings there are, for one that is unknown.
+    """
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"]) or "settings"
     if first["type"] == "extra_forbidden":
-        return SettingsError(
-            f"unknown setting {key!r}", where=where, hint="`config.yaml` of any run lists them all"
-        )
-    return SettingsError(
-        f"setting {key!r}: {first['msg']}", where=where, got=repr(first.get("input"))
-    )
+        return SettingsError(f"unknown setting {key!r}", where=where, hint=_advice(key, [*names]))
+    # A sentence of ours, which pydantic introduces with words of its own.
+    said = first.get("ctx", {}).get("error", first["msg"])
+    return SettingsError(f"setting {key!r}: {said}", where=where, got=repr(first.get("input")))
+
+
+def _advice(unknown: str, names: list[str]) -> str:
+    """What the user may have meant: a setting of that name elsewhere, or one written likewise."""
+    last = unknown.rpartition(".")[2]
+    meant = [name for name in names if name.rpartition(".")[2] == last]
+    meant = meant or difflib.get_close_matches(unknown, names, n=3, cutoff=0.8)
+    listed = "`config.yaml` of any run lists them all"
+    return f"did you mean {' or '.join(meant[:4])}? {listed}" if meant else listed

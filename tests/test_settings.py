@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import pytest
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from recon.errors import SettingsError
 from recon.settings import Settings
@@ -9,6 +9,13 @@ from recon.settings import Settings
 
 class Inner(Settings):
     window_px: int = Field(default=9, ge=1, description="Window.")
+
+    @field_validator("window_px")
+    @classmethod
+    def _odd(cls, value: int) -> int:
+        if value % 2 == 0:
+            raise ValueError("an odd number is needed")
+        return value
 
 
 class Outer(Settings):
@@ -34,6 +41,9 @@ def test_settings_cannot_be_changed() -> None:
         ({"inner": {"window": 3}}, r"config\.yaml: unknown setting 'inner\.window'"),
         ({"inner": {"window_px": 0}}, r"setting 'inner\.window_px': .*greater than.*\(got 0\)"),
         ({"inner": {"window_px": "wide"}}, r"setting 'inner\.window_px': .*integer.*got 'wide'"),
+        ({"inner": {"window_px": 4}}, r"setting 'inner\.window_px': an odd number is n.*\(got 4\)"),
+        ({"inner": {"windw_px": 3}}, r"did you mean inner\.window_px\?"),
+        ({"window_px": 3}, r"did you mean inner\.window_px\?"),
     ],
 )
 def test_a_bad_setting_is_named_with_its_path(values: dict[str, object], message: str) -> None:

@@ -100,9 +100,15 @@ def load_config(
     _merge(values, defaults or {})
     if path is not None:
         _merge(values, _read_yaml(path))
+    told = dict(values)
     for text in overrides:
         _merge(values, _parse_override(text))
-    return ReconConfig.parse(values, where=str(path) if path else None)
+    try:
+        return ReconConfig.parse(values)
+    except SettingsError:
+        if path is not None:
+            ReconConfig.parse(told, where=str(path))  # the file's fault, not that of the overrides
+        raise
 
 
 def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> list[str]:

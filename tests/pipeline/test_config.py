@@ -57,6 +57,13 @@ def test_a_wrong_file_is_refused_by_name(tmp_path: Path, text: str, message: str
     assert "\n" not in str(caught.value)
 
 
+def test_the_file_is_not_blamed_for_a_wrong_override(tmp_path: Path) -> None:
+    (tmp_path / "good.yaml").write_text("matching:\n  matcher: sgm\n")
+    with pytest.raises(SettingsError, match=r"^setting 'matching\.sad\.window_px': ") as refused:
+        load_config(tmp_path / "good.yaml", ["matching.sad.window_px=8"])
+    assert "good.yaml" not in str(refused.value)
+
+
 def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"none\.yaml: configuration cannot be read"):
         load_config(tmp_path / "none.yaml")
