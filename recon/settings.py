@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -35,7 +35,7 @@ class Settings(BaseModel):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            raise settings_error(error, where=where, names=setting_names(cls)) from error
+            raise settings_error(error, where=where, names=[*setting_names(cls)]) from error
 
 
 def setting_names(settings: type[BaseModel]) -> Iterator[str]:
@@ -47,7 +47,7 @@ def setting_names(settings: type[BaseModel]) -> Iterator[str]:
 
 
 def settings_error(
-    error: ValidationError, *, where: str | None = None, names: Iterator[str] = iter(())
+    error: ValidationError, *, where: str | None = None, names: Sequence[str] = ()
 ) -> SettingsError:
     """Tell pydantic's first complaint in one line.
 
@@ -59,13 +59,13 @@ def settings_error(
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"]) or "settings"
     if first["type"] == "extra_forbidden":
-        return SettingsError(f"unknown setting {key!r}", where=where, hint=_advice(key, [*names]))
+        return SettingsError(f"unknown setting {key!r}", where=where, hint=_advice(key, names))
     # A sentence of ours, which pydantic introduces with words of its own.
     said = first.get("ctx", {}).get("error", first["msg"])
     return SettingsError(f"setting {key!r}: {said}", where=where, got=repr(first.get("input")))
 
 
-def _advice(unknown: str, names: list[str]) -> str:
+def _advice(unknown: str, names: Sequence[str]) -> str:
     """What the user may have meant: a setting of that name elsewhere, or one written likewise."""
     last = unknown.rpartition(".")[2]
     meant = [name for name in names if name.rpartition(".")[2] == last]

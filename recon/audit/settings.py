@@ -15,7 +15,10 @@ class AuditSettings(Settings):
         fewer = {"features": min(self.features, 800), "max_lag": min(self.max_lag, 3)}
         return self.model_copy(update=fewer)
 
-    quick: bool = Field(default=True, description="Whether `recon map` looks at its input first.")
+    quick: bool = Field(
+        default=True,
+        description="Whether `recon map`, `pair`, `disparity` look at their input first.",
+    )
     frames: int = Field(
         default=300, ge=2, description="Frames looked at in all; of longer drives in several runs."
     )

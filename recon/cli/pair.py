@@ -28,8 +28,9 @@ def pair(
     right: Right,
     calib: Annotated[Path, typer.Option(help=_CALIB_HELP)],
     unit_m: Annotated[
-        float, typer.Option(min=1e-6, help="Metres per unit in an OpenCV file, e.g. 0.001 for mm.")
-    ] = 1.0,
+        float | None,
+        typer.Option(min=1e-6, help="Metres per unit in an OpenCV file, e.g. 0.001 for mm. [1]"),
+    ] = None,
     truth: Annotated[
         Path | None,
         typer.Option(help="Ground-truth disparity (PFM or 16-bit PNG) to compare with."),
@@ -62,7 +63,8 @@ def pair(
 
         overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
         settings = load_config(config, overrides, PAIR_DEFAULTS)
-        given = read_pair_input(left, right, calib, truth, metres_per_unit=unit_m)
+        unit = settings.source.metres_per_unit if unit_m is None else unit_m
+        given = read_pair_input(left, right, calib, truth, metres_per_unit=unit)
         options = PairOptions("pair", out, threads, present_pair)
         run = run_pair(given, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)
@@ -102,7 +104,8 @@ def disparity(
 
         overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
         settings = load_config(config, overrides, PAIR_DEFAULTS)
-        given = read_pair_input(left, right, calib)
+        unit = settings.source.metres_per_unit
+        given = read_pair_input(left, right, calib, metres_per_unit=unit)
         options = PairOptions("disparity", out, threads, present_disparity)
         run = run_pair(given, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from recon.audit import Finding
 from recon.errors import MeshingError
 from recon.evaluation import evaluate_disparity
 from recon.formats.atomic import write_text
@@ -24,6 +25,7 @@ from recon.meshing import reconstruct_mesh
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
 from recon.pipeline.machine import use_threads
+from recon.pipeline.pair_checks import OnePair, check_found, find_pair_faults
 from recon.pipeline.record import fingerprint, write_record
 from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.stopwatch import Stopwatch
@@ -121,13 +123,13 @@ def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> Pai
         reconstructor = FrameReconstructor(
             given.calibration, config, threads=threads, stopwatch=watch
         )
+        faults = _look(given, config, options, watch)
         if options.command == "disparity":
-            pair, disparity = reconstructor.match(given.pair)
-            run = replace(
-                _run(given, config, pair, disparity), warnings=reconstructor.inspect(pair)
-            )
+            run = _match(given, config, reconstructor)
         else:
             run = _reconstruct(given, config, reconstructor, watch)
+        few = check_found(run.disparity, given.pair, faults)
+        run = replace(run, warnings=(*(fault.text for fault in faults), *few, *run.warnings))
         with watch.stage("write"):
             _write(run, directory)
         run.summary.update(cost(watch, time.perf_counter() - start))
@@ -147,6 +149,21 @@ def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> Pai
         }
         write_record(directory, options.command, record)
     return run
+
+
+def _look(
+    given: PairInput, config: ReconConfig, options: PairOptions, watch: Stopwatch
+) -> tuple[Finding, ...]:
+    """What is wrong with the pictures or their calibration before anything is matched."""
+    with watch.stage("audit"):
+        one = OnePair(given.pair, given.calibration, given.files)
+        return find_pair_faults(one, config, metric=options.command == "pair")
+
+
+def _match(given: PairInput, config: ReconConfig, reconstructor: FrameReconstructor) -> PairRun:
+    """The run of a disparity alone."""
+    pair, disparity = reconstructor.match(given.pair)
+    return replace(_run(given, config, pair, disparity), warnings=reconstructor.inspect(pair))
 
 
 def _reconstruct(

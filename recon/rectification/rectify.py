@@ -160,6 +160,8 @@ class Rectifier:
                 where=pair.name or f"frame {pair.index}",
                 got=f"{width_px}x{height_px}",
                 expected=f"{self.camera.width_px}x{self.camera.height_px}",
+                hint="give pictures as they were calibrated, not resized, cropped or turned, or "
+                "the calibration of these",
             )
 
 

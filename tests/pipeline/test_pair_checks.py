@@ -1,0 +1,77 @@
+"""One pair: what cannot give a cloud, or gives one of wrong size, is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.errors import MatchingError
+from recon.pipeline.config import PAIR_DEFAULTS, load_config
+from recon.pipeline.pair_run import PairInput, PairOptions, PairRun, run_pair
+from recon.structures import RectifiedCamera, StereoPair
+
+CAMERA = RectifiedCamera(300.0, 160.0, 120.0, 160.0, 0.1, 320, 240)
+
+
+@pytest.fixture(scope="module")
+def pair() -> StereoPair:
+    """Blurred noise, 12 pixels further left in the right picture."""
+    world = np.random.default_rng(3).integers(0, 256, (240, 340)).astype(np.uint8)
+    world = cv2.normalize(cv2.GaussianBlur(world, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX)
+    world = np.asarray(world, np.uint8)
+    return StereoPair(world[:, :320], world[:, 12:332], name="left.png")
+
+
+def run(
+    pair: StereoPair, out: Path, camera: RectifiedCamera = CAMERA, command: str = "disparity"
+) -> PairRun:
+    settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
+    return run_pair(PairInput(pair, camera), settings, PairOptions(command, out))
+
+
+def test_a_good_pair_is_not_warned_of(pair: StereoPair, tmp_path: Path) -> None:
+    assert run(pair, tmp_path / "out").warnings == ()
+
+
+def test_pictures_that_show_nothing_are_refused_and_leave_nothing(
+    pair: StereoPair, tmp_path: Path
+) -> None:
+    dark = replace(pair, right=np.zeros_like(pair.right))
+    with pytest.raises(MatchingError, match=r"^left\.png: no pixel .* right camera shows nothing"):
+        run(dark, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_same_picture_twice_is_refused_as_such(pair: StereoPair, tmp_path: Path) -> None:
+    with pytest.raises(MatchingError, match="left and right are the same picture"):
+        run(replace(pair, right=pair.left), tmp_path / "out")
+
+
+def test_pictures_of_two_things_are_said_to_be_hardly_a_pair(
+    pair: StereoPair, tmp_path: Path
+) -> None:
+    other = replace(pair, right=np.ascontiguousarray(pair.right[::-1]))
+    (said,) = run(other, tmp_path / "out").warnings
+    assert said.startswith("only ")
+    assert "same moment" in said
+
+
+@pytest.mark.parametrize(
+    ("camera", "word"),
+    [
+        (replace(CAMERA, baseline_m=100.0), "baseline is implausible: 100 m"),
+        (replace(CAMERA, cx_px=310.0, cx_right_px=310.0), "calibration is of another size"),
+    ],
+)
+def test_a_calibration_that_gives_a_cloud_of_wrong_size_is_warned_of(
+    pair: StereoPair, tmp_path: Path, camera: RectifiedCamera, word: str
+) -> None:
+    run_ = run(pair, tmp_path / "pair", camera, "pair")
+    assert any(word in line for line in run_.warnings)
+    assert run_.summary["warnings"] == list(run_.warnings)
+    # Nobody asked for depth here.
+    assert run(pair, tmp_path / "disparity", camera).warnings == ()
