@@ -18,7 +18,7 @@ from recon.structures.arrays import Float32, Int32
 
 
 def decode_octomap(path: Path) -> tuple[Int32, Float32, float]:
-    """Cells, log-odds and resolution of an ``.ot`` or ``.bt`` file, by what its header says.
+    """Cells, log-odds and resolution of a ``.bt`` file.
 
     Pruned leaves are expanded into the cells that they stand for.
 
@@ -38,28 +38,21 @@ def decode_octomap(path: Path) -> tuple[Int32, Float32, float]:
 
 def _read_tree(path: Path) -> Any:
     """The tree of a file, whole."""
-    header = _read_header(path)
-    if header[0] == b"# Octomap OcTree binary file":
-        tree = pyoctomap.OcTree(0.1)
-        whole = tree.readBinary(str(path))
-    elif header[0] == b"# Octomap OcTree file":
-        tree = pyoctomap.OcTree(0.1).read(str(path))
-        # A truncated file is read without complaint, and its last nodes are noise.
-        whole = tree is not None and b"size %d" % tree.calcNumNodes() in header
-    else:
+    first = _first_line(path)
+    if first != b"# Octomap OcTree binary file":
         raise FormatError(
-            "the file is not an OctoMap", where=path, got=header[0][:40], expected=".bt or .ot"
+            "the file is not an OctoMap", where=path, got=first[:40], expected=".bt or .ot"
         )
-    if not whole:
+    tree = pyoctomap.OcTree(0.1)
+    if not tree.readBinary(str(path)):
         raise FormatError("the OctoMap is truncated or damaged", where=path)
     return tree
 
 
-def _read_header(path: Path) -> list[bytes]:
-    """The first lines of a file."""
+def _first_line(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            return [file.readline(200).strip() for _ in range(8)]
+            return file.readline(200).strip()
     except OSError as error:
         raise FormatError("cannot read the OctoMap", where=path) from error
 

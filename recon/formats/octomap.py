@@ -12,8 +12,9 @@ from typing import IO
 import numpy as np
 
 from recon.adapters.pyoctomap import decode_octomap
-from recon.errors import MappingError
+from recon.errors import FormatError, MappingError
 from recon.formats.atomic import atomic_path
+from recon.formats.octomap_leaves import FULL_TREE, octomap_pieces
 from recon.formats.octree import (
     DEPTH,
     INNER,
@@ -174,12 +175,27 @@ def _check(voxels: OccupancyVoxels) -> None:
 
 
 def read_octomap(path: str | PathLike[str]) -> OccupancyVoxels:
-    """Read a ``.bt`` or ``.ot`` file; leaves that stand for many cells are expanded.
+    """Read a ``.bt`` or ``.ot`` file, by what its header says; pruned leaves are expanded.
 
     The log-odds of a ``.bt`` file are those that OctoMap gives to occupied and to free.
 
     Raises:
         FormatError: The file is missing or is no OctoMap.
     """
-    keys, log_odds, resolution_m = decode_octomap(Path(path))
-    return OccupancyVoxels(keys, log_odds, resolution_m)
+    if not _is_full(Path(path)):
+        return OccupancyVoxels(*decode_octomap(Path(path)))
+    pieces = list(octomap_pieces(Path(path)))
+    return OccupancyVoxels(
+        np.concatenate([piece.keys for piece in pieces]),
+        np.concatenate([piece.log_odds for piece in pieces]),
+        pieces[0].resolution_m,
+    )
+
+
+def _is_full(path: Path) -> bool:
+    """Whether a file says that it is an ``.ot``."""
+    try:
+        with path.open("rb") as file:
+            return file.readline(200).strip() == FULL_TREE
+    except OSError as error:
+        raise FormatError("cannot read the OctoMap", where=path, got=error.strerror) from error

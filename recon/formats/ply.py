@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from os import PathLike
 from typing import Any, Final
@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from recon.errors import FormatError
 from recon.formats.atomic import atomic_path
-from recon.formats.ply_tables import PlyHeader, Table, TableStream, read_tables, write_tables
+from recon.formats.ply_tables import (
+    PlyHeader,
+    Table,
+    TableStream,
+    read_table_pieces,
+    read_tables,
+    write_tables,
+)
 from recon.structures import Frame, PointCloud
 from recon.structures.arrays import Float32, UInt8
 
@@ -27,6 +34,7 @@ _SCALARS: Final = (
     ("count", "count", "<i4"),
 )
 _FRAME: Final = "frame "
+_PIECE_POINTS: Final = 1 << 19
 _FRAMES: Final[tuple[Frame, ...]] = ("camera", "world", "map")
 
 
@@ -102,24 +110,41 @@ def read_ply(path: str | PathLike[str]) -> PointCloud:
             point though it holds points.
     """
     header, tables = read_tables(path, ["vertex"])
-    vertex = tables.get("vertex")
-    if vertex is None or not _has(vertex, _XYZ):
-        raise FormatError("the PLY file has no vertices with x, y and z", where=path)
-    xyz = _stacked(vertex, _XYZ, np.float32)
-    finite = np.isfinite(xyz).all(axis=1)
-    if len(xyz) and not finite.any():
-        raise FormatError("no point of the PLY file is finite", where=path)
-    cloud = PointCloud(
-        xyz=xyz,
-        rgb=colours_of(vertex),
-        normals=normals_of(vertex),
+    vertex = _vertices(tables.get("vertex"), path)
+    cloud = replace(
+        _shape(vertex, header),
         confidence=_confidence(vertex),
         sigma_m=_scalar(vertex, "sigma", np.float32),
         weight=_scalar(vertex, "weight", np.float32),
         count=_scalar(vertex, "count", np.int32),
-        frame=_frame(header),
     )
-    return cloud if finite.all() else cloud.select(finite)
+    kept = _finite(cloud)
+    _check_kept(len(cloud), len(kept), path)
+    return kept
+
+
+def read_ply_pieces(
+    path: str | PathLike[str], points_each: int = _PIECE_POINTS
+) -> Iterator[PointCloud]:
+    """Read a cloud as `read_ply` does, so many points at a time: places, normals and colours.
+
+    Other numbers are left out: what ``quality`` is, only all of it can tell.
+
+    Args:
+        path: The file.
+        points_each: Points of a piece, before those that are not finite are dropped.
+
+    Raises:
+        FormatError: As in `read_ply`, when it is come upon.
+    """
+    vertex: Table | None = None
+    points, kept = 0, 0
+    for header, vertex in read_table_pieces(path, "vertex", points_each):
+        piece = _finite(_shape(_vertices(vertex, path), header))
+        points, kept = points + len(vertex), kept + len(piece)
+        yield piece
+    _vertices(vertex, path)
+    _check_kept(points, kept, path)
 
 
 def vertex_dtype(*, normals: bool, colours: bool) -> list[tuple[str, str]]:
@@ -161,6 +186,33 @@ def _table(cloud: PointCloud) -> Table:
     for attribute, name, _ in scalars:
         table[name] = getattr(cloud, attribute)
     return table
+
+
+def _vertices(vertex: Table | None, path: str | PathLike[str]) -> Table:
+    """The table of vertices, which must have places."""
+    if vertex is None or not _has(vertex, _XYZ):
+        raise FormatError("the PLY file has no vertices with x, y and z", where=path)
+    return vertex
+
+
+def _shape(vertex: Table, header: PlyHeader) -> PointCloud:
+    """Places, normals and colours of vertices."""
+    return PointCloud(
+        xyz=_stacked(vertex, _XYZ, np.float32),
+        rgb=colours_of(vertex),
+        normals=normals_of(vertex),
+        frame=_frame(header),
+    )
+
+
+def _finite(cloud: PointCloud) -> PointCloud:
+    finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
+    return cloud if finite.all() else cloud.select(finite)
+
+
+def _check_kept(points: int, kept: int, path: str | PathLike[str]) -> None:
+    if points and not kept:
+        raise FormatError("no point of the PLY file is finite", where=path)
 
 
 def _has(table: Table, names: tuple[str, ...]) -> bool:

@@ -5,7 +5,7 @@ Ref: G. Turk, "The PLY polygon file format", 1994.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import SEEK_END, PathLike
 from pathlib import Path
@@ -71,6 +71,32 @@ def read_tables(
         with Path(path).open("rb") as stream:
             header = _read_header(stream, path)
             return header, _read_body(stream, header, wanted, path)
+    except OSError as error:
+        raise FormatError("cannot read the file", where=path, got=error.strerror) from error
+
+
+def read_table_pieces(
+    path: str | PathLike[str], wanted: str, rows_each: int
+) -> Iterator[tuple[PlyHeader, Table]]:
+    """Read an element of a PLY file so many rows at a time, each time with the header.
+
+    Args:
+        path: The file.
+        wanted: Name of the element; a file without it gives nothing.
+        rows_each: Most rows that are in memory.
+
+    Raises:
+        FormatError: As in `read_tables`.
+    """
+    try:
+        with Path(path).open("rb") as stream:
+            header = _read_header(stream, path)
+            for element in header.elements:
+                for table in _pieces(stream, header, element, rows_each, path):
+                    if element[0] == wanted:
+                        yield header, table
+                if element[0] == wanted:
+                    return
     except OSError as error:
         raise FormatError("cannot read the file", where=path, got=error.strerror) from error
 
@@ -249,17 +275,36 @@ def _read_body(
     for name, count, dtype in header.elements:
         if not missing:
             break
-        read = _read_text if header.encoding == "ascii" else _read_binary
-        tables[name] = _checked_lists(read(stream, count, dtype), path)
-        if len(tables[name]) < count:
+        [tables[name]] = _pieces(stream, header, (name, count, dtype), count, path)
+        missing.discard(name)
+    return {name: table for name, table in tables.items() if name in wanted}
+
+
+def _pieces(
+    stream: IO[bytes],
+    header: PlyHeader,
+    element: tuple[str, int, np.dtype[Any]],
+    rows_each: int,
+    path: str | PathLike[str],
+) -> Iterator[Table]:
+    """The rows of an element, so many at a time; one table at least."""
+    name, count, dtype = element
+    read = _read_text if header.encoding == "ascii" else _read_binary
+    rows = 0
+    while True:
+        expected = min(rows + rows_each, count)
+        table = _checked_lists(read(stream, expected - rows, dtype), path)
+        rows += len(table)
+        if rows < expected:
             raise FormatError(
                 f"the file is truncated in its element {name!r}",
                 where=path,
-                got=f"{len(tables[name])} rows",
+                got=f"{rows} rows",
                 expected=f"{count}",
             )
-        missing.discard(name)
-    return {name: table for name, table in tables.items() if name in wanted}
+        yield table
+        if rows == count:
+            return
 
 
 def _read_binary(stream: IO[bytes], count: int, dtype: np.dtype[Any]) -> Table:

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.errors import FormatError
+from recon.errors import FormatError, SettingsError
 from recon.pipeline.config import ReconConfig, load_config
 from recon.pipeline.run_directory import RECORD
 from recon.structures.arrays import Float64, freeze
@@ -57,6 +57,16 @@ def open_run(folder: Path) -> FinishedRun:
         raise FormatError("the run made no map: its record has no T_map_world", where=folder)
     mapped_by = record.get(MAPPED_BY, record.get("command"))
     return FinishedRun(folder, str(mapped_by), load_config(folder / CONFIG), T_map_world)
+
+
+def refuse_as_target(run: Path, out: Path | None) -> None:
+    """Refuse to write what is made of a run into its own folder, from which it would vanish.
+
+    Raises:
+        SettingsError: ``out`` is the folder of the run.
+    """
+    if out is not None and out.resolve() == run.resolve():
+        raise SettingsError("the results would replace the run", where=out, hint="another --out")
 
 
 def _matrix(value: Any) -> Float64 | None:

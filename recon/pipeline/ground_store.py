@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,9 +68,10 @@ class GroundStore:
         self._folder = folder
         self._settings = settings
         self._boxes: dict[str, Window] = {}
+        self._parts: Counter[Tile] = Counter()
 
     def put_cloud(self, tile: Tile, cloud: PointCloud) -> None:
-        """Put by a tile of the fused cloud; where it has normals, what faces up.
+        """Put by a tile of the fused cloud, or a part of one; where it has normals, what faces up.
 
         Raises:
             OutputError: It cannot be written.
@@ -78,7 +80,8 @@ class GroundStore:
         if cloud.normals is not None:
             upright = math.cos(math.radians(self._settings.max_tilt_deg))
             xyz = xyz[cloud.normals[:, 2] >= upright]
-        self._put(f"cloud_{tile[0]}_{tile[1]}", xyz)
+        self._parts[tile] += 1
+        self._put(f"cloud_{tile[0]}_{tile[1]}_{self._parts[tile]}", xyz)
 
     def put_floors(self, tile: Tile, xyz: Float32) -> None:
         """Put by the floors of a tile of voxels.

@@ -45,16 +45,20 @@ def side_by_side(
 ) -> Iterator[Result]:
     """Yield ``function(item)`` in order, computed in several threads.
 
-    At most ``threads + 1`` results exist at a time. An error is raised at its item's turn.
+    At most ``threads + 1`` results exist at a time. An error is raised at its item's turn; when
+    the caller leaves off, what has begun is waited for and nothing else is begun.
     """
-    with ThreadPoolExecutor(threads, thread_name_prefix="side-by-side") as pool:
-        waiting: deque[Future[Result]] = deque()
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="side-by-side")
+    waiting: deque[Future[Result]] = deque()
+    try:
         for item in items:
             waiting.append(pool.submit(function, item))
             if len(waiting) > threads:
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 class OneBehind:

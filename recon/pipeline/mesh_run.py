@@ -5,27 +5,25 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from shutil import copyfile
+from typing import Any
 
 from recon.errors import SettingsError
-from recon.formats.atomic import write_text
+from recon.formats.atomic import atomic_path, write_text
 from recon.formats.mesh import MESH_SUFFIXES, read_mesh, write_mesh
 from recon.formats.mlp import write_mlp
-from recon.formats.octomap import read_octomap
-from recon.formats.ply import read_ply, write_ply
+from recon.formats.octomap_leaves import octomap_pieces
+from recon.formats.ply import read_ply, read_ply_pieces, write_ply
 from recon.meshing import MeshSettings, reconstruct_mesh
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.drive_mesh import write_drive_mesh
-from recon.pipeline.finished_run import OCTOMAP, open_run
+from recon.pipeline.finished_run import CLOUD, OCTOMAP, open_run, refuse_as_target
 from recon.pipeline.machine import use_threads
 from recon.pipeline.record import fingerprint, write_record
 from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.stopwatch import Stopwatch
 from recon.pipeline.summary import cost
 from recon.pipeline.tile_store import TileStore
-from recon.structures import PointCloud
-
-CLOUD: Final = "map/cloud.ply"
 
 
 @dataclass(frozen=True)
@@ -60,15 +58,15 @@ def run_mesh(source: Path, config: ReconConfig, options: MeshOptions) -> dict[st
     threads = use_threads(options.threads)
     _check_formats(options.formats)
     watch = Stopwatch()
-    cloud_path = open_run(source).folder / CLOUD if source.is_dir() else source
-    with watch.stage("read"):
-        cloud = read_ply(cloud_path)
+    cloud_path = source
+    if source.is_dir():
+        cloud_path = open_run(source).folder / CLOUD
+        refuse_as_target(source, options.out)
     with RunDirectory.for_command("mesh", options.out) as directory:
-        write_ply(directory.path("mesh/cloud.ply"), cloud)
         if source.is_dir():
-            figures = _mesh_run(source, cloud, config.mesh, directory, threads, watch)
+            figures = _mesh_run(source, config.mesh, directory, threads, watch)
         else:
-            figures = _mesh_cloud(cloud, config.mesh, directory, watch)
+            figures = _mesh_cloud(source, config.mesh, directory, watch)
         with watch.stage("write"):
             whole = directory.path("mesh/mesh.ply")
             others = [suffix for suffix in dict.fromkeys(options.formats) if suffix != "ply"]
@@ -77,7 +75,6 @@ def run_mesh(source: Path, config: ReconConfig, options: MeshOptions) -> dict[st
             write_text(directory.path("config.yaml"), dump_config(config))
         summary = {
             "cloud": str(cloud_path),
-            "points": len(cloud),
             **figures,
             **cost(watch, time.perf_counter() - start),
             "out": str(directory.folder),
@@ -93,38 +90,46 @@ def run_mesh(source: Path, config: ReconConfig, options: MeshOptions) -> dict[st
 
 
 def _mesh_cloud(
-    cloud: PointCloud, settings: MeshSettings, directory: RunDirectory, watch: Stopwatch
+    path: Path, settings: MeshSettings, directory: RunDirectory, watch: Stopwatch
 ) -> dict[str, Any]:
     """Write the surface of a cloud in one piece."""
+    with watch.stage("read"):
+        cloud = read_ply(path)
+        write_ply(directory.path("mesh/cloud.ply"), cloud)
     with watch.stage("mesh"):
         mesh = reconstruct_mesh(cloud, settings)
     write_mesh(directory.path("mesh/mesh.ply"), mesh)
     layers = {name: directory.path(f"mesh/{name}.ply") for name in ("mesh", "cloud")}
     write_mlp(directory.path("mesh/mesh.mlp"), layers)
-    return {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "warnings": []}
+    return {
+        "points": len(cloud),
+        "vertices": len(mesh.vertices),
+        "faces": len(mesh.faces),
+        "warnings": [],
+    }
 
 
 def _mesh_run(
-    run: Path,
-    cloud: PointCloud,
-    settings: MeshSettings,
-    directory: RunDirectory,
-    threads: int,
-    watch: Stopwatch,
+    run: Path, settings: MeshSettings, directory: RunDirectory, threads: int, watch: Stopwatch
 ) -> dict[str, Any]:
     """Write the surface of a run's map tile by tile."""
     warnings = []
     store = TileStore(directory.state("mesh"), settings.tile_m)
+    layer = directory.path("mesh/cloud.ply")
     with watch.stage("read"):
-        store.put_cloud(cloud)
+        for cloud in read_ply_pieces(run / CLOUD):
+            store.put_cloud(cloud)
+        with atomic_path(layer) as temporary:
+            copyfile(run / CLOUD, temporary)
         if settings.free_space and (run / OCTOMAP).is_file():
-            store.put_voxels(read_octomap(run / OCTOMAP))
+            for voxels in octomap_pieces(run / OCTOMAP):
+                store.put_voxels(voxels)
         elif settings.free_space:
             warnings.append(f"the run has no {OCTOMAP}: free space is not known")
     with watch.stage("mesh"):
-        layer = directory.path("mesh/cloud.ply")
         written = write_drive_mesh(store, settings, directory, layer, threads)
     return {
+        "points": store.total,
         "vertices": written.vertices,
         "faces": written.faces,
         "tiles": len(written.tiles),

@@ -15,7 +15,7 @@ import numpy as np
 
 from recon.errors import FormatError, SettingsError
 from recon.formats.atomic import write_text
-from recon.formats.ply import read_ply
+from recon.formats.ply import read_ply_pieces
 from recon.formats.rays import RayFile
 from recon.formats.trajectory import read_kitti_poses
 from recon.geometry.se3 import apply
@@ -29,6 +29,7 @@ from recon.pipeline.finished_run import (
     TRAJECTORY,
     FinishedRun,
     open_run,
+    refuse_as_target,
 )
 from recon.pipeline.machine import use_threads
 from recon.pipeline.occupancy_files import OccupancyWriter
@@ -117,10 +118,7 @@ class _Drive:
 
     def __init__(self, request: OccupancyRequest) -> None:
         self.run = open_run(request.run)
-        if request.out is not None and request.out.resolve() == request.run.resolve():
-            raise SettingsError(
-                "the results would replace the run", where=request.out, hint="another --out"
-            )
+        refuse_as_target(request.run, request.out)
         self.config = _configure(self.run, request)
         self._rays = _open_rays(self.run.folder / RAYS_FILE)
         self.trajectory: Trajectory = read_kitti_poses(self.run.folder / TRAJECTORY)
@@ -149,11 +147,12 @@ class _Drive:
         return store
 
     def clouds(self, edge_m: float) -> Iterator[tuple[Tile, PointCloud]]:
-        """The fused cloud, map axes, in tiles."""
-        cloud = read_ply(self.run.folder / CLOUD)
-        homes = np.floor(cloud.xyz[:, :2] / edge_m).astype(np.int64)
-        for tile in sorted(set(map(tuple, homes.tolist()))):
-            yield (tile[0], tile[1]), cloud.select((homes == tile).all(axis=1))
+        """The fused cloud, map axes, in parts of tiles."""
+        for cloud in read_ply_pieces(self.run.folder / CLOUD):
+            homes = np.floor(cloud.xyz[:, :2] / edge_m).astype(np.int64)
+            tiles, where = np.unique(homes, axis=0, return_inverse=True)
+            for number, tile in enumerate(tiles.tolist()):
+                yield (tile[0], tile[1]), cloud.select(where.ravel() == number)
 
 
 def _configure(run: FinishedRun, request: OccupancyRequest) -> ReconConfig:

@@ -1,8 +1,9 @@
-"""`recon` in a process that ends, or meets a full disk, at its n-th write.
+"""`recon` in a process that ends, is interrupted, or meets a full disk, at its n-th write.
 
-``python break_at_write.py (kill|full|count) N ARGUMENTS…``: a write is what makes a file appear
-whole under its name. ``kill`` ends the process by SIGKILL before it (even N) or after it (odd N),
-``full`` lets the disk be full from there on, ``count`` prints how many writes there were.
+``python break_at_write.py (kill|interrupt|full|count) N ARGUMENTS…``: a write is what makes a file
+appear whole under its name. ``kill`` ends the process by SIGKILL before it (even N) or after it
+(odd N), ``interrupt`` does what Ctrl-C does, ``full`` lets the disk be full from there on,
+``count`` prints how many writes there were.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ def replace(self: Path, target: Path) -> Path:
     broken = MODE == "kill" and _writes == LAST
     if broken and LAST % 2 == 0:
         os.kill(os.getpid(), signal.SIGKILL)
+    if MODE == "interrupt" and _writes == LAST:
+        os.kill(os.getpid(), signal.SIGINT)
     moved = _replace(self, target)
     if broken:
         os.kill(os.getpid(), signal.SIGKILL)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -122,6 +123,32 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
     assert f"recon map --resume {tmp_path / 'run'} goes on from there" in line
     assert [path.name for path in (tmp_path / "run").iterdir()] == [".partial"]
     runs.finish(tmp_path / "run")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["mesh", "occupancy"])
+def test_what_is_made_of_a_run_stays_as_it_was_when_it_cannot_be_made_again(
+    runs: Runs, tmp_path: Path, command: str
+) -> None:
+    out, run = tmp_path / "out", runs.drive.parent / "unbroken"
+
+    def again(mode: str, at: int) -> subprocess.CompletedProcess[str]:
+        arguments = [mode, str(at), command, str(run), "--out", str(out), "--quiet"]
+        arguments += ["--set", "mesh.tile_m=10"] if command == "mesh" else []
+        broken = [sys.executable, str(BREAKER), *arguments]
+        return subprocess.run(broken, capture_output=True, text=True, check=False)
+
+    assert again("count", 0).returncode == 0
+    writes = int(Path(os.environ["COUNT"]).read_text())
+    made = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    for mode, code, words in (("full", 1, "error: .*No space left"), ("interrupt", 130, "interr")):
+        # In the first third the run is read, in the others its products are made.
+        for at in (writes // 6, writes // 2):
+            done = again(mode, at)
+            assert done.returncode == code
+            [line] = done.stderr.splitlines()
+            assert re.match(words, line)
+            assert made == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
 
 
 def kill(command: list[str], after_s: float) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from recon.errors import FormatError, MappingError, OutputError
 from recon.formats.octomap import read_octomap, write_octomap, write_octomap_tiles
+from recon.formats.octomap_leaves import octomap_pieces
 from recon.formats.octree import KEY_LIMIT
 from recon.structures import OccupancyVoxels
 
@@ -139,3 +141,75 @@ def test_a_map_too_large_for_octomap_is_refused(tmp_path: Path, cell: int) -> No
     with pytest.raises(MappingError, match="too large"):
         write_octomap(tmp_path / "map", voxels)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("nodes_each", [1, 7, 1000, 10**9])
+def test_a_file_is_read_in_pieces_in_its_order(tmp_path: Path, nodes_each: int) -> None:
+    _, full = write_octomap(tmp_path / "map", _random_voxels(3, 8, 2000))
+    whole, pieces = read_octomap(full), list(octomap_pieces(full, nodes_each))
+    assert len(pieces) > 1 or nodes_each == 10**9
+    assert {piece.resolution_m for piece in pieces} == {0.2}
+    np.testing.assert_array_equal(np.concatenate([piece.keys for piece in pieces]), whole.keys)
+    np.testing.assert_array_equal(
+        np.concatenate([piece.log_odds for piece in pieces]), whole.log_odds
+    )
+
+
+def test_a_piece_takes_memory_for_its_cells_alone(tmp_path: Path) -> None:
+    _, full = write_octomap(tmp_path / "map", _random_voxels(5, 60, 200_000))
+    cells = sum(len(piece) for piece in octomap_pieces(full, 1000))  # compiles the kernel
+    tracemalloc.start()
+    assert sum(len(piece) for piece in octomap_pieces(full, 1000)) == cells > 180_000
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    # A cell is 16 bytes: the whole would be 3 MB, and twice that while it is made.
+    assert peak_bytes < 3e5
+
+
+def test_pruned_leaves_of_octomaps_own_files_are_expanded(tmp_path: Path) -> None:
+    keys = np.stack(np.unravel_index(np.arange(12**3), (12, 12, 12)), axis=1) - 4
+    tree = pyoctomap.OcTree(0.2)
+    for centre in ((keys + 0.5) * 0.2).tolist():
+        tree.updateNode(centre, 1.5)  # leaves that have become alike are pruned at once
+    pruned = bytes(tree.write())
+    assert pruned.count(np.float32(1.5).tobytes()) < len(keys) / 2
+    (tmp_path / "pruned.ot").write_bytes(pruned)
+    back = read_octomap(tmp_path / "pruned.ot")
+    assert sorted(back.keys.tolist()) == sorted(keys.tolist())
+    np.testing.assert_array_equal(back.log_odds, np.float32(1.5))
+
+
+def _damage(content: bytes, kind: str) -> bytes:
+    data = content.index(b"data\n") + len(b"data\n")
+    if kind == "cut":
+        return content[:-3]
+    if kind == "no tree":
+        return content[: data - len(b"data\n")]
+    if kind == "more nodes than the tree has":
+        size = content[content.index(b"size ") :].split(b"\n")[0]
+        more = b"size %d" % (int(size.split()[1]) + 1)
+        return content.replace(size, more) + bytes(5)
+    if kind == "leaf without children near the root":
+        return content[: data + 4] + b"\0" + content[data + 5 :]
+    if kind == "not a number":
+        return content[:-5] + np.float32(np.nan).tobytes() + content[-1:]
+    return content.replace(b"id OcTree", b"id ColorOcTree")
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "cut",
+        "no tree",
+        "more nodes than the tree has",
+        "leaf without children near the root",
+        "not a number",
+        "another tree",
+    ],
+)
+def test_a_damaged_ot_file_is_a_format_error(tmp_path: Path, kind: str) -> None:
+    _, full = write_octomap(tmp_path / "map", _random_voxels(4, 30, 3000))
+    full.write_bytes(_damage(full.read_bytes(), kind))
+    words = "ColorOcTree" if kind == "another tree" else "truncated or damaged"
+    with pytest.raises(FormatError, match=words):
+        read_octomap(full)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.errors import MeshingError, OutputError
+from recon.errors import FormatError, MeshingError, OutputError, SettingsError
 from recon.formats.mesh import read_mesh
 from recon.formats.octomap import write_octomap
 from recon.formats.ply import write_ply
@@ -218,6 +218,29 @@ def test_one_tile_is_the_mesh_itself(run: Path) -> None:
 def test_a_run_without_octomap_is_meshed_with_a_warning(run: Path) -> None:
     (run / "map" / "octomap.ot").unlink()
     assert "free space is not known" in mesh_of(run)["warnings"][0]
+
+
+def test_the_cloud_of_a_run_is_taken_as_it_is(run: Path) -> None:
+    assert mesh_of(run)["points"] == len(street())
+    copied = run.parent / "mesh" / "mesh" / "cloud.ply"
+    assert copied.read_bytes() == (run / "map" / "cloud.ply").read_bytes()
+
+
+def test_a_damaged_map_leaves_the_earlier_mesh(run: Path) -> None:
+    mesh_of(run)
+    out = run.parent / "mesh"
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    whole = (run / "map" / "octomap.ot").read_bytes()
+    (run / "map" / "octomap.ot").write_bytes(whole[:-5])
+    with pytest.raises(FormatError, match=r"octomap\.ot: the OctoMap is truncated"):
+        mesh_of(run)
+    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def test_the_run_itself_is_never_replaced(run: Path) -> None:
+    with pytest.raises(SettingsError, match="replace the run"):
+        run_mesh(run, load_config(None, []), MeshOptions(out=run))
+    assert (run / "map" / "cloud.ply").is_file()
 
 
 def test_a_folder_that_cannot_be_written_is_told(store: TileStore, tmp_path: Path) -> None:

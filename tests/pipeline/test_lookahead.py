@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 import threading
+import time
 from collections.abc import Iterator
 from functools import partial
 
@@ -45,6 +47,20 @@ def test_no_more_items_are_begun_than_can_be_held() -> None:
     assert next(results) == 0
     results.close()
     assert len(begun) <= 3
+
+
+def test_nothing_is_begun_after_an_interruption() -> None:
+    begun: list[int] = []
+
+    def work(item: int) -> None:
+        begun.append(item)
+        time.sleep(0.2)  # the caller waits for this result by now, and the next item waits too
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+        time.sleep(0.2)
+
+    with pytest.raises(KeyboardInterrupt):
+        list(side_by_side(work, range(100), threads=1))
+    assert begun == [0]
 
 
 def test_at_most_depth_items_are_drawn_ahead() -> None:
