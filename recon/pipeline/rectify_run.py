@@ -269,7 +269,7 @@ def _warnings(summary: dict[str, Any], pictures: PicturePairs) -> list[str]:
     if summary["up_to_scale"]:
         lines.append("without a calibration: rows correspond, but depth is up to scale, no metres")
     if summary.get("row_error_px", 0.0) > _WARN_ROW_PX:
-        lines.append(f"rows are {summary['row_error_px']:.2f} px apart: a matcher wants 0.5")
+        lines.append(f"rows are {summary['row_error_px']:.2f} px apart: a matcher needs 0.5")
     if "row_error_px" not in summary:
         lines.append("no features to measure rows by")
     if pictures.by_order:

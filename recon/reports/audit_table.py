@@ -20,7 +20,7 @@ def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
     lines = {
         "frames": _frames(summary),
         "rows": _rows(summary),
-        "eyes": _eyes(summary),
+        "left, right": _eyes(summary),
         "time": _time(summary),
         "brightness": _known("right / left {:.2f}", summary["gain"]),
         "sharpness": _known(
@@ -29,7 +29,7 @@ def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
             summary["sharpness_right"],
         ),
         "disparities": _known(
-            "{0:.1f} to {2:.1f} px in use, half of them under {1:.1f} px",
+            "{0:.1f} to {2:.1f} px (5 to 95 %), median {1:.1f} px",
             *summary.get("disparity_5_50_95_px", [None]),
         ),
         "rig": _rig(summary),
@@ -41,7 +41,7 @@ def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
     mended = summary.get("mended")
     if mended is not None:
         turn = f"{mended['pitch_deg']:+.3f} deg pitch, {mended['roll_deg']:+.3f} deg roll"
-        lines["mended"] = f"{mended['calibration']}: right camera turned by {turn}"
+        lines["mended"] = f"{mended['calibration']}: right camera rotated by {turn}"
     return lines
 
 
@@ -50,9 +50,9 @@ def _frames(summary: Mapping[str, Any]) -> str:
     step_s = summary["usual_step_s"]
     rate = "" if step_s is None else f" at {1 / step_s:.3g} Hz, {summary['gaps']} gaps"
     return (
-        f"{summary['frames']}{rate}; of {summary['frames_read']} looked at, "
-        f"{summary['repeated_frames']} repeat the one before"
-        + (f", one camera stands still for {frozen}" if frozen else "")
+        f"{summary['frames']}{rate}; {summary['frames_read']} examined, "
+        f"{summary['repeated_frames']} repeated"
+        + (f", one camera frozen for {frozen}" if frozen else "")
     )
 
 
@@ -61,14 +61,14 @@ def _rows(summary: Mapping[str, Any]) -> str:
         return _UNKNOWN
     return (
         f"{summary['row_error_rms_px']:.2f} px rms (mean {summary['row_error_mean_px']:+.2f}, "
-        f"spread {summary['row_error_spread_px']:.2f}, of which the features' noise is "
-        f"{summary['row_noise_px']:.2f}); mended by pitch {summary['mend_pitch_deg']:+.3f}, "
+        f"spread {summary['row_error_spread_px']:.2f}, feature noise "
+        f"{summary['row_noise_px']:.2f}); corrected by pitch {summary['mend_pitch_deg']:+.3f}, "
         f"roll {summary['mend_roll_deg']:+.3f} deg"
     )
 
 
 def _eyes(summary: Mapping[str, Any]) -> str:
-    return _known("{:.0f} % of near features as if left and right were swapped", _percent(summary))
+    return _known("{:.0f} % of near features suggest swapped cameras", _percent(summary))
 
 
 def _percent(summary: Mapping[str, Any]) -> float | None:
