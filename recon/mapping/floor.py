@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from recon.kernels.voxels import pack_keys
 from recon.mapping.ground import GroundSettings
+from recon.mapping.log_odds import log_odds
 from recon.structures import OccupancyVoxels, PointCloud
 from recon.structures.arrays import Bool, Float32, Int32
 
-_FULL: Final = math.log(0.6 / 0.4)
-_EMPTY: Final = math.log(0.45 / 0.55)
+_FULL: Final = log_odds(0.6)
+_EMPTY: Final = log_odds(0.45)
 _REACH: Final = 2
 """A floor splits its evidence over two voxels, so the free one may be the second above."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +12,7 @@ from pydantic import Field
 
 from recon.errors import MappingError
 from recon.mapping.ground import GroundSurface
+from recon.mapping.log_odds import log_odds
 from recon.settings import Settings
 from recon.structures import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
 from recon.structures.arrays import Bool, Float64
@@ -113,8 +113,8 @@ def flatten(
     s = settings
     hit = (height >= s.min_height_m) & (height <= s.max_height_m) & (voxels.log_odds > 0)
     low_air = (height >= 0) & (height <= s.free_height_m)
-    full = voxels.log_odds >= _log_odds(s.occupied_probability)
-    empty = voxels.log_odds <= _log_odds(s.free_probability)
+    full = voxels.log_odds >= log_odds(s.occupied_probability)
+    empty = voxels.log_odds <= log_odds(s.free_probability)
     found = _Found(
         blocked=any_in(hit & full, s.min_voxels),
         seen_through=any_in(empty & low_air),
@@ -143,8 +143,8 @@ def drop_undecided(voxels: OccupancyVoxels, settings: GridSettings) -> Occupancy
     Programs that read an OctoMap call everything above 0.5 occupied, and the rest free: a voxel
     that a single uncertain ray touched would be either.
     """
-    full = voxels.log_odds >= _log_odds(settings.occupied_probability)
-    empty = voxels.log_odds <= _log_odds(settings.free_probability)
+    full = voxels.log_odds >= log_odds(settings.occupied_probability)
+    empty = voxels.log_odds <= log_odds(settings.free_probability)
     known = full | empty
     return OccupancyVoxels(voxels.keys[known], voxels.log_odds[known], voxels.resolution_m)
 
@@ -171,7 +171,3 @@ def _without_small_blobs(blocked: Bool, least: int) -> Bool:
     )
     large = stats[:, cv2.CC_STAT_AREA] >= least
     return np.asarray(blocked & large[labels])
-
-
-def _log_odds(probability: float) -> float:
-    return math.log(probability / (1.0 - probability))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, Final
 
 import numpy as np
@@ -11,6 +10,7 @@ from pydantic import Field
 
 from recon.errors import MappingError
 from recon.kernels import clamped, raycast, voxels
+from recon.mapping.log_odds import log_odds
 from recon.mapping.occupancy_part import OccupancyPart
 from recon.mapping.surface_points import points_of, sum_points
 from recon.settings import Settings
@@ -101,13 +101,14 @@ class OccupancyBuilder:
             MappingError: The cloud is not in camera axes, or a point or pose is not finite or
                 too far away.
         """
-        _check(cloud, T_world_camera, self._settings.resolution_m)
+        check_camera_cloud(cloud)
+        _check_pose(T_world_camera, self._settings.resolution_m)
         rays = self._rays(cloud, self._T_map_world @ T_world_camera)
         s = self._settings
         self._evidence = raycast.cast_rays(self._evidence, rays, s.spread_sigmas)
         if s.thin_surfaces:
             self._points = voxels.add_points(self._points, _hits(rays), 1.0, 0)
-        low, high = _log_odds(s.min_probability), _log_odds(s.max_probability)
+        low, high = log_odds(s.min_probability), log_odds(s.max_probability)
         self._map = clamped.add_evidence(self._map, self._evidence, low, high)
 
     def voxels(self) -> OccupancyVoxels:
@@ -142,11 +143,9 @@ class OccupancyBuilder:
         s = self._settings
         T = T_map_camera.copy()
         T[:3] /= s.resolution_m
-        n = len(cloud)
         ends, values = raycast.measure_points(
             cloud.xyz,
-            np.zeros(n, np.float32) if cloud.sigma_m is None else cloud.sigma_m,
-            np.ones(n, np.float32) if cloud.confidence is None else cloud.confidence,
+            *sigma_and_confidence(cloud),
             T,
             s.max_range_m / s.resolution_m,
             s.free_margin_sigmas,
@@ -158,8 +157,8 @@ class OccupancyBuilder:
             ends=means,
             free=free.astype(np.float64),
             sigma=sigma.astype(np.float64),
-            hit=np.float32(_log_odds(s.hit_probability)) * confidence * hit,
-            miss=np.float32(_log_odds(s.miss_probability)) * confidence,
+            hit=np.float32(log_odds(s.hit_probability)) * confidence * hit,
+            miss=np.float32(log_odds(s.miss_probability)) * confidence,
         )
 
 
@@ -186,19 +185,34 @@ def _reduce(
     return centres + means[:, :3], means[:, 3:]
 
 
-def _log_odds(probability: float) -> float:
-    return math.log(probability / (1.0 - probability))
+def sigma_and_confidence(cloud: PointCloud) -> tuple[Float32, Float32]:
+    """Both float32 (N,); 0 m and 1 where the cloud has none."""
+    n = len(cloud)
+    return (
+        np.zeros(n, np.float32) if cloud.sigma_m is None else cloud.sigma_m,
+        np.ones(n, np.float32) if cloud.confidence is None else cloud.confidence,
+    )
 
 
-def _check(cloud: PointCloud, T_world_camera: NDArray[Any], resolution_m: float) -> None:
-    """Refuse what would silently spoil the map."""
+def check_camera_cloud(cloud: PointCloud) -> None:
+    """Refuse a cloud that would silently spoil the map.
+
+    Raises:
+        MappingError: It is not in camera axes, or a number is not finite.
+    """
     if cloud.frame != "camera":
         raise MappingError(
             "the occupancy map takes clouds in camera axes", got=cloud.frame, expected="camera"
         )
-    numbers = (cloud.xyz, T_world_camera, cloud.sigma_m, cloud.confidence)
+    numbers = (cloud.xyz, cloud.sigma_m, cloud.confidence)
     if not all(a is None or np.isfinite(a).all() for a in numbers):
-        raise MappingError("a point or pose to map is not finite")
+        raise MappingError("a point to map is not finite")
+
+
+def _check_pose(T_world_camera: NDArray[Any], resolution_m: float) -> None:
+    """Refuse a pose that would silently spoil the map."""
+    if not np.isfinite(T_world_camera).all():
+        raise MappingError("a pose to map is not finite")
     far_m = resolution_m * (voxels.KEY_LIMIT / 2)
     if np.abs(T_world_camera[:3, 3]).max() > far_m:
         raise MappingError(

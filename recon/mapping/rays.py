@@ -10,9 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from recon.errors import MappingError
 from recon.kernels import raycast, voxels
-from recon.mapping.occupancy import OccupancySettings
+from recon.mapping.occupancy import OccupancySettings, check_camera_cloud, sigma_and_confidence
 from recon.structures import PointCloud, RayCloud, RayGrain
 
 _UNITS_PER_CELL: Final = 64
@@ -41,16 +40,16 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
     Raises:
         MappingError: The cloud is not in camera axes, or a number is not finite.
     """
-    _check(cloud)
-    grain, n = ray_grain(settings), len(cloud)
+    check_camera_cloud(cloud)
+    grain = ray_grain(settings)
+    sigma_m, sure = sigma_and_confidence(cloud)
     xyz, sigma_m = raycast.limit_points(
         cloud.xyz,
-        np.zeros(n, np.float32) if cloud.sigma_m is None else cloud.sigma_m,
+        sigma_m,
         settings.max_range_m,
         _beyond_m(settings),
         settings.free_margin_sigmas,
     )
-    sure = np.ones(n, np.float32) if cloud.confidence is None else cloud.confidence
     points = voxels.VoxelPoints(
         xyz, (sure > 0).astype(np.float32), np.stack([sigma_m, sure], axis=1)
     )
@@ -71,14 +70,3 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
 def _beyond_m(settings: OccupancySettings) -> float:
     """Where points out of range are moved to: never into a cube with one that is in range."""
     return settings.max_range_m + 2 * settings.resolution_m / settings.rays_per_voxel
-
-
-def _check(cloud: PointCloud) -> None:
-    if cloud.frame != "camera":
-        raise MappingError(
-            "the occupancy map takes clouds in camera axes", got=cloud.frame, expected="camera"
-        )
-    if not all(
-        a is None or np.isfinite(a).all() for a in (cloud.xyz, cloud.sigma_m, cloud.confidence)
-    ):
-        raise MappingError("a point or pose to map is not finite")

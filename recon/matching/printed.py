@@ -10,10 +10,10 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from recon.errors import MatchingError
-from recon.matching.search import usual_ndisp
+from recon.matching.search import OddInt, usual_ndisp
 from recon.settings import Settings
 from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import Float32, Int32
@@ -25,7 +25,7 @@ _SIGMA_PX: Final = 1 / math.sqrt(12)
 class PrintedSettings(Settings):
     """Settings of the printed matcher."""
 
-    patch_px: int = Field(default=11, ge=1, le=61, description="Edge of the square patch; odd.")
+    patch_px: OddInt = Field(default=11, ge=1, le=61, description="Edge of the square patch; odd.")
     signed: bool = Field(
         default=True,
         description="Sum the differences with their signs, as Eq. 9-10 are printed; false = sum "
@@ -38,13 +38,6 @@ class PrintedSettings(Settings):
         description="Number of disparities searched, from 0. None: what the calibration says, or "
         "else a tenth of the image width, rounded up to a multiple of 16.",
     )
-
-    @field_validator("patch_px")
-    @classmethod
-    def _is_odd(cls, value: int) -> int:
-        if value % 2 == 0:
-            raise ValueError("a patch needs a pixel in its middle: an odd number")
-        return value
 
 
 class PrintedMatcher:

@@ -30,12 +30,12 @@ from recon.matching.half_size import (
     undivided,
 )
 from recon.matching.search import (
-    FITS,
     MeasuredSettings,
     MinTexture,
     OddInt,
     UniquenessPercent,
     finish,
+    rules_of,
 )
 from recon.matching.strips import StripSearch, in_strips
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
@@ -159,17 +159,7 @@ class SadMatcher:
         # The middles of the two halves lie half a radius above and below the pixel.
         lean = math.floor(s.window_slant * rows_radius / 2 + 0.5)
         search = Search(ndisp, s.min_disparity_px, radius, rows_radius, s.cost_cap, lean)
-        rules = Rules(
-            ndisp=ndisp,
-            minimum=s.min_disparity_px,
-            fit=FITS[s.subpixel],
-            texture=s.min_texture,
-            uniqueness=s.uniqueness_percent,
-            left_right=s.left_right_or_none,
-            window_pixels=s.window_px * s.window_height_px,
-            sigma_floor_px=s.sigma_floor_px,
-        )
-        return search, rules
+        return search, rules_of(s, ndisp, s.window_px * s.window_height_px)
 
 
 def _smoothed(disparity: Disparity, median_px: int) -> Disparity:

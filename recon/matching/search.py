@@ -10,14 +10,14 @@ from pydantic import AfterValidator, Field
 
 from recon.errors import MatchingError
 from recon.kernels.opposite import average_opposite
-from recon.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA, Refined, reject
+from recon.kernels.refine import EQUIANGULAR, NO_FIT, ODDS, PARABOLA, Refined, Rules, reject
 from recon.kernels.speckle import find_speckles
 from recon.matching.strips import in_strips
 from recon.settings import Settings
 from recon.structures import Disparity, Reason, RectifiedCamera
 from recon.structures.arrays import Float32
 
-FITS: Final = {"none": NO_FIT, "equiangular": EQUIANGULAR, "parabola": PARABOLA}
+_FITS: Final = {"none": NO_FIT, "equiangular": EQUIANGULAR, "parabola": PARABOLA}
 """The codes of `MeasuredSettings.subpixel`."""
 
 _SAME_SURFACE_PX: Final = 1.0
@@ -126,6 +126,30 @@ class MeasuredSettings(SearchSettings):
         le=31,
         description="Each disparity becomes the mean of the pairs of opposite neighbours, in a "
         "square of this width, that lie on its surface; odd. 1 = as measured.",
+    )
+
+
+def rules_of(
+    settings: MeasuredSettings, ndisp: int, window_pixels: int, odds: float = ODDS
+) -> Rules:
+    """What the checks ask for, by the settings.
+
+    Args:
+        settings: Of the matcher.
+        ndisp: Number of disparities searched.
+        window_pixels: As in `Rules`.
+        odds: As in `Rules`.
+    """
+    return Rules(
+        ndisp=ndisp,
+        minimum=settings.min_disparity_px,
+        fit=_FITS[settings.subpixel],
+        texture=settings.min_texture,
+        uniqueness=settings.uniqueness_percent,
+        left_right=settings.left_right_or_none,
+        window_pixels=window_pixels,
+        sigma_floor_px=settings.sigma_floor_px,
+        odds=odds,
     )
 
 

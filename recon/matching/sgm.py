@@ -21,11 +21,11 @@ from recon.kernels.path_costs import (
 )
 from recon.kernels.path_rows import Paths
 from recon.kernels.plane_minima import PARTS
-from recon.kernels.refine import REFINED_BYTES, Rules, refine_minima, refined_in
+from recon.kernels.refine import REFINED_BYTES, refine_minima, refined_in
 from recon.kernels.semi_global import band_columns, empty_scratch, scratch_bytes, semi_global_minima
 from recon.matching.gradients import texture
 from recon.matching.scratch import ResultPool, ScratchPool
-from recon.matching.search import FITS, MeasuredSettings, OddInt, finish
+from recon.matching.search import MeasuredSettings, OddInt, finish, rules_of
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
 
 _LEVELS: Final = 250
@@ -146,7 +146,9 @@ class SgmMatcher:
         s = self._settings
         ndisp = s.ndisp_within(pair.camera)
         window, descriptor, size = _window(s), _descriptor(s), pair.left.shape
-        paths, rules = _paths(s, ndisp, window.levels), _rules(s, ndisp, window.levels)
+        paths = _paths(s, ndisp, window.levels)
+        # A cost is about so many times the mean cost of a pixel.
+        rules = rules_of(s, ndisp, max(1, round(PARTS * window.levels)), _ODDS)
         results = self._results.lend(REFINED_BYTES * pair.left.size)
         refined = refined_in(results, *size)
 
@@ -211,19 +213,4 @@ def _paths(settings: SgmSettings, ndisp: int, levels: float) -> Paths:
         edge=s.edge_grey_levels,
         overlap=s.overlap_rows,
         side_overlap=_SIDE_OVERLAP,
-    )
-
-
-def _rules(settings: SgmSettings, ndisp: int, levels: float) -> Rules:
-    s = settings
-    return Rules(
-        ndisp=ndisp,
-        minimum=s.min_disparity_px,
-        fit=FITS[s.subpixel],
-        texture=s.min_texture,
-        uniqueness=s.uniqueness_percent,
-        left_right=s.left_right_or_none,
-        window_pixels=max(1, round(PARTS * levels)),
-        sigma_floor_px=s.sigma_floor_px,
-        odds=_ODDS,
     )
