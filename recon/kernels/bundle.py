@@ -1,9 +1,9 @@
-"""Poses of a few frames and points seen in them: one Gauss-Newton step of all together.
+"""Bundle adjustment: a Gauss-Newton step of the poses of a few frames and the points seen in them.
 
-The system is sparse: a point ties only the frames that see it. So each point is eliminated as
-soon as it is summed up, and what is left is a small system of the poses alone.
+The system is sparse, because a point connects only the frames that see it. So the points are
+eliminated one by one (Schur complement), which leaves a small system of the poses alone.
 
-The twins in plain numpy stand in `recon.kernels.bundle_reference`.
+The twins in plain numpy are in `recon.kernels.bundle_reference`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Float64 = NDArray[np.float64]
 
 MIN_DEPTH_M: Final = 0.1
 RIDGE: Final = 1e-9
-"""Added to diagonals, so that what nothing is known of can be solved for."""
+"""Added to the diagonals, so that the system is solvable where nothing is observed."""
 
 
 class BundleModel(NamedTuple):
@@ -47,7 +47,7 @@ class BundleModel(NamedTuple):
 
 
 class NormalEquations(NamedTuple):
-    """Blocks of the Gauss-Newton system: poses (W, 6), points (N, 3), and what ties them.
+    """Blocks of the Gauss-Newton system: poses (W, 6), points (N, 3), and between the two.
 
     A step of a pose is a translation and a rotation vector in its own axes.
     """
@@ -276,7 +276,7 @@ def _subtract(S: Float64, row: int, column: int, folded: Float64, block: Float64
 def _solve_symmetric(S: Float64, g: Float64) -> None:
     """Solve ``S x = g`` in place from the lower half of S, as L·D·Lᵀ.
 
-    A pivot that is not positive tells that the step is not to be trusted: no step is made.
+    Where a pivot is not positive the system is not positive definite, and no step is made.
     """
     size = len(g)
     for j in range(size):

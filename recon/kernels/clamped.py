@@ -1,16 +1,16 @@
-"""Log-odds in blocks of 8×8×8 voxels, kept so that parts of a drive can be put together later.
+"""Clamped log-odds in blocks of 8×8×8 voxels, such that parts of a drive can be chained later.
 
 A frame changes the log-odds of a cell by ``x → min(max(x + change, lowest), highest)``. Functions
-of this form stay of this form when one follows the other:
+of this form are closed under composition:
 
     x → min(max(x + sum, low), high)
 
-So three numbers per cell say all that a part of a drive did to it, whatever was known before it
-began; parts that are chained in order give what one long drive would have given, the clamps
-included. A sum of clamped log-odds would not: a car that was seen ten times and then, in the next
-part, looked through ten times would stay.
+So three numbers per cell describe what a part of a drive did to it, whatever was known before; and
+chaining the parts in order gives exactly what one long drive would have given, clamps included.
+Adding up clamped log-odds would not: a car that was seen ten times in one part, and looked through
+ten times in the next, would stay.
 
-The twins in plain Python stand in `recon.kernels.clamped_reference`.
+The twins in plain Python are in `recon.kernels.clamped_reference`.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class CellRows(NamedTuple):
 
 
 def make_clamped(rows: int) -> ClampedBlocks:
-    """No blocks yet, room for ``rows``."""
+    """No blocks yet, memory for ``rows``."""
     return ClampedBlocks(
         table=make_table(rows),
         keys=np.zeros(rows, np.int64),
@@ -140,7 +140,7 @@ def _chain(
     low: np.float32,
     high: np.float32,
 ) -> None:
-    """Let ``x → min(max(x + change, low), high)`` follow what was done to a cell before."""
+    """Compose what was done to a cell with ``x → min(max(x + change, low), high)``."""
     before = cells[row, cell, 0]
     if np.isnan(before):
         cells[row, cell, 0] = change
@@ -165,7 +165,7 @@ def observed_rows(blocks: ClampedBlocks) -> CellRows:
 
 
 def chain_rows(blocks: ClampedBlocks, rows: CellRows) -> ClampedBlocks:
-    """Let a later part of a drive follow: what it did to each cell is done to the map.
+    """Chain a later part of a drive: what it did to each cell is done to the map.
 
     Args:
         blocks: The map; written, or replaced by larger stores where they are full.

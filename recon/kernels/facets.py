@@ -1,8 +1,8 @@
 """Which cells the surface of the points around them crosses.
 
 Depth is uncertain, so hits of one surface scatter over several cells along the rays. The mean of
-many hits is known better than each: a plane through the points in and around a cell, precise
-points first, tells whether the surface is in this cell or in the one before or behind it.
+many hits is more precise than each: a plane through the points in and around a cell, weighted by
+their precision, tells whether the surface is in this cell or in the one before or behind it.
 
 All lengths are in cells. The twin in plain Python stands in `recon.kernels.facets_reference`.
 
@@ -23,13 +23,13 @@ from recon.kernels.voxels import EMPTY, enter_keys, find, make_table, pack_key
 
 AROUND: Final = 27
 LEAST: Final = 3
-"""Points that a plane needs; with fewer, a cell is crossed where one of them lies in it."""
+"""Points that a plane needs; with fewer, a cell counts as crossed if it holds one."""
 
 
 def crossed_cells(
     cells: NDArray[np.int32], keys: NDArray[np.int64], sums: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Fit a plane to the points in and around each cell, and see whether it crosses the cell.
+    """Fit a plane to the points in and around each cell, and test whether it crosses the cell.
 
     The normal is that of the weighted covariance of the points. The plane's distance from the
     centre of the cell is their weighted mean; points beside the normal count less, by a Gaussian

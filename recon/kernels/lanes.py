@@ -1,12 +1,11 @@
-"""Vectors of neighbouring values, for loops that the compiler does not turn into vectors itself.
+"""SIMD vectors, for loops that the compiler does not vectorise itself.
 
-A vector is `LANES` values that lie side by side in an array; what is written for one is done to
-all of them by one instruction or two. The functions here are plain numpy: that is what they mean,
-and what runs where numba is switched off. Compiled, each becomes the LLVM instruction that is
-registered for it further down, and a vector lives in a register.
+A vector holds `LANES` neighbouring values of an array. The functions here are plain numpy, which
+defines them and runs where numba is switched off. Compiled, each becomes the LLVM instructions that
+are registered for it further down, and a vector stays in a register.
 
-Arithmetic wraps around, as numpy's does. A vector is no value to keep: no function that Python
-calls takes or returns one.
+Arithmetic wraps around, as numpy's does. Vectors exist in compiled code alone: no function that
+Python calls takes or returns one.
 
 Ref: LLVM Language Reference Manual, "Vector Operations"; numba manual, "Low-level extension API".
 """
@@ -25,32 +24,32 @@ from numba.extending import lower_builtin, models, register_model, type_callable
 from numpy.typing import NDArray
 
 LANES: Final = 32
-"""Values of a vector: one register of 16-bit values, or half of one of bytes, where registers have
-512 bits; elsewhere the compiler takes several for one."""
+"""Values of a vector. In 16 bits they fill a register of 512 bits; where registers are smaller, the
+compiler uses several."""
 
 Lanes: TypeAlias = NDArray[Any]
 """uint8 or uint16 (LANES,)."""
 
 
 def load(array: NDArray[Any], at: int) -> Lanes:
-    """The values ``at`` to ``at + LANES - 1`` of a uint8 or uint16 array (n,); no check."""
+    """Values ``at`` to ``at + LANES - 1`` of a uint8 or uint16 array (n,); bounds are unchecked."""
     lanes: Lanes = array[at : at + LANES].copy()
     return lanes
 
 
 def store(array: NDArray[Any], at: int, lanes: Lanes) -> None:
-    """Write a vector to ``at`` and on; no check."""
+    """Write a vector from ``at`` on; bounds are unchecked."""
     array[at : at + LANES] = lanes
 
 
 def load_row(rows: NDArray[Any], n: int, at: int) -> Lanes:
-    """The same of row ``n`` of an array (m, n)."""
+    """`load` from row ``n`` of a C-ordered array of rows."""
     lanes: Lanes = rows[n, at : at + LANES].copy()
     return lanes
 
 
 def store_row(rows: NDArray[Any], n: int, at: int, lanes: Lanes) -> None:
-    """Write a vector to row ``n``, to ``at`` and on; no check."""
+    """`store` to row ``n`` of a C-ordered array of rows."""
     rows[n, at : at + LANES] = lanes
 
 
@@ -101,7 +100,7 @@ def where_less(a: Lanes, b: Lanes, then: Lanes, otherwise: Lanes) -> Lanes:
 
 
 def fit(lanes: Lanes, array: NDArray[Any]) -> Lanes:
-    """Bytes, as values of the kind that an array holds."""
+    """Bytes, converted to the dtype of an array."""
     return lanes.astype(array.dtype)
 
 
@@ -126,7 +125,7 @@ def spread_lowest(lanes: Lanes) -> Lanes:
 
 
 class _Vector(types.Type):  # type: ignore[misc]
-    """What numba knows of a vector: the type of its values."""
+    """Numba's type of a vector with elements of some integer type."""
 
     def __init__(self, element: types.Integer) -> None:
         self.element = element
@@ -135,7 +134,7 @@ class _Vector(types.Type):  # type: ignore[misc]
 
 @register_model(_Vector)
 class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
-    """How a vector is held: as LLVM's vector."""
+    """Represents a vector by LLVM's vector type."""
 
     def __init__(self, manager: Any, vector: _Vector) -> None:
         super().__init__(manager, vector, llvm_type(vector.element.bitwidth))
@@ -147,11 +146,11 @@ def llvm_type(bits: int, lanes: int = LANES) -> ir.VectorType:
 
 
 def compiled_as(function: Callable[..., Any], typer: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate what writes LLVM instructions for a function of vectors.
+    """Decorate a function that emits LLVM instructions in place of a function of vectors.
 
     Args:
         function: The function in plain numpy.
-        typer: Its result's type, from those of its arguments.
+        typer: Gives the type of its result, from those of its arguments.
     """
     type_callable(function)(lambda context: typer)
     return lower_builtin(function, types.VarArg(types.Any))  # type: ignore[no-any-return]
@@ -164,14 +163,14 @@ def _binary(function: Callable[..., Any], write: Callable[..., Any]) -> None:
         return a if isinstance(a, _Vector) and a == b else None
 
     type_callable(function)(lambda context: typer)
-    # For vectors alone: an operator has other meanings, which are to stay.
+    # For vectors alone: operators keep their other meanings.
     lower_builtin(function, _Vector, _Vector)(
         lambda context, builder, signature, arguments: write(builder, *arguments)
     )
 
 
 def _intrinsic(name: str) -> Callable[..., Any]:
-    """What writes LLVM's own function of two vectors."""
+    """Emits a call of one of LLVM's intrinsic functions of two vectors."""
 
     def write(builder: Any, a: Any, b: Any) -> Any:
         kind = ir.FunctionType(a.type, [a.type, a.type])
@@ -182,7 +181,7 @@ def _intrinsic(name: str) -> Callable[..., Any]:
 
 
 def _write_distance(builder: Any, a: Any, b: Any) -> Any:
-    # A difference that saturates at nought, either way round: one of the two is nought.
+    # Saturating differences in either order: one of the two is zero.
     minus = _intrinsic("usub.sat")
     return builder.or_(minus(builder, a, b), minus(builder, b, a))
 
@@ -218,13 +217,13 @@ def _write_splat(builder: Any, value: Any, lanes: int) -> Any:
 
 
 def _address(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
-    """Where the second argument points to in the first, an array, as an address of some kind."""
+    """Address, as of some type, of an element: arguments are the array and the index."""
     array = context.make_array(signature.args[0])(context, builder, arguments[0])
     return builder.bitcast(builder.gep(array.data, [arguments[1]]), kind.as_pointer())
 
 
 def address_in_row(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
-    """Where the second and third argument point to in the first, an array of rows."""
+    """Address, as of some type, of an element: arguments are the array, the row and the column."""
     rows = context.make_array(signature.args[0])(context, builder, arguments[0])
     n, at = (
         context.cast(builder, value, given, types.intp)
@@ -236,7 +235,7 @@ def address_in_row(context: Any, builder: Any, signature: Any, arguments: Any, k
 
 def type_in_row(rows: Any, n: Any, at: Any) -> Any:
     """The type of a vector in an array of rows; None = the array does not fit."""
-    # Of any other layout the address would be another one.
+    # The address is computed for a C-ordered array.
     fits = isinstance(rows, types.Array) and rows.ndim == 1 + 1 and rows.layout == "C"
     return _Vector(rows.dtype) if fits else None
 
@@ -313,7 +312,7 @@ def _narrow(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 @compiled_as(spread_lowest, lambda lanes: lanes)
 def _spread_lowest(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    # Turned by ever fewer lanes, within ever smaller parts, and never taken out of the register.
+    # A butterfly of exchanges between ever nearer lanes, which stays in registers.
     found, turn = arguments[0], LANES // 2
     while turn:
         order = [lane ^ turn for lane in range(LANES)]
@@ -323,7 +322,7 @@ def _spread_lowest(context: Any, builder: Any, signature: Any, arguments: Any) -
 
 
 def shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
-    """Lanes of two vectors: up to ``LANES - 1`` those of the first."""
+    """Lanes of two vectors in some order; ``LANES`` is the first lane of the second one."""
     return builder.shuffle_vector(a, b, ir.Constant(llvm_type(32), order))
 
 

@@ -1,4 +1,4 @@
-"""Averages of opposite neighbours: noise goes, slopes and steps stay.
+"""Averages over pairs of opposite neighbours, which keep slopes and steps.
 
 The twin in plain numpy is `recon.kernels.opposite_reference.average_opposite_reference`.
 """
@@ -22,11 +22,11 @@ def average_opposite(
     """Average each pixel of some rows with the pairs of opposite neighbours that are near it.
 
     A pair is a neighbour and its mirror image about the pixel; it counts where both are within
-    the picture, have a value, and differ from the pixel's by ``largest_step`` or less. The mean of
-    a pair is the pixel's own value on every plane, so a slope is left as it is, beside holes and
-    steps too, where a mean over whatever is there would be pulled to one side. Of the square only
-    the fields of a chessboard are asked that have the pixel's colour: noise is shared by
-    neighbours, so the others tell little more, in twice the time.
+    the picture, have a value, and differ from the pixel's by ``largest_step`` or less. On a plane
+    the mean of a pair is the pixel's own value, so slopes are preserved even beside holes and
+    steps, where a mean over all neighbours would be biased. Only the fields of a chessboard that
+    have the pixel's colour are used: the noise of neighbours is correlated, so the others would
+    add little for twice the time.
 
     Args:
         values: float32 (H, W); NaN = none.
@@ -67,9 +67,9 @@ def _add_pair(
     count: NDArray[np.float32],
 ) -> None:
     """Add one pair of neighbours of each pixel of a row. No comparison with NaN is true."""
-    nought, two = np.float32(0), np.float32(2)
+    zero, two = np.float32(0), np.float32(2)
     for x in range(row.size):
         a, b, centre = one[x], other[x], row[x]
         near = (abs(a - centre) <= step) & (abs(b - centre) <= step)
-        total[x] += a + b if near else nought
-        count[x] += two if near else nought
+        total[x] += a + b if near else zero
+        count[x] += two if near else zero

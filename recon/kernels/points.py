@@ -1,12 +1,12 @@
-"""Pixels with a disparity become points, each with its normal, in one pass over the rows.
+"""Back-projection of disparities to points with normals, in one pass over the rows.
 
 With focal length f, a plane ``n·X = 1`` is ``d + doffs = p·(u - cx) + q·(v - cy) + r`` in the
 disparity map, and ``n`` is parallel to ``(p·f, q·f, r)``. So a least-squares plane through the
-disparities of a window gives the normal without a search for neighbours, and its sign. The sums
-over a window are made down its columns first and along its rows then; all rows are straight
-loops, which the compiler turns into vector instructions.
+disparities of a window gives the normal, with its sign, without a search for neighbours. The sums
+over a window are made down its columns first, then along its rows, by loops that the compiler
+vectorises.
 
-The twin in plain numpy stands in `recon.kernels.points_reference`.
+The twin in plain numpy is `recon.kernels.points_reference.make_points_reference`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 
 MIN_SPREAD: Final = 1e-6
-"""Known pixels of a window that spread by less lie on a line: they leave the plane free to turn."""
+"""Known pixels of a window that spread by less lie on a line, and determine no plane."""
 
 _COLUMN_SUMS: Final = 5
 _WINDOW_SUMS: Final = 9
@@ -93,7 +93,7 @@ class Points(NamedTuple):
 
 
 def make_points(maps: Maps, rules: PointRules) -> Points:
-    """Points of the pixels that may become some."""
+    """Points of all pixels that the rules let through."""
     step = rules.stride
     room = int(np.count_nonzero(np.isfinite(maps.values[::step, ::step])))
     points = Points(

@@ -1,14 +1,14 @@
-"""Evidence of occupancy along rays, in blocks of 8×8×8 voxels that exist where rays went.
+"""Evidence of occupancy along rays, in blocks of 8×8×8 voxels that are allocated where rays go.
 
-A ray is walked cell by cell (Amanatides and Woo 1987). What one frame says of a cell is
-collected first, so that a thousand rays through it count once, and a hit outweighs every miss:
-OctoMap's rule (Hornung et al. 2013). Then `recon.kernels.clamped` adds the frame to the log-odds.
+A ray is traversed cell by cell (Amanatides and Woo 1987). The evidence of one frame is collected
+first, so that a thousand rays through a cell count once and a hit outweighs every miss: OctoMap's
+rule (Hornung et al. 2013). Then `recon.kernels.clamped` adds the frame to the log-odds.
 
-A measurement is not a point but a normal distribution along its ray: a cell is hit by the share
-of the distribution that lies in it, and only what lies well before it is free.
+A measurement is a normal distribution along its ray, not a point: a cell is hit by the share of the
+distribution that lies in it, and only what lies well before it is free.
 
-All lengths are in cells, but for those of the points that come in. The twins in plain Python
-stand in `recon.kernels.raycast_reference`.
+All lengths are in cells, except those of the points given. The twins in plain Python are in
+`recon.kernels.raycast_reference`.
 
 Ref: J. Amanatides and A. Woo, "A fast voxel traversal algorithm for ray tracing", Eurographics
 1987; A. Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on
@@ -35,7 +35,7 @@ _SQRT2: Final = math.sqrt(2.0)
 
 
 class Blocks(NamedTuple):
-    """Blocks of cells, one row each: what one frame says of them (evidence).
+    """The evidence of one frame: blocks of cells, one row each.
 
     Attributes:
         table: int64 (C, 2), hash from packed block index to row.
@@ -79,14 +79,14 @@ def measure_points(
     max_range: float,
     margin: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Turn points of a camera into ends of rays, and what is known of each ray.
+    """Turn points of a camera into rays: their ends, and what is known of each.
 
-    A point farther than ``max_range`` is moved along its ray to that range, and hits nothing.
+    A point farther than ``max_range`` is moved along its ray to that range and is no hit.
 
     Args:
         xyz: float32 (N, 3), camera axes, metres.
         sigma: float32 (N,), standard deviation of the depth, metres.
-        confidence: float32 (N,), handed through.
+        confidence: float32 (N,), passed through.
         T: float64 (4, 4), from camera axes in metres to cells of the map: a rotation times a scale.
         max_range: Range of a hit, in cells.
         margin: Standard deviations before a point where free space ends.
@@ -142,8 +142,8 @@ def limit_points(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Move points that are out of range along their rays to a common distance.
 
-    Their rays stay free as far as before: what a point moves, its uncertainty is made smaller
-    by, down to none. So points far apart can be averaged, for they hit nothing anyway.
+    They are no hits anyway, and at one distance they can be averaged. A ray must stay free as far
+    as before, so the uncertainty of a point shrinks by as much as it moves, down to none.
 
     Args:
         xyz: float32 (N, 3), camera axes.
@@ -179,7 +179,7 @@ def _limit_points(
 
 
 def make_blocks(rows: int) -> Blocks:
-    """No blocks yet, room for ``rows``, of whose cells nothing is said."""
+    """No blocks yet, memory for ``rows``, without evidence."""
     return Blocks(
         table=make_table(rows),
         keys=np.zeros(rows, np.int64),
@@ -230,8 +230,8 @@ def cast_rays(evidence: Blocks, rays: Rays, spread: float) -> Blocks:
 def _cast_rays(
     evidence: tuple[NDArray[Any], ...], rays: tuple[NDArray[Any], ...], start: int, spread: float
 ) -> int:
-    """Cast from ray ``start`` on; returns the first that finds no room (and may be cast again)."""
-    # Arrays are taken out of their tuples once: inside the loops that would count references.
+    """Cast from ray ``start`` on; return the first that finds no memory left, to be cast again."""
+    # Arrays are taken out of their tuples once: inside the loops numba would count references.
     table, keys, values, used = evidence
     origin, ends, frees, sigmas, hits, misses = rays
     rows = used[0]

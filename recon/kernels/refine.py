@@ -1,6 +1,6 @@
-"""From the minima of a search to disparities: sub-pixel fit, checks, how sure and how exact.
+"""From the minima of a search to disparities: checks, sub-pixel fit, confidence and sigma.
 
-Works on what any search over whole disparities leaves behind (`recon.kernels.minima.Minima`).
+Works on the result of any search over whole disparities (`recon.kernels.minima.Minima`).
 The twin in plain numpy is `recon.kernels.refine_reference.refine_minima_reference`.
 """
 
@@ -18,26 +18,26 @@ VALID, LOW_TEXTURE, AMBIGUOUS, LEFT_RIGHT, OCCLUDED, OUT_OF_RANGE, BORDER = rang
 """The codes of `recon.structures.Reason`; a test holds them equal."""
 
 NO_FIT, EQUIANGULAR, PARABOLA = range(3)
-"""Ways to place the minimum between candidates."""
+"""Sub-pixel fits of the minimum between candidates."""
 
 SIGMA_LARGEST_PX: Final = 2.0
-"""A flat minimum tells no more than this."""
+"""Standard deviation at a flat minimum; none is larger."""
 
 WRONG_PX: Final = 1.0
-"""A pixel counts as wrong from this error on; so a wrong one is off by no less."""
+"""Error from which a disparity counts as wrong; the least error of a wrong one."""
 
 ODDS: Final = 2.2
 """Odds of being right at margin 1 and a standard deviation of 1 px (see `refine_minima`)."""
 
 
 class Rules(NamedTuple):
-    """What the checks ask for.
+    """Thresholds of the checks, and what costs mean.
 
     Attributes:
         ndisp: Number of candidates.
         minimum: Disparity of candidate 0, pixels.
         fit: NO_FIT, EQUIANGULAR or PARABOLA.
-        texture: Least texture of a pixel that is kept.
+        texture: Least texture of a pixel, in the unit of the texture given.
         uniqueness: By how many per cent the second best cost must exceed the best.
         left_right: Largest difference between the two views, candidates; negative = unchecked.
         window_pixels: Number of pixels that a cost sums up.
@@ -93,18 +93,18 @@ def refine_minima(
     end: int,
     refined: Refined,
 ) -> None:
-    """Judge the minima of some rows, and measure those that stand.
+    """Check the minima of some rows, and refine those that pass.
 
     The first of these that applies is the reason of a pixel: no candidate, or one that ends at
     the border of the right picture (BORDER); too little texture (LOW_TEXTURE); the minimum at
-    an end of what was searched (OUT_OF_RANGE); the right view disagrees, and finds no pixel here
-    (OCCLUDED) or does (LEFT_RIGHT); a second best that is too good (AMBIGUOUS).
+    an end of what was searched (OUT_OF_RANGE); the right view disagrees, and none of its pixels is
+    matched here (OCCLUDED) or one is (LEFT_RIGHT); a second best that is too good (AMBIGUOUS).
 
     The sub-pixel offset is that of two equally steep lines (EQUIANGULAR, the shape of a sum of
     absolute differences) or of a parabola. The standard deviation is that of a displacement
     estimated from N pixels with gradient g and noise n, here in its least-absolute form,
     ``pi/2 · mean|n| / (mean|g| · sqrt(N))``; the cost at the vertex of the lines is N·mean|n|,
-    their slope is N·mean|g|. A floor is added (squared) for what the model leaves out.
+    their slope is N·mean|g|. A floor is added in quadrature for what the model leaves out.
 
     The confidence is the probability that the disparity is off by no more than 1 px. Its odds grow
     with the margin ``m = (second - best) / (N + best)``, the distance of the two costs in units of
@@ -112,15 +112,15 @@ def refine_minima(
     ``odds · sqrt(m / sigma³)``. The powers are rounded from a logistic regression on Middlebury
     scenes and the factor is fitted to them (`docs/evaluation.md` has the scenes held out).
 
-    The standard deviation that is told is that of a mixture of right and wrong: its square is
-    ``c·sigma² + (1 - c)·max(sigma, WRONG_PX)²``. The noise alone explains the errors on level
-    surfaces; how often windows that span a step of depth are wrong, only the confidence knows.
+    The standard deviation returned is that of a mixture of right and wrong disparities: its square
+    is ``c·sigma² + (1 - c)·max(sigma, WRONG_PX)²``. Noise alone explains the errors on smooth
+    surfaces; that windows across depth steps are often wrong only shows in the confidence.
 
     Args:
         minima: What the search found.
         texture: float32 (end - first, W), of those rows, in the unit of ``rules.texture``; NaN = no
             picture there (BORDER).
-        rules: What is asked for.
+        rules: Thresholds.
         first: First row to do.
         end: The row after the last.
         refined: Written: the rows ``first`` to ``end - 1``.
@@ -132,7 +132,7 @@ def refine_minima(
     implementation", IJCV 8, 1992 (variance).
     """
     width = minima.winner.shape[1]
-    # Of each column, with one more at either side: whether a pixel of the right view chose it.
+    # Whether a pixel of the right view chose each column; one more column at either side.
     chosen = np.empty(width + 2, np.uint8)
     apart = np.empty(width, np.int32)
     for y in range(first, end):
@@ -144,11 +144,11 @@ def refine_minima(
 
 @njit(cache=True, nogil=True)
 def reject(mask: NDArray[np.bool_], code: int, refined: Refined) -> None:
-    """Take away what was found at the pixels of a mask, in place.
+    """Invalidate the pixels of a mask, in place.
 
     Args:
         mask: bool (H, W).
-        code: The reason that they get.
+        code: The reason code that they get.
         refined: Changed.
     """
     height, width = mask.shape
@@ -193,7 +193,7 @@ def _judge(
     y: int,
     reason: NDArray[np.uint8],
 ) -> None:
-    """Write the reasons of one row: choices instead of branches, the first reason chosen last."""
+    """Write the reasons of one row; without branches, so the first reason is selected last."""
     winner, best_cost, cost_before = minima.winner[y], minima.costs[0, y], minima.costs[1, y]
     cost_after, second_cost = minima.costs[2, y], minima.costs[3, y]
     to_left, to_right = chosen, chosen[2:]
@@ -205,7 +205,7 @@ def _judge(
     for x in range(winner.size):
         close = np.int32(second_cost[x]) * np.int32(100) <= np.int32(best_cost[x]) * unique
         code = np.uint8(AMBIGUOUS) if close and unique > 0 else np.uint8(VALID)
-        # A slanted surface that is wider in the left view leaves gaps: neighbours count too.
+        # On a slanted surface that is wider in the left view matches leave gaps: neighbours count.
         seen = (to_left[x] | middle[x] | to_right[x]) != 0
         differs = np.uint8(LEFT_RIGHT) if seen else np.uint8(OCCLUDED)
         code = differs if apart[x] > largest else code
@@ -223,8 +223,8 @@ def _judge(
 def _measure(minima: Minima, rules: Rules, y: int, refined: Refined) -> None:
     """Write disparity, standard deviation and confidence of one row.
 
-    All pixels are measured, and those that do not stand are wiped out: a loop without branches, in
-    float32 alone, becomes vector instructions (and numpy's rules of division: no check for nought).
+    All pixels are computed and invalid ones overwritten: a loop without branches and in float32
+    alone is vectorised. So it needs numpy's error model, which does not check for division by zero.
     """
     winner, minimum = minima.winner[y], np.float32(rules.minimum)
     best_cost, cost_before = minima.costs[0, y], minima.costs[1, y]
@@ -232,7 +232,7 @@ def _measure(minima: Minima, rules: Rules, y: int, refined: Refined) -> None:
     values, confidences, sigmas = refined.values[y], refined.confidence[y], refined.sigma_px[y]
     reasons = refined.reason[y]
     lines, parabola = rules.fit == EQUIANGULAR, rules.fit == PARABOLA
-    nought, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
     largest, nan = np.float32(SIGMA_LARGEST_PX), np.float32(np.nan)
     variance_floor = np.float32(rules.sigma_floor_px) * np.float32(rules.sigma_floor_px)
     pixels, odds_of_one = np.float32(rules.window_pixels), np.float32(rules.odds)
@@ -243,12 +243,12 @@ def _measure(minima: Minima, rules: Rules, y: int, refined: Refined) -> None:
         slope = max(before, after) - best
         bend = before + after - best - best
         steepness = bend if parabola else slope
-        fits = (lines or parabola) and steepness > nought
+        fits = (lines or parabola) and steepness > zero
         offset = half * (before - after) / (steepness if fits else one)
-        offset = offset if fits else nought
+        offset = offset if fits else zero
 
-        vertex = max(best - half * abs(before - after), nought)
-        sloped = slope > nought
+        vertex = max(best - half * abs(before - after), zero)
+        sloped = slope > zero
         noise = noise_of_one * vertex / (slope if sloped else one)
         sigma = min(np.sqrt(variance_floor + noise * noise), largest)
         sigma = sigma if sloped else largest
@@ -256,11 +256,11 @@ def _measure(minima: Minima, rules: Rules, y: int, refined: Refined) -> None:
         margin = (second - best) / (pixels + best)
         odds = odds_of_one * np.sqrt(margin / (sigma * sigma * sigma))
         confidence = odds / (odds + one)
-        confidence = confidence if second_cost[x] != NO_COST else nought
+        confidence = confidence if second_cost[x] != NO_COST else zero
         if_wrong = max(sigma, np.float32(WRONG_PX))
         variance = confidence * (sigma * sigma) + (one - confidence) * (if_wrong * if_wrong)
 
         valid = reasons[x] == VALID
         values[x] = minimum + np.float32(winner[x]) + offset if valid else nan
-        confidences[x] = confidence if valid else nought
+        confidences[x] = confidence if valid else zero
         sigmas[x] = min(np.sqrt(variance), largest) if valid else nan

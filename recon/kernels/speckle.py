@@ -1,4 +1,4 @@
-"""Small regions of a disparity map that hang together with nothing around them."""
+"""Speckles: small connected regions of a disparity map."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 
 class _Runs(NamedTuple):
-    """Pixels of a row that hang together: run ``n`` is ``starts[n]`` to ``ends[n] - 1``.
+    """Connected pixels of a row: run ``n`` is ``starts[n]`` to ``ends[n] - 1``.
 
-    Room for as many as there are pixels; what is not used is never touched, and costs nothing.
+    There is memory for as many runs as pixels; pages that are never touched cost nothing.
 
     Attributes:
-        starts: int32 (N,), places in the flat map.
+        starts: int32 (N,), indices into the flattened map.
         ends: int32 (N,).
-        parents: int32 (N,), of the same region and not after it; its own if it is the root.
-        sizes: int32 (N,), of a root: the pixels of its region.
+        parents: int32 (N,), an earlier run of the same region, or for the root itself.
+        sizes: int32 (N,), for a root, pixels of its region.
     """
 
     starts: NDArray[np.int32]
@@ -32,7 +32,7 @@ class _Row(NamedTuple):
 
     Attributes:
         runs: int32 (W,), the run of each pixel that has a value.
-        breaks: uint8 (W,), 1 where a pixel does not go on with the run of the one before.
+        breaks: uint8 (W,), 1 where a pixel does not belong to the run of the one before.
     """
 
     runs: NDArray[np.int32]

@@ -1,4 +1,4 @@
-"""Squares of bytes, transposed in registers; as in `recon.kernels.lanes`, plain numpy says how.
+"""Transposition of square blocks of bytes in registers; plain numpy defines it (see `lanes`).
 
 Ref: as `recon.kernels.lanes`.
 """
@@ -22,15 +22,17 @@ from recon.kernels.lanes import (
 
 
 def transpose(rows: NDArray[Any], n: int, at: int, out: NDArray[Any], m: int, to: int) -> None:
-    """Write a block of `LANES` by `LANES` bytes of one array, transposed, to another; no check.
+    """Write a block of `LANES` by `LANES` bytes, transposed, to another array.
+
+    Bounds are unchecked.
 
     Args:
-        rows: uint8 (N, C); the block begins at row ``n``, column ``at``.
-        n: As said.
-        at: As said.
-        out: uint8 (M, D), written; the block begins at row ``m``, column ``to``.
-        m: As said.
-        to: As said.
+        rows: uint8 (N, C).
+        n: First row of the block.
+        at: Its first column.
+        out: uint8 (M, D), written.
+        m: First row of the transposed block.
+        to: Its first column.
     """
     out[m : m + LANES, to : to + LANES] = rows[n : n + LANES, at : at + LANES].T
 
@@ -70,8 +72,8 @@ class _Part(NamedTuple):
 
 def _write_transposed(builder: Any, block: list[Any]) -> list[Any]:
     """Transpose a square of bytes."""
-    # First the quarters of the square change places, then each half of a vector is dealt with by
-    # itself, lane by lane like a pack of cards: no instruction has to cross from one to the other.
+    # First the quarters of the square change places. Then the halves of all vectors are interleaved
+    # lane by lane, each half by itself: no instruction has to move lanes between halves.
     half = LANES // 2
     low = [*range(half), *range(LANES, LANES + half)]
     pairs = list(zip(block[:half], block[half:], strict=True))
@@ -87,7 +89,7 @@ def _write_transposed(builder: Any, block: list[Any]) -> list[Any]:
 
 
 def _write_dealt(builder: Any, part: list[Any], first: list[int], second: list[int]) -> list[Any]:
-    """Deal the vectors of one half with those of the other, until each holds one lane of all."""
+    """Interleave one half of the vectors with the other until each holds one lane of all."""
     half = len(part) // 2
     for _ in range(half.bit_length()):
         pairs = zip(part[:half], part[half:], strict=True)

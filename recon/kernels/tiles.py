@@ -1,7 +1,7 @@
-"""Which candidates are offered to the pixels of which tile of a picture.
+"""Which candidates are searched in which tile of a picture.
 
-A search at half size costs an eighth and says which disparities there are in a part of a picture.
-Only those are worth offering at full size.
+A search at half size costs an eighth and tells which disparities occur in each part of a picture.
+Only those are worth searching at full size.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 GROUP: Final = 8
-"""Candidates that are offered, or not offered, together."""
+"""Candidates that are offered or left out together."""
 
 Offer = NDArray[np.bool_]
 """bool (G,), which groups of candidates are offered."""
@@ -34,16 +34,15 @@ class Tiles(NamedTuple):
 
 
 class Support(NamedTuple):
-    """What it takes for candidates to be offered.
+    """How much support by matches at half size offers a group of candidates to a tile.
 
     Attributes:
-        margin_x: So far beside a tile its columns are looked at too, pixels.
-        margin_y: So far above and below a tile its rows are looked at too, pixels.
-        margin: A match supports the candidates that are so far from it, and nearer ones.
-        matched: Least share of the pixels looked at that are to be matched; with fewer, all
-            candidates are offered.
-        share: Least share of those matches that support a group.
-        least: Least number of matches that support a group.
+        margin_x: Columns beside a tile whose matches count too, pixels at full size.
+        margin_y: Rows above and below a tile whose matches count too, pixels at full size.
+        margin: A match supports candidates up to this far from it.
+        matched: Least share of matched pixels; with fewer, all candidates are offered.
+        share: Least share of the matches that support an offered group.
+        least: Least number of matches that support an offered group.
     """
 
     margin_x: int
@@ -55,7 +54,7 @@ class Support(NamedTuple):
 
 
 def make_tiles(shape: tuple[int, int], size: tuple[int, int], ndisp: int) -> Tiles:
-    """Tiles that are offered everything.
+    """Tiles that are offered every candidate.
 
     Args:
         shape: Rows and columns of the picture.
@@ -82,7 +81,7 @@ def offer_supported(
         halved: float32 (h, w), disparities of the pictures at half size; NaN = no match.
         minimum: Disparity of candidate 0 at full size.
         ndisp: Number of candidates at full size.
-        support: What it takes.
+        support: How much support is needed.
         first: First row of tiles to do.
         end: The row after the last.
         tiles: ``offered`` is written.
@@ -105,14 +104,14 @@ def offer_supported(
 
 @njit(cache=True, nogil=True)
 def _reach(tile: int, size: int, margin: int, halved: int) -> tuple[int, int]:
-    """First and end, at half size, of what is looked at for a tile, along one side."""
+    """Range at half size that counts for a tile, along one axis: first and one after the last."""
     start, end = tile * size - margin, (tile + 1) * size + margin
     return max(start, 0) // 2, min(end // 2, halved)
 
 
 @njit(cache=True, nogil=True)
 def _count(halved: NDArray[np.float32], minimum: int, counts: NDArray[np.int64]) -> int:
-    """Count the matches at each candidate of full size; give their number."""
+    """Count the matches at each candidate of full size; return their number."""
     matched = 0
     for y in range(halved.shape[0]):
         for x in range(halved.shape[1]):

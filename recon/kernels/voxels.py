@@ -1,12 +1,12 @@
 """A hash of voxels, and sums over the points that fall into each.
 
 Three cell indices are packed into one int64 and looked up in an open-addressing table (linear
-probing, capacity a power of two, at most half full). The table gives a row number; what is
-stored of a voxel lies in arrays under that row, in the order in which voxels were first seen, so
-the result does not depend on the hash. Tables and rows grow by doubling: adding a point costs a
-constant time on average, however large the map is.
+probing, capacity a power of two, at most half full). The table gives a row number; the data of a
+voxel are in arrays at that row, in the order in which voxels were first seen, so the result does
+not depend on the hash. Tables and arrays grow by doubling: adding a point takes constant time on
+average, however large the map is.
 
-The twins in plain Python stand in `recon.kernels.voxels_reference`.
+The twins in plain Python are in `recon.kernels.voxels_reference`.
 """
 
 from __future__ import annotations
@@ -233,7 +233,7 @@ def _add_points(
     frame: int,
     start: int,
 ) -> int:
-    """Add points from ``start`` on; returns the first that finds no room."""
+    """Add points from ``start`` on; return the first that finds no memory left."""
     table, keys, sums, information, best, frames, last, used = voxels
     xyz, weights, values = points
     columns, rows = values.shape[1], used[0]
