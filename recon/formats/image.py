@@ -1,4 +1,4 @@
-"""Pictures: PNG, JPEG, PGM, PPM and TIFF, whole or not at all."""
+"""Pictures: PNG, JPEG, PGM, PPM, BMP and TIFF, whole or not at all."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def read_image(path: StrPath) -> UInt8:
     the pixels as the sensor recorded them.
 
     Args:
-        path: PNG, JPEG, PGM, PPM or TIFF, recognised by content.
+        path: PNG, JPEG, PGM, PPM, BMP or TIFF, recognised by content.
 
     Returns:
         uint8 (H, W) where the file is grey, else (H, W, 3) RGB.

@@ -2,7 +2,7 @@
 
 Ref:
     PNG: ISO/IEC 15948, section 5 (chunks). JPEG: ITU-T T.81, annex B (markers).
-    PGM and PPM: the netpbm manual.
+    PGM and PPM: the netpbm manual. BMP: BITMAPINFOHEADER in the Windows GDI reference.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ _TIFF_STARTS: Final = (b"II*\x00", b"MM\x00*")
 _PNM_HEADER: Final = re.compile(
     rb"P([2356])(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)\s"
 )
-UNDERSTOOD: Final = "PNG, JPEG, PGM, PPM or TIFF"
+_BMP_HEADER: Final = struct.Struct("<2xI4xI4xiiHHII")
+UNDERSTOOD: Final = "PNG, JPEG, PGM, PPM, BMP or TIFF"
 
 
 def check_image_bytes(content: bytes, path: StrPath) -> None:
@@ -42,6 +43,8 @@ def check_image_bytes(content: bytes, path: StrPath) -> None:
         _check_jpeg(content, path)
     elif content[:1] == b"P" and content[1:2] in b"2356":
         _check_pnm(content, path)
+    elif content.startswith(b"BM"):
+        _check_bmp(content, path)
     elif not is_tiff(content):
         raise FormatError("not an image", where=path, expected=UNDERSTOOD)
 
@@ -98,3 +101,16 @@ def _check_pnm(content: bytes, path: StrPath) -> None:
         found = (len(content) - header.end()) // (2 if top > 255 else 1)
     if found < samples:
         raise _truncated("PGM/PPM", path, f"{found} of {samples} samples")
+
+
+def _check_bmp(content: bytes, path: StrPath) -> None:
+    """Rows are padded to four bytes; the sizes that a header declares may be 0, so count them."""
+    if len(content) < _BMP_HEADER.size:
+        raise _truncated("BMP", path, f"the file ends after {len(content)} bytes, in its header")
+    header = _BMP_HEADER.unpack_from(content)
+    _, offset, width, height, _, bits, compression, stored = header
+    rows = (width * bits + 31) // 32 * 4 * abs(height)
+    run_lengths = compression in {1, 2}
+    needed = offset + (stored if run_lengths else rows)
+    if len(content) < needed:
+        raise _truncated("BMP", path, f"{len(content)} of {needed} bytes")

@@ -15,6 +15,8 @@ from recon.structures.arrays import Float64
 # Files print rotations with four to seven digits; what is further off is no rotation.
 _RIGID_TOLERANCE = 1e-3
 _UNIT_TOLERANCE = 1e-2
+# Geocentric and map coordinates stay under 1e7 m; a number beyond is none of a place.
+_FARTHEST_M = 1e8
 
 
 def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
@@ -109,6 +111,7 @@ def _from_kitti(
             got=f"{len(table)} poses",
             expected=f"{len(times)}",
         )
+    _check_positions(table[:, 3::4], lines, path)
     poses = np.zeros((len(table), 4, 4))
     poses[:, :3, :] = table.reshape(-1, 3, 4)
     poses[:, 3, 3] = 1.0
@@ -118,6 +121,7 @@ def _from_kitti(
 
 
 def _from_tum(table: Float64, lines: list[int], path: StrPath) -> Trajectory:
+    _check_positions(table[:, 1:4], lines, path)
     norms = np.linalg.norm(table[:, 4:], axis=1)
     for norm, line in zip(norms, lines, strict=True):
         if abs(norm - 1) > _UNIT_TOLERANCE:
@@ -130,6 +134,18 @@ def _from_tum(table: Float64, lines: list[int], path: StrPath) -> Trajectory:
         raise FormatError("time runs backwards", where=f"{path}:{line}")
     poses = [make_transform(rotation_from_quaternion(row[4:]), row[1:4]) for row in table]
     return Trajectory(np.stack(poses), table[:, 0].copy())
+
+
+def _check_positions(xyz_m: Float64, lines: list[int], path: StrPath) -> None:
+    far_m = np.abs(xyz_m).max(axis=1)
+    worst = int(np.argmax(far_m))
+    if far_m[worst] > _FARTHEST_M:
+        raise FormatError(
+            "position is farther off than any on Earth",
+            where=f"{path}:{lines[worst]}",
+            got=f"{far_m[worst]:.3g} m",
+            expected=f"at most {_FARTHEST_M:.0e} m",
+        )
 
 
 def _check_rotation(rotation: Float64, where: str) -> None:

@@ -44,7 +44,8 @@ def find_picture_faults(sample: Sample, settings: AuditSettings) -> Iterator[Fin
             "black",
             True,
             f"the {_SIDES[side]} camera shows nothing: its pictures are even, at grey level "
-            f"{mean:.0f} of 255; check its cable, its lens cap and its exposure",
+            f"{mean:.0f} of 255; check its cable, its lens cap and its exposure "
+            "(16-bit images must fill their range)",
         )
     yield from _find_blur(sample, settings)
     gains = np.concatenate([np.zeros(0), *sample.gains])

@@ -26,6 +26,8 @@ from recon.structures.arrays import Float64
 
 ReferenceFrame = Literal["camera", "map"]
 _PATH = "trajectory_tum.txt"
+# Half of either cloud near the other is a fit, however bad; a tenth of both is none.
+_FITS, _HARDLY_MEETS = 0.5, 0.1
 
 
 @dataclass(frozen=True)
@@ -104,10 +106,41 @@ def run_evaluate_map(
         found |= fitted
     by_threshold = [plain(evaluate_map(cloud, reference, limit)) for limit in files.thresholds_m]
     found |= _in_reach(cloud, reference, path, by_threshold)
-    summary = {**by_threshold[0], **found, "by_threshold": by_threshold, "warnings": []}
+    doubt = _doubt(estimate, files, cloud, reference, by_threshold[0])
+    warnings = [] if doubt is None else [doubt]
+    summary = {**by_threshold[0], **found, "by_threshold": by_threshold, "warnings": warnings}
     if out is not None:
         _write(MapComparison(files, cloud, reference, summary), out, present)
     return summary
+
+
+def _doubt(
+    estimate: _Estimate,
+    files: MapFiles,
+    cloud: PointCloud,
+    reference: PointCloud,
+    figures: dict[str, Any],
+) -> str | None:
+    """Whether the two lie in different axes, or far apart: figures of that say nothing."""
+    best = max(figures["precision"], figures["recall"])
+    if best >= _FITS:
+        return None
+    T = estimate.T_map_world
+    if T is not None and files.align_to is None and not files.icp:
+        name, T_other = ("map", T) if files.frame == "camera" else ("camera", invert(T))
+        moved = transform_cloud(cloud, T_other, frame=cloud.frame)
+        f_score = evaluate_map(moved, reference, figures["threshold_m"]).f_score
+        if f_score > max(2 * figures["f_score"], _HARDLY_MEETS):
+            return (
+                f"the reference seems to be in the axes of the {name}: there F would be "
+                f"{f_score:.2f}; use --reference-frame {name}"
+            )
+    if best >= _HARDLY_MEETS:
+        return None
+    return (
+        f"map and reference hardly meet: the median distance is {figures['median_m']:.3g} m; "
+        "check --reference-frame, or align them with --align-to or --align icp"
+    )
 
 
 def _in_reach(

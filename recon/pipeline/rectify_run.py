@@ -156,7 +156,9 @@ def _by_file(options: RectifyOptions, config: ReconConfig, first: StereoPair) ->
     rig = read_calibration(path or "", width, height, metres_per_unit=options.metres_per_unit)
     if not isinstance(rig, StereoCalibration):
         raise CalibrationError(
-            "the calibration is one of pictures that are rectified already", where=path
+            "the calibration is one of pictures that are rectified already",
+            where=path,
+            hint="nothing is left to do: recon pair and recon map take them as they are",
         )
     rectifier = Rectifier(rig, config.rectification)
     turns, camera = plan_turns(rig, config.rectification), rectifier.camera

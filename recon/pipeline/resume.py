@@ -18,7 +18,7 @@ from recon.pipeline.checkpoint import quick_fingerprint
 from recon.pipeline.config import ReconConfig, load_config
 from recon.pipeline.machine import versions
 from recon.pipeline.memory import memory_overrides
-from recon.pipeline.run_directory import STARTED, RunDirectory, state_folder
+from recon.pipeline.run_directory import RECORD, STARTED, RunDirectory, state_folder
 from recon.sources import StereoSource, open_source
 from recon.structures import Trajectory
 
@@ -32,6 +32,7 @@ _OTHER: Final = {
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _MEMORY: Final = "memory"
 _NOTHING: Final = "there is no unfinished run to resume"
+_START_ANEW: Final = "start it without --resume"
 
 
 @dataclass(frozen=True)
@@ -214,9 +215,11 @@ def read_started(folder: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise OutputError(_NOTHING, where=folder, hint="start it without --resume") from error
+        finished = (folder / RECORD).is_file()
+        hint = "it is finished; without --resume it runs again" if finished else _START_ANEW
+        raise OutputError(_NOTHING, where=folder, hint=hint) from error
     if not isinstance(content, dict):
-        raise OutputError(_NOTHING, where=folder, hint="start it without --resume")
+        raise OutputError(_NOTHING, where=folder, hint=_START_ANEW)
     return content
 
 

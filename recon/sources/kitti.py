@@ -50,7 +50,7 @@ def open_kitti(
 
     Args:
         folder: The folder of the drive.
-        settings: Perhaps name another calibration.
+        settings: Perhaps name another calibration, or a rate in place of times.
         cameras: (0, 1) for the grey, (2, 3) for the colour pair; None = grey where there is one.
 
     Raises:
@@ -64,9 +64,10 @@ def open_kitti(
         raise SourceError("folder does not exist", where=path)
     pair = cameras or choose_cameras(path, "image_{}")
     pictures = list_pairs(*(path / f"image_{camera}" for camera in pair))
-    times = read_times(path / "times.txt", len(pictures))
-    rig, calibration_files = _read_rig(path, settings or SourceSettings(), pair, pictures[0][0])
-    texts = (*calibration_files, path / "times.txt", _find_poses(path))
+    settings = settings or SourceSettings()
+    times, time_files = _read_times(path, len(pictures), settings)
+    rig, calibration_files = _read_rig(path, settings, pair, pictures[0][0])
+    texts = (*calibration_files, *time_files, _find_poses(path))
     return PictureSource(
         name=path.resolve().name,
         description=f"KITTI odometry drive, image_{pair[0]} and image_{pair[1]}",
@@ -133,6 +134,23 @@ def _names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir() if is_picture(path)}
 
 
+def _read_times(
+    folder: Path, frames: int, settings: SourceSettings
+) -> tuple[Float64, tuple[Path, ...]]:
+    """Seconds of each frame, and the file that tells them; none where a rate is given."""
+    if settings.rate_hz is not None:
+        return np.arange(frames) / settings.rate_hz, ()
+    path = folder / "times.txt"
+    if not path.exists():
+        raise SourceError(
+            "times are missing",
+            where=path,
+            hint="write the time of each frame in seconds, one per line, or give the frames per "
+            "second with --set source.rate_hz=",
+        )
+    return read_times(path, frames), (path,)
+
+
 def _read_rig(
     folder: Path, settings: SourceSettings, cameras: tuple[int, int], picture: Path
 ) -> tuple[Rig, tuple[Path, ...]]:
@@ -141,7 +159,9 @@ def _read_rig(
     if settings.calibration is not None:
         return read_rig(settings, folder, size)
     if not path.exists():
-        raise SourceError("calibration is missing", where=path)
+        raise SourceError(
+            "calibration is missing", where=path, hint="name a file with --calib FILE"
+        )
     return read_kitti_calib(path, *size, cameras), (path,)
 
 

@@ -11,8 +11,8 @@ from typing import Final
 
 from recon.errors import SourceError
 from recon.sources.pairing import natural_key
+from recon.sources.pictures import PICTURES
 
-_PICTURES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 _NUMBER: Final = re.compile(r"\d+")
 
 Key = tuple[object, ...]
@@ -79,12 +79,12 @@ def list_pictures(where: str | Path) -> list[Path]:
         if folder.is_dir()
         else (Path(name) for name in glob.glob(str(where), recursive=True))  # noqa: PTH207
     )
-    pictures = [path for path in found if path.suffix.lower() in _PICTURES and path.is_file()]
+    pictures = [path for path in found if path.suffix.lower() in PICTURES and path.is_file()]
     if not pictures:
         raise SourceError(
             "no pictures there",
             where=where,
-            expected=", ".join(sorted(_PICTURES)),
+            expected=", ".join(sorted(PICTURES)),
             hint='put patterns in quotes: "left*.png"',
         )
     return sorted(pictures, key=lambda path: natural_key(path.name))

@@ -16,7 +16,7 @@ from recon.sources.pairing import natural_key
 from recon.structures import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
 from recon.structures.arrays import Float64, UInt8
 
-PICTURES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff"})
+PICTURES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,7 @@ def read_times(path: Path, frames: int) -> Float64:
         FormatError: A line is no number, or time runs backwards.
     """
     if not path.exists():
-        raise SourceError(
-            "times are missing", where=path, hint="write one line per frame: its time in seconds"
-        )
+        raise SourceError("file does not exist", where=path)
     table, lines = read_table(path, (1,))
     times: Float64 = table[:frames, 0].copy()
     if len(times) < frames:

@@ -98,6 +98,19 @@ def test_a_truncated_picture_is_refused_wherever_it_was_cut(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("shape", [(16, 18), (16, 18, 3)])
+def test_a_bmp_is_read_whole_or_not_at_all(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    pixels = picture(*shape)
+    content = cv2.imencode(".bmp", pixels if pixels.ndim == 2 else pixels[:, :, ::-1])[1].tobytes()
+    path = tmp_path / "a.bmp"
+    path.write_bytes(content)
+    np.testing.assert_array_equal(read_image(path), pixels)
+    for cut in (1, 40, len(content) - 30):
+        path.write_bytes(content[:-cut])
+        with pytest.raises(FormatError, match=r"a\.bmp: BMP image is truncated"):
+            read_image(path)
+
+
 @settings(max_examples=40, deadline=None)
 @given(cut=st.integers(1, 400), suffix=st.sampled_from([".png", ".jpg"]))
 def test_no_cut_passes_unseen(
@@ -148,12 +161,14 @@ def test_pgm_is_read_binary_and_ascii_with_comments(tmp_path: Path, content: byt
     [
         (None, "file does not exist"),
         (b"", "file is empty"),
-        (b"hello, I am text", r"not an image \(expected PNG, JPEG, PGM, PPM or TIFF\)"),
+        (b"hello, I am text", r"not an image \(expected PNG, JPEG, PGM, PPM, BMP or TIFF\)"),
         (b"\x89PNG\r\n\x1a\n", "PNG image is truncated"),
         (b"\xff\xd8\xff\xe0", "JPEG image is truncated"),
         (b"P5\n4 4\n255\nabc", r"PGM/PPM image is truncated or damaged \(got 3 of 16 samples\)"),
         (b"P2\n2 2\n255\n1 2 3\n", r"got 3 of 4 samples"),
         (b"P5\nfour", "no readable header"),
+        (b"BM", "BMP image is truncated"),
+        (b"BM" + bytes(52), "image cannot be decoded"),
         (b"II*\x00garbage", "image cannot be decoded"),
     ],
 )

@@ -145,3 +145,13 @@ def test_real_drives_have_their_published_length(
     trajectory = read_trajectory(recon_data / "driven" / drive / "poses.txt")
     assert len(trajectory) == frames
     assert abs(trajectory.path_length_m - length_m) < 1
+
+
+@pytest.mark.parametrize(
+    "line", ["1 0 0 1e30 0 1 0 0 0 0 1 0", "0.5 0 -1e30 0 0 0 0 1"], ids=["kitti", "tum"]
+)
+def test_a_place_that_is_none_on_earth_is_refused(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "path.txt"
+    path.write_text(line + "\n")
+    with pytest.raises(FormatError, match=r"path\.txt:1: position .*got 1e\+30 m"):
+        read_trajectory(path)

@@ -40,13 +40,26 @@ def test_a_run_equals_itself_in_either_frame(run: Path, inside: str, frame: str)
     reference = run.parent / f"in_{frame}.ply"
     figures = run_evaluate_map(MapFiles(run / inside, reference, frame=frame))
     assert figures["f_score"] == 1.0
+    assert figures["warnings"] == []
     # Both clouds are thinned on grids that start elsewhere, after a rotation of float32 points.
     assert 0.0 <= figures["p95_m"] < 0.15
 
 
-def test_the_wrong_frame_does_not_fit(run: Path) -> None:
-    figures = run_evaluate_map(MapFiles(run, run.parent / "in_map.ply", frame="camera"))
+@pytest.mark.parametrize(("right", "wrong"), [("map", "camera"), ("camera", "map")])
+def test_the_wrong_frame_does_not_fit_and_the_right_one_is_named(
+    run: Path, right: str, wrong: str
+) -> None:
+    figures = run_evaluate_map(MapFiles(run, run.parent / f"in_{right}.ply", frame=wrong))
     assert figures["f_score"] < 0.5
+    (doubt,) = figures["warnings"]
+    assert f"--reference-frame {right}" in doubt
+
+
+def test_clouds_that_do_not_meet_are_said_not_to(run: Path) -> None:
+    reference = read_ply(run.parent / "in_camera.ply")
+    write_ply(run.parent / "far.ply", replace(reference, xyz=reference.xyz + np.float32(50)))
+    (doubt,) = run_evaluate_map(MapFiles(run, run.parent / "far.ply"))["warnings"]
+    assert "hardly meet" in doubt
 
 
 def test_a_cloud_of_no_run_is_taken_as_it_is(run: Path) -> None:

@@ -11,6 +11,7 @@ from recon.formats.image import write_image
 from recon.formats.trajectory import read_kitti_poses
 from recon.sources.kitti import open_kitti
 from recon.sources.protocol import StereoSource
+from recon.sources.settings import SourceSettings
 
 CALIB = {
     0: "700 0 16 0 0 700 8 0 0 0 1 0",
@@ -151,13 +152,13 @@ def empty_both(folder: Path) -> None:
         (empty("image_1"), SourceError, r"image_1/000000\.png: picture is missing"),
         (empty_both, SourceError, "image_0: folder holds no pictures"),
         (drop_folder("image_1"), SourceError, "folder of the other camera is missing.*image_1"),
-        (remove("calib.txt"), SourceError, r"calib\.txt: calibration is missing"),
+        (remove("calib.txt"), SourceError, r"calib\.txt: calibration is missing; .*--calib"),
         (write("calib.txt", f"P0: {CALIB[0]}\n"), FormatError, r"calib\.txt: .*has no P1"),
         (write("calib.txt", f"P0: {CALIB[0]}\nP1: {CALIB[0]}\n"), CalibrationError,
          r"calib\.txt: baseline is zero"),
         (write("calib.txt", f"P0: {CALIB[1]}\nP1: {CALIB[0]}\n"), CalibrationError,
          r"calib\.txt: baseline is negative.*swapped"),
-        (remove("times.txt"), SourceError, r"times\.txt: times are missing"),
+        (remove("times.txt"), SourceError, r"times\.txt: times are missing; .*source\.rate_hz="),
         (write("times.txt", "0\n0.1\n"), SourceError,
          r"times\.txt: fewer times than pictures \(got 2 times, expected 3\)"),
         (write("times.txt", "0\n0.2\n0.1\n"), FormatError, r"times\.txt:3: time runs backwards"),
@@ -179,6 +180,14 @@ def test_a_spoiled_drive_is_refused_before_the_run_with_one_line_that_names_the_
         open_kitti(folder)
     assert "\n" not in str(caught.value)
     assert str(tmp_path) in str(caught.value)
+
+
+def test_a_rate_stands_in_for_times(tmp_path: Path) -> None:
+    folder = make_drive(tmp_path)
+    (folder / "times.txt").unlink()
+    source = open_kitti(folder, SourceSettings(rate_hz=4.0))
+    assert [pair.timestamp_s for pair in source] == [0.0, 0.25, 0.5]
+    assert not any(file.name == "times.txt" for file in source.files)
 
 
 @pytest.mark.parametrize("name", ["image_0/000002.png", "image_1/000001.png"])
