@@ -53,7 +53,7 @@ def _compact(vertices: Float32, faces: Int32) -> tuple[Float32, Int32]:
     if len(faces) == 0:
         raise MeshingError(
             "trimming left no face of the surface",
-            hint="the points may be too sparse: raise max_distance_spacings or use fewer filters",
+            hint="raise mesh.max_depth or mesh.max_distance_spacings, or filter less",
         )
     used, renumbered = np.unique(faces, return_inverse=True)
     return vertices[used], renumbered.reshape(-1, 3).astype(np.int32)
