@@ -36,12 +36,12 @@ class EdgeSettings(Settings):
 def remove_flying_edges(disparity: Disparity, settings: EdgeSettings) -> Disparity:
     """Drop the pixels that too few of their neighbours could share a surface with.
 
-    Depth is blind to what is noise far away; disparity is not, so the test is made there. A
-    surface that both cameras see changes by less than ``max_gradient`` pixels per pixel (the
-    disparity gradient limit); a neighbour within that cone supports the centre. On a clean step
-    each side keeps half of its window, on a convex corner a third, while the mixed pixels on the
-    ramp between the sides keep little more than their own column. Pixels without a disparity
-    support nobody; outside the picture the border is mirrored.
+    The noise of depth grows with distance, that of disparity does not, so the test is on
+    disparities. A surface that both cameras see changes by less than ``max_gradient`` pixels per
+    pixel (the disparity gradient limit); a neighbour within that cone supports the centre. At a
+    clean step each side keeps half of its window, at a convex corner a third, while the mixed
+    pixels on the ramp between the sides keep little more than their own column. Pixels without a
+    disparity support none; outside the picture the border is mirrored.
 
     Args:
         disparity: What a matcher found.

@@ -1,4 +1,4 @@
-"""Loop closure: recognise a place, prove it by geometry, bend the path so that it closes."""
+"""Loop closure: recognise a place, verify it by geometry, correct the path."""
 
 from recon.loops.settings import LoopSettings
 

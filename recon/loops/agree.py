@@ -1,4 +1,4 @@
-"""Which loops their neighbours confirm."""
+"""Which loops are confirmed by neighbouring loops."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ Poses: TypeAlias = Mapping[int, tuple[Float64, float]]
 """For each keyframe its pose by odometry, and the path up to it."""
 
 ALIKE: Final = Drift(0.3, np.deg2rad(1.0))
-"""Standard deviation of a verified loop that drift is compared with: small, and never nothing."""
+"""Standard deviation of a verified loop, added to the drift: small, but never zero."""
 _MAJORITY: Final = 2  # keyframes that confirm a loop, for each that contradicts it
 
 
 def agreeing_loops(loops: Sequence[Loop], poses: Poses, settings: LoopSettings) -> list[Loop]:
     """The loops that enough others confirm, and few contradict.
 
-    Two loops and the odometry between their ends make a ring that must close within the drift
-    over its two ways. A false match would have to be wrong in the same way time after time; and
-    where a row of alike houses makes it so, the right matches nearby contradict it, and it them:
-    what has no clear majority is left.
+    Two loops and the odometry between their ends form a cycle that must close within the drift
+    over its two odometry sections. False loops would have to be wrong in the same way several
+    times. Where a row of similar houses makes them so, right loops nearby contradict them: without
+    a clear majority none is accepted.
 
     Args:
         loops: Verified loops.
@@ -41,7 +41,7 @@ def agreeing_loops(loops: Sequence[Loop], poses: Poses, settings: LoopSettings) 
         near = np.flatnonzero(lasts_m <= settings.agree_m)
         rings = {k: _closes(loop, loops[k], poses, settings) for k in near.tolist()}
         against = {loops[k].last for k, closes in rings.items() if not closes}
-        # Loops to elsewhere on the path may contradict, but over such a way all too easily agree.
+        # Loops to elsewhere on the path may contradict, but over that distance agree too easily.
         same = {loops[k].last for k, closes in rings.items() if firsts_m[k] <= settings.agree_m}
         if len(same - against) >= max(settings.min_agreeing, _MAJORITY * len(against)):
             agreeing.append(loop)
@@ -49,7 +49,7 @@ def agreeing_loops(loops: Sequence[Loop], poses: Poses, settings: LoopSettings) 
 
 
 def _closes(one: Loop, other: Loop, poses: Poses, settings: LoopSettings) -> bool:
-    """Whether two loops tell the same, as far as odometry can tell."""
+    """Whether two loops agree within the drift of the odometry between them."""
     T_lasts, lasts_m = _between(one.last, other.last, poses)
     T_firsts, firsts_m = _between(one.first, other.first, poses)
     ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)

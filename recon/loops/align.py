@@ -1,4 +1,4 @@
-"""The motion between two stereo frames from points that both see, using both views alike."""
+"""The motion between two stereo frames from points that both see, symmetric in the two."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Alignment:
 def locate(
     points: Float64, uv: Float64, camera: RectifiedCamera, settings: VerifySettings
 ) -> Float64 | None:
-    """Where a camera stands that sees known points: ``T_points_camera``, or None.
+    """Pose of a camera that sees known points, ``T_points_camera``; None = too few agree.
 
     Ref:
         Fischler and Bolles, "Random sample consensus", CACM 1981.
@@ -75,7 +75,7 @@ def locate(
     if not found or inliers is None or len(inliers) < settings.min_inliers:
         return None
     among = inliers.reshape(-1)
-    # RANSAC's own pose is a closed-form fit that one far point can throw: refit to the set.
+    # RANSAC's own pose is a closed-form fit that one far point can throw off: refit to the set.
     rotation, translation = cv2.solvePnPRefineLM(
         points[among], uv[among], camera.matrix, None, *_start(points, uv, among, camera)
     )
@@ -86,14 +86,14 @@ def locate(
 def refine(
     first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCamera, s: VerifySettings
 ) -> Alignment:
-    """The motion of least robust misfit of columns, rows and disparities in both frames.
+    """Fit the motion to columns, rows and disparities in both frames, with Cauchy weights.
 
     Args:
-        first: The matches in the one frame.
-        last: The same in the other.
-        T_first_last: float64 (4, 4), near the motion.
-        camera: Of both.
-        s: Standard deviations, and when a match agrees.
+        first: The matches in the earlier frame.
+        last: The same in the later frame.
+        T_first_last: float64 (4, 4), initial motion.
+        camera: Of both frames.
+        s: Standard deviations, and the inlier limit.
     """
     T = T_first_last
     for _ in range(_STEPS):
@@ -109,7 +109,7 @@ def refine(
 def agreement(
     first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCamera, s: VerifySettings
 ) -> Bool:
-    """Matches (N,) whose reprojection is within the limit in both frames."""
+    """bool (N,), matches whose reprojection error is within the limit in both frames."""
     agree = np.ones(len(first.xyz), np.bool_)
     for T, points, seen in (
         (T_first_last, last.xyz, first.uvd),
@@ -124,7 +124,7 @@ def agreement(
 def _start(
     points: Float64, uv: Float64, among: NDArray[np.int32], camera: RectifiedCamera
 ) -> tuple[Float64, Float64]:
-    """A rough pose of a set that agrees."""
+    """An initial pose from the inliers."""
     _, rotation, translation = cv2.solvePnP(
         points[among], uv[among], camera.matrix, None, flags=cv2.SOLVEPNP_SQPNP
     )
@@ -136,10 +136,10 @@ def _normal_equations(
 ) -> tuple[Float64, Float64]:
     """Gauss-Newton's matrix (6, 6) and gradient (6,) for a step in the axes of ``last``."""
     H, g = np.zeros((6, 6)), np.zeros(6)
-    # What the first frame sees of the last one's points: they move with the step.
+    # Points of the last frame, seen by the first: they move with the step.
     moved = apply(T, last.xyz)
     turn = T[:3, :3] @ step_jacobian(last.xyz)
-    # What the last frame sees of the first one's points: they move against it.
+    # Points of the first frame, seen by the last: they move against it.
     back = apply(invert(T), first.xyz)
     for xyz, d_xyz, seen in ((moved, turn, first.uvd), (back, -step_jacobian(back), last.uvd)):
         r, J = _residuals(xyz, d_xyz, seen, camera, s)
@@ -152,7 +152,7 @@ def _normal_equations(
 def _residuals(
     xyz: Float64, d_xyz: Float64, seen: Float64, camera: RectifiedCamera, s: VerifySettings
 ) -> tuple[Float64, Float64]:
-    """Misfits (N, 3) in standard deviations and their derivatives (N, 3, 6); 0 behind a camera."""
+    """Whitened residuals (N, 3) and their derivatives (N, 3, 6); 0 for points behind a camera."""
     sigma = np.array([s.sigma_uv_px, s.sigma_uv_px, s.sigma_d_px])
     front = xyz[:, 2] > 0.1
     z = np.where(front, xyz[:, 2], 1.0)

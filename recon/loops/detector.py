@@ -1,4 +1,4 @@
-"""Looks for loops while a drive goes on."""
+"""Detection of loops during a drive."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from recon.structures import Disparity, RectifiedPair
 from recon.structures.arrays import Float64
 
 CONTRADICTED: Final = "odometry contradicts"
-"""Why a loop is refused whose motion odometry cannot have missed by so much."""
+"""Why a loop is refused that differs from odometry by more than its drift explains."""
 
 
 @dataclass(frozen=True, eq=False)
 class StoredKeyframe:
-    """A keyframe, where odometry saw it, and what was found there.
+    """A keyframe with its pose and the result of its search for loops.
 
     Attributes:
-        keyframe: Features and shape.
+        keyframe: Features and coarse disparities.
         T_world_camera: float64 (4, 4), by odometry.
-        path_m: Path up to it, as `doubtful_path` counts it.
+        path_m: Path up to it, by `doubtful_path`.
         loops: Verified loops that end in it.
         refused: Why other candidates were refused.
     """
@@ -44,7 +44,7 @@ class StoredKeyframe:
 
 @runtime_checkable
 class KeyframeStore(Protocol):
-    """Keeps keyframes out of the detector's memory."""
+    """Where the detector keeps keyframes, in memory or on disk."""
 
     def put(self, stored: StoredKeyframe) -> None:
         """Keep a keyframe."""
@@ -56,7 +56,7 @@ class KeyframeStore(Protocol):
 
 
 class KeyframeMemory:
-    """Keeps keyframes in memory: for short drives."""
+    """Keeps keyframes in memory, for short drives."""
 
     def __init__(self) -> None:
         self._kept: dict[int, StoredKeyframe] = {}
@@ -77,13 +77,13 @@ class KeyframeMemory:
 
 
 class LoopDetector:
-    """Looks for earlier places in each keyframe of a drive.
+    """Searches the earlier keyframes of a drive for the place of each new one.
 
-    All it remembers of a keyframe is its pose and some kilobytes of words; the rest goes to the
-    store. The same frames in the same order give the same loops.
+    It keeps the pose and some kilobytes of words of each keyframe; the rest goes to the store. The
+    same frames in the same order give the same loops.
 
     Args:
-        settings: What is kept, compared and believed.
+        settings: Of loop closure.
         store: Where keyframes go.
     """
 
@@ -108,15 +108,15 @@ class LoopDetector:
         path_m: float,
         measured: bool = True,
     ) -> tuple[Loop, ...]:
-        """Take the next frame; loops that geometry confirms are given, and kept in ``loops``.
+        """Add the next frame; return its verified loops, which ``loops`` keeps as well.
 
         Args:
             frame: Its number.
             pair: Its pictures.
             disparity: Of its left view.
             T_world_camera: float64 (4, 4), by odometry.
-            path_m: Path up to it, as `doubtful_path` counts it.
-            measured: False where the pose rests on no measurement; such a frame is no keyframe.
+            path_m: Path up to it, by `doubtful_path`.
+            measured: False where the pose is extrapolated; such a frame is no keyframe.
         """
         if not measured or not self._is_due(T_world_camera):
             return ()
@@ -127,13 +127,13 @@ class LoopDetector:
         return stored.loops
 
     def restore(self, stored: StoredKeyframe) -> None:
-        """Take a keyframe of an interrupted drive, with what was found there."""
+        """Add a keyframe of an interrupted drive, with its loops."""
         self._places.add(self._place(stored))
         self.loops.extend(stored.loops)
         self.refused.update(stored.refused)
 
     def agreeing(self) -> list[Loop]:
-        """The loops that enough others of other keyframes confirm."""
+        """The loops that enough loops of other keyframes confirm."""
         places = self._places
         known = zip(places.frames, places.T_world_camera, places.path_m.tolist(), strict=True)
         poses = {frame: (T, path_m) for frame, T, path_m in known}
@@ -152,7 +152,7 @@ class LoopDetector:
         return moved or float(np.rad2deg(angle_rad(T))) >= settings.angle_deg
 
     def _compared(self, new: StoredKeyframe, pair: RectifiedPair) -> StoredKeyframe:
-        """The keyframe with the first candidate that is one place with it, if any is."""
+        """The keyframe with the loop to the first candidate that is verified, if any is."""
         place, refused = self._place(new), []
         for old in self._candidates(place):
             known = self._store.get(self._places.frames[old]).keyframe
@@ -166,7 +166,7 @@ class LoopDetector:
         return replace(new, refused=tuple(refused))
 
     def _candidates(self, place: Place) -> list[int]:
-        """Numbers of old keyframes that may be near, most alike first."""
+        """Numbers of old keyframes that may be near, most similar first."""
         candidates = self._settings.candidates
         near = self._places.near(place, self._settings)
         if not near.any():
@@ -184,7 +184,7 @@ class LoopDetector:
         return chosen
 
     def _possible(self, old: int, new: Place, loop: Loop) -> bool:
-        """Whether odometry can be as wrong as a loop says."""
+        """Whether drift explains the difference between a loop and odometry."""
         T = invert(self._places.T_world_camera[old]) @ new.T_world_camera
         drift = drift_over(new.path_m - float(self._places.path_m[old]), self._settings.drift)
         return is_possible(invert(T) @ loop.T_first_last, drift, ALIKE, self._settings.drift)

@@ -1,4 +1,4 @@
-"""How far odometry may be off between two moments of a drive."""
+"""A model of how odometry drifts."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from recon.structures.arrays import Bool, Float64
 
 @dataclass(frozen=True)
 class Drift:
-    """Standard deviations of a motion that odometry tells.
+    """Standard deviations of a motion by odometry.
 
     Attributes:
-        position_m: Of where it ends.
+        position_m: Of its translation.
         angle_rad: Of its rotation.
     """
 
@@ -27,12 +27,12 @@ class Drift:
 
 
 def doubtful_path(T_world_camera: Float64, measured: Bool, settings: DriftSettings) -> Float64:
-    """Path up to each frame, in which a metre without measurement counts as many.
+    """Length of the path up to each frame, in which extrapolated metres count several times.
 
     Args:
         T_world_camera: float64 (N, 4, 4).
-        measured: bool (N,), False where a pose rests on no measurement.
-        settings: How much such a frame counts.
+        measured: bool (N,), False where a pose is extrapolated.
+        settings: How much such frames count.
 
     Returns:
         float64 (N,), metres.
@@ -44,17 +44,17 @@ def doubtful_path(T_world_camera: Float64, measured: Bool, settings: DriftSettin
 
 
 def drift_over(path_m: float, settings: DriftSettings) -> Drift:
-    """How far odometry may be off after a path.
+    """Drift over a path.
 
-    The scale error is taken as constant, the heading as a random walk, whose position error
-    is that of a straight drive, the worst there is: ``turn·√(path³/3)``.
+    The scale error is constant and the heading a random walk. The position error of the latter is
+    that of a straight drive, the worst case: ``turn·√(path³/3)``.
     """
     position_m, turn_rad = spread_over(np.array(path_m), settings)
     return Drift(float(position_m), float(turn_rad))
 
 
 def spread_over(path_m: Float64, settings: DriftSettings) -> tuple[Float64, Float64]:
-    """The standard deviations of `drift_over` for many paths: of positions and of rotations."""
+    """`drift_over` of many paths (N,): standard deviations of positions and of rotations."""
     turn = math.radians(settings.turn_deg)
     position_m = np.hypot(settings.share * path_m, turn * np.sqrt(path_m**3 / 3.0))
     return position_m, turn * np.sqrt(path_m)
@@ -66,9 +66,9 @@ def is_possible(
     """Whether a motion differs from odometry's by no more than drift explains.
 
     Args:
-        T_difference: float64 (4, 4), odometry's motion undone after the other one.
+        T_difference: float64 (4, 4), inverse of odometry's motion times the other one.
         drift: Of odometry over that motion.
-        floor: Standard deviation of the other motion.
+        floor: Standard deviations of the other motion.
         settings: How many standard deviations are possible.
     """
     off_m = float(np.linalg.norm(T_difference[:3, 3]))

@@ -1,4 +1,4 @@
-"""Bends a path so that its loops close."""
+"""Pose graph optimisation: corrects a path so that its loops close."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from recon.loops.verify import Loop
 from recon.structures import Trajectory
 from recon.structures.arrays import Float64
 
-_EASING: Final = 10.0  # a loop's tolerance falls by this factor from round to round
-_KEPT: Final = 0.25  # weight of a loop above which it is believed
+_EASING: Final = 10.0  # factor by which the tolerance of loops falls from round to round
+_KEPT: Final = 0.25  # least weight of a loop that is believed
 
 
 @dataclass(frozen=True, eq=False)
 class Closure:
-    """What became of a path and its loops.
+    """A path after loop closure.
 
     Attributes:
-        trajectory: The path, bent so that the loops close; the very same where none does.
-        closed: The loops that it closes.
+        trajectory: The corrected path; the same object where no loop is closed.
+        closed: The loops that are closed.
         refused: The loops that the rest of the graph contradicts.
     """
 
@@ -40,7 +40,7 @@ class Closure:
     refused: tuple[Loop, ...]
 
     def correction(self, odometry: Trajectory, frame: int) -> Float64:
-        """``T_corrected_world`` (4, 4) of what was mapped around a frame by odometry."""
+        """``T_corrected_world`` (4, 4) for what was mapped at a frame with the odometry's pose."""
         T_new, T_old = (path.T_world_camera[frame] for path in (self.trajectory, odometry))
         return orthonormalise(T_new @ invert(T_old))
 
@@ -48,16 +48,16 @@ class Closure:
 def close_loops(
     trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop], settings: LoopSettings
 ) -> Closure:
-    """Bend a path so that its loops close.
+    """Correct a path so that its loops close.
 
-    Nodes stand along the path; odometry ties each to the next, loops tie them across. The pose
-    graph may switch loops off. It begins with a tolerance that lets every loop take part and
-    tightens it step by step, so that a right loop is not refused for the very drift that it is
-    there to undo. If closing bends the odometry more than it can be wrong, no loop is believed.
+    Nodes are spaced along the path; odometry edges link each to the next, loop edges link distant
+    ones. The optimiser may switch loops off. It starts with a tolerance that admits every loop and
+    tightens it step by step, so that a right loop is not refused because of the very drift that it
+    corrects. If the loops deform the odometry more than its drift explains, none is believed.
 
     Args:
         trajectory: By odometry.
-        path_m: float64 (N,), path up to each frame as `doubtful_path` counts it.
+        path_m: float64 (N,), path up to each frame, by `doubtful_path`.
         loops: Loops between frames of it.
         settings: Nodes and tolerances.
 
@@ -71,7 +71,7 @@ def close_loops(
     ties = [_loop_edge(loop, trajectory, path_m, nodes, settings) for loop in loops]
     try:
         poses, weights = _solve(trajectory.T_world_camera[nodes], steps, ties, settings)
-    except RegistrationError:  # a map of the drive as odometry saw it is better than none
+    except RegistrationError:  # a map by odometry alone is better than none
         return Closure(trajectory, (), tuple(loops))
     bend_chi2 = float(np.mean([misfit(edge, poses) for edge in steps]))
     kept = weights >= _KEPT
@@ -93,7 +93,7 @@ def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
 
 
 def _nodes(path_m: Float64, settings: LoopSettings) -> NDArray[np.intp]:
-    """Frames at even distances along the path, the first and the last among them."""
+    """Frames at even distances along the path, including the first and the last."""
     length = float(path_m[-1])
     count = min(settings.graph.max_nodes, max(2, math.ceil(length / settings.graph.node_m) + 1))
     marks = np.searchsorted(path_m, np.linspace(0.0, length, count))
@@ -119,7 +119,7 @@ def _odometry_edges(
     poses = trajectory.T_world_camera
     edges = []
     for k, (first, last) in enumerate(pairwise(nodes)):
-        # A node may stand where the path stands still: 0.1 m keeps its edge finite.
+        # Where the camera stands still, 0.1 m keeps the information finite.
         drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1), settings.drift)
         T = invert(poses[first]) @ poses[last]
         edges.append(PoseEdge(k, k + 1, T, _information(drift)))
@@ -133,7 +133,7 @@ def _loop_edge(
     nodes: NDArray[np.intp],
     settings: LoopSettings,
 ) -> PoseEdge:
-    """The loop, moved to the nodes that are next to its ends."""
+    """The loop as an edge between the nodes nearest to its frames."""
     poses = trajectory.T_world_camera
     first, last = (_nearest_node(path_m, nodes, frame) for frame in (loop.first, loop.last))
     to_first = invert(poses[nodes[first]]) @ poses[loop.first]
@@ -175,7 +175,7 @@ def _turned(information: Float64, T_frame_node: Float64) -> Float64:
 def _bent(
     trajectory: Trajectory, path_m: Float64, nodes: NDArray[np.intp], T_world_node: Float64
 ) -> Trajectory:
-    """Every pose carried along by the node before it and the node after it, by distance."""
+    """Every pose moved with the nodes before and after it, interpolated by distance."""
     old = trajectory.T_world_camera
     before = np.clip(np.searchsorted(nodes, np.arange(len(old)), side="right") - 1, 0, None)
     before = np.minimum(before, len(nodes) - 2)

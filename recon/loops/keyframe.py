@@ -1,4 +1,4 @@
-"""What is kept of a frame to recognise its place: features with disparity, and coarse shape."""
+"""Keyframes for place recognition: features with disparity, and coarse disparities."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SCALES: Final = 5
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    """A place, as it looked.
+    """What is kept of a frame to recognise its place.
 
     Attributes:
         frame: Number of the frame in the drive.
@@ -91,10 +91,10 @@ def make_keyframe(
 
 
 def words_of(descriptors: UInt8, settings: CandidateSettings) -> NDArray[np.uint32]:
-    """The words of a picture, sorted, each once.
+    """The distinct words of a picture, sorted.
 
-    A word is the value of some fixed bits of a descriptor: alike descriptors are likely to share
-    one, unlike ones are not, and no vocabulary needs to be learnt.
+    A word is the value of some fixed bits of a descriptor: similar descriptors are likely to share
+    one, different ones are not, and no vocabulary has to be trained.
 
     Args:
         descriptors: uint8 (N, 32).
@@ -113,13 +113,13 @@ def words_of(descriptors: UInt8, settings: CandidateSettings) -> NDArray[np.uint
 
 @lru_cache
 def _chosen_bits(tables: int, bits: int) -> NDArray[np.intp]:
-    """Which bits make the words: all tables differ while there are bits enough."""
+    """Which bits form the words; tables share none while there are enough bits."""
     shuffled = np.random.default_rng(0).permutation(8 * _DESCRIPTOR_BYTES)
     return np.resize(shuffled, tables * bits)
 
 
 def _spread(corners: Sequence[Any], shape: tuple[int, ...], settings: KeyframeSettings) -> Any:
-    """The strongest corners of each cell, in turn, until there are enough."""
+    """The strongest corners of all cells, one rank after the other, until there are enough."""
     uv = _places_of(corners)
     strength = np.array([corner.response for corner in corners], np.float32)
     octave = np.array([corner.octave for corner in corners], np.int32)
@@ -133,14 +133,14 @@ def _spread(corners: Sequence[Any], shape: tuple[int, ...], settings: KeyframeSe
 
 
 def _places_of(corners: Sequence[Any]) -> Float32:
-    """Columns and rows (N, 2); also of none, for which OpenCV gives no array."""
+    """Columns and rows (N, 2) of corners, of which there may be none."""
     return np.asarray(cv2.KeyPoint.convert(corners), np.float32).reshape(-1, 2)
 
 
 def _disparity(
     disparity: Disparity, uv: Float32, settings: KeyframeSettings, camera: RectifiedCamera
 ) -> Float32:
-    """Disparity (N,) at features; NaN where unknown, small, or unlike its neighbours."""
+    """Disparity (N,) at features; NaN where unknown, small, or inconsistent with neighbours."""
     height, width = disparity.values.shape
     column, row = np.rint(uv).astype(np.int64).T
     step = np.arange(-1, 2)

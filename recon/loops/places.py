@@ -1,4 +1,4 @@
-"""The places that a drive has passed: which may be near, and which look alike."""
+"""The places of a drive: which may be near by odometry, and which look similar."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _LONGEST_RUN: Final = 256  # pictures: half a million words, which merge in 50 m
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """What stays in memory of a keyframe.
+    """What is kept in memory of a keyframe.
 
     Attributes:
         frame: Its frame.
         T_world_camera: float64 (4, 4), by odometry.
-        path_m: Path up to it, as `doubtful_path` counts it.
+        path_m: Path up to it, by `doubtful_path`.
         words: uint32 (W,), sorted, each once.
     """
 
@@ -34,7 +34,7 @@ class Place:
 
 
 class Places:
-    """All places so far, in order; a question to thousands of them takes some milliseconds."""
+    """All places so far, in order; a query among thousands takes some milliseconds."""
 
     def __init__(self) -> None:
         self._frames: list[int] = []
@@ -46,7 +46,7 @@ class Places:
         return len(self._frames)
 
     def add(self, place: Place) -> None:
-        """Remember a place."""
+        """Add the next place."""
         count = len(self)
         if count == len(self._path_m):
             self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
@@ -71,7 +71,7 @@ class Places:
         return self._path_m[: len(self)]
 
     def near(self, place: Place, settings: LoopSettings) -> Bool:
-        """Whether odometry could be so wrong (N,) that each sees the same as a later place."""
+        """bool (N,), places that drift allows to be in view of a later one."""
         way_m = place.path_m - self.path_m
         sigma_m, sigma_rad = spread_over(np.maximum(way_m, 0.0), settings.drift)
         T = invert(self.T_world_camera) @ place.T_world_camera
@@ -82,13 +82,13 @@ class Places:
         return np.asarray(near & (way_m >= seen.min_path_m))
 
     def likeness(self, place: Place) -> Float64:
-        """Likeness (N,) of each to a place, in [0, 1]."""
+        """float64 (N,), similarity of each to a place, in [0, 1]."""
         return self._words.likeness(place.words)
 
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """The sorted words of pictures in a row, and whose each is.
+    """The sorted words of consecutive pictures, with the picture of each.
 
     Attributes:
         first: Number of the first picture.
@@ -106,14 +106,14 @@ class _Run:
         """Two runs as one."""
         words = np.concatenate([self.words, other.words])
         owners = np.concatenate([self.owners, other.owners + np.uint16(self.count)])
-        # The stable sort sees that two parts are sorted, and merges them.
+        # The stable sort detects the two sorted runs and merges them.
         order = np.argsort(words, kind="stable")
         return _Run(self.first, self.count + other.count, words[order], owners[order])
 
     def shared(self, words: NDArray[np.uint32]) -> NDArray[np.intp]:
-        """Number of words (count,) that each picture has in common with another one."""
+        """int64 (count,), number of words that each picture shares with another one."""
         begin, end = (np.searchsorted(self.words, words, side) for side in ("left", "right"))
-        # All places of words[k] in the run are begin[k], begin[k] + 1, … end[k] - 1.
+        # words[k] is in the run at begin[k] … end[k] - 1.
         found = end - begin
         before = np.cumsum(found) - found
         places = np.arange(found.sum()) + np.repeat(begin - before, found)
@@ -121,9 +121,9 @@ class _Run:
 
 
 class WordIndex:
-    """Which picture has which words.
+    """An inverted index: which pictures have which words.
 
-    Runs of sorted words are merged when they are of one size, as in a binary counter, up to a
+    Runs of sorted words are merged when they have the same size, as in a binary counter, up to a
     size that still merges in little time and memory.
 
     Ref:
@@ -135,7 +135,7 @@ class WordIndex:
         self._runs: list[_Run] = []
 
     def add(self, words: NDArray[np.uint32]) -> None:
-        """Take the words of the next picture, each once, sorted."""
+        """Add the distinct, sorted words of the next picture."""
         run = _Run(len(self._sizes), 1, np.asarray(words), np.zeros(len(words), np.uint16))
         self._sizes.append(len(words))
         while self._runs and self._runs[-1].count == run.count < _LONGEST_RUN:
@@ -143,7 +143,7 @@ class WordIndex:
         self._runs.append(run)
 
     def likeness(self, words: NDArray[np.uint32]) -> Float64:
-        """Share of words (N,) that each picture has in common with another one, in [0, 1]."""
+        """float64 (N,), shared words of each picture and another one, normalised to [0, 1]."""
         shared = np.zeros(len(self._sizes))
         for run in self._runs:
             shared[run.first : run.first + run.count] = run.shared(words)

@@ -1,4 +1,4 @@
-"""Whether two keyframes show one place, by geometry."""
+"""Geometric verification of loops."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _CELLS = 4
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Two frames that show one place, and how they stand to each other.
+    """Two frames that show the same place, and the motion between them.
 
     Attributes:
         first: Number of the earlier frame.
@@ -28,7 +28,7 @@ class Loop:
         T_first_last: float64 (4, 4).
         information: float64 (6, 6) of a step (translation in metres, rotation vector in radians)
             in the axes of the later frame.
-        inliers: Matches that agree, seen both ways.
+        inliers: Matches that agree in both frames.
         dense_share: Share of the coarse disparities that agree.
     """
 
@@ -46,11 +46,11 @@ class Loop:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What geometry says about a candidate.
+    """The result of a verification.
 
     Attributes:
-        loop: The loop, or None.
-        refused: Why there is none; "" where there is.
+        loop: The loop; None = refused.
+        refused: Why; "" where there is a loop.
     """
 
     loop: Loop | None
@@ -60,12 +60,11 @@ class Verdict:
 def verify(
     first: Keyframe, last: Keyframe, camera: RectifiedCamera, settings: VerifySettings
 ) -> Verdict:
-    """Whether two keyframes show one place.
+    """Whether two keyframes show the same place.
 
-    Matches must be the best both ways; the poses from the points of each in the picture of the
-    other must be inverse to each other; the matches that agree must be many, a fair share, spread
-    over both pictures, and fix the motion in all directions; and the surfaces between the
-    features must agree with it too.
+    Matches must be mutually best. The motions found in either direction must be inverse to each
+    other. The inliers must be many, a fair share of the matches, spread over both pictures, and
+    determine the motion in all directions. The coarse disparities must agree with it, too.
     """
     seen = match(first, last, camera, settings)
     aligned = _aligned(*seen, camera, settings)
@@ -82,7 +81,7 @@ def verify(
 def _aligned(
     first: Seen, last: Seen, camera: RectifiedCamera, settings: VerifySettings
 ) -> Alignment | str:
-    """The motion that the matches prove, or why they prove none."""
+    """The motion between the frames, or why it is not verified."""
     T_there = locate(first.xyz, last.uvd[:, :2], camera, settings)
     if T_there is None:
         return "no common motion"
@@ -117,11 +116,11 @@ def dense_agreement(
     camera: RectifiedCamera,
     settings: VerifySettings,
 ) -> float:
-    """Share of the coarse disparities of one frame that the other confirms, the worse way round.
+    """Share of the coarse disparities of one frame that the other confirms, in the worse direction.
 
-    Where one sees less disparity than predicted it looks through the other's surface, which
-    contradicts; where it sees more, something stands in between, which says nothing.
-    NaN-free: 0 where the two hardly overlap.
+    A smaller disparity than predicted means seeing through the other's surface: a contradiction. A
+    larger one means that something is in front of it, which does not count. 0 where the two frames
+    hardly overlap.
     """
     shares = (
         _confirmed(last, first, T_first_last, camera, settings),
@@ -144,7 +143,7 @@ def _confirmed(
     off = _interpolated(target.coarse, (u - half) / step, (v - half) / step) - d
     tolerance = settings.dense_tolerance_px + settings.dense_tolerance_share * np.abs(d)
     with np.errstate(invalid="ignore"):
-        telling = off <= tolerance  # NaN = unknown on one side, which says nothing
+        telling = off <= tolerance  # False for NaN, unknown in one of the frames
     if int(telling.sum()) < settings.min_dense_points:
         return 0.0
     return float(np.mean(off[telling] >= -tolerance[telling]))
@@ -204,7 +203,7 @@ def _weakness(
     camera: RectifiedCamera,
     settings: VerifySettings,
 ) -> str:
-    """Why the matches that agree prove nothing; "" where they do."""
+    """Why the inliers are not enough; "" where they are."""
     inliers = int(aligned.agree.sum())
     if inliers < max(settings.min_inliers, settings.min_inlier_share * matches):
         return "few inliers"

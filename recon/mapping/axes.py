@@ -1,4 +1,4 @@
-"""Map axes (x forward, y left, z up), and the plane that the first frame stands on."""
+"""Map axes (x forward, y left, z up), and the ground plane below the first frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ground that only the voxels know: farther out than clouds are fused, and less sharp."""
+"""Ground from occupancy voxels: it reaches farther than the fused cloud, but is less precise."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from recon.structures.arrays import Bool, Float32, Int32
 _FULL: Final = log_odds(0.6)
 _EMPTY: Final = log_odds(0.45)
 _REACH: Final = 2
-"""A floor splits its evidence over two voxels, so the free one may be the second above."""
+"""Evidence of a floor may be split over two voxels, so the free one may be the second above."""
 
 
 def find_floors(voxels: OccupancyVoxels) -> Float32:

@@ -55,9 +55,8 @@ class FusionSettings(Settings):
 def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
     """The depth at which a matching error of ``nominal_error_px`` costs ``max_depth_error_m``.
 
-    The error of a depth grows with its square, ``Z²·error_px / (f·b)``, so this is where a rig
-    stops to measure as finely as the map is meant to be; the same setting fits a short baseline
-    and a long one.
+    The error of a depth grows with its square, ``Z²·error_px / (f·b)``: beyond this range a rig
+    measures less precisely than the map requires. The setting fits short and long baselines.
 
     Args:
         camera: The rectified camera.
@@ -137,14 +136,14 @@ class MapBuilder:
         )
 
     def take(self) -> FusedPart:
-        """The part so far, which the builder forgets: the next part begins."""
+        """The part so far; the builder starts a new one."""
         part = self.part()
         self._sums = voxels.make_sums(1, VALUES)
         self._known, self._frames = dict.fromkeys(self._known, True), 0
         return part
 
     def resume(self, part: FusedPart, frames: int) -> None:
-        """Go on after a part that was taken from another builder.
+        """Continue a part that was taken from another builder.
 
         Args:
             part: The part.

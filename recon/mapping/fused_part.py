@@ -1,4 +1,4 @@
-"""What a part of a drive adds to the fused cloud: sums per voxel, which add up with other parts."""
+"""The part of the fused cloud by a part of a drive: sums per voxel, additive over parts."""
 
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ class FusedPart:
         )
 
     def moved(self, T_new_world: Float64, voxel_m: float) -> FusedPart:
-        """The part after a rigid motion: each voxel's sums go where its mean point comes to lie.
+        """The part after a rigid motion: each voxel's sums go to the voxel of its moved mean point.
 
-        Where several voxels come to lie in one, their sums add up; the number of frames and the
-        information are those of the one that has most, since the frames are the same.
+        Where several go to the same voxel, their sums add up; the number of frames and the
+        information are the largest of theirs, since the frames are the same.
         """
         if not len(self):
             return self
@@ -125,10 +125,9 @@ class FusedPart:
 
 
 def join_fused(parts: Iterable[FusedPart]) -> FusedPart:
-    """Add parts of different frames up, as if all their frames had gone into one map.
+    """Add parts of different frames, as if all their frames had been fused into one map.
 
-    What one of the parts does not know, the whole does not know; a part without clouds says
-    nothing about that.
+    Attributes that one of the parts does not know are unknown in the sum; empty parts do not count.
     """
     total = voxels.make_sums(1, VALUES)
     known, any_known = set(KNOWABLE), False

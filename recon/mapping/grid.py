@@ -1,4 +1,4 @@
-"""From voxels to the flat grid that robots plan on, by heights above the local ground."""
+"""From voxels to the 2-D grid that robots plan on, by heights above the local ground."""
 
 from __future__ import annotations
 

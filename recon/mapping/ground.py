@@ -1,9 +1,9 @@
-"""The ground along a drive: a height for every place near the path, slopes and drift included.
+"""The ground along a drive: a height map near the path that follows slopes and drift.
 
 A drive of some hundred metres is never level: one degree of pitch in the first frame is three
 metres after 170 m. So heights above ground are not heights above a plane. The surface starts
-below the path, one camera height down, and grows outward ring by ring; each cell of a ring looks
-for ground only near the height that its inner neighbours have.
+below the path, one camera height down, and grows outward ring by ring; each cell of a ring
+searches for ground only near the height of its inner neighbours.
 """
 
 from __future__ import annotations
@@ -106,8 +106,8 @@ def estimate_ground_surface(
 
     Args:
         cloud: The fused cloud in map axes (z up). With normals, only points that face up count.
-        positions_m: float (N, 3), where the camera was, map axes; N ≥ 1. A row of NaN parts one
-            piece of a path from the next.
+        positions_m: float (N, 3), positions of the camera, map axes; N ≥ 1. A row of NaN separates
+            pieces of a path.
         settings: How to follow it.
 
     Returns:
@@ -147,7 +147,7 @@ def _field(cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSetting
 
 
 class _Field:
-    """The cells while the surface grows."""
+    """The surface while it grows."""
 
     def __init__(self, cloud: PointCloud, path: Float64, settings: GroundSettings) -> None:
         self._settings = settings

@@ -19,7 +19,7 @@ from recon.structures.arrays import Float32, Float64, Int32
 
 _FIRST_POINTS: Final = 1 << 12
 _LEAST_SIGMA_CELLS: Final = 0.1
-"""No point is more certain than this: a mean of many is not weighed down by one."""
+"""Least standard deviation of a point, so that none outweighs all others in a mean."""
 
 
 class OccupancySettings(Settings):
@@ -121,13 +121,13 @@ class OccupancyBuilder:
         return OccupancyPart(clamped.observed_rows(self._map), points)
 
     def take(self) -> OccupancyPart:
-        """The part so far, which the builder forgets: the next part begins."""
+        """The part so far; the builder starts a new one."""
         part, self._map = self.part(), clamped.make_clamped(256)
         self._points = voxels.make_sums(_FIRST_POINTS, 0)
         return part
 
     def resume(self, part: OccupancyPart) -> None:
-        """Go on after a part that was taken from another builder."""
+        """Continue a part that was taken from another builder."""
         self._map = clamped.chain_rows(clamped.make_clamped(256), part.rows)
         if part.points is not None:
             self._points = sum_points([part.points])

@@ -1,4 +1,4 @@
-"""What a part of a drive does to the occupancy of space, to be followed by other parts."""
+"""The part of the occupancy by a part of a drive, to be chained with other parts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from recon.structures import OccupancyVoxels
 from recon.structures.arrays import Float32, Float64, Int32
 
 _UNSURE: Final = np.float32(0.01)
-"""Log-odds of a voxel that was hit, though the surface is likely in another: hardly above even."""
+"""Log-odds of a voxel that was hit though the surface is likely in another: just above even."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class OccupancyPart:
         )
 
     def moved(self, T_new_map: Float64, resolution_m: float) -> OccupancyPart:
-        """The part after a rigid motion: each cell takes what was at its centre before."""
+        """The part after a rigid motion: each cell gets the values that were at its centre."""
         T_cells = T_new_map.copy()
         T_cells[:3, 3] /= resolution_m
         blocks = clamped.chain_rows(clamped.make_clamped(1), self.rows)
@@ -71,8 +71,8 @@ class OccupancyPart:
     def voxels(self, resolution_m: float) -> OccupancyVoxels:
         """The log-odds of a drive that consists of this part alone.
 
-        A voxel that was hit is undecided where the surface of the points around it does not
-        cross it: the surface then lies in the voxel before or behind.
+        A voxel that was hit is undecided unless the surface of the points around it crosses it:
+        the surface is then in the voxel before or behind.
         """
         change, low, high = self.rows.values.T
         cells, log_odds = self.cells, np.minimum(np.maximum(change, low), high)
@@ -91,7 +91,7 @@ def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints) -> Float32:
 
 
 def join_occupancy(parts: Iterable[OccupancyPart]) -> OccupancyPart:
-    """Parts that follow one another in time, as one."""
+    """Parts that follow one another in time, chained."""
     blocks, points = clamped.make_clamped(1), []
     for part in parts:
         blocks = clamped.chain_rows(blocks, part.rows)

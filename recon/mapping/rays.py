@@ -1,7 +1,7 @@
-"""What of a frame is kept for occupancy: points averaged in small cubes, and rounded.
+"""Rays of a frame that are kept for occupancy: points averaged in small cubes, and rounded.
 
-Maps are made of what is kept, so that the same map can be made again, and others: with other
-voxels, other heights or other poses.
+Maps are built from the kept rays, so that the same map can be built again, and others with other
+voxels, heights or poses.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _FIRST_ROWS: Final = 1 << 15
 
 
 def ray_grain(settings: OccupancySettings) -> RayGrain:
-    """How coarse the rays are that are kept for a map."""
+    """The resolution of the rays that are kept for a map."""
     cell_m = settings.resolution_m / settings.rays_per_voxel
     # The farthest places must fit into 16 bits.
     unit_m = max(cell_m / _UNITS_PER_CELL, (_beyond_m(settings) + cell_m) / _LARGEST)
@@ -30,8 +30,8 @@ def ray_grain(settings: OccupancySettings) -> RayGrain:
 def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
     """Average the points of a frame in cubes; points without confidence are dropped.
 
-    A point out of the map's range is moved along its ray to just beyond it: it still hits
-    nothing, and frees what it freed.
+    A point out of the map's range is moved along its ray to just beyond it: it is still no hit, and
+    frees the same space.
 
     Args:
         cloud: Points in camera axes. ``sigma_m`` None = exact; ``confidence`` None = 1.

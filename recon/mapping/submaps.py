@@ -1,8 +1,8 @@
-"""A drive in pieces: submaps of consecutive frames, each with its own part of both maps.
+"""Submaps: consecutive frames with their part of the fused cloud and of the occupancy.
 
-A piece is built in the world of the odometry. Where nothing corrects the odometry, pieces put
-together are the map that one long drive would have given; where a loop closure moves a piece, its
-voxels are moved with it, and nothing has to be matched again.
+A submap is built in the world of the odometry. Without corrections, all submaps together are the
+map that one long drive would have given; where loop closure moves a submap, its voxels are moved
+with it, and nothing has to be matched again.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from recon.structures.arrays import Float64
 
 
 class SubmapSettings(Settings):
-    """Where a drive is cut, and in which tiles its map is put together.
+    """Where a drive is divided into submaps, and into which tiles its map.
 
-    Cuts and tiles bound the memory; apart from rounding they change no result.
+    Both bound the memory; apart from rounding they change no result.
     """
 
     length_m: float = Field(

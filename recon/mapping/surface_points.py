@@ -1,4 +1,4 @@
-"""Where the hits in each cell lie on average: what tells the cell of a surface from the next."""
+"""Mean position of the hits in each cell, which tells in which of two cells a surface is."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class SurfacePoints:
         return self.select(np.isin(home, blocks))
 
     def moved(self, T_new_map: Float64) -> SurfacePoints:
-        """The sums after a rigid motion: those of a cell go where its mean point comes to lie.
+        """The sums after a rigid motion: those of a cell go to the cell of its moved mean point.
 
         Args:
             T_new_map: float64 (4, 4), its translation in cells.

@@ -1,4 +1,4 @@
-"""Filling holes: a disparity for every pixel, as the benchmarks' dense figures need it."""
+"""Filling of holes: a disparity for every pixel, for the dense metrics of benchmarks."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from recon.structures.arrays import Bool, Float32, Int32, frozen_array
 def fill_holes(values: Float32) -> Float32:
     """Give each pixel without a disparity that of the background beside it.
 
-    What only one camera sees is hidden behind something nearer, so of the nearest values to the
-    left and to the right on the same row the smaller one is taken, and where there is one alone,
-    that one. A row without any value is filled from the nearest row that has some, the upper one
-    first. Known values stay as they are.
+    What only one camera sees is hidden behind something nearer, so a hole gets the smaller one of
+    the nearest values to the left and to the right on its row, or the only one. A row without any
+    value is copied from the nearest row with some, the upper one of two. Known values stay.
 
     Args:
         values: float32 (H, W), pixels; NaN = none.

@@ -1,4 +1,4 @@
-"""Horizontal gradients: what windows compare, and how much of it there is in them."""
+"""Horizontal gradients, which windows compare, and their mean magnitude, the texture."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def clipped_gradients(image: UInt8, cap: int, rows: range) -> UInt8:
     Args:
         image: uint8 (H, W).
         cap: At most 127.
-        rows: N rows in a row.
+        rows: N consecutive rows.
 
     Returns:
         uint8 (N, W), ``cap`` where there is none.
@@ -38,8 +38,8 @@ def texture(pair: RectifiedPair, window: tuple[int, int], least: float, rows: ra
     Args:
         pair: The pictures.
         window: Width and height of the window, pixels.
-        least: What will be asked of it; if that is nothing it is not computed, but 0.
-        rows: N rows in a row.
+        least: The threshold; at 0 the texture is not computed, but returned as 0.
+        rows: N consecutive rows.
 
     Returns:
         float32 (N, W) of those rows, grey levels per pixel; NaN = no picture.

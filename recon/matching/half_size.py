@@ -1,8 +1,8 @@
-"""What pictures at half size say about where to search at full size.
+"""Search at half size, which tells where to search at full size.
 
-Their search costs an eighth. Its reliable matches name the disparities of each tile; a match that
-lies elsewhere would be a mistake more often than not, so that a search among fewer candidates is
-not only faster, but also more accurate.
+It takes an eighth of the time. Its reliable matches give the disparities of each tile; a match at
+another disparity would more often than not be wrong, so a search among fewer candidates is not only
+faster, but also more accurate.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def halve(image: UInt8) -> UInt8:
     return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def no_texture_asked(width: int, valid: Bool | None, rows: range) -> Float32:
-    """float32 (N, w) of N rows: 0, and where there is no picture NaN, as the checks take it."""
+def zero_texture(width: int, valid: Bool | None, rows: range) -> Float32:
+    """float32 (N, w), texture for checks that ask for none: 0, NaN where there is no picture."""
     texture = np.zeros((len(rows), width), np.float32)
     if valid is not None:
         texture[~valid[2 * rows.start : 2 * rows.stop : 2, ::2]] = np.nan
@@ -87,5 +87,5 @@ def divided(search: Search, shape: tuple[int, int]) -> Tiles:
 
 
 def support(share: float) -> Support:
-    """What it takes for candidates to be offered to a tile."""
+    """How much support offers candidates to a tile; ``share`` as in `Support`."""
     return Support(margin_x=8, margin_y=8, margin=3, matched=0.15, share=share, least=4)

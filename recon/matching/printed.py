@@ -1,6 +1,6 @@
 """Block matching as the seed paper prints it: whole disparities, no check, plain numpy.
 
-It is there to be compared with, by ``recon paper`` alone, and so it is no entry of ``MATCHERS``.
+It exists for comparison by ``recon paper`` alone, so it is no entry of ``MATCHERS``.
 """
 
 from __future__ import annotations

@@ -15,25 +15,25 @@ from recon.structures import Disparity, RectifiedPair
 from recon.structures.arrays import UInt8
 
 _COARSE_WIDTH_PX: Final = 200
-"""Pictures are made smaller by whole factors until they are about as wide."""
+"""Approximate width of the small pair; pictures are reduced by whole factors."""
 
 _STEP: Final = 16
 _SHARE: Final = 99.5
-"""Per cent of the trusted disparities that the range must hold before its margin is added."""
+"""Percentile of the trusted disparities that the range must include before its margin."""
 
 _LEAST_MATCHES: Final = 100
 _CONFIDENCE: Final = 0.8
 
 
 class AutoRangeMatcher:
-    """Lets another matcher search as far as each pair needs; a `Matcher`.
+    """Chooses the range of another matcher for each pair; a `Matcher`.
 
-    The range is a function of the pair alone, never of the frames before it, so that a run that
-    is resumed gives the same result. It is never narrower than the usual rule, so from frame to
-    frame it changes only where something comes nearer than that.
+    The range is a function of the pair alone, never of the frames before it, so that a resumed run
+    gives the same result. It is never narrower than `usual_ndisp`, so from frame to frame it
+    changes only where something is nearer than that allows.
 
     Args:
-        matcher: What matches; it must take its range from the camera.
+        matcher: The matcher; it must take its range from the camera.
         minimum_px: The first disparity that it searches.
     """
 
@@ -54,10 +54,10 @@ class AutoRangeMatcher:
 
 
 def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
-    """Number of disparities that a pair needs, from matching it when it is small.
+    """Number of disparities that a pair needs, from matching it at a small size.
 
-    The small pair is searched up to half its width. What is trusted there says how near the scene
-    comes; a pixel of the small pair and a tenth are added, because something small may be nearer.
+    The small pair is searched up to half its width. Its trusted disparities tell how near the scene
+    is; a tenth and one pixel of the small pair are added, because small objects may be nearer.
 
     Args:
         pair: The rectified pair.

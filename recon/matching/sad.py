@@ -25,9 +25,9 @@ from recon.matching.half_size import (
     half_rules,
     half_search,
     halve,
-    no_texture_asked,
     support,
     undivided,
+    zero_texture,
 )
 from recon.matching.search import (
     MeasuredSettings,
@@ -139,7 +139,7 @@ class SadMatcher:
         halved = half_search(search)
         views = halve(pair.left), halve(pair.right)
         shape = views[0].shape
-        asked = partial(no_texture_asked, shape[1], pair.valid)
+        asked = partial(zero_texture, shape[1], pair.valid)
         whole, rules = undivided(halved, shape), half_rules(halved)
         found = self._half.find(pool, views, halved, whole, rules, asked)
         tiles = divided(search, pair.left.shape)

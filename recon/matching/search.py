@@ -1,4 +1,4 @@
-"""What every matcher over a range of disparities has in common: the range, and the checks."""
+"""What all matchers over a range of disparities share: range, checks and post-processing."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class SearchSettings(Settings):
 
 
 class MeasuredSettings(SearchSettings):
-    """Of the matchers that measure each match: between whole disparities, and how exactly."""
+    """Settings of the matchers with sub-pixel disparities and uncertainties of their own."""
 
     subpixel: Literal["equiangular", "parabola", "none"] = Field(
         default="equiangular", description="How the minimum is placed between whole disparities."

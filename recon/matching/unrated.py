@@ -1,4 +1,4 @@
-"""Disparities of matchers that do not tell how sure they are."""
+"""Disparities of matchers without confidence and uncertainty of their own."""
 
 from __future__ import annotations
 
@@ -11,26 +11,31 @@ from recon.structures.arrays import Float32, UInt8
 
 
 class UnratedSettings(Settings):
-    """What is assumed of every match of a matcher that rates none.
+    """Confidence and uncertainty that are assumed for every match.
 
-    The defaults are how OpenCV's two do on MiddEval3 at quarter size: 90 to 92 % of what they
-    keep is within a pixel, and 68 % within a quarter.
+    The defaults are measured with OpenCV's matchers on MiddEval3 at quarter size: 90 to 92 % of
+    the disparities they keep are within a pixel, and 68 % within a quarter.
     """
 
     assumed_confidence: float = Field(
-        default=0.9, ge=0.0, le=1.0, description="Given to every match: the matcher tells none."
+        default=0.9,
+        ge=0.0,
+        le=1.0,
+        description="Confidence of every match: the matcher gives none.",
     )
     assumed_sigma_px: float = Field(
-        default=0.25, gt=0.0, description="Given to every match: the matcher tells none."
+        default=0.25,
+        gt=0.0,
+        description="Standard deviation of every match: the matcher gives none.",
     )
 
 
 def unrated_disparity(
     values: Float32, reason: UInt8, pair: RectifiedPair, settings: UnratedSettings
 ) -> Disparity:
-    """A disparity whose matches all count alike.
+    """A disparity map whose matches all have the same confidence and uncertainty.
 
-    A match that has no picture, or lies beside the right picture, becomes BORDER.
+    A match where there is no picture, or that lies outside the right picture, becomes BORDER.
 
     Args:
         values: float32 (H, W), pixels; read where ``reason`` is VALID.

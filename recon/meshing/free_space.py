@@ -1,4 +1,4 @@
-"""Where no surface can be: space that the cameras looked through."""
+"""Free space that the cameras looked through, where no surface can be."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from recon.structures.arrays import Bool, Float32
 
 
 def looked_through(vertices: Float32, voxels: OccupancyVoxels) -> Bool:
-    """Which vertices hang in free space: their voxel is free, and none around it is occupied.
+    """Which vertices are in free space: their voxel is free, and none around it is occupied.
 
-    A surface runs along voxels that are occupied, but half of it lies in their free neighbours.
+    A surface follows occupied voxels, but half of it is in their free neighbours.
 
     Args:
         vertices: float32 (V, 3), map axes.

@@ -1,4 +1,4 @@
-"""Closing the seams between meshes that were cut along one plane."""
+"""Closing of seams between meshes that were cut along the same plane."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def open_edges(mesh: TriangleMesh, plane: Plane) -> Float32:
 
 
 def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float) -> TriangleMesh:
-    """Let a mesh end on the border of its neighbour that was cut in the same plane.
+    """Fit a mesh to the border of its neighbour that was cut in the same plane.
 
     The vertices of the mesh move onto the border, and those of the border are inserted into the
     mesh, so that both follow one line.
@@ -48,7 +48,7 @@ def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float
         mesh: The mesh.
         plane: Where both were cut.
         border: float32 (E, 2, 3), the neighbour's `open_edges`.
-        reach_m: What is farther from the other stays: there the other has no surface.
+        reach_m: What is farther from the other mesh stays: there the other has no surface.
     """
     rows = np.flatnonzero(plane.holds(mesh.vertices))
     if not len(rows) or not len(border):

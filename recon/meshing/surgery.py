@@ -1,4 +1,4 @@
-"""Cutting meshes: vertices kept, small pieces dropped, normals of what is left."""
+"""Trimming of meshes: vertices, small components, normals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From frames to poses: a visual prior and a kiss-icp correction that must earn its place."""
+"""From frames to poses: visual odometry, corrected by kiss-icp where that helps."""
 
 from recon.odometry.known import KnownPoses
 from recon.odometry.prior import MotionPrior

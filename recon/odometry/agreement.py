@@ -1,8 +1,8 @@
-"""Whether a motion explains the pictures: every patch is asked, not the features that gave it.
+"""Whether a motion explains the pictures: a check on all patches, not on the tracked features.
 
 Features may agree on a motion that is not the camera's: that of a lorry ahead, or none at all
-where they slide along the edge of a road. The rest of the picture then tells: shifted by the
-motion, its patches do not look like what is seen where they should lie.
+where they slide along the edge of a road. Then the rest of the picture contradicts: its patches,
+moved accordingly, do not match what is seen there.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Agreement:
 
     Attributes:
         telling: Patches with texture in all directions, which can tell motions apart.
-        share: Share of them that look alike where the motion takes them; NaN = there is none.
+        share: Share of them that match where the motion takes them; NaN = there are none.
     """
 
     telling: int
@@ -41,7 +41,7 @@ class Agreement:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """One frame as the check needs it.
+    """What the check needs of a frame.
 
     Attributes:
         left: uint8 (H, W).
@@ -58,9 +58,9 @@ class _Samples:
 
     Attributes:
         patch: int64 (N,), number of the patch of each.
-        before: float64 (N,), grey values in the one.
-        now: float64 (N,), grey values in the other.
-        slope: float64 (N, 2), change of the first per pixel to the right and down.
+        before: float64 (N,), grey values in the last picture.
+        now: float64 (N,), grey values where the motion takes them in this one.
+        slope: float64 (N, 2), gradient of ``before`` per pixel to the right and down.
     """
 
     patch: Int64
@@ -76,12 +76,12 @@ def explain_motion(
     camera: RectifiedCamera,
     settings: AgreementSettings,
 ) -> Agreement:
-    """Count the patches of the last picture that a motion takes to where they are in this one.
+    """Count the patches of the last picture that match where a motion takes them in this one.
 
-    Every pixel with a disparity is taken along by the motion. A patch is explained where its grey
-    values correlate with those that are there, noise set aside; brightness and contrast may
-    change. Patches without texture, or with edges of one direction alone, look alike after
-    many motions and are not counted; a picture that is dark now tells nothing at all.
+    Every sampled pixel with a disparity is moved. A patch matches where its grey values correlate
+    with those seen there, corrected for noise; brightness and contrast may change. Patches without
+    texture, or with edges in one direction alone, match after many motions and are not counted; in
+    a picture that is dark by now no patch is.
 
     Args:
         before: The last frame.
@@ -94,7 +94,7 @@ def explain_motion(
     count = np.bincount(samples.patch)
     noise = (noise_sigma(before.left), noise_sigma(left))
     telling = (count >= settings.min_pixels) & _textured(samples, count, noise[0], settings)
-    # A picture that shows next to nothing but noise where the patches should lie is blind.
+    # A picture that shows little more than noise where the patches should be is blind.
     blind = _power(samples, samples.now, count) < 2.0 * noise[1] ** 2
     if not telling.any() or blind[telling].mean() > 0.5:
         return Agreement(0, float("nan"))
@@ -105,12 +105,12 @@ def explain_motion(
 def noise_sigma(grey: UInt8) -> float:
     """Standard deviation of the noise of a picture, grey values.
 
-    From the median of its mixed fourth differences, in which slopes and straight edges cancel.
+    From the median of mixed fourth differences, in which gradients and straight edges cancel.
 
     Ref:
         Immerkær, "Fast noise variance estimation", CVIU 1996.
     """
-    # Every fourth column and row: some ten thousand values tell a median to one per cent.
+    # Every fourth column and row: some ten thousand values give a median to one per cent.
     columns = [grey[:, k : k + grey.shape[1] - 2 : 4].astype(np.int16) for k in range(3)]
     across = columns[0] - 2 * columns[1] + columns[2]
     rows = [across[k : k + len(across) - 2 : 4] for k in range(3)]
@@ -128,7 +128,7 @@ def _sample(
     camera: RectifiedCamera,
     settings: AgreementSettings,
 ) -> _Samples:
-    """Every n-th pixel with a disparity that the motion leaves in the picture."""
+    """Every n-th pixel with a disparity that stays in the picture."""
     step, (height, width) = settings.stride_px, left.shape
     # Slopes need a neighbour on either side.
     row, column = np.nonzero(before.disparity.valid[1:-1:step, 1:-1:step])
@@ -153,7 +153,7 @@ def _interpolated(image: UInt8, u: Float64, v: Float64) -> Float64:
     """Grey values (N,) between pixels."""
     if not len(u):
         return np.zeros(0)
-    # A map of more than 32767 rows is refused, so the places fill rows of a picture.
+    # OpenCV refuses maps of more than 32767 rows, so the points are wrapped into rows.
     rows = -(-len(u) // 1024)
     columns, lines = (np.resize(x.astype(np.float32), (rows, 1024)) for x in (u, v))
     grey = np.asarray(cv2.remap(image, columns, lines, cv2.INTER_LINEAR), dtype=np.float64)
@@ -163,7 +163,7 @@ def _interpolated(image: UInt8, u: Float64, v: Float64) -> Float64:
 def _textured(
     samples: _Samples, count: Int64, sigma: float, settings: AgreementSettings
 ) -> NDArray[np.bool_]:
-    """Patches that change in every direction by more than the noise does."""
+    """bool (P,), patches with gradients in every direction that exceed the noise."""
     x, y = samples.slope.T
     xx, yy, xy = (_mean(samples, values, count) for values in (x * x, y * y, x * y))
     least = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
@@ -172,7 +172,7 @@ def _textured(
 
 
 def _correlation(samples: _Samples, count: Int64, noise: tuple[float, float]) -> Float64:
-    """Correlation (P,) of what a patch shows in the two pictures, their noise set aside."""
+    """Correlation (P,) of each patch between the two pictures, corrected for noise."""
     one, other = samples.before, samples.now
     mean, mean_other = (_mean(samples, values, count) for values in (one, other))
     both = _mean(samples, one * other, count) - mean * mean_other

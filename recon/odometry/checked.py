@@ -1,4 +1,4 @@
-"""An odometry whose poses are doubted: what is unsure, or what the picture is against, is said."""
+"""An odometry whose poses are checked: uncertain and contradicted ones are marked."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class CheckedState:
 
 
 class CheckedOdometry:
-    """Asks of every motion how sure it is, and whether the picture bears it out.
+    """Checks how certain every motion is, and whether the picture agrees with it.
 
     Poses stay as they are; ``health.ok`` and its notes say which are not to be trusted.
 
@@ -42,7 +42,7 @@ class CheckedOdometry:
         self._state: CheckedState | None = None
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """Register the next frame, and doubt the result."""
+        """Register the next frame, and check the result."""
         result, state = self._odometry.register(frame), self._state
         sight = Sight(frame.pair.left, frame.disparity)
         self._state = CheckedState(sight, result.T_world_camera)
@@ -56,7 +56,7 @@ class CheckedOdometry:
     def _doubts(
         self, health: OdometryHealth, before: Sight, frame: OdometryFrame, T_before_now: Float64
     ) -> list[str]:
-        """What speaks against a motion; nothing, where it is to be trusted."""
+        """What speaks against a motion; empty where it is to be trusted."""
         settings = self._settings
         length_m = float(np.linalg.norm(T_before_now[:3, 3]))
         if health.sigma_m > settings.max_sigma_m + settings.max_sigma_share * length_m:
@@ -65,7 +65,7 @@ class CheckedOdometry:
         found = explain_motion(before, frame.pair.left, T_before_now, camera, agreement)
         if found.telling >= agreement.min_telling:
             return _contradiction(found.share, found.telling, agreement.min_share)
-        # A motion of features says how sure it is; any other has nothing to show for itself here.
+        # A visual motion has passed the test of its uncertainty; any other has no other evidence.
         if np.isfinite(health.sigma_m):
             return []
         return [f"only {found.telling} patches of the picture can tell one motion from another"]

@@ -1,4 +1,4 @@
-"""Corners to follow, spread over the picture."""
+"""Corners to track, spread over the picture."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from recon.structures.arrays import Bool, Float32, UInt8
 
 
 def find_corners(grey: UInt8, taken_uv: Float32, settings: CornerSettings) -> Float32:
-    """The best corners of each cell of a picture, away from those that are already followed.
+    """The best corners of each cell of a picture, away from those already tracked.
 
-    Cells keep one strongly textured place from taking all features: motion is only well
-    determined by features that surround the camera.
+    Cells keep one strongly textured region from taking all features: only features spread over the
+    picture determine the motion well.
 
     Args:
         grey: uint8 (H, W).
-        taken_uv: float32 (N, 2), columns and rows of features already followed; each counts in
-            its cell.
+        taken_uv: float32 (N, 2), columns and rows of features already tracked; they count
+            towards the limit of their cell.
         settings: Cell size, number and quality of corners.
 
     Returns:
@@ -33,13 +33,13 @@ def find_corners(grey: UInt8, taken_uv: Float32, settings: CornerSettings) -> Fl
     cells = _cell_of(np.stack([u, v], axis=1), grey.shape, settings)
     order = np.lexsort((u, v, -score[v, u], cells))
     rank = _rank_in_group(cells[order])
-    room = settings.per_cell - _count_per_cell(taken_uv, grey.shape, settings)
-    keep = order[rank < room[cells[order]]]
+    missing = settings.per_cell - _count_per_cell(taken_uv, grey.shape, settings)
+    keep = order[rank < missing[cells[order]]]
     return np.stack([u[keep], v[keep]], axis=1).astype(np.float32)
 
 
 def _peaks(score: Float32, settings: CornerSettings) -> Bool:
-    """Pixels that are the best of their surroundings and good enough, off the border."""
+    """Local maxima of the score that are good enough and away from the border."""
     size = 2 * settings.distance_px + 1
     peak = score >= cv2.dilate(score, np.ones((size, size), np.uint8))
     peak &= score > settings.min_score
@@ -50,7 +50,7 @@ def _peaks(score: Float32, settings: CornerSettings) -> Bool:
 
 
 def _free(shape: tuple[int, ...], taken_uv: Float32, settings: CornerSettings) -> Bool:
-    """Pixels that lie off every feature that is already followed."""
+    """Pixels away from every feature already tracked."""
     free = np.ones(shape, np.uint8)
     for u, v in np.rint(taken_uv).astype(int).tolist():
         cv2.circle(free, (u, v), settings.distance_px, 0, -1)

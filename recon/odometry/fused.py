@@ -1,4 +1,4 @@
-"""Visual odometry, corrected by kiss-icp where ICP knows better."""
+"""Visual odometry, corrected by kiss-icp where ICP is more certain."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from recon.structures.arrays import Float64
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
-    """Where the camera is before ICP is asked.
+    """The pose before ICP.
 
     Attributes:
         T_world_camera: float64 (4, 4), the last pose moved on by the visual motion.
-        covariance: float64 (6, 6) of a step of it.
-        visual: What the visual odometry said.
+        covariance: float64 (6, 6), of a step in its axes.
+        visual: The result of the visual odometry.
     """
 
     T_world_camera: Float64
@@ -36,12 +36,12 @@ class _Prior:
 
     @property
     def seen(self) -> bool:
-        """Whether the motion was seen, not extrapolated."""
+        """Whether the motion was measured, not extrapolated."""
         return self.visual.information is not None
 
 
 class FusedOdometry:
-    """A visual prior for every frame, and a kiss-icp correction that must earn its place.
+    """Visual odometry as the prior of every frame, and gated corrections by kiss-icp.
 
     Args:
         settings: Points, ICP and the gate.
@@ -70,23 +70,23 @@ class FusedOdometry:
         self._lost = 0
         self._mapped = False
         self._frames = 0
-        # Until ICP was heard, it is taken to be as good as it can be.
+        # Until ICP has run, it is assumed to be as good as it can be.
         gate = settings.gate
         self._icp_covariance = step_covariance(gate.icp_floor_m, gate.icp_floor_deg)
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
         """Register the next frame.
 
-        ICP costs as much as vision and seldom knows better, so it is asked every few frames, and
-        whenever the prior is unsure. Without a visual motion the last one goes on and ICP may
-        correct it; without either the health says that the pose rests on no measurement, and the
-        map is left as it is.
+        ICP takes as long as the visual odometry and rarely improves it, so it runs every few frames
+        and whenever the prior is uncertain. Without a visual motion the last one is continued and
+        ICP may correct it; without either, the health says that the pose rests on no measurement,
+        and the map is not updated.
         """
         prior = self._prior(self._visual.track(frame))
         due = self._frames % self._settings.icp.every == 0
         self._frames += 1
         if due or not prior.seen or self._icp_may_help(prior):
-            result = self._asked(prior, frame)
+            result = self._with_icp(prior, frame)
         else:
             result = OdometryResult(prior.T_world_camera, prior.visual.result.health)
         self._T_visual = prior.visual.result.T_world_camera
@@ -94,11 +94,11 @@ class FusedOdometry:
         return result
 
     def _icp_may_help(self, prior: _Prior) -> bool:
-        """Whether ICP, as sure as it was when it was last heard, would change an unsure prior."""
+        """Whether ICP, if as certain as the last time, would change the prior."""
         return icp_may_help(prior.covariance, self._icp_covariance, self._settings.gate)
 
-    def _asked(self, prior: _Prior, frame: OdometryFrame) -> OdometryResult:
-        """The prior after ICP was heard; its map has the frame afterwards."""
+    def _with_icp(self, prior: _Prior, frame: OdometryFrame) -> OdometryResult:
+        """The prior with ICP's correction; the frame is added to ICP's map."""
         points = select_points(frame, self._settings.points)
         result = self._corrected(prior, points)
         if result.health.ok and len(points) >= self._settings.icp.min_points:
@@ -117,7 +117,7 @@ class FusedOdometry:
         return _Prior(orthonormalise(T), covariance, visual)
 
     def _corrected(self, prior: _Prior, points: PointCloud) -> OdometryResult:
-        """The prior, moved by as much of ICP's correction as was earned."""
+        """The prior, moved by the part of ICP's correction that passes the gate."""
         health = prior.visual.result.health
         if not self._mapped or len(points) < self._settings.icp.min_points:
             note = "no map for ICP yet" if not self._mapped else "too few points for ICP"
@@ -132,14 +132,14 @@ class FusedOdometry:
         return OdometryResult(T, _health(health, alignment, correction, verdict))
 
     def _align(self, prior: _Prior, points: PointCloud) -> IcpAlignment:
-        """ICP from the prior; where that was not seen, from farther away first."""
+        """ICP from the prior; from an extrapolated one with a wider threshold first."""
         icp, T = self._settings.icp, prior.T_world_camera
         if not prior.seen:
             T = self._icp.align(points.xyz, T, icp.lost_threshold_m).T_world_camera
         return self._icp.align(points.xyz, T, icp.threshold_m)
 
     def _measure(self, prior: _Prior, alignment: IcpAlignment) -> Correction:
-        """What ICP would change, and how the frame fits the map on both sides of it."""
+        """What ICP would change, and how the frame fits the map before and after."""
         T_prior_icp = invert(prior.T_world_camera) @ alignment.T_world_camera
         near = apply(invert(prior.T_world_camera), self._icp.map_points())
         surfaces = describe_surfaces(near, self._settings.icp.surface_m)
@@ -150,7 +150,7 @@ class FusedOdometry:
         )
 
     def _learn_offset(self, prior: _Prior, correction: Correction) -> None:
-        """Average what ICP says in every frame alike, where the prior is good."""
+        """Average ICP's corrections of good priors: their mean is a bias, not a motion."""
         if prior.seen and correction.after.overlap >= self._settings.gate.min_overlap:
             self._measured += 1
             share = 1.0 / min(self._measured, self._settings.gate.offset_frames)

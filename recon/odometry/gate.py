@@ -1,4 +1,4 @@
-"""Which part of an ICP correction is taken: as much as it knows better than the prior."""
+"""Which part of an ICP correction is applied: a Kalman update with outlier tests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from recon.structures.arrays import Float64
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What ICP would do to the prior, and how the frame fits the map with and without it.
+    """How ICP would move the prior, and how the frame fits the map with and without it.
 
     Attributes:
         step: float64 (6,), translation in metres and rotation vector in radians, in camera axes
@@ -30,12 +30,12 @@ class Correction:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What is taken of a correction.
+    """The part of a correction that is applied.
 
     Attributes:
-        step: float64 (6,), the part that is taken; zero where it was refused.
-        accepted: True where any was taken.
-        note: Why it was refused; empty where it was not.
+        step: float64 (6,), the part; zero where the correction is refused.
+        accepted: Whether any of it is applied.
+        note: Why it is refused; empty where it is not.
     """
 
     step: Float64
@@ -48,14 +48,14 @@ def judge(
 ) -> Verdict:
     """Weigh an ICP correction against its prior.
 
-    A Kalman update: along each direction the correction counts by how sure ICP is there against
-    how sure the prior is. Along a corridor ICP knows nothing and takes nothing.
+    A Kalman update: in each direction the correction is weighted by the certainty of ICP against
+    that of the prior. Along a corridor ICP knows nothing, and nothing is applied.
 
     Args:
-        correction: What ICP would do.
-        offset: float64 (6,), the standing part of ICP's corrections, which is no news.
+        correction: How ICP would move the prior.
+        offset: float64 (6,), mean of ICP's corrections, a bias that is subtracted.
         prior_covariance: float64 (6, 6) of a step of the prior, metres and radians.
-        settings: Limits, and how far each side's own confidence is believed.
+        settings: Limits, and how far ICP's own certainty is believed.
     """
     if correction.after.overlap < settings.min_overlap:
         return _refused(f"overlap {correction.after.overlap:.2f} under {settings.min_overlap:g}")
@@ -75,29 +75,29 @@ def judge(
 
 
 def icp_may_help(prior: Float64, icp: Float64, settings: GateSettings) -> bool:
-    """Whether an ICP of some covariance would know better than a prior in any direction."""
+    """Whether ICP with some covariance would improve a prior in any direction."""
     share, _ = _shares(prior, prior + icp)
     return bool(share.max() >= settings.min_share)
 
 
 def icp_covariance(fit: Fit, settings: GateSettings) -> Float64:
-    """Covariance (6, 6) of ICP: from the surfaces it rests on, with a floor for their bias."""
+    """Covariance (6, 6) of ICP: from the surfaces that fix it, with a floor for their bias."""
     floor = step_covariance(settings.icp_floor_m, settings.icp_floor_deg)
     return covariance_of(settings.icp_independence * fit.information) + floor
 
 
 def _worthwhile(prior: Float64, both: Float64, news: Float64, min_share: float) -> Float64:
-    """The Kalman step, without the directions in which little of the news would be taken."""
+    """The Kalman step, without the directions of small gain."""
     share, directions = _shares(prior, both)
     kept = np.where(share >= min_share, share, 0.0)
     return np.asarray(directions @ (kept * np.linalg.solve(directions, news)))
 
 
 def _shares(prior: Float64, both: Float64) -> tuple[Float64, Float64]:
-    """Shares (6,) taken in independent directions, and these (6, 6), one a column.
+    """Gains (6,) in independent directions, and these directions (6, 6), one per column.
 
-    With ``both = L·Lᵀ`` the Kalman gain ``prior·both⁻¹`` becomes symmetric; its eigenvalues are
-    the shares.
+    Whitened by ``both = L·Lᵀ``, the Kalman gain ``prior·both⁻¹`` is symmetric; its eigenvalues are
+    the gains.
     """
     L = np.linalg.cholesky(both)
     half = np.linalg.solve(L, prior)

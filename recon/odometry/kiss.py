@@ -13,7 +13,7 @@ from recon.structures.arrays import Float64
 
 
 class KissOdometry:
-    """Gives kiss-icp every point, as a LiDAR would; it loses motion on dense stereo clouds.
+    """Gives kiss-icp every point, as with a LiDAR; on dense stereo clouds it underestimates motion.
 
     Args:
         settings: Range, voxel, threshold.
@@ -33,7 +33,7 @@ class KissOdometry:
         self._poses: list[Float64] = []
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """Register the next frame; one with too few points is left out and extrapolated."""
+        """Register the next frame; one with too few points is extrapolated."""
         points = all_points(frame, self._settings.max_range_m)
         if len(points) < self._settings.min_points:
             note = f"{len(points)} points are too few for ICP; the last motion goes on"
@@ -48,7 +48,7 @@ class KissOdometry:
         return OdometryResult(T_world_camera, health)
 
     def _extrapolated(self) -> Float64:
-        """The last pose, moved on by the last motion."""
+        """The last pose, moved by the last motion."""
         if len(self._poses) < 2:
             return self._poses[-1] if self._poses else np.eye(4)
         before, last = self._poses

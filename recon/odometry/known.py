@@ -1,4 +1,4 @@
-"""Poses that are known already, given out frame by frame."""
+"""Known poses in place of an odometry."""
 
 from __future__ import annotations
 

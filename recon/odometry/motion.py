@@ -1,4 +1,4 @@
-"""What is expected of the next frame: the last motion goes on."""
+"""The constant-velocity motion model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from recon.geometry.se3 import exp_so3, invert, log_so3, make_transform, orthono
 from recon.structures.arrays import Float64
 
 _LONGEST_GAP: Final = 20.0
-"""Over more times the last interval no motion is foretold: the last one is repeated once."""
+"""In intervals: over a longer gap the motion is not extrapolated in time, but repeated once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,18 +39,18 @@ class Motion:
         return orthonormalise(self.T_world_camera @ part_of(self.T_before_camera, share))
 
     def moved(self, T_world_camera: Float64, timestamp_s: float) -> Motion:
-        """After a measured pose: the motion to it is the last one now."""
+        """After a measured pose, which gives a new motion."""
         motion = invert(self.T_world_camera) @ T_world_camera
         return Motion(T_world_camera, timestamp_s, motion, timestamp_s - self.timestamp_s)
 
     def drifted(self, timestamp_s: float) -> Motion:
-        """After a frame without a measured pose: the same motion goes on."""
+        """After a frame without a measured pose: the same motion continues."""
         T = self.predict(timestamp_s)
         return Motion(T, timestamp_s, self.T_before_camera, self.interval_s)
 
 
 def part_of(T: Float64, share: float) -> Float64:
-    """A motion (4, 4) done in part, or several times: rotation and translation in proportion."""
+    """A fraction or multiple of a motion (4, 4): rotation and translation in proportion."""
     if share == 1.0:
         return T
     return make_transform(exp_so3(share * log_so3(T[:3, :3])), share * T[:3, 3])

@@ -1,4 +1,4 @@
-"""Which pixels go to ICP: the ones that stereo measures well."""
+"""Points for ICP: the pixels that stereo measures well."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from recon.structures.arrays import Bool, Float32, UInt8
 
 
 def select_points(frame: OdometryFrame, settings: PointSettings) -> PointCloud:
-    """Textured points whose disparity agrees with its neighbours, near enough to be exact.
+    """Near, textured points whose disparity agrees with its neighbours.
 
-    Dense stereo clouds are smeared along the ray where there is no texture across it, and
-    extend the ground towards the camera; aligned as they are, they lose forward motion.
+    Dense stereo clouds are smeared along the rays where there is little texture, and extend the
+    ground towards the camera; ICP on all points underestimates forward motion.
 
     Args:
         frame: Pictures and disparity.
-        settings: Texture, consistency, range and accuracy that are asked for.
+        settings: Required texture, consistency, range and accuracy.
 
     Returns:
         Points in camera axes with ``sigma_m``; perhaps none.

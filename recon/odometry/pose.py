@@ -1,4 +1,4 @@
-"""The pose of one frame from points whose places are known."""
+"""The pose of one frame from known points (perspective-n-point)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from recon.structures.arrays import Bool, Float64
 
 @dataclass(frozen=True, eq=False)
 class LocatedCamera:
-    """Where a camera stands, by points whose places are known.
+    """The pose of a camera, from known points.
 
     Attributes:
         T_world_camera: float64 (4, 4).
@@ -34,18 +34,18 @@ def locate_camera(
     T_world_guess: Float64,
     settings: PoseSettings,
 ) -> LocatedCamera | None:
-    """Where a camera stands that sees known points, by the largest set that agrees.
+    """The pose of a camera that sees known points, from the largest set of them that agrees.
 
     OpenCV's RANSAC finds that set well, but its pose is a closed-form fit (EPnP) that one point
-    near the horizon throws by metres or kilometres. So only the set is taken: the pose is fitted
-    to it anew, from the guess and from RANSAC's pose, and the one that more points agree with wins.
-    RANSAC seeds its own generator, so equal input gives equal output.
+    near the horizon throws off by metres or kilometres. So only the set is used: the pose is fitted
+    to it again, from the guess and from RANSAC's pose, and the fit with more inliers wins. RANSAC
+    seeds its own generator, so equal input gives equal output.
 
     Args:
         xyz_world: float64 (N, 3), the points.
         uv: float64 (N, 2), where the camera sees them.
         camera: The rectified camera.
-        T_world_guess: float64 (4, 4), where the camera is expected.
+        T_world_guess: float64 (4, 4), the predicted pose.
         settings: Tolerance, samples, and how many must agree.
 
     Returns:
@@ -69,7 +69,7 @@ def locate_camera(
 
 
 def enough_agree(agreeing: int, tracks: int, settings: PoseSettings) -> bool:
-    """Whether so many agreeing points of so many tracks make a pose."""
+    """Whether so many of the tracks agree that the pose counts as measured."""
     return agreeing >= max(settings.min_inliers, settings.min_inlier_share * tracks)
 
 

@@ -1,4 +1,4 @@
-"""How the camera moved by a path from elsewhere: wheels, an inertial unit, a satellite receiver."""
+"""The motion of the camera by other sensors: wheels, an inertial unit, a satellite receiver."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _CAMERA_FROM_BODY: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
-    """A path of the same rig on the same clock, of which only motions are used.
+    """A path of the same rig on the same clock, of which only relative motions are used.
 
     Attributes:
-        path: Where the left camera was; its rate may be any, its world any.
+        path: Poses at any rate and in any world frame.
         settings: Axes, gaps, accuracy.
     """
 
@@ -37,7 +37,7 @@ class MotionPrior:
             )
 
     def check_covers(self, stamps_s: Float64) -> None:
-        """Refuse a path that tells nothing about a drive.
+        """Refuse a path that gives no motion of a drive.
 
         Args:
             stamps_s: float64 (N,), times of its frames.
@@ -57,7 +57,7 @@ class MotionPrior:
         )
 
     def motion(self, from_s: float, to_s: float) -> Float64 | None:
-        """T_from_to (4, 4) of the camera between two times; None = the path does not tell."""
+        """T_from_to (4, 4) of the camera between two times; None = the path has a gap there."""
         start, end = self._pose_at(from_s), self._pose_at(to_s)
         if start is None or end is None or not to_s > from_s:
             return None
@@ -68,12 +68,12 @@ class MotionPrior:
         return orthonormalise(T)
 
     def sigmas(self, T_from_to: Float64) -> tuple[float, float]:
-        """Standard deviations of a motion: metres, degrees."""
+        """Standard deviations of a motion: translation in metres, rotation in degrees."""
         s, length_m = self.settings, float(np.linalg.norm(T_from_to[:3, 3]))
         return s.sigma_m + s.sigma_share * length_m, s.sigma_deg
 
     def _pose_at(self, time_s: float) -> Float64 | None:
-        """The pose (4, 4) at a time, between the two nearest ones."""
+        """The pose (4, 4) at a time, interpolated; None = outside the path or in a gap."""
         times_s = self.path.timestamps_s
         if not times_s[0] <= time_s <= times_s[-1]:
             return None

@@ -13,11 +13,11 @@ from recon.structures.arrays import Float64, freeze
 
 @dataclass(frozen=True, eq=False)
 class OdometryFrame:
-    """All that an odometry may use of one frame.
+    """What an odometry is given of one frame.
 
     Attributes:
-        pair: The rectified pictures, for tracking.
-        disparity: What the matcher found in them.
+        pair: The rectified pictures.
+        disparity: Their disparity.
     """
 
     pair: RectifiedPair
@@ -29,21 +29,21 @@ class OdometryHealth:
     """How far the pose of one frame can be trusted. NaN = does not apply or not measured.
 
     Attributes:
-        ok: False where the pose is not to be trusted: it rests on no measurement (it is then
-            extrapolated), or the picture speaks against it.
+        ok: False where the pose is not to be trusted: it is extrapolated, or the picture
+            contradicts it.
         tracks: Features followed from the last frame.
         inliers: Features that agree with the visual motion.
         reprojection_px: Their median reprojection error.
-        sigma_m: Standard deviation of the visual translation from the frames before.
-        sigma_deg: The same for the rotation.
+        sigma_m: Standard deviation of the visual translation, given the frames before.
+        sigma_deg: That of the rotation.
         icp_points: Points given to ICP.
         overlap: Share of ICP source points with a neighbour in the map.
         residual_m: Median distance of those to the map.
         correction_m: Translation by which ICP would move the prior.
         correction_deg: Rotation by which ICP would move the prior.
-        accepted: True where (a part of) the ICP correction was taken.
+        accepted: True where (a part of) the ICP correction was applied.
         notes: Why something was refused or went wrong, for the log.
-        warnings: What a user must know about the frame, though it may have a pose.
+        warnings: Problems of the frame that the user should know, even if it has a pose.
     """
 
     ok: bool = True
@@ -80,11 +80,11 @@ class OdometryResult:
 
 @runtime_checkable
 class Odometry(Protocol):
-    """Follows the camera from frame to frame; holds state, so frames come in order.
+    """Tracks the camera from frame to frame; holds state, so frames must come in order.
 
-    The state can be pickled: from it a drive goes on as if it had never been broken off.
+    It can be pickled: a drive resumed from the copy gives the same poses as without a break.
     """
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """Register the next frame. A poor or empty frame gives a health record, not a jump."""
+        """Register the next frame. On a poor or empty one the health says so; poses never jump."""
         ...

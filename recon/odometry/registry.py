@@ -25,12 +25,12 @@ ODOMETRIES: Final[dict[str, Callable[[OdometrySettings, MotionPrior | None], Odo
 def make_odometry(
     name: str, settings: OdometrySettings | None = None, prior: Trajectory | None = None
 ) -> Odometry:
-    """Make the odometry of a name; it doubts its poses.
+    """Make the odometry of a name; its poses are checked (`CheckedOdometry`).
 
     Args:
         name: A key of `ODOMETRIES`.
-        settings: The settings of all odometries; each takes its own part.
-        prior: How the camera moved by other means, on the clock of the frames; None = not known.
+        settings: The settings of all odometries; each uses its own part.
+        prior: Path of the rig by other sensors, on the clock of the frames; None = not known.
 
     Raises:
         SettingsError: There is no such odometry, or it takes no prior.
@@ -44,5 +44,5 @@ def make_odometry(
             "kiss takes no prior", expected="visual or fused", hint="drop --prior or --odometry"
         )
     settings = settings or OdometrySettings()
-    told = None if prior is None else MotionPrior(prior, settings.prior)
-    return CheckedOdometry(ODOMETRIES[name](settings, told), settings.trust)
+    motion_prior = None if prior is None else MotionPrior(prior, settings.prior)
+    return CheckedOdometry(ODOMETRIES[name](settings, motion_prior), settings.trust)

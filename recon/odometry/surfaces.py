@@ -1,4 +1,4 @@
-"""The local map as surfaces: what a point that lies near it can say about the pose."""
+"""A local map as surfaces, and what points near them determine of a pose."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from recon.kernels.voxels import pack_keys
 from recon.structures.arrays import Bool, Float64
 
 MIN_POINTS = 10
-"""Fewer points of a cell do not tell a surface."""
+"""Least number of points in a cell with a surface."""
 
 THIN_SHARE = 0.1
 """A cell is thin along an axis where its points spread by less than this share of its edge.
@@ -20,17 +20,17 @@ THIN_SHARE = 0.1
 Points that fill a cell evenly spread by 0.29 of its edge (1/√12)."""
 
 NOISE_M = 0.02
-"""No surface is known better than this."""
+"""Standard deviation that is added to that of every surface."""
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Cells of a map, each with its middle and with what it fixes.
+    """Cells of a map, each with its mean and its surface.
 
     Attributes:
         edge_m: Edge of a cell.
         keys: int64 (M,), packed cell indices, ascending.
-        means: float64 (M, 3), middle of the points of each cell.
+        means: float64 (M, 3), mean of the points in each cell.
         information: float64 (M, 3, 3), inverse covariance along the thin axes, zero along the
             others: a wall fixes one direction, a pole two, a bush none.
     """
@@ -48,8 +48,8 @@ class Fit:
     Attributes:
         overlap: Share of points that lie in a cell of the map.
         residual_m: Median distance of points to the surface of their cell; NaN = no surface.
-        information: float64 (6, 6), what the points tell about a step (translation in metres,
-            rotation vector in radians) of their frame.
+        information: float64 (6, 6), of a step (translation in metres, rotation vector in radians)
+            of their frame.
     """
 
     overlap: float
@@ -58,7 +58,7 @@ class Fit:
 
 
 def describe_surfaces(xyz: Float64, edge_m: float) -> Surfaces:
-    """Sum a cloud up by the surfaces in its cells.
+    """Fit a surface to the points in each cell of a cloud.
 
     Args:
         xyz: float64 (N, 3).
@@ -93,7 +93,7 @@ def fit_surfaces(xyz: Float64, surfaces: Surfaces) -> Fit:
 
 
 def _thin_information(covariance: Float64, edge_m: float) -> Float64:
-    """Inverse covariance (M, 3, 3) along the axes on which the points hardly spread."""
+    """Inverse covariance (M, 3, 3) along the thin axes, zero along the others."""
     spread, axes = np.linalg.eigh(covariance)
     thin = np.sqrt(np.maximum(spread, 0.0)) < THIN_SHARE * edge_m
     strength = np.where(thin, 1.0 / (np.maximum(spread, 0.0) + NOISE_M**2), 0.0)
@@ -102,7 +102,7 @@ def _thin_information(covariance: Float64, edge_m: float) -> Float64:
 
 
 def _distance_m(off: Float64, information: Float64) -> Float64:
-    """Distances (N,) along the thin axes: the Mahalanobis distance, in units of the surface."""
+    """Distances (N,) along the thin axes: Mahalanobis distances, scaled to metres."""
     square = np.einsum("ni,nij,nj->n", off, information, off)
     strength = np.einsum("nii->n", information)
     distance: Float64 = np.sqrt(np.maximum(square, 0.0) / strength)

@@ -1,4 +1,4 @@
-"""Following features from picture to picture, and finding them in the other eye."""
+"""Tracking of features from picture to picture, and their disparity."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from recon.structures.arrays import Bool, Float32, UInt8
 def follow(
     source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32, settings: TrackSettings
 ) -> tuple[Float32, Bool]:
-    """Follow features to another picture, and back again as a check.
+    """Track features to another picture, and back again as a check.
 
     Args:
         source: Picture in which the features are known.
-        target: Picture in which they are looked for.
-        uv: float32 (N, 2), where they are in ``source``.
-        guess_uv: float32 (N, 2), where they may be in ``target``.
+        target: Picture to which they are tracked.
+        uv: float32 (N, 2), columns and rows in ``source``.
+        guess_uv: float32 (N, 2), predicted columns and rows in ``target``.
         settings: Window and tolerances.
 
     Returns:
-        float32 (N, 2), where they are in ``target``, and bool (N,), True where the way back
-        ends where the way there began.
+        float32 (N, 2), columns and rows in ``target``, and bool (N,), True where tracking back
+        ends at the feature.
 
     Ref:
         Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2001;
@@ -43,7 +43,7 @@ def follow(
 
 
 def _comparable(source: UInt8, target: UInt8, max_change: float) -> UInt8:
-    """The target, at the exposure of the source where the two differ."""
+    """The target, adapted to the exposure of the source if the two differ."""
     ours, theirs = (np.ravel(cv2.meanStdDev(image)) for image in (source, target))
     same = np.abs(theirs - ours) <= max_change * ours
     return target if same.all() else exposed_as(source, target)
@@ -53,7 +53,7 @@ def sample_disparity(disparity: Disparity, uv: Float32, settings: TrackSettings)
     """The matcher's disparity of features: the median around each, where that is consistent.
 
     Tracking features into the right picture instead gave two to four times the drift on real
-    drives; a likely reason is that patches at the edge of an object see the background too.
+    drives, probably because patches at the edge of an object contain the background, too.
 
     Args:
         disparity: The matcher's result.

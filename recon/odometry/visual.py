@@ -1,4 +1,4 @@
-"""Visual odometry: features followed through a short window of stereo frames."""
+"""Visual odometry: features tracked through a short window of stereo frames."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class VisualState:
     """What is kept from frame to frame.
 
     Attributes:
-        window: The last frames that were seen, and the points in them.
+        window: The last frames that were registered, and the points in them.
         left: uint8 (H, W), the left picture of the newest of them.
         disparity: Its disparity.
-        motion: Where the camera is by now, which may be some frames later.
-        seen_s: Time of the newest of the frames that were seen.
+        motion: Pose and motion by now, which may be some frames later.
+        seen_s: Time of the newest frame that was registered.
     """
 
     window: TrackWindow
@@ -44,13 +44,13 @@ class VisualState:
 
 @dataclass(frozen=True, eq=False)
 class VisualEstimate:
-    """A pose, and how well it is known.
+    """A pose and its uncertainty.
 
     Attributes:
         result: Pose and health.
         information: float64 (6, 6) of a step (translation in metres, rotation vector in
-            radians) in camera axes, of what was seen or of the prior that carries; None where
-            the pose is extrapolated.
+            radians) in camera axes: of the tracks, or of the prior where there are none; None
+            where the pose is extrapolated.
     """
 
     result: OdometryResult
@@ -67,12 +67,12 @@ class _Seen:
 
 
 class VisualOdometry:
-    """Follows the camera by the features it sees.
+    """Tracks the camera by features.
 
     Args:
         settings: Corners, tracks, pose and window.
-        prior: How the camera moved by other means: features are looked for where it leads, it
-            carries through frames that show none, and features that contradict it are refused.
+        prior: Motion by other sensors: it predicts where features are, bridges frames without any,
+            and refuses features that contradict it.
     """
 
     def __init__(self, settings: VisualSettings, prior: MotionPrior | None = None) -> None:
@@ -81,16 +81,16 @@ class VisualOdometry:
         self._state: VisualState | None = None
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """Register the next frame; without a visual motion, the last one is assumed to go on."""
+        """Register the next frame; without a visual motion, the last one is continued."""
         return self.track(frame).result
 
     def track(self, frame: OdometryFrame) -> VisualEstimate:
-        """The same, with what is known about the pose.
+        """Register the next frame, with the uncertainty of its pose.
 
-        Where features cannot be followed, they are looked for in the whole picture: after a gap,
-        or once the sight is back. Where that fails too, a frame with features of its own is a
-        new beginning at the pose where the last motion leads; one without leaves the last frame
-        that was seen waiting for the next.
+        Where features cannot be tracked, they are matched over the whole picture: after a gap, or
+        once the view is clear again. Where that fails too, a frame with features of its own starts
+        a new window at the predicted pose; a frame without any is skipped, and the next one is
+        matched with the last that was registered.
         """
         state = self._state
         if state is None:
@@ -98,17 +98,19 @@ class VisualOdometry:
             self._state = self._begin(frame, motion)
             return VisualEstimate(OdometryResult(np.eye(4), OdometryHealth()), None)
         time_s = frame.pair.timestamp_s
-        told = self._told(state.motion.timestamp_s, time_s)
+        prior_motion = self._prior_motion(state.motion.timestamp_s, time_s)
         motion = state.motion.drifted(time_s)
-        if told is not None:
-            motion = state.motion.moved(state.motion.T_world_camera @ told, time_s)
+        if prior_motion is not None:
+            motion = state.motion.moved(state.motion.T_world_camera @ prior_motion, time_s)
         predicted = motion.T_world_camera
-        seen = self._followed(state, frame, predicted) or self._found_again(state, frame, predicted)
+        seen = self._by_tracking(state, frame, predicted) or self._by_matching(
+            state, frame, predicted
+        )
         if seen is None:
-            return self._lost(state, frame, motion, told)
+            return self._lost(state, frame, motion, prior_motion)
         if self._contradicts(state, seen, frame):
             what = "features contradict the prior"
-            return self._lost(state, frame, motion, told, what)
+            return self._lost(state, frame, motion, prior_motion, what)
         T_world_camera = seen.window.T_world_camera[-1].copy()
         window = self._replenish(seen.window.trimmed(self._settings.window.frames), frame)
         motion = state.motion.moved(T_world_camera, time_s)
@@ -116,38 +118,38 @@ class VisualOdometry:
         return self._estimate(seen, frame.pair.camera)
 
     def _begin(self, frame: OdometryFrame, motion: Motion) -> VisualState:
-        """A new window at the pose where the camera is by now."""
+        """A new window that starts at a pose."""
         window = self._replenish(_empty(motion.T_world_camera), frame)
         time_s = frame.pair.timestamp_s
         return VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
 
-    def _told(self, from_s: float, to_s: float) -> Float64 | None:
-        """The motion between two times by the prior, where there is one that tells."""
+    def _prior_motion(self, from_s: float, to_s: float) -> Float64 | None:
+        """The motion between two times by the prior; None = not known."""
         return None if self._prior is None else self._prior.motion(from_s, to_s)
 
     def _contradicts(self, state: VisualState, seen: _Seen, frame: OdometryFrame) -> bool:
-        """Whether what was seen since the last frame that was, is no motion by the prior."""
-        told = self._told(state.seen_s, frame.pair.timestamp_s)
-        if told is None or self._prior is None:
+        """Whether the visual motion since the last registered frame contradicts the prior."""
+        prior_motion = self._prior_motion(state.seen_s, frame.pair.timestamp_s)
+        if prior_motion is None or self._prior is None:
             return False
         found = invert(state.window.T_world_camera[-1]) @ seen.window.T_world_camera[-1]
-        off = as_step(invert(told) @ found)
+        off = as_step(invert(prior_motion) @ found)
         information = self._information(seen.window, frame.pair.camera)
-        both = covariance_of(information) + step_covariance(*self._prior.sigmas(told))
+        both = covariance_of(information) + step_covariance(*self._prior.sigmas(prior_motion))
         return float(np.sqrt(off @ np.linalg.solve(both, off))) > self._prior.settings.max_sigmas
 
-    def _followed(
+    def _by_tracking(
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
-        """The frame by the features that were followed into it."""
+        """The frame, registered by tracking; None = that fails."""
         return self._register(
             state.window, self._observe(state, frame, predicted), frame, predicted
         )
 
-    def _found_again(
+    def _by_matching(
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
-        """The frame by features that look alike, wherever they are now."""
+        """The frame, registered by matching over the whole picture; None = that fails."""
         count = self._settings.relocate_features
         uv, uv_now = match_features(state.left, frame.pair.left, count, any_scale=True)
         camera, T_world_then = frame.pair.camera, state.window.T_world_camera[-1]
@@ -159,14 +161,12 @@ class VisualOdometry:
         seen = self._register(window, now, frame, predicted)
         if seen is None:
             return None
-        note = "features were looked for in the whole picture"
-        # The matches are scattered over both pictures; what is followed next begins anew.
-        return _Seen(seen.window, seen.tracks, note)
+        return replace(seen, note="features were looked for in the whole picture")
 
     def _register(
         self, window: TrackWindow, uvd: Float64, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
-        """The window with the new frame in it, where enough features agree on one motion."""
+        """The window with the new frame added, if enough features agree on one motion."""
         camera, settings = frame.pair.camera, self._settings
         tracks = np.flatnonzero(np.isfinite(uvd[:, 0]))
         found = locate_camera(
@@ -186,19 +186,19 @@ class VisualOdometry:
         state: VisualState,
         frame: OdometryFrame,
         motion: Motion,
-        told: Float64 | None,
+        prior_motion: Float64 | None,
         what: str = "no motion fits",
     ) -> VisualEstimate:
-        """The motion goes on; what is seen of it decides from where it is followed next."""
+        """Continue the motion; a frame with enough features starts a new window."""
         begun = self._begin(frame, motion)
         points = len(begun.window.xyz_world)
         sees = points >= self._settings.pose.min_inliers
         self._state = begun if sees else replace(state, motion=motion)
         why = f"{what if sees else 'nothing to follow in the picture'} ({points} features)"
-        if told is None or self._prior is None:
+        if prior_motion is None or self._prior is None:
             health = OdometryHealth(False, notes=(f"lost: {why}; the last motion goes on",))
             return VisualEstimate(OdometryResult(motion.T_world_camera, health), None)
-        sigma_m, sigma_deg = self._prior.sigmas(told)
+        sigma_m, sigma_deg = self._prior.sigmas(prior_motion)
         note = f"carried by the prior: {why}"
         health = OdometryHealth(sigma_m=sigma_m, sigma_deg=sigma_deg, notes=(note,))
         information = np.asarray(np.linalg.inv(step_covariance(sigma_m, sigma_deg)), np.float64)
@@ -224,7 +224,7 @@ class VisualOdometry:
         return np.where(d + camera.doffs_px < self._settings.pose.min_disparity_px, np.nan, d)
 
     def _replenish(self, window: TrackWindow, frame: OdometryFrame) -> TrackWindow:
-        """The window with new points where the newest frame has room for them."""
+        """The window with new points where the newest frame has too few."""
         taken = window.uvd[-1, window.seen[-1], :2].astype(np.float32)
         uv = find_corners(frame.pair.left, taken, self._settings.corners)
         d = self._disparity(frame.disparity, frame.pair.camera, uv)
@@ -232,12 +232,12 @@ class VisualOdometry:
         return window.with_points(uvd, _points(uvd, window.T_world_camera[-1], frame.pair.camera))
 
     def _information(self, window: TrackWindow, camera: RectifiedCamera) -> Float64:
-        """Information (6, 6) of the newest pose, tracks being less independent than many."""
+        """Information (6, 6) of the newest pose, scaled because errors of tracks correlate."""
         settings = self._settings.window
         return settings.independence * pose_information(window, camera, settings)
 
     def _estimate(self, seen: _Seen, camera: RectifiedCamera) -> VisualEstimate:
-        """What a registered frame says, and how sure it is."""
+        """The pose of a registered frame, its health and its information."""
         window = seen.window
         information = self._information(window, camera)
         newest = window.seen[-1]

@@ -1,7 +1,7 @@
-"""A short window of frames whose poses and points are adjusted together.
+"""Bundle adjustment over a short window of frames.
 
-Two frames give a motion; a few more give each point several looks, so that the error of one
-disparity is averaged before it becomes an error of the path.
+Two frames give a motion; with a few more, each point is seen several times, so that errors of its
+disparities average out before they become errors of the path.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class TrackWindow:
         return np.isfinite(self.uvd[:, :, 0])
 
     def with_frame(self, T_world_camera: Float64, uvd: Float64) -> TrackWindow:
-        """One frame more."""
+        """The window with one more frame."""
         return replace(
             self,
             T_world_camera=np.concatenate([self.T_world_camera, T_world_camera[None]]),
@@ -46,7 +46,7 @@ class TrackWindow:
         )
 
     def with_points(self, uvd: Float64, xyz_world: Float64) -> TrackWindow:
-        """Points more, first seen in the newest frame."""
+        """The window with more points, first seen in the newest frame."""
         unseen = np.full((len(self.uvd) - 1, len(uvd), 3), np.nan)
         return replace(
             self,
@@ -55,14 +55,14 @@ class TrackWindow:
         )
 
     def trimmed(self, frames: int) -> TrackWindow:
-        """The newest frames, and the points that are still followed or were seen twice in them."""
+        """The newest frames, and the points still tracked or seen twice in them."""
         uvd = self.uvd[-frames:]
         seen = np.isfinite(uvd[:, :, 0])
         keep = seen[-1] | (seen.sum(axis=0) >= 2)
         return TrackWindow(self.T_world_camera[-frames:], uvd[:, keep], self.xyz_world[keep])
 
     def without_newest(self, wrong: Bool) -> TrackWindow:
-        """Without the newest observations of the points of a mask (N,): their tracks end."""
+        """The window without the newest observations of masked points (N,): their tracks end."""
         uvd = self.uvd.copy()
         uvd[-1, wrong] = np.nan
         return replace(self, uvd=uvd)
@@ -85,7 +85,7 @@ def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
 
 
 def misfits(window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings) -> Bool:
-    """bool (N,), points whose newest observation is too far from its prediction."""
+    """bool (N,), points whose newest observation is an outlier."""
     residual = np.nan_to_num(reprojection(window, camera))
     sigmas = [settings.sigma_uv_px, settings.sigma_uv_px, settings.sigma_d_px]
     square = np.square(residual / np.array(sigmas)).sum(axis=1)
@@ -93,7 +93,7 @@ def misfits(window: TrackWindow, camera: RectifiedCamera, settings: WindowSettin
 
 
 def adjust(window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings) -> TrackWindow:
-    """Poses and points that explain all observations best; the oldest pose stays.
+    """Adjust poses and points to all observations; the oldest pose stays fixed.
 
     Levenberg-Marquardt on whitened residuals with Cauchy weights; the points are eliminated
     (Schur complement), so that each step solves for the poses alone.
@@ -134,7 +134,7 @@ def _levenberg_marquardt(
 def pose_information(
     window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings
 ) -> Float64:
-    """What the newest frame's observations tell about its pose, given the frames before.
+    """Information of the newest frame's observations on its pose, given the frames before.
 
     Returns:
         float64 (6, 6), information of a step (translation in metres, rotation vector in radians)
