@@ -1,9 +1,9 @@
-"""The errors of the project: one tree, one clear line each.
+"""The exceptions of the project: one hierarchy, one clear line each.
 
 ::
 
     ReconError
-    ├── SettingsError            a setting is unknown or out of its range
+    ├── SettingsError            a setting is unknown or out of range
     ├── ShapeError               an array has the wrong dtype, shape or values
     ├── CalibrationError         cameras that cannot give metric depth
     ├── FormatError              a file is missing, truncated or not what it claims to be
@@ -12,9 +12,9 @@
     ├── RegistrationError        frames cannot be registered
     ├── MappingError             a map cannot be built
     ├── MeshingError             a surface cannot be reconstructed
-    ├── EvaluationError          an estimate cannot be compared with its truth
+    ├── EvaluationError          an estimate cannot be compared with ground truth
     ├── OutputError              a result cannot be written
-    ├── MemoryLimitError         a run takes more memory than it may
+    ├── MemoryLimitError         a run exceeds its memory limit
     └── MissingDependencyError   an optional package is not installed
 
 The command line prints ``str(error)`` and exits with 1; the library only raises.
@@ -27,13 +27,13 @@ from typing import Any
 
 
 class ReconError(Exception):
-    """An error that a user can act on, told in one line.
+    """An error that a user can act on, described in one line.
 
     Args:
         what: What is wrong, in a few words.
-        where: File, frame or setting concerned.
-        got: What was found.
-        expected: What would have been right.
+        where: The file, frame or setting concerned.
+        got: The value found.
+        expected: A value that would be valid.
         hint: What to do about it.
     """
 
@@ -66,7 +66,7 @@ class ReconError(Exception):
 
 
 class SettingsError(ReconError):
-    """A setting is unknown or out of its range."""
+    """A setting is unknown or out of range."""
 
 
 class ShapeError(ReconError):
@@ -102,7 +102,7 @@ class MeshingError(ReconError):
 
 
 class EvaluationError(ReconError):
-    """An estimate cannot be compared with its truth."""
+    """An estimate cannot be compared with ground truth."""
 
 
 class OutputError(ReconError):
@@ -110,7 +110,7 @@ class OutputError(ReconError):
 
 
 class MemoryLimitError(ReconError):
-    """A run takes more memory than it may."""
+    """A run exceeds its memory limit."""
 
 
 class MissingDependencyError(ReconError):

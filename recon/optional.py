@@ -1,4 +1,4 @@
-"""The one gate for optional packages, passed when they are called for and not before."""
+"""Imports optional packages, at the moment they are needed."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ def require(module: str, *, extra: str) -> ModuleType:
 
     Args:
         module: Name to import, such as ``"rosbags"``.
-        extra: The extra of this project that installs it.
+        extra: The extra of this project that provides it.
 
     Returns:
         The imported module.
 
     Raises:
-        MissingDependencyError: The package is not installed; the message has the pip line.
+        MissingDependencyError: The package is not installed; the message has the pip command.
     """
     try:
         return import_module(module)

@@ -1,4 +1,4 @@
-"""The base of every stage's settings: frozen, checked, unknown keys refused."""
+"""Base class of every stage's settings: frozen, validated, unknown keys rejected."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Settings(BaseModel):
     """Immutable settings of one stage.
 
     Subclasses give each field a default, a unit in its name and a ``Field(description=…)``
-    with its bounds. Two equal settings give equal results: no environment variable counts.
+    with its bounds. Equal settings give equal results: environment variables have no effect.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
@@ -27,10 +27,10 @@ class Settings(BaseModel):
 
         Args:
             values: Nested mapping, as read from YAML.
-            where: Named in the error: the file or option that the values came from.
+            where: The file or option that the values came from, for the error message.
 
         Raises:
-            SettingsError: A key is unknown or a value out of range; the first is named.
+            SettingsError: A key is unknown or a value out of range; the first one is named.
         """
         try:
             return cls.model_validate(values)
@@ -39,7 +39,7 @@ class Settings(BaseModel):
 
 
 def setting_names(settings: type[BaseModel]) -> Iterator[str]:
-    """The dotted names of all settings below a model, and of the models among them."""
+    """The dotted names of all settings of a model, including nested models."""
     for name, field in settings.model_fields.items():
         yield name
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
@@ -49,24 +49,24 @@ def setting_names(settings: type[BaseModel]) -> Iterator[str]:
 def settings_error(
     error: ValidationError, *, where: str | None = None, names: Sequence[str] = ()
 ) -> SettingsError:
-    """Tell pydantic's first complaint in one line.
+    """Describe pydantic's first error in one line.
 
     Args:
-        error: What pydantic raised.
-        where: Named in the error.
-        names: Dotted names of the settings there are, for one that is unknown.
+        error: The error of pydantic.
+        where: The file or option, for the error message.
+        names: Dotted names of all settings, to suggest one for an unknown name.
     """
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"]) or "settings"
     if first["type"] == "extra_forbidden":
         return SettingsError(f"unknown setting {key!r}", where=where, hint=_advice(key, names))
-    # A sentence of ours, which pydantic introduces with words of its own.
+    # Our own message, without the prefix that pydantic adds.
     said = first.get("ctx", {}).get("error", first["msg"])
     return SettingsError(f"setting {key!r}: {said}", where=where, got=repr(first.get("input")))
 
 
 def _advice(unknown: str, names: Sequence[str]) -> str:
-    """What the user may have meant: a setting of that name elsewhere, or one written likewise."""
+    """Suggest settings of that name elsewhere, or with a similar name."""
     last = unknown.rpartition(".")[2]
     meant = [name for name in names if name.rpartition(".")[2] == last]
     meant = meant or difflib.get_close_matches(unknown, names, n=3, cutoff=0.8)

@@ -1,1 +1,1 @@
-"""Files of the field, read and written; every foreign convention ends here."""
+"""Readers and writers of file formats; foreign conventions are converted here and nowhere else."""

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: temporary file, fsync, rename."""
+"""Atomic file writes: temporary file, fsync, rename."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from recon.errors import OutputError
 
 @contextmanager
 def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path to write to, which becomes ``path`` when the block ends well.
+    """Give a temporary path to write to, which is renamed to ``path`` if the block succeeds.
 
-    The temporary lies in the same folder and ends in the same name, so a library that chooses
-    its format by the suffix chooses the same. Missing folders are made. When the block raises,
-    the temporary is removed and a file that stood at ``path`` before is untouched.
+    The temporary file is in the same folder and has the same suffix, so a library that chooses the
+    format by the suffix chooses the same one. Missing folders are created. If the block raises,
+    the temporary file is removed and an existing file at ``path`` is left untouched.
 
     Args:
-        path: The file to write or to replace.
+        path: The file to write or replace.
 
     Yields:
-        The temporary path; nothing exists there yet.
+        The temporary path, which does not exist yet.
 
     Raises:
         OutputError: The folder or file cannot be written, or the block wrote nothing.
@@ -44,7 +44,7 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
 
 
 def write_text(path: str | PathLike[str], text: str) -> None:
-    """Write UTF-8 text, line ends as they are, atomically.
+    """Write UTF-8 text atomically, without converting line endings.
 
     Raises:
         OutputError: The file cannot be written.
@@ -63,8 +63,8 @@ def write_bytes(path: str | PathLike[str], content: bytes) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Wait until a file, or a folder's list of names, is on the disk."""
-    if os.name == "nt" and path.is_dir():  # Windows cannot open a folder, and needs no sync of it
+    """Flush a file, or the directory entries of a folder, to disk."""
+    if os.name == "nt" and path.is_dir():  # Windows cannot open a folder, nor needs to sync it
         return
     handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
     try:
@@ -74,7 +74,7 @@ def _sync(path: Path) -> None:
 
 
 def _remove(temporary: Path) -> None:
-    """Remove what a failed block left; where even that fails, the first error counts."""
+    """Remove the temporary file of a failed block; an error here must not hide the first one."""
     try:
         temporary.unlink(missing_ok=True)
     except OSError:
@@ -86,5 +86,5 @@ def _output_error(target: Path, error: OSError) -> OutputError:
         "cannot write the file",
         where=target,
         got=error.strerror or type(error).__name__,
-        hint="check that the folder is writable and the disk not full",
+        hint="check that the folder is writable and the disk is not full",
     )

@@ -1,4 +1,4 @@
-"""Any calibration file, recognised by its content."""
+"""Reads any supported calibration file, recognised by its content."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ _OPENCV: Final = re.compile(r"^%YAML|<opencv_storage>|opencv-matrix")
 def read_calibration(
     path: StrPath, width_px: int, height_px: int, *, metres_per_unit: float = 1.0
 ) -> RectifiedCamera | StereoCalibration:
-    """Read a calibration file of a kind that need not be named.
+    """Read a calibration file of any supported format.
 
-    Understood are our own YAML, KITTI's ``calib.txt`` (the grey pair where it has one, else the
-    colour pair), Middlebury's ``calib.txt``, what OpenCV's ``FileStorage`` writes, ROS CameraInfo
-    (one of the two files; the other is found beside it), and kalibr's camera chain.
+    Supported are our own YAML, KITTI's ``calib.txt`` (the grey pair if it has one, else the colour
+    pair), Middlebury's ``calib.txt``, OpenCV's ``FileStorage`` files, ROS CameraInfo (either of the
+    two files; the other is expected in the same folder), and kalibr's camera chain.
 
     Args:
         path: The file.
-        width_px: Width of the pictures, for files that do not tell.
-        height_px: Height of the pictures.
-        metres_per_unit: Unit of the translation in an OpenCV file; the others define theirs.
+        width_px: Image width, for formats that do not store it.
+        height_px: Image height.
+        metres_per_unit: Unit of the translation in an OpenCV file; other formats define theirs.
 
     Returns:
-        A `RectifiedCamera` where the pictures are rectified already.
+        A `RectifiedCamera` if the images are already rectified.
 
     Raises:
-        FormatError: The file is missing, damaged or of no kind that is understood.
-        CalibrationError: The numbers cannot give depth.
+        FormatError: The file is missing, damaged or of an unknown format.
+        CalibrationError: The calibration cannot give depth.
     """
     text = read_text(path)
     if _OURS.search(text):
         return read_recon_calibration(path)
-    # OpenCV first: its extrinsics hold a ``P1:`` as well.
+    # OpenCV before KITTI: its extrinsics contain a ``P1:`` as well.
     if _OPENCV.search(text):
         return read_opencv_calibration(
             path, size_px=(width_px, height_px), metres_per_unit=metres_per_unit

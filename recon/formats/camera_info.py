@@ -1,4 +1,4 @@
-"""ROS CameraInfo as YAML: one file for each camera of a rig."""
+"""ROS CameraInfo as YAML: one file per camera."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SIDES: Final = ("left", "right")
 
 
 def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
-    """Names of the two files: ``left`` and ``right`` in a name change places, or are added."""
+    """Paths of the left and right file: ``left`` or ``right`` in the name is swapped, or added."""
     given = Path(path)
     for side in _SIDES:
         if re.search(side, given.stem):
@@ -35,22 +35,22 @@ def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
 
 
 def read_camera_info(path: StrPath) -> StereoCalibration:
-    """Read a rig from one of its two files; the other is found by its name.
+    """Read a rig from either of its two files; the other is found by its name.
 
-    The pose of the right camera is taken from the two rectifications: with
-    ``P[0, 3] = -fx · baseline`` the file alone tells it.
+    The pose of the right camera follows from the two rectifying rotations and
+    ``P[0, 3] = -fx · baseline``.
 
     Raises:
-        FormatError: A file is missing, damaged or of an unknown lens model.
-        CalibrationError: The numbers cannot give depth.
+        FormatError: A file is missing or damaged, or a lens model is not supported.
+        CalibrationError: The calibration cannot give depth.
     """
     left_path, right_path = camera_info_paths(path)
     if not (left_path.is_file() and right_path.is_file()):
         missing = right_path if left_path.is_file() else left_path
         raise FormatError(
-            "the other camera's CameraInfo is not there",
+            "CameraInfo of the other camera is missing",
             where=missing,
-            hint="the two files are told by 'left' and 'right' in their names",
+            hint="give both files the same name but for 'left' and 'right'",
         )
     left, R_left, _ = _read_one(left_path)
     right, R_right, P_right = _read_one(right_path)
@@ -63,16 +63,16 @@ def rig_of_camera_infos(
     P_right: Float64,
     where: StrPath,
 ) -> StereoCalibration:
-    """The rig that two CameraInfos describe, whether from files or from messages.
+    """The rig described by two CameraInfos, from files or messages.
 
     Args:
-        left: The left camera, and float64 (3, 3), the rotation of its rectification.
-        right: The same of the right one.
-        P_right: float64 (3, 4), the rectified right camera.
-        where: Named in errors.
+        left: The left camera and its rectifying rotation, float64 (3, 3).
+        right: The right camera, likewise.
+        P_right: float64 (3, 4), projection matrix of the rectified right camera.
+        where: File or topic, for error messages.
 
     Raises:
-        CalibrationError: The numbers cannot give depth.
+        CalibrationError: The calibration cannot give depth.
     """
     if P_right[0, 3] >= 0:
         raise CalibrationError(
@@ -80,7 +80,7 @@ def rig_of_camera_infos(
             where=where,
             got=f"P[0, 3] = {P_right[0, 3]:g}",
             expected="-fx * baseline, below 0",
-            hint="these may be of two single calibrations, or left and right swapped",
+            hint="the cameras were calibrated one by one, or left and right are swapped",
         )
     offset = np.array([P_right[0, 3] / P_right[0, 0], 0.0, 0.0])
     with naming(where):
@@ -99,14 +99,14 @@ def write_camera_info(
     Args:
         path: See `camera_info_paths`.
         calibration: The raw cameras.
-        rotations: float64 (3, 3) of each camera, from its axes to the rectified ones.
+        rotations: float64 (3, 3) per camera, from its raw axes to the rectified axes.
         rectified: The rectified camera.
 
     Returns:
         The two files.
 
     Raises:
-        CalibrationError: ROS has no name for a lens.
+        CalibrationError: ROS cannot represent a lens model.
         OutputError: A file cannot be written.
     """
     paths = camera_info_paths(path)
@@ -143,7 +143,7 @@ def _matrix(values: NDArray[Any]) -> dict[str, Any]:
 
 
 def _read_one(path: Path) -> tuple[CameraIntrinsics, Float64, Float64]:
-    """A camera, its rectifying rotation (3, 3) and its projection (3, 4)."""
+    """Read a camera, its rectifying rotation (3, 3) and its projection matrix (3, 4)."""
     fields = Fields(read_yaml(path), path)
     data = {
         name: fields.below(name)

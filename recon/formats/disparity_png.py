@@ -1,4 +1,4 @@
-"""Disparity as a PNG: 16 bits, ``256·d``, 0 = unknown (KITTI)."""
+"""Disparity as a 16-bit PNG: ``256·d``, 0 = unknown (KITTI)."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ def read_disparity_png(path: StrPath, *, scale: float = 256.0) -> Float32:
 
     Args:
         path: PNG or PGM of 8 or 16 bits.
-        scale: Grey levels per pixel of disparity: 256 in KITTI, 4 or 8 or 16 in Middlebury.
+        scale: Grey levels per pixel of disparity: 256 in KITTI; 4, 8 or 16 in Middlebury.
 
     Returns:
         float32 (H, W), pixels; NaN where the level is 0.
 
     Raises:
-        FormatError: The file is missing, no grey image, truncated, or of 8 bits where the scale
-            needs 16.
+        FormatError: The file is missing, truncated, not a grey image, or has 8 bits where the
+            scale needs 16.
     """
     levels = read_grey_levels(path)
     if levels.dtype == np.uint8 and scale > 255:
@@ -37,7 +37,8 @@ def read_disparity_png(path: StrPath, *, scale: float = 256.0) -> Float32:
 def write_disparity_png(path: StrPath, values: Float32, *, scale: float = 256.0) -> None:
     """Write a disparity as a 16-bit PNG atomically.
 
-    A disparity of (nearly) 0 becomes level 1, as in KITTI's own writer: level 0 is unknown.
+    A disparity that would round to 0 becomes level 1, as in KITTI's own writer, because level 0
+    means unknown.
 
     Args:
         path: Ends in .png.
@@ -58,12 +59,12 @@ def write_disparity_png(path: StrPath, values: Float32, *, scale: float = 256.0)
             where=path,
             got=f"{values[known].min():g} to {values[known].max():g} px",
             expected=f"0 to {65535 / scale:g} px",
-            hint="write PFM instead, or take a smaller scale",
+            hint="write PFM instead, or use a smaller scale",
         )
     write_image(path, np.where(known, np.maximum(levels, 1), 0).astype(np.uint16))
 
 
 def fitting_scale(values: Float32) -> float:
-    """The largest power of two, at most KITTI's 256, with which ``values`` fit 16 bits."""
+    """The largest power of two, at most KITTI's 256, for which ``values`` fit 16 bits."""
     highest = max(1.0, float(np.nanmax(values, initial=1.0)))
     return min(256.0, 2.0 ** math.floor(math.log2(65535 / highest)))

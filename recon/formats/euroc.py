@@ -1,4 +1,4 @@
-"""EuRoC (ASL) recordings: cameras as ``sensor.yaml``, the true path as a table."""
+"""EuRoC (ASL) recordings: cameras as ``sensor.yaml``, ground truth as a table."""
 
 from __future__ import annotations
 
@@ -26,15 +26,14 @@ def read_euroc_camera(path: StrPath) -> tuple[CameraIntrinsics, Float64]:
     """Read one camera.
 
     Args:
-        path: ``sensor.yaml`` beside the pictures of a camera.
+        path: ``sensor.yaml`` in the folder of a camera.
 
     Returns:
         The camera, and float64 (4, 4) ``T_body_camera``, metres.
 
     Raises:
-        FormatError: The file is missing, or lacks something, or the lens is of a kind that is
-            not understood.
-        CalibrationError: The numbers make no camera.
+        FormatError: The file is missing or incomplete, or the lens model is not supported.
+        CalibrationError: The values do not make a valid camera.
     """
     content = read_yaml(path)
     fu, fv, cu, cv = _numbers(content, "intrinsics", (4,), path)
@@ -56,15 +55,15 @@ def read_euroc_camera(path: StrPath) -> tuple[CameraIntrinsics, Float64]:
 
 
 def read_euroc_truth(path: StrPath) -> Trajectory:
-    """Read the true path of the body: ``time [ns], x y z, qw qx qy qz``, and more columns.
+    """Read the true trajectory of the body: ``time [ns], x y z, qw qx qy qz``, and more columns.
 
     Returns:
-        ``T_world_body``, as the motion capture gives it.
+        ``T_world_body``, in the frame of the motion capture.
 
     Raises:
         FormatError: The file is missing or damaged.
     """
-    # Position, quaternion, then velocity and biases, or none of them.
+    # Position and quaternion, with or without velocity and biases.
     table, _ = read_table(path, (17, 8))
     poses = [make_transform(rotation_from_quaternion(row[[5, 6, 7, 4]]), row[1:4]) for row in table]
     return Trajectory(np.stack(poses), table[:, 0] * NS)
@@ -78,9 +77,9 @@ def _numbers(
     except KeyError as error:
         raise FormatError(f"camera has no {key!r}", where=path) from error
     except (TypeError, ValueError) as error:
-        raise FormatError(f"{key!r} is no list of numbers", where=path) from error
+        raise FormatError(f"{key!r} is not a list of numbers", where=path) from error
     if numbers.ndim != 1 or shape[0] not in {None, numbers.size} or not np.isfinite(numbers).all():
         raise FormatError(
-            f"{key!r} is not what it should be", where=path, expected=f"{shape[0]} finite numbers"
+            f"{key!r} is invalid", where=path, expected=f"{shape[0] or 'only'} finite numbers"
         )
     return numbers

@@ -1,4 +1,4 @@
-"""Numbers out of nested mappings, as YAML gives them, each checked and named where it is wrong."""
+"""Typed access to nested mappings read from YAML; errors name the field."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from recon.structures.arrays import Float64
 
 
 class Fields:
-    """A mapping of a file.
+    """A mapping read from a file.
 
     Args:
         values: The mapping.
-        path: Its file, named in errors.
-        prefix: Where in the file the mapping stands, such as ``left.``.
+        path: The file, for error messages.
+        prefix: Path of the mapping in the file, such as ``left.``.
     """
 
     def __init__(self, values: Mapping[str, Any], path: StrPath, prefix: str = "") -> None:
@@ -28,10 +28,10 @@ class Fields:
         return name in self._values
 
     def get(self, name: str) -> Any:
-        """What stands there, whatever it is.
+        """The value of a field, of any type.
 
         Raises:
-            FormatError: Nothing stands there; all of the methods raise this.
+            FormatError: The field is missing; all methods raise this.
         """
         if name not in self._values:
             got = ", ".join(str(key) for key in self._values) or "nothing"
@@ -41,21 +41,21 @@ class Fields:
         return self._values[name]
 
     def below(self, name: str) -> Fields:
-        """The mapping that stands there."""
+        """The mapping in a field."""
         value = self.get(name)
         if not isinstance(value, Mapping):
             raise self._wrong(name, value, "a mapping")
         return Fields(value, self._path, f"{self._prefix}{name}.")
 
     def text(self, name: str) -> str:
-        """The text that stands there."""
+        """The value of a field as text."""
         return str(self.get(name))
 
     def numbers(self, name: str, shape: tuple[int, ...] | None = None) -> Float64:
-        """float64 of that shape; None = a list of any length."""
+        """The value as float64 of that shape; None = a list of any length."""
         value = self.get(name)
         try:
-            # Text too: PyYAML takes 1e-05, without a dot, for text.
+            # Via text, as PyYAML reads 1e-05 (no dot) as text.
             array = np.array(value, dtype=np.str_).astype(np.float64)
         except (TypeError, ValueError) as error:
             raise self._wrong(name, value, "numbers") from error
@@ -68,14 +68,14 @@ class Fields:
         return array.reshape(shape)
 
     def number(self, name: str) -> float:
-        """One number."""
+        """The value as one number."""
         return float(self.numbers(name, (1,))[0])
 
     def count(self, name: str) -> int:
-        """One whole number, above zero."""
+        """The value as one positive integer."""
         value = self.number(name)
         if value != int(value) or value < 1:
-            raise self._wrong(name, value, "a whole number above 0")
+            raise self._wrong(name, value, "a positive integer")
         return int(value)
 
     def _wrong(self, name: str, got: Any, expected: str) -> FormatError:

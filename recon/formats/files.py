@@ -1,4 +1,4 @@
-"""Reading whole files, with one clear line where that fails."""
+"""Reads whole files, with a clear error if that fails."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ StrPath = str | PathLike[str]
 
 
 def read_bytes(path: StrPath) -> bytes:
-    """Read a file that must hold something.
+    """Read a file that must not be empty.
 
     Raises:
-        FormatError: It does not exist, cannot be read or is empty.
+        FormatError: The file does not exist, cannot be read or is empty.
     """
     try:
         content = Path(path).read_bytes()
@@ -33,22 +33,22 @@ def read_bytes(path: StrPath) -> bytes:
 
 
 def read_text(path: StrPath) -> str:
-    """Read a UTF-8 text file that must hold something.
+    """Read a UTF-8 text file that must not be empty.
 
     Raises:
-        FormatError: It does not exist, cannot be read, is empty or is no text.
+        FormatError: The file does not exist, cannot be read, is empty or is not text.
     """
     try:
         return read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise FormatError(
-            "not a text file", where=path, got=f"byte {error.start} is no UTF-8"
+            "not a text file", where=path, got=f"byte {error.start} is not UTF-8"
         ) from error
 
 
 @contextmanager
 def naming(path: StrPath) -> Iterator[None]:
-    """Name the file in errors of values that are made from its content."""
+    """Add the file to errors raised by values built from its content."""
     try:
         yield
     except ReconError as error:
@@ -64,14 +64,14 @@ def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[i
 
     Args:
         path: The text file.
-        columns: The numbers of columns that are understood; all rows must have the same.
+        columns: The permitted numbers of columns; all rows must have the same.
 
     Returns:
         float64 (N, C), finite, N ≥ 1, and the line number of each row, counted from 1.
 
     Raises:
-        FormatError: A row has another number of columns, or holds something that is no finite
-            number; the line is named.
+        FormatError: A row has the wrong number of columns or a value that is not a finite number;
+            the line is named.
     """
     rows: list[list[float]] = []
     lines: list[int] = []
@@ -83,7 +83,7 @@ def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[i
         lines.append(number)
         columns = (len(words),)
     if not rows:
-        raise FormatError("file holds no numbers", where=path)
+        raise FormatError("file contains no numbers", where=path)
     return np.array(rows, dtype=np.float64), lines
 
 

@@ -1,6 +1,6 @@
-"""``frames.csv``: which pictures were taken together, and when; one line per pair.
+"""``frames.csv``: the image pairs of a recording with their times, one line per pair.
 
-A pair counts when its line stands: the line is written after both pictures.
+A line is written after both of its images, so a pair is complete once its line exists.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ HEADER: Final = "# left picture, right picture, left time [s], right time [s]\n"
 
 @dataclass(frozen=True)
 class CapturedFrame:
-    """One line.
+    """One line: a pair of images and their times.
 
     Attributes:
-        left: Left picture, relative to the folder of the list.
-        right: Right picture.
-        left_s: When the left one was taken.
-        right_s: When the right one was taken.
+        left: Left image, relative to the folder of the list.
+        right: Right image, likewise.
+        left_s: Time of the left image.
+        right_s: Time of the right image.
     """
 
     left: str
@@ -33,7 +33,7 @@ class CapturedFrame:
     right_s: float
 
     def line(self) -> str:
-        """The line of this frame, with its end."""
+        """This frame as a line, with the newline."""
         return f"{self.left},{self.right},{self.left_s:.6f},{self.right_s:.6f}\n"
 
 
@@ -41,12 +41,12 @@ def read_frames(path: StrPath) -> list[CapturedFrame]:
     """Read the list.
 
     Raises:
-        FormatError: It is missing or empty, or a line is damaged.
+        FormatError: The file is missing or empty, or a line is damaged.
     """
     lines = enumerate(read_text(path).splitlines(), start=1)
     frames = [_parse(line, f"{path}:{n}") for n, line in lines if line and line[0] != "#"]
     if not frames:
-        raise FormatError("file lists no pictures", where=path)
+        raise FormatError("file lists no images", where=path)
     return frames
 
 
@@ -56,7 +56,7 @@ def _parse(line: str, where: str) -> CapturedFrame:
         left, right, left_s, right_s = words
         times = float(left_s), float(right_s)
     except ValueError as error:
-        raise FormatError("not two pictures and their times", where=where, got=line[:60]) from error
+        raise FormatError("not two images and their times", where=where, got=line[:60]) from error
     if not all(math.isfinite(time) for time in times):
         raise FormatError("time is not finite", where=where, got=line[:60])
     return CapturedFrame(left, right, *times)

@@ -1,4 +1,4 @@
-"""Meshes as binary glTF 2.0 (.glb): one file that browsers, Blender and phones open.
+"""Meshes as binary glTF 2.0 (.glb), for browsers, Blender and phones.
 
 Ref: Khronos Group, "glTF 2.0 specification", sections 3.6 (buffers), 3.7 (meshes), 4.4 (GLB).
 """
@@ -23,15 +23,15 @@ _MATERIAL: Final = {
     "doubleSided": True,
     "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
 }
-#: Colours that come from pictures hold their light already.
+#: Colours taken from images already include the lighting.
 _UNLIT: Final = "KHR_materials_unlit"
 
 
 def write_glb(path: str | PathLike[str], mesh: TriangleMesh) -> None:
-    """Write a mesh as GLB with float vertices, its coordinates as they are.
+    """Write a mesh as GLB with float vertices, without changing its coordinates.
 
-    glTF's vertex colours are linear light, so the bytes of pictures (sRGB) are converted; 16 bits
-    keep the dark ones apart.
+    Vertex colours of glTF are linear, so sRGB colours are converted, to 16 bits to keep dark tones
+    distinct.
 
     Raises:
         OutputError: The file cannot be written.
@@ -49,7 +49,7 @@ def write_glb(path: str | PathLike[str], mesh: TriangleMesh) -> None:
 
 
 def srgb_from_linear(rgb: UInt8) -> UInt8:
-    """What a reader that knows nothing of colour spaces makes of our colours, undone."""
+    """Convert linear colours back to sRGB, for readers that ignore the colour space."""
     share = rgb / 255
     curve = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1 / 2.4) - 0.055)
     return np.asarray(np.rint(curve * 255), dtype=np.uint8)
@@ -67,7 +67,7 @@ def _linear(rgb: UInt8) -> NDArray[np.uint16]:
 def _document(
     mesh: TriangleMesh, attributes: dict[str, tuple[NDArray[Any], int]]
 ) -> tuple[dict[str, Any], bytes]:
-    """The JSON part, and the arrays that it describes one after the other."""
+    """The JSON part, and the arrays it describes as one block of bytes."""
     arrays = [*attributes.values(), (mesh.faces.astype(np.uint32).reshape(-1, 1), _UINT)]
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
@@ -79,7 +79,7 @@ def _document(
         )
         accessors.append(_accessor(values, component, len(accessors)))
         offset += values.nbytes
-    # Readers need the bounding box of the positions.
+    # glTF requires the bounding box of the positions.
     accessors[0] |= {
         "min": mesh.vertices.min(axis=0).tolist(),
         "max": mesh.vertices.max(axis=0).tolist(),
@@ -105,7 +105,7 @@ def _document(
 
 
 def _accessor(values: NDArray[Any], component: int, view: int) -> dict[str, Any]:
-    """How one array is to be read."""
+    """The description of one array."""
     kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]]
     return {
         "bufferView": view,
@@ -117,6 +117,6 @@ def _accessor(values: NDArray[Any], component: int, view: int) -> dict[str, Any]
 
 
 def _chunk(kind: bytes, content: bytes, filler: bytes) -> bytes:
-    """One chunk of the container, filled up to four bytes."""
+    """One chunk of the container, padded to a multiple of four bytes."""
     content += filler * (-len(content) % 4)
     return struct.pack("<I4s", len(content), kind) + content

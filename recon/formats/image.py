@@ -1,4 +1,4 @@
-"""Pictures: PNG, JPEG, PGM, PPM, BMP and TIFF, whole or not at all."""
+"""Images: PNG, JPEG, PGM, PPM, BMP and TIFF; damaged files are rejected."""
 
 from __future__ import annotations
 
@@ -26,36 +26,37 @@ _WRITABLE: Final = _GREY_ONLY | _COLOUR_ONLY | _EIGHT_BIT_ONLY | {".png", ".tif"
 
 
 def read_image(path: StrPath) -> UInt8:
-    """Read a picture to look at or to match.
+    """Read an image for display or matching, as 8 bits.
 
-    16-bit pictures are scaled from their whole range to 8 bits (``value / 257``, rounded). An
-    alpha channel is dropped. The orientation tag of a camera is ignored: a calibration belongs to
-    the pixels as the sensor recorded them.
+    16-bit images are scaled over their full range to 8 bits (``value / 257``, rounded). An alpha
+    channel is dropped. The EXIF orientation is ignored: a calibration refers to the pixels as the
+    sensor recorded them.
 
     Args:
         path: PNG, JPEG, PGM, PPM, BMP or TIFF, recognised by content.
 
     Returns:
-        uint8 (H, W) where the file is grey, else (H, W, 3) RGB.
+        uint8 (H, W) if the file is grey, else (H, W, 3) RGB.
 
     Raises:
-        FormatError: The file is missing, empty, truncated, no image, or of floating-point pixels.
+        FormatError: The file is missing, empty, truncated, not an image, or has floating-point
+            pixels.
     """
     return _eight_bits(read_levels(path))
 
 
 def _eight_bits(levels: NDArray[Any]) -> UInt8:
-    """16 bits scaled to 8, rounded."""
+    """Scale 16 bits to 8, rounded."""
     if levels.dtype == np.uint8:
         return levels
     return ((levels.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
 def read_levels(path: StrPath) -> NDArray[Any]:
-    """Read a picture whose numbers mean something: a mask, or a scaled disparity.
+    """Read an image with its values as stored, such as a mask or a scaled disparity.
 
     Returns:
-        uint8 or uint16, as stored, (H, W) or (H, W, 3) RGB.
+        uint8 or uint16, (H, W) or (H, W, 3) RGB.
 
     Raises:
         FormatError: As in `read_image`.
@@ -64,7 +65,7 @@ def read_levels(path: StrPath) -> NDArray[Any]:
 
 
 def decode_image(content: bytes, where: StrPath) -> UInt8:
-    """Like `read_image`, from bytes that came in a message.
+    """Like `read_image`, from bytes in memory.
 
     Raises:
         FormatError: As in `read_image`.
@@ -88,7 +89,7 @@ def decode_levels(content: bytes, path: StrPath) -> NDArray[Any]:
         raise FormatError("image cannot be decoded", where=path, hint="copy the file again")
     if image.dtype not in (np.uint8, np.uint16):
         raise FormatError(
-            "image has a pixel type that is not understood",
+            "pixel type of the image is not supported",
             where=path,
             got=image.dtype.name,
             expected="8 or 16 bits",
@@ -97,29 +98,29 @@ def decode_levels(content: bytes, path: StrPath) -> NDArray[Any]:
 
 
 def read_grey_levels(path: StrPath) -> NDArray[Any]:
-    """Like `read_levels`, but (H, W): a grey picture stored as three equal channels is taken.
+    """Like `read_levels`, but always (H, W); three equal channels count as grey.
 
     Raises:
-        FormatError: As in `read_image`, or the picture has colours.
+        FormatError: As in `read_image`, or the image is in colour.
     """
     levels = read_levels(path)
     if levels.ndim == 2:
         return levels
     if (levels != levels[:, :, :1]).any():
-        raise FormatError("image has colours", where=path, expected="grey")
+        raise FormatError("image is in colour", where=path, expected="grey")
     return np.ascontiguousarray(levels[:, :, 0])
 
 
 def write_image(path: StrPath, image: NDArray[Any]) -> None:
-    """Write a picture atomically; the suffix chooses the format.
+    """Write an image atomically, in the format given by the suffix.
 
     Args:
         path: Ends in .png, .tif, .tiff, .jpg, .jpeg, .pgm (grey) or .ppm (colour).
         image: uint8 or uint16 (not JPEG), (H, W) grey or (H, W, 3) RGB.
 
     Raises:
-        ShapeError: The array is no picture.
-        OutputError: The suffix cannot hold this picture, or the file cannot be written.
+        ShapeError: The array is not an image.
+        OutputError: The format is unknown or cannot hold this image, or the file cannot be written.
     """
     _check_pixels(image)
     suffix = Path(path).suffix.lower()
@@ -136,9 +137,9 @@ def write_image(path: StrPath, image: NDArray[Any]) -> None:
 
 @contextmanager
 def silent_opencv() -> Iterator[None]:
-    """Keep OpenCV from writing to standard error what is raised as an error anyway.
+    """Stop OpenCV from logging to standard error what we raise as an exception anyway.
 
-    Only a damaged TIFF gets that far; the level is one for all threads, hence the lock.
+    The log level is shared by all threads, hence the lock.
     """
     log = cv2.utils.logging
     with _LOG_LEVEL_LOCK:
@@ -151,7 +152,7 @@ def silent_opencv() -> Iterator[None]:
 
 
 def swap_red_and_blue(image: NDArray[Any]) -> NDArray[Any]:
-    """RGB from OpenCV's BGR, or the other way round."""
+    """Convert between RGB and OpenCV's BGR, in either direction."""
     return np.ascontiguousarray(image[:, :, ::-1])
 
 
@@ -159,7 +160,7 @@ def _check_pixels(image: NDArray[Any]) -> None:
     shaped = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
     if image.dtype not in (np.uint8, np.uint16) or not shaped or image.size == 0:
         raise ShapeError(
-            "array is no picture",
+            "array is not an image",
             got=f"{image.dtype.name} {image.shape}",
             expected="uint8 or uint16 (H, W) or (H, W, 3)",
         )
@@ -178,7 +179,7 @@ def _check_suffix(path: StrPath, suffix: str, image: NDArray[Any]) -> None:
     )
     if not fits:
         raise OutputError(
-            f"a {suffix} file cannot hold this picture",
+            f"a {suffix} file cannot hold this image",
             where=path,
             got=f"{image.dtype.name} {image.shape}",
             hint="write .png",

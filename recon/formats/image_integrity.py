@@ -1,4 +1,4 @@
-"""Is an image file whole? Decoders fill what is missing and say nothing, so ask before decoding.
+"""Detects truncated and damaged image files, which decoders fill in silently.
 
 Ref:
     PNG: ISO/IEC 15948, section 5 (chunks). JPEG: ITU-T T.81, annex B (markers).
@@ -26,16 +26,16 @@ UNDERSTOOD: Final = "PNG, JPEG, PGM, PPM, BMP or TIFF"
 
 
 def check_image_bytes(content: bytes, path: StrPath) -> None:
-    """Check by its content that an image file is of a kind that is understood, and whole.
+    """Check that the content of a file is a complete image of a supported format.
 
-    A TIFF is only recognised: its decoder does refuse a truncated file.
+    For TIFF only the format is checked: its decoder does reject truncated files.
 
     Args:
         content: The whole file.
-        path: Named in the error.
+        path: The file, for the error message.
 
     Raises:
-        FormatError: It is no image, or truncated or damaged.
+        FormatError: The file is not an image, or is truncated or damaged.
     """
     if content.startswith(_PNG_START):
         _check_png(content, path)
@@ -50,7 +50,7 @@ def check_image_bytes(content: bytes, path: StrPath) -> None:
 
 
 def is_tiff(content: bytes) -> bool:
-    """Tell a TIFF by its first bytes."""
+    """Whether the content starts like a TIFF."""
     return content.startswith(_TIFF_STARTS)
 
 
@@ -61,7 +61,7 @@ def _truncated(kind: str, path: StrPath, got: str) -> FormatError:
 
 
 def _check_png(content: bytes, path: StrPath) -> None:
-    """Walk the chunks up to IEND; each must lie inside the file and match its checksum."""
+    """Walk the chunks up to IEND; each must be complete and match its checksum."""
     at = len(_PNG_START)
     name = b""
     while name != b"IEND":
@@ -78,7 +78,7 @@ def _check_png(content: bytes, path: StrPath) -> None:
 
 
 def _check_jpeg(content: bytes, path: StrPath) -> None:
-    """Look for the end marker behind the start of the scan; an embedded preview has its own."""
+    """Look for the end marker after the start of scan; an embedded thumbnail has its own."""
     at = 2
     while content[at : at + 2] != b"\xff\xda":
         if at + 4 > len(content) or content[at] != 0xFF:
@@ -104,7 +104,7 @@ def _check_pnm(content: bytes, path: StrPath) -> None:
 
 
 def _check_bmp(content: bytes, path: StrPath) -> None:
-    """Rows are padded to four bytes; the sizes that a header declares may be 0, so count them."""
+    """Compute the size from rows padded to four bytes, as a header may declare a size of 0."""
     if len(content) < _BMP_HEADER.size:
         raise _truncated("BMP", path, f"the file ends after {len(content)} bytes, in its header")
     header = _BMP_HEADER.unpack_from(content)

@@ -1,4 +1,4 @@
-"""Kalibr's camera chain of two cameras."""
+"""Kalibr's camera chain (camchain), for two cameras."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ def read_kalibr(path: StrPath) -> StereoCalibration:
     """Read ``cam0`` as the left and ``cam1`` as the right camera of a camera chain.
 
     Raises:
-        FormatError: The file is damaged, or a lens is of a model that is not known here
-            (``omni``, ``ds``, ``eucm``, ``fov``).
-        CalibrationError: The numbers cannot give depth.
+        FormatError: The file is damaged, or a lens model is not supported (``omni``, ``ds``,
+            ``eucm``, ``fov``).
+        CalibrationError: The calibration cannot give depth.
 
     Ref: Kalibr's wiki, "Yaml formats": ``T_cn_cnm1`` maps points of camera n-1 to camera n.
     """
@@ -39,7 +39,7 @@ def write_kalibr(path: StrPath, calibration: StereoCalibration) -> None:
     """Write a camera chain atomically.
 
     Raises:
-        CalibrationError: Kalibr has no name for a lens: it knows two radial terms and fisheyes.
+        CalibrationError: Kalibr cannot represent a lens: it has two radial terms, or a fisheye.
         OutputError: The file cannot be written.
     """
     chain: dict[str, Any] = {}
@@ -62,7 +62,7 @@ def write_kalibr(path: StrPath, calibration: StereoCalibration) -> None:
 def _camera(fields: Fields, path: StrPath) -> CameraIntrinsics:
     if fields.text("camera_model") != "pinhole":
         raise FormatError(
-            "camera model is not understood",
+            "camera model is not supported",
             where=path,
             got=fields.text("camera_model"),
             expected="pinhole (with radtan or equidistant distortion)",

@@ -22,26 +22,27 @@ def read_kitti_calib(
 ) -> RectifiedCamera:
     """Read the rectified camera of one stereo pair.
 
-    ``P = K·[I | t]`` with ``t`` from camera 0; the baseline is how far the two cameras of the
-    pair lie apart along x, so it is right for the colour pair too.
+    ``P = K·[I | t]`` with ``t`` relative to camera 0. The baseline is the distance of the two
+    cameras along x, so it holds for the colour pair too.
 
     Args:
         path: ``calib.txt`` of a KITTI odometry sequence (``P0:`` …), or ``calib_cam_to_cam.txt``
             of a raw drive (``P_rect_00:`` …).
-        width_px: Image width; the file does not know it.
+        width_px: Image width; the file does not contain it.
         height_px: Image height.
         cameras: Left and right camera: (0, 1) grey, (2, 3) colour.
 
     Raises:
-        FormatError: The file is missing, has no such cameras, or a matrix is not 12 numbers.
-        CalibrationError: The two have different focal lengths or rows, or no positive baseline.
+        FormatError: The file is missing or lacks a camera, or a matrix is not 12 numbers.
+        CalibrationError: The cameras differ in focal length or principal row, or the baseline is
+            not positive.
     """
     left, right = (_projection(path, camera) for camera in cameras)
     if not np.allclose(left[:, :3][[0, 1, 1], [0, 1, 2]], right[:, :3][[0, 1, 1], [0, 1, 2]]):
         raise CalibrationError(
             f"P{cameras[0]} and P{cameras[1]} have different focal lengths or rows",
             where=path,
-            hint="a rectified pair shares them; rectify the pictures first",
+            hint="a rectified pair shares them; rectify the images first",
         )
     baseline_m = float(_centre_m(left)[0] - _centre_m(right)[0])
     if baseline_m <= 0:
@@ -64,9 +65,9 @@ def read_kitti_calib(
 
 
 def read_kitti_offset(path: StrPath, camera: int) -> Float64:
-    """Where a camera stands: float64 (4, 4), ``T_camera_camera0``, a translation in metres.
+    """Pose of a camera: float64 (4, 4), ``T_camera_camera0``, a translation in metres.
 
-    KITTI's poses are those of camera 0.
+    KITTI's trajectories are those of camera 0.
 
     Raises:
         FormatError: As in `read_kitti_calib`.
@@ -77,10 +78,10 @@ def read_kitti_offset(path: StrPath, camera: int) -> Float64:
 
 
 def list_kitti_cameras(path: StrPath) -> frozenset[int]:
-    """The numbers of the cameras that a calibration file has a matrix for.
+    """Numbers of the cameras that have a matrix in a calibration file.
 
     Raises:
-        FormatError: The file is missing or no text.
+        FormatError: The file is missing or not text.
     """
     return frozenset(int(number) for number, _ in _LINE.findall(read_text(path)))
 
@@ -102,9 +103,11 @@ def _projection(path: StrPath, camera: int) -> Float64:
             f"P{camera} is not a 3x4 matrix", where=path, expected="12 numbers"
         ) from error
     if not np.isfinite(matrix).all():
-        raise FormatError(f"P{camera} holds a number that is not finite", where=path)
+        raise FormatError(f"P{camera} has a value that is not finite", where=path)
     if not np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
-        raise FormatError(f"P{camera} is no projection of a rectified camera", where=path)
+        raise FormatError(
+            f"P{camera} is not the projection matrix of a rectified camera", where=path
+        )
     if min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise CalibrationError(
             f"focal length of P{camera} is not positive", where=path, got=f"{matrix[0, 0]:g} px"

@@ -1,4 +1,4 @@
-"""KITTI raw calibration, ``calib_cam_to_cam.txt``: four cameras as built, and as rectified."""
+"""KITTI raw calibration, ``calib_cam_to_cam.txt``: four cameras, raw and rectified."""
 
 from __future__ import annotations
 
@@ -21,20 +21,19 @@ _SIZES: Final = {"S": 2, "K": 9, "D": 5, "R": 9, "T": 3, "S_rect": 2}
 def read_kitti_raw_calib(
     path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int]
 ) -> RectifiedCamera | StereoCalibration:
-    """Read the cameras of one stereo pair, rectified or not, as the size of the pictures tells.
+    """Read the cameras of one stereo pair, rectified or raw according to the image size.
 
-    The rectified pictures (``_sync`` drives) are smaller than what the sensors recorded
-    (``_extract`` drives).
+    Rectified images (``_sync`` drives) are smaller than raw ones (``_extract`` drives).
 
     Args:
         path: ``calib_cam_to_cam.txt``.
-        width_px: Width of the pictures.
-        height_px: Height of the pictures.
+        width_px: Image width.
+        height_px: Image height.
         cameras: Left and right camera: (0, 1) grey, (2, 3) colour.
 
     Raises:
-        FormatError: The file is missing or lacks a line, or the pictures have neither size.
-        CalibrationError: The numbers cannot give depth.
+        FormatError: The file is missing or lacks a line, or the image size is neither of the two.
+        CalibrationError: The calibration cannot give depth.
 
     Ref: Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013, section 4.
     """
@@ -46,10 +45,10 @@ def read_kitti_raw_calib(
         return read_kitti_calib(path, width_px, height_px, cameras)
     if (width_px, height_px) != recorded:
         raise FormatError(
-            "pictures have another size than the calibration",
+            "image size differs from the calibration",
             where=path,
             got=f"{width_px}x{height_px}",
-            expected=f"{rectified[0]}x{rectified[1]} rectified, {recorded[0]}x{recorded[1]} not",
+            expected=f"{rectified[0]}x{rectified[1]} rectified, {recorded[0]}x{recorded[1]} raw",
         )
     T_left_0, T_right_0 = (_pose(rows, camera, path) for camera in cameras)
     with naming(path):
@@ -77,7 +76,7 @@ def _numbers(rows: dict[str, str], key: str, camera: int, path: StrPath) -> Floa
     except KeyError as error:
         raise FormatError(f"calibration has no {name}", where=path) from error
     except ValueError as error:
-        raise FormatError(f"{name} holds something that is no number", where=path) from error
+        raise FormatError(f"{name} has a value that is not a number", where=path) from error
     if len(numbers) != _SIZES[key] or not np.isfinite(numbers).all():
         raise FormatError(f"{name} is not {_SIZES[key]} finite numbers", where=path)
     return numbers

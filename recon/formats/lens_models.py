@@ -1,4 +1,4 @@
-"""What ROS and kalibr call the lens models, and how many coefficients each has there."""
+"""Names of the lens models in ROS and kalibr, and their numbers of coefficients."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from recon.formats.files import StrPath
 from recon.structures import CameraIntrinsics, LensModel
 from recon.structures.arrays import Float64
 
-# Name -> our model, and the numbers of coefficients that the name allows; the first that will do is
-# written.
+# Name -> our model and the permitted numbers of coefficients; a writer uses the first that fits.
 Models = Mapping[str, tuple[LensModel, tuple[int, ...]]]
 
 ROS_MODELS: Final[Models] = {
@@ -37,19 +36,19 @@ def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Float64:
 def lens_of(
     models: Models, name: str, coefficients: Float64, path: StrPath
 ) -> tuple[LensModel, Float64]:
-    """Our model of a name, and its coefficients.
+    """Our lens model for a format's name, and its coefficients.
 
     Raises:
-        FormatError: The model is not known, or has another number of coefficients.
+        FormatError: The model is not supported, or the number of coefficients is wrong.
     """
     if name not in models:
         raise FormatError(
-            "lens model is not understood", where=path, got=name, expected=", ".join(models)
+            "lens model is not supported", where=path, got=name, expected=", ".join(models)
         )
     model, counts = models[name]
     if coefficients.size not in counts:
         raise FormatError(
-            f"lens model {name!r} has another number of coefficients",
+            f"lens model {name!r} has the wrong number of coefficients",
             where=path,
             got=coefficients.size,
             expected=" or ".join(str(count) for count in counts),
@@ -58,15 +57,15 @@ def lens_of(
 
 
 def name_lens(models: Models, camera: CameraIntrinsics, form: str) -> tuple[str, Float64]:
-    """The name that a format has for a camera's lens, and the coefficients as it wants them.
+    """A format's name for the lens model of a camera, and the coefficients padded as it needs.
 
     Args:
-        models: What the format knows.
+        models: The models of the format.
         camera: The camera.
-        form: The format, named in the error.
+        form: Name of the format, for the error message.
 
     Raises:
-        CalibrationError: The format has no name for it.
+        CalibrationError: The format cannot represent the lens.
     """
     most = int(np.flatnonzero(camera.distortion).max(initial=-1)) + 1
     for name, (model, counts) in models.items():
@@ -76,7 +75,7 @@ def name_lens(models: Models, camera: CameraIntrinsics, form: str) -> tuple[str,
             padded[:most] = camera.distortion[:most]
             return name, padded
     raise CalibrationError(
-        f"a {form} file cannot hold this lens",
+        f"a {form} file cannot store this lens model",
         got=f"{camera.model} with {most} coefficients",
         expected=", ".join(models),
         hint="calibrate with --set calibration.radial_terms=2, or write another format",

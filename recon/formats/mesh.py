@@ -1,4 +1,4 @@
-"""Meshes as PLY, OBJ, STL and GLB files, chosen by the suffix."""
+"""Meshes as PLY, OBJ, STL and GLB files, according to the suffix."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from recon.structures import TriangleMesh
 from recon.structures.arrays import Int32
 
 MESH_SUFFIXES: Final = (".ply", ".obj", ".stl", ".glb")
-#: The property of a face has two names in the wild.
+#: Both names are in use for this property of a face.
 _INDICES: Final = ("vertex_indices", "vertex_index")
 
 
 def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
-    """Write a mesh; it appears whole or not at all.
+    """Write a mesh atomically.
 
-    PLY is binary with float vertices; OBJ and GLB carry normals and colours too; STL knows
-    neither. GLB is glTF 2.0 in one file.
+    PLY is binary with float vertices. PLY, OBJ and GLB keep normals and colours; STL has neither.
+    GLB is glTF 2.0 in one file.
 
     Args:
-        path: The file; its suffix (.ply, .obj, .stl or .glb) says the format.
+        path: The file; its suffix (.ply, .obj, .stl or .glb) gives the format.
         mesh: The mesh.
 
     Raises:
@@ -52,7 +52,7 @@ def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
     elif suffix == ".glb":
         write_glb(path, mesh)
     else:
-        # Open3D takes two seconds to load: a PLY does not wait for it.
+        # Importing Open3D takes two seconds; PLY files do not need it.
         from recon.adapters import open3d_meshes  # noqa: PLC0415
 
         with atomic_path(path) as temporary:
@@ -60,11 +60,12 @@ def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
 
 
 def join_meshes(path: str | PathLike[str], parts: Sequence[tuple[Path, int, int]]) -> None:
-    """Write the meshes of several PLY files as one PLY; two of them are held at a time.
+    """Join the meshes of several PLY files into one PLY, with at most two in memory.
 
     Args:
-        path: The file; it appears whole or not at all.
-        parts: File, vertices and faces of each part, at least one; all with the same fields.
+        path: The file, written atomically.
+        parts: File, number of vertices and number of faces of each part, at least one; all with
+            the same fields.
 
     Raises:
         FormatError: A part cannot be read.
@@ -86,11 +87,11 @@ def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
     """Read a mesh.
 
     Args:
-        path: The file; its suffix (.ply, .obj, .stl or .glb) says the format.
+        path: The file; its suffix (.ply, .obj, .stl or .glb) gives the format.
 
     Raises:
-        FormatError: The file is missing, of an unknown kind, truncated, has faces that are not
-            triangles or that name vertices which do not exist, or has no faces.
+        FormatError: The file is missing, of an unknown format, truncated, has no faces, or has
+            faces that are not triangles or refer to vertices that do not exist.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in MESH_SUFFIXES:
@@ -109,7 +110,7 @@ def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
 
 
 def _tables(mesh: TriangleMesh, start: int = 0) -> dict[str, Table]:
-    """The two tables of a PLY mesh; its vertices are numbered from ``start``."""
+    """The two tables of a PLY mesh, with ``start`` added to the vertex indices of its faces."""
     fields = vertex_dtype(normals=mesh.normals is not None, colours=mesh.rgb is not None)
     vertices = np.zeros(len(mesh.vertices), fields)
     fill_vertices(vertices, mesh.vertices, mesh.normals, mesh.rgb)
@@ -124,7 +125,7 @@ def _read_ply(path: str | PathLike[str]) -> TriangleMesh:
     _, tables = read_tables(path, ["vertex", "face"])
     vertex, faces = tables.get("vertex"), _faces(tables.get("face"))
     if vertex is None or faces is None or len(faces) == 0:
-        raise FormatError("the PLY file has no faces: it is a cloud", where=path)
+        raise FormatError("the PLY file has no faces: it is a point cloud", where=path)
     if not {"x", "y", "z"} <= set(vertex.dtype.names or ()):
         raise FormatError("the PLY file has no vertices with x, y and z", where=path)
     return TriangleMesh(
@@ -143,10 +144,10 @@ def _faces(table: Table | None) -> Int32 | None:
 
 
 def _checked(mesh: TriangleMesh, path: str | PathLike[str]) -> TriangleMesh:
-    """The mesh, if its faces name vertices that exist and its vertices are finite."""
+    """Check that all faces refer to existing vertices and all vertices are finite."""
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise FormatError(
-            "a face names a vertex that does not exist",
+            "a face refers to a vertex that does not exist",
             where=path,
             got=f"{int(mesh.faces.max())}",
             expected=f"less than {len(mesh.vertices)}",

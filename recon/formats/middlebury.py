@@ -30,20 +30,19 @@ from recon.structures.arrays import UInt8
 
 @dataclass(frozen=True, eq=False)
 class MiddleburyScene:
-    """One scene with all that its folder says about it.
+    """One scene with all data of its folder.
 
     Attributes:
         name: Name of the folder.
-        generation: Whose layout the folder has: "2005" is that of 2006 too, "2014" that of
-            MiddEval3 too.
-        pair: The pictures; they are rectified.
-        camera: Geometry, or None where none is published: 2001, 2003, and 2005 or 2006 without
+        generation: Layout of the folder: "2005" includes 2006, and "2014" includes MiddEval3.
+        pair: The rectified images.
+        camera: The camera, or None if none is published: 2001, 2003, and 2005 or 2006 without
             ``dmin.txt``. Matching can then use a `stand_in_camera`.
-        truth: True disparity of the left picture, or None where the folder has none.
-        ndisp: Number of disparities that suffice, or None where it is not published.
-        isint: True where results are rounded to whole pixels before they are compared.
-        full_size_factor: Full-size pixels per pixel here: the benchmark's error limits are in
-            full-size pixels.
+        truth: True disparity of the left image, or None if the folder has none.
+        ndisp: Number of disparities to search, or None if it is not published.
+        isint: True if results are rounded to whole pixels before comparison.
+        full_size_factor: Full-size pixels per pixel of these images: the error thresholds of the
+            benchmark are in full-size pixels.
     """
 
     name: str
@@ -57,18 +56,18 @@ class MiddleburyScene:
 
 
 def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
-    """Read one scene; `middlebury_layout` lists what is understood.
+    """Read one scene; `middlebury_layout` lists the supported layouts.
 
     Raises:
-        FormatError: The folder is no Middlebury scene, or a file in it is missing, damaged or of
-            another size than the left picture.
-        CalibrationError: The calibration file cannot give depth.
+        FormatError: The folder is not a Middlebury scene, or a file in it is missing, damaged or
+            of another size than the left image.
+        CalibrationError: The calibration cannot give depth.
     """
     path = Path(folder).resolve()
     layout = find_layout(path)
     if layout is None:
         raise FormatError(
-            "folder is no Middlebury scene",
+            "folder is not a Middlebury scene",
             where=folder,
             expected="im0 and im1 with calib.txt, view1 and view5, im2 and im6, or im3 and im4",
         )
@@ -91,10 +90,10 @@ def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
 
 
 def stand_in_camera(width_px: int, height_px: int, ndisp: int | None = None) -> RectifiedCamera:
-    """A camera for pictures whose calibration is unknown: fit for matching, not for depth.
+    """A placeholder camera for uncalibrated images: valid for matching, not for depth.
 
-    The focal length is taken as the image width and the baseline as 1, so depth is in units of
-    an unknown length.
+    The focal length is set to the image width and the baseline to 1, so depth has an unknown
+    scale.
     """
     cx_px = (width_px - 1) / 2
     return RectifiedCamera(
@@ -113,7 +112,7 @@ def _read_pair(path: Path, layout: Layout) -> StereoPair:
     left, right = (_read_picture(path, stem) for stem in (layout.left, layout.right))
     if left.shape != right.shape:
         raise FormatError(
-            "left and right picture differ in size",
+            "left and right images differ in size",
             where=path,
             got=f"{layout.left} {_size(left)}, {layout.right} {_size(right)}",
         )
@@ -123,7 +122,7 @@ def _read_pair(path: Path, layout: Layout) -> StereoPair:
 def _read_picture(path: Path, stem: str) -> UInt8:
     file = find_picture(path, stem)
     if file is None:
-        raise FormatError("picture is missing", where=path, expected=f"{stem}.png")
+        raise FormatError("image is missing", where=path, expected=f"{stem}.png")
     return read_image(file)
 
 
@@ -139,7 +138,7 @@ def _read_calib(
     calib = read_middlebury_calib(path / "calib.txt")
     if (calib.camera.width_px, calib.camera.height_px) != (width_px, height_px):
         raise FormatError(
-            "size in the calibration is not that of the pictures",
+            "image size in the calibration differs from the images",
             where=path / "calib.txt",
             got=f"{calib.camera.width_px}x{calib.camera.height_px}",
             expected=_size(left),
@@ -148,7 +147,7 @@ def _read_calib(
 
 
 def _read_ndisp(path: Path) -> int | None:
-    """``info.txt`` of the version 2 benchmark: grey levels per pixel, largest disparity."""
+    """Read ``info.txt`` of the version 2 benchmark: grey levels per pixel, largest disparity."""
     info = path / "v2eval" / "info.txt"
     if not info.is_file():
         return None

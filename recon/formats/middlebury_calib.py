@@ -1,4 +1,4 @@
-"""Calibration of Middlebury scenes: ``calib.txt`` of 2014, nominal numbers of 2005 and 2006."""
+"""Calibration of Middlebury scenes: ``calib.txt`` of 2014, nominal values of 2005 and 2006."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _2005_BASELINE_M: Final = 0.160
 
 @dataclass(frozen=True)
 class MiddleburyCalib:
-    """All that a ``calib.txt`` says.
+    """The content of a ``calib.txt``.
 
     Attributes:
         camera: The rectified camera, in metres.
-        isint: True where the truth is in whole pixels, so that results are rounded before they
-            are compared.
+        isint: True if the ground truth is in whole pixels, so that results are rounded before
+            comparison.
         vmin_px: Smallest true disparity, or None.
         vmax_px: Largest true disparity, or None.
-        doffs_px: ``doffs`` as the file has it; the camera's is the difference of its principal
-            points, which are rounded too. None = the file does not say.
+        doffs_px: ``doffs`` as in the file; that of the camera is the difference of its rounded
+            principal points. None = not in the file.
     """
 
     camera: RectifiedCamera
@@ -45,9 +45,9 @@ def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
     """Read a ``calib.txt`` of the 2014 data or of MiddEval3.
 
     Raises:
-        FormatError: The file is missing, lacks a key, or a value is no number.
-        CalibrationError: The two cameras differ in focal length or rows, the baseline is not
-            positive, or ``doffs`` is not ``cx1 - cx0``.
+        FormatError: The file is missing, lacks a key, or a value is not a number.
+        CalibrationError: The cameras differ in focal length or principal row, the baseline is
+            not positive, or ``doffs`` is not ``cx1 - cx0``.
     """
     entries = dict(_LINE.findall(read_text(path)))
     cam0, cam1 = (_matrix(entries, key, path) for key in ("cam0", "cam1"))
@@ -72,15 +72,15 @@ def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
 def nominal_camera_2005(
     width_px: int, height_px: int, dmin_px: float, factor: float
 ) -> RectifiedCamera:
-    """The camera of a 2005 or 2006 scene, for which the publishers give round numbers.
+    """The camera of a 2005 or 2006 scene, from the nominal values that are published.
 
-    The pictures are cropped so that a disparity is too small by ``dmin``. The principal point is
-    unknown and taken as the middle of the picture.
+    The images are cropped so that disparities are too small by ``dmin``. The principal point is
+    unknown and assumed at the image centre.
 
     Args:
-        width_px: Image width at the size at hand.
+        width_px: Image width.
         height_px: Image height.
-        dmin_px: Content of ``dmin.txt``, full-size pixels.
+        dmin_px: Content of ``dmin.txt``, in full-size pixels.
         factor: Full-size pixels per pixel: 1, 2 or 3.
     """
     cx_px = (width_px - 1) / 2
@@ -98,7 +98,7 @@ def nominal_camera_2005(
 def _check_views(cam0: Float64, cam1: Float64, doffs_px: float, path: StrPath) -> None:
     if not np.allclose(cam0[[0, 1, 1], [0, 1, 2]], cam1[[0, 1, 1], [0, 1, 2]], rtol=1e-4):
         raise CalibrationError("cam0 and cam1 have different focal lengths or rows", where=path)
-    # Three decimals are printed of each number.
+    # Each value is printed with three decimals.
     if abs(cam1[0, 2] - cam0[0, 2] - doffs_px) > 0.01:
         raise CalibrationError(
             "doffs is not the difference of the principal points",
@@ -121,7 +121,7 @@ def _number(entries: dict[str, str], key: str, path: StrPath) -> float:
     except ValueError:
         number = float("nan")
     if not np.isfinite(number):
-        raise FormatError(f"{key!r} is no finite number", where=path, got=text)
+        raise FormatError(f"{key!r} is not a finite number", where=path, got=text)
     return number
 
 
@@ -135,5 +135,5 @@ def _matrix(entries: dict[str, str], key: str, path: StrPath) -> Float64:
             f"{key!r} is not a 3x3 matrix", where=path, got=text, expected="[f 0 cx; 0 f cy; 0 0 1]"
         ) from error
     if not np.isfinite(matrix).all():
-        raise FormatError(f"{key!r} holds a number that is not finite", where=path, got=text)
+        raise FormatError(f"{key!r} has a value that is not finite", where=path, got=text)
     return matrix

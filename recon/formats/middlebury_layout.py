@@ -1,7 +1,7 @@
-"""Which files a Middlebury scene of each year consists of, and in what units its truth is.
+"""The files of a Middlebury scene in each year's data set, and the units of its ground truth.
 
 =========  ==================  ======================  =========================================
-year       pictures            truth                   grey levels per pixel of disparity
+year       images              truth                   grey levels per pixel of disparity
 =========  ==================  ======================  =========================================
 2001       im3, im4 (Tsukuba)  disp3                   16
 2001       scene1.row3.col3    truedisp.row3.col3      16 (Tsukuba as published)
@@ -13,8 +13,8 @@ year       pictures            truth                   grey levels per pixel of 
 MiddEval3  im0, im1, calib     disp0GT, disp1GT (PFM)  floats, inf = unknown
 =========  ==================  ======================  =========================================
 
-The pictures of 2005 and 2006 may lie in folders for light and exposure (``Aloe/Illum1/Exp1``), the
-truth above them. ``calib.txt`` may be missing where the truth is PFM.
+The images of 2005 and 2006 may be in subfolders by lighting and exposure (``Aloe/Illum1/Exp1``),
+with the ground truth above them. ``calib.txt`` may be missing if the ground truth is PFM.
 
 Ref: https://vision.middlebury.edu/stereo/data/
 """
@@ -49,11 +49,11 @@ class Layout:
     """File stems of a scene.
 
     Attributes:
-        left: Left picture.
-        right: Right picture.
-        truth_left: True disparity of the left view.
-        truth_right: True disparity of the right view.
-        calibrated: True where there should be a ``calib.txt``, and the truth is in PFM.
+        left: Left image.
+        right: Right image.
+        truth_left: True disparity of the left image.
+        truth_right: True disparity of the right image.
+        calibrated: True if a ``calib.txt`` is expected and the ground truth is PFM.
     """
 
     left: str
@@ -75,7 +75,7 @@ _EVAL3: Final = Layout("im0", "im1", "disp0GT", "disp1GT", calibrated=True)
 
 
 def find_layout(folder: Path) -> Layout | None:
-    """The layout that a folder's files fit, or None; one picture of the two is enough."""
+    """The layout that matches the files of a folder, or None; one of the two images suffices."""
     marks = ("calib.txt", "disp0GT.pfm", "disp0.pfm")
     if any((folder / mark).is_file() for mark in marks):
         eval3 = (folder / "disp0GT.pfm").is_file()
@@ -88,13 +88,13 @@ def find_layout(folder: Path) -> Layout | None:
 
 
 def find_picture(folder: Path, stem: str) -> Path | None:
-    """The picture of that stem, whatever its suffix, or None."""
+    """The image file with that stem and any image suffix, or None."""
     paths = (folder / f"{stem}{suffix}" for suffix in _PICTURES)
     return next((path for path in paths if path.is_file()), None)
 
 
 def generation_of(layout: Layout, width_px: int) -> Generation:
-    """The year; scenes of 2001 and 2003 share their names and differ in width."""
+    """The year; scenes of 2001 and 2003 have the same file names and differ in width."""
     if layout.calibrated:
         return "2014"
     if layout == _2005:
@@ -103,7 +103,7 @@ def generation_of(layout: Layout, width_px: int) -> Generation:
 
 
 def levels_per_pixel(layout: Layout, width_px: int, height_px: int) -> float | None:
-    """Grey levels per pixel of disparity in the truth's files; None = they are PFM."""
+    """Grey levels per pixel of disparity in the ground truth; None = PFM."""
     generation = generation_of(layout, width_px)
     if generation == "2014":
         return None
@@ -113,22 +113,22 @@ def levels_per_pixel(layout: Layout, width_px: int, height_px: int) -> float | N
 
 
 def scene_root(folder: Path) -> Path:
-    """The folder that a scene is named after: above those for light and exposure."""
+    """The folder of the scene itself, above any subfolders by lighting and exposure."""
     while _VARIANT.fullmatch(folder.name):
         folder = folder.parent
     return folder
 
 
 def full_size_factor(layout: Layout, width_px: int, height_px: int, folder: Path) -> float:
-    """Full-size pixels per pixel of the scene at hand.
+    """Full-size pixels per pixel of these images.
 
-    MiddEval3 tells the size by the last letter of the collection (``trainingQ``); scenes of its
-    table that lie elsewhere are known by their names.
+    MiddEval3 gives the size by the last letter of the collection (``trainingQ``); in other
+    folders its scenes are recognised by name.
 
     Args:
         layout: The layout.
-        width_px: Width of the pictures.
-        height_px: Height of the pictures.
+        width_px: Width of the images.
+        height_px: Height of the images.
         folder: Folder of the scene.
     """
     generation = generation_of(layout, width_px)

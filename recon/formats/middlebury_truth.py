@@ -1,4 +1,4 @@
-"""True disparity of Middlebury scenes, and where it is seen by both cameras."""
+"""True disparity of Middlebury scenes, and which pixels both cameras see."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ _TOLERANCE_PX: Final = 1.0
 def read_middlebury_truth(
     folder: Path, layout: Layout, scale: float | None, shape: tuple[int, int]
 ) -> DisparityTruth | None:
-    """Read the truth of the left view.
+    """Read the ground truth of the left image.
 
-    Pixels count as seen by both cameras where a mask file says so; without one, where the two
-    true disparities agree within a pixel; without a right truth, everywhere.
+    Pixels count as visible to both cameras according to a mask file; without one, where the left
+    and right true disparities agree within a pixel; without a right one, everywhere.
 
     Args:
         folder: Folder of the scene.
         layout: Its file names.
         scale: Grey levels per pixel of disparity; None = PFM.
-        shape: (H, W) of the pictures.
+        shape: (H, W) of the images.
 
     Returns:
-        The truth, or None where the folder has none.
+        The ground truth, or None if the folder has none.
 
     Raises:
         FormatError: A file is damaged or of another size.
@@ -54,15 +54,15 @@ def read_middlebury_truth(
 
 
 def cross_check(left: Float32, right: Float32, tolerance_px: float) -> Bool:
-    """Where the left and the right disparity tell of the same point.
+    """Where the left and the right disparity describe the same point.
 
     Args:
-        left: float32 (H, W), disparity of the left view; NaN = unknown.
-        right: float32 (H, W), disparity of the right view, ``x_left - x_right`` as well.
+        left: float32 (H, W), disparity of the left image; NaN = unknown.
+        right: float32 (H, W), disparity of the right image, also ``x_left - x_right``.
         tolerance_px: Largest difference.
 
     Returns:
-        bool (H, W) in the left view.
+        bool (H, W) in the left image.
     """
     height, width = left.shape
     columns = np.rint(np.arange(width) - np.nan_to_num(left, nan=2.0 * width)).astype(np.int64)
@@ -94,7 +94,7 @@ def _read_mask(folder: Path, shape: tuple[int, int]) -> Bool | None:
 def _check_shape(path: Path, got: tuple[int, ...], expected: tuple[int, int]) -> None:
     if got != expected:
         raise FormatError(
-            "size is not that of the pictures",
+            "size differs from the images",
             where=path,
             got=f"{got[1]}x{got[0]}",
             expected=f"{expected[1]}x{expected[0]}",

@@ -1,4 +1,4 @@
-"""MeshLab projects (.mlp): layers that open together."""
+"""MeshLab projects (.mlp): several layers opened together."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _IDENTITY = "\n1 0 0 0 \n0 1 0 0 \n0 0 1 0 \n0 0 0 1 \n"
 def write_mlp(path: str | PathLike[str], layers: Mapping[str, str | PathLike[str]]) -> None:
     """Write a MeshLab project.
 
-    MeshLab looks for the files relative to the project, so the folder can be moved as a whole.
+    File paths are relative to the project, so the folder can be moved as a whole.
 
     Args:
-        path: The project file; it appears whole or not at all.
+        path: The project file, written atomically.
         layers: Label and file of each layer, such as ``{"cloud": "map/cloud.ply"}``; the files
             must exist.
 
@@ -39,7 +39,7 @@ def write_mlp(path: str | PathLike[str], layers: Mapping[str, str | PathLike[str
 
 
 def _relative(file: str | PathLike[str], project: Path) -> str:
-    """A layer's file as MeshLab finds it from the project's folder."""
+    """Path of a layer's file relative to the project's folder."""
     if not Path(file).is_file():
         raise OutputError(
             "a layer of the MeshLab project does not exist", where=file, hint="write it first"

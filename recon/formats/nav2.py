@@ -1,8 +1,8 @@
-"""Nav2 (ROS) maps: a PGM picture and a YAML file that says how to read it.
+"""Nav2 (ROS) maps: a PGM image and a YAML file that describes it.
 
 Ref: https://docs.nav2.org/configuration/packages/configuring-map-server.html (mode ``trinary``):
-occupancy of a pixel is ``(255 - value) / 255``; above ``occupied_thresh`` it is occupied, below
-``free_thresh`` free, else unknown. The first row of the picture has the largest y.
+the occupancy of a pixel is ``(255 - value) / 255``; above ``occupied_thresh`` the cell is
+occupied, below ``free_thresh`` free, else unknown. The first row of the image has the largest y.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from recon.structures import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.structures.arrays import UInt8
 
 _OCCUPIED_THRESH: Final = 0.65
-# 0.25, often seen, would read the grey of unknown (205: 0.196…) back as free.
+# With the common 0.25, the grey level of unknown (205, occupancy 0.196…) would be read as free.
 _FREE_THRESH: Final = 0.196
 _GREY: Final = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
 _STRIP_ROWS: Final = 256
@@ -31,14 +31,14 @@ _PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d+)\s+(\d+)\s+(\d+)\s
 
 
 def write_nav2(path: str | PathLike[str], grid: OccupancyGrid) -> tuple[Path, Path]:
-    """Write ``path.pgm`` and ``path.yaml``, each atomically, the picture first.
+    """Write ``path.pgm`` and ``path.yaml``, each atomically, the image first.
 
     Args:
         path: Both names without their suffixes, such as ``map/grid``.
         grid: The grid.
 
     Returns:
-        The two paths written: picture, YAML.
+        The two paths written: image, YAML.
 
     Raises:
         OutputError: A file cannot be written.
@@ -55,13 +55,14 @@ def write_nav2(path: str | PathLike[str], grid: OccupancyGrid) -> tuple[Path, Pa
 
 
 def read_nav2(path: str | PathLike[str]) -> OccupancyGrid:
-    """Read a map by Nav2's rules for mode ``trinary``.
+    """Read a map as Nav2 does in mode ``trinary``.
 
     Args:
         path: The YAML file.
 
     Raises:
-        FormatError: A file is missing or damaged, the mode is another, or the map is turned.
+        FormatError: A file is missing or damaged, the mode is not ``trinary``, or the map is
+            rotated.
     """
     path = Path(path)
     fields = _fields(path)
@@ -85,7 +86,7 @@ def _grey(cells: NDArray[np.int8]) -> UInt8:
 
 
 def _describe(grid: OccupancyGrid, image: str) -> dict[str, Any]:
-    """What the YAML file says."""
+    """The content of the YAML file."""
     return {
         "image": image,
         "mode": "trinary",
@@ -98,13 +99,13 @@ def _describe(grid: OccupancyGrid, image: str) -> dict[str, Any]:
 
 
 def _fields(path: Path) -> dict[str, Any]:
-    """The YAML file's content, checked."""
+    """Read and validate the content of the YAML file."""
     try:
         fields = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise FormatError("cannot read the map's YAML file", where=path) from error
     if not isinstance(fields, dict):
-        raise FormatError("the map's YAML file holds no fields", where=path)
+        raise FormatError("the map's YAML file is not a mapping", where=path)
     missing = [key for key in _KEYS if key not in fields]
     if missing:
         raise FormatError(f"the map's YAML file has no {missing[0]!r}", where=path)
@@ -117,30 +118,30 @@ def _fields(path: Path) -> dict[str, Any]:
 
 
 def _check_numbers(fields: dict[str, Any], path: Path) -> None:
-    """Refuse fields that are no numbers, and turned maps."""
+    """Reject fields that are not numbers, and rotated maps."""
     origin = fields["origin"]
     numbers = [fields[key] for key in ("resolution", "occupied_thresh", "free_thresh")]
     whole = isinstance(origin, list) and len(origin) == 3
     if not whole or not all(isinstance(n, (int, float)) for n in (*numbers, *origin)):
-        raise FormatError("the map's YAML file holds something that is no number", where=path)
+        raise FormatError("the map's YAML file holds a value that is not a number", where=path)
     if origin[2] != 0:
-        raise FormatError("the map is turned", where=path, got=f"yaw {origin[2]:g}", expected="0")
+        raise FormatError("the map is rotated", where=path, got=f"yaw {origin[2]:g}", expected="0")
 
 
 def _read_pgm(path: Path) -> UInt8:
-    """A binary 8-bit PGM, uint8 (rows, columns)."""
+    """Read a binary 8-bit PGM, uint8 (rows, columns)."""
     try:
         content = path.read_bytes()
     except OSError as error:
-        raise FormatError("cannot read the map's picture", where=path) from error
+        raise FormatError("cannot read the map's image", where=path) from error
     header = _PGM_HEADER.match(content)
     if header is None or int(header[3]) != 255:
-        raise FormatError("the map's picture is not a binary 8-bit PGM", where=path)
+        raise FormatError("the map's image is not a binary 8-bit PGM", where=path)
     columns, rows = int(header[1]), int(header[2])
     body = content[header.end() :]
     if len(body) != rows * columns:
         raise FormatError(
-            "the map's picture is truncated",
+            "the map's image is truncated",
             where=path,
             got=f"{len(body)} bytes",
             expected=f"{rows * columns}",

@@ -1,4 +1,4 @@
-"""OctoMap files: ``.ot`` with log-odds, ``.bt`` with occupied and free alone."""
+"""OctoMap files: ``.ot`` with log-odds, ``.bt`` with only occupied and free."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def write_octomap(path: str | PathLike[str], voxels: OccupancyVoxels) -> tuple[P
     """Write ``path.bt`` and ``path.ot``, each atomically.
 
     Args:
-        path: Both names without their suffixes, such as ``map/octomap``.
+        path: The common path without suffix, such as ``map/octomap``.
         voxels: The map.
 
     Returns:
         The two paths written: ``.bt``, ``.ot``.
 
     Raises:
-        MappingError: The map is larger than an OctoMap can be.
+        MappingError: The map is too large for an OctoMap.
         OutputError: A file cannot be written.
     """
     return write_octomap_tiles(path, [voxels], DEPTH // 2, voxels.resolution_m)
@@ -50,19 +50,19 @@ def write_octomap(path: str | PathLike[str], voxels: OccupancyVoxels) -> tuple[P
 def write_octomap_tiles(
     path: str | PathLike[str], tiles: Iterable[OccupancyVoxels], depth: int, resolution_m: float
 ) -> tuple[Path, Path]:
-    """Write both files from pieces of a map; memory for one piece at a time.
+    """Write both files from tiles of a map, with one tile in memory at a time.
 
     Args:
-        path: Both names without their suffixes.
-        tiles: Pieces; no cube of ``2^depth`` cells a side has cells in two of them.
-        depth: 1 to 15.
-        resolution_m: Edge of a cell.
+        path: The common path without suffix.
+        tiles: Tiles of the map; every cube with a side of ``2^depth`` cells lies in one tile.
+        depth: Tree depth of these cubes, 1 to 15.
+        resolution_m: Cell size.
 
     Returns:
         The two paths written: ``.bt``, ``.ot``.
 
     Raises:
-        MappingError: The map is larger than an OctoMap can be.
+        MappingError: The map is too large for an OctoMap.
         OutputError: A file cannot be written.
     """
     stem = Path(path)
@@ -81,13 +81,14 @@ def write_octomap_tiles(
 
 @dataclass
 class _Node:
-    """A branch in the tree above the pieces.
+    """A node of the tree above the cubes, or the root of a cube.
 
     Attributes:
-        cube: Its place among the cubes of its size.
-        branch: Itself; its bytes are those of the node alone, or none where they are in a file.
-        children: Nodes below, by their place.
-        full: Begin and end of the bytes of a piece in the file.
+        cube: Its index among the cubes of its size.
+        branch: Its branch; the bytes are those of the node alone, or empty for a cube, whose
+            bytes are in the temporary file.
+        children: Child nodes, by their index 0 to 7.
+        full: Start and end of the bytes of a cube in the temporary file, for the ``.ot``.
         binary: The same, for the ``.bt``.
     """
 
@@ -99,12 +100,12 @@ class _Node:
 
 
 def _nodes(voxels: OccupancyVoxels, depth: int, pieces: IO[bytes]) -> list[_Node]:
-    """The branches of the cubes of a tile, whose bytes are put by."""
+    """Nodes for the cubes of a tile; their bytes are appended to ``pieces``."""
     _check(voxels)
     if len(voxels) == 0:
         return []
     x, y, z = ((voxels.keys.astype(np.int64) + KEY_LIMIT) >> depth).T
-    # One number for three: numpy sorts rows slowly.
+    # One combined key, as numpy sorts rows slowly.
     number = (x << 32) | (y << 16) | z
     order = np.argsort(number, kind="stable")
     begins = np.flatnonzero(np.diff(number[order], prepend=-1))
@@ -126,7 +127,7 @@ def _append(pieces: IO[bytes], content: bytes) -> tuple[int, int]:
 
 
 def _tree(nodes: list[_Node], depth: int) -> _Node | None:
-    """The root above the branches of cubes, level by level; None for a map without cells."""
+    """Join the nodes level by level up to the root; None for a map without cells."""
     for _ in range(DEPTH - depth):
         groups: dict[Cube, dict[int, _Node]] = {}
         for node in nodes:
@@ -153,7 +154,7 @@ def _write_tree(
 
 
 def _write_node(file: IO[bytes], node: _Node, pieces: IO[bytes], *, binary: bool) -> None:
-    """A node and all below it, depth first; a leaf of a ``.bt`` was told by its parent."""
+    """Write a node and all below it, depth first; a ``.bt`` stores leaves in their parents."""
     if binary and node.branch.kind != INNER:
         return
     file.write(node.branch.binary if binary else node.branch.full)
@@ -175,12 +176,12 @@ def _check(voxels: OccupancyVoxels) -> None:
 
 
 def read_octomap(path: str | PathLike[str]) -> OccupancyVoxels:
-    """Read a ``.bt`` or ``.ot`` file, by what its header says; pruned leaves are expanded.
+    """Read a ``.bt`` or ``.ot`` file, according to its header; pruned leaves are expanded.
 
-    The log-odds of a ``.bt`` file are those that OctoMap gives to occupied and to free.
+    For a ``.bt`` file, the log-odds are OctoMap's values for occupied and free.
 
     Raises:
-        FormatError: The file is missing or is no OctoMap.
+        FormatError: The file is missing or not an OctoMap.
     """
     if not _is_full(Path(path)):
         return OccupancyVoxels(*decode_octomap(Path(path)))
@@ -193,7 +194,7 @@ def read_octomap(path: str | PathLike[str]) -> OccupancyVoxels:
 
 
 def _is_full(path: Path) -> bool:
-    """Whether a file says that it is an ``.ot``."""
+    """Whether a file has the header of an ``.ot``."""
     try:
         with path.open("rb") as file:
             return file.readline(200).strip() == FULL_TREE

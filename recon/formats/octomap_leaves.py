@@ -1,4 +1,4 @@
-"""The cells of an OctoMap ``.ot`` file, piece by piece: no tree of the whole map is in memory.
+"""Reads the cells of an OctoMap ``.ot`` file piece by piece, without a whole tree in memory.
 
 Ref: A. Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on
 octrees", Autonomous Robots 34, 2013, section 3.4; the format is that of OctoMap 1.9.
@@ -22,21 +22,21 @@ from recon.structures.arrays import Int32
 FULL_TREE: Final = b"# Octomap OcTree file"
 _NODE: Final = np.dtype([("log_odds", "<f4"), ("children", "u1")])
 _LONGEST_HEADER_LINES: Final = 100
-#: Level of the largest leaf that is believed: it stands for as many cells as memory holds.
+#: Level of the largest leaf accepted; a larger one would expand to too many cells for memory.
 _COARSEST: Final = DEPTH - 8
 
 
 def octomap_pieces(path: Path, nodes_each: int = 1 << 19) -> Iterator[OccupancyVoxels]:
-    """Read the cells of an ``.ot`` file in the order of the file, in one piece at least.
+    """Read the cells of an ``.ot`` file in file order, in at least one piece.
 
-    Leaves that stand for many cells are expanded.
+    Leaves that cover several cells are expanded.
 
     Args:
         path: The file.
-        nodes_each: Nodes of the tree that are read at a time.
+        nodes_each: Number of tree nodes to read at a time.
 
     Raises:
-        FormatError: The file is missing, is no ``.ot`` file, or is truncated or damaged.
+        FormatError: The file is missing, truncated, damaged or not an ``.ot`` file.
     """
     try:
         with path.open("rb") as file:
@@ -63,7 +63,7 @@ def _pieces(file: IO[bytes], path: Path, nodes_each: int) -> Iterator[OccupancyV
 
 
 def _cells(nodes: NDArray[np.void], walk: TreeWalk, resolution_m: float) -> OccupancyVoxels | None:
-    """The cells of the next nodes; None where they are none of the tree."""
+    """The cells of the next nodes; None if they do not fit the tree."""
     seen, leaves = find_leaves(np.ascontiguousarray(nodes["children"]), walk)
     log_odds = nodes["log_odds"][leaves.nodes]
     coarse = (leaves.levels < _COARSEST).any()
@@ -74,7 +74,7 @@ def _cells(nodes: NDArray[np.void], walk: TreeWalk, resolution_m: float) -> Occu
 
 
 def _expand(leaves: Leaves) -> tuple[Int32, NDArray[np.intp]]:
-    """Cells of leaves of any size, and the leaf that each belongs to."""
+    """Expand leaves of any size to cells, with the leaf that each belongs to."""
     keys, source = [np.zeros((0, 3), np.int32)], [np.zeros(0, np.intp)]
     for level in np.unique(leaves.levels).tolist():
         edge = 1 << (DEPTH - level)
@@ -87,10 +87,10 @@ def _expand(leaves: Leaves) -> tuple[Int32, NDArray[np.intp]]:
 
 
 def _read_header(file: IO[bytes], path: Path) -> tuple[int, float]:
-    """Number of nodes, and the edge of a cell; the file is left behind the header."""
+    """Read the number of nodes and the cell size; leave the file just after the header."""
     first = file.readline(200).strip()
     if first != FULL_TREE:
-        raise FormatError("the file is no .ot OctoMap", where=path, got=first[:40])
+        raise FormatError("not an .ot OctoMap file", where=path, got=first[:40])
     fields: dict[bytes, bytes] = {}
     for _ in range(_LONGEST_HEADER_LINES):
         name, _, value = file.readline(200).strip().partition(b" ")
@@ -103,6 +103,6 @@ def _read_header(file: IO[bytes], path: Path) -> tuple[int, float]:
         raise FormatError("the OctoMap is truncated or damaged", where=path) from error
     if fields.get(b"id") != b"OcTree" or nodes < 0 or not 0 < resolution_m < np.inf:
         raise FormatError(
-            "the file holds no octree of occupancy", where=path, got=fields.get(b"id", b"")[:40]
+            "the file has no occupancy octree", where=path, got=fields.get(b"id", b"")[:40]
         )
     return nodes, resolution_m

@@ -1,8 +1,8 @@
-"""OctoMap's files, written branch by branch: no tree of the whole map is ever in memory.
+"""Encodes OctoMap files branch by branch, without a tree of the whole map in memory.
 
-A branch is a cube of ``2^depth`` cells a side. Its cells are sorted along a Morton curve (x is the
-fastest bit), so that the nodes of each level are runs of cells, and the place of every node in
-the file, which lists nodes depth first, follows from the sizes of the branches below it.
+A branch is a cube with a side of ``2^depth`` cells. Its cells are sorted in Morton order (x is the
+lowest bit), so the nodes of each level are runs of cells. Files list nodes depth first, so the
+position of every node follows from the sizes of the branches.
 
 Ref: A. Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on
 octrees", Autonomous Robots 34, 2013, section 3.4; the formats are those of OctoMap 1.9.
@@ -20,22 +20,22 @@ from recon.structures.arrays import Bool, Float32, Int32
 
 DEPTH: Final = 16
 KEY_LIMIT: Final = 1 << (DEPTH - 1)
-"""An OctoMap holds cells in ``[-KEY_LIMIT, KEY_LIMIT)`` on each axis."""
+"""Cell indices of an OctoMap lie in ``[-KEY_LIMIT, KEY_LIMIT)`` on each axis."""
 FREE, OCCUPIED, INNER = 1, 2, 3
 _Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Branch:
-    """A node with all that is below it.
+    """A node with everything below it.
 
     Attributes:
         full: Its bytes in an ``.ot`` file.
-        binary: Its bytes in a ``.bt`` file; empty for a leaf, which its parent describes.
-        value: Its log-odds: the largest below it.
+        binary: Its bytes in a ``.bt`` file; empty for a leaf, which is stored in its parent.
+        value: Its log-odds: the maximum of the leaves below it.
         kind: 1 = free, 2 = occupied, 3 = has children, in the pruned tree of the ``.bt``.
-        nodes: Number of nodes in the ``.ot``, itself included.
-        pruned_nodes: Number of nodes in the ``.bt``, itself included.
+        nodes: Number of nodes in the ``.ot``, including itself.
+        pruned_nodes: Number of nodes in the ``.bt``, including itself.
     """
 
     full: bytes
@@ -47,10 +47,10 @@ class Branch:
 
 
 def encode_branch(keys: Int32, log_odds: Float32, depth: int) -> Branch:
-    """The branch of a cube of cells.
+    """Encode the branch of a cube of cells.
 
     Args:
-        keys: int32 (N, 3), N ≥ 1, cells of one cube of ``2^depth`` a side, each once.
+        keys: int32 (N, 3), N ≥ 1, distinct cells of one cube with a side of ``2^depth``.
         log_odds: float32 (N,); 0 and above = occupied.
         depth: At least 1.
     """
@@ -79,10 +79,10 @@ def encode_branch(keys: Int32, log_odds: Float32, depth: int) -> Branch:
 
 
 def join_branches(children: dict[int, Branch]) -> Branch:
-    """The node above some branches: its own bytes, to be followed by theirs in their order.
+    """The parent node of some branches: its own bytes only; those of the branches follow in order.
 
     Args:
-        children: Branches by their place, 0 to 7: bit 0 is x, bit 1 y, bit 2 z.
+        children: Branches by their index, 0 to 7: bit 0 is x, bit 1 y, bit 2 z.
     """
     value = max(child.value for child in children.values())
     kinds = {child.kind for child in children.values()}
@@ -97,14 +97,14 @@ def join_branches(children: dict[int, Branch]) -> Branch:
 
 
 def _parents_kind(kinds: _Index, begin: _Index) -> _Index:
-    """Kinds of parents: eight equal leaves make a leaf, all else has children."""
+    """Kinds of the parents: eight equal leaves become a leaf; any other node has children."""
     low, high = np.minimum.reduceat(kinds, begin), np.maximum.reduceat(kinds, begin)
     size = np.diff(np.r_[begin, len(kinds)])
     return np.where((size == 8) & (low == high) & (low != INNER), low, INNER)
 
 
 def _encode_full(codes: list[_Index], values: list[Float32], begins: list[_Index]) -> bytes:
-    """Every node as its value and a bit for each child."""
+    """Encode every node as its value and one bit per child."""
     everywhere = [np.ones(len(code), dtype=np.bool_) for code in codes]
     places = _places(everywhere, begins, 5)
     out = np.zeros(5 * sum(map(len, codes)), np.uint8)
@@ -120,7 +120,7 @@ def _encode_full(codes: list[_Index], values: list[Float32], begins: list[_Index
 def _encode_binary(
     codes: list[_Index], kinds: list[_Index], begins: list[_Index]
 ) -> tuple[bytes, int]:
-    """Every node with children as two bits for each child; and the number of nodes."""
+    """Encode every node that has children as two bits per child; also the number of nodes."""
     inner = [kind == INNER for kind in kinds]
     places = _places(inner, begins, 2)
     out = np.zeros(2 * sum(int(which.sum()) for which in inner), np.uint8)
@@ -136,7 +136,7 @@ def _encode_binary(
 
 
 def _places(written: list[Bool], begins: list[_Index], size: int) -> list[_Index]:
-    """Where the bytes of each node begin, per level; nodes that are not written take none."""
+    """Byte offset of each node, per level; nodes that are not written take no bytes."""
     sizes = [size * written[0].astype(np.int64)]
     for up, begin in enumerate(begins, 1):
         below = np.add.reduceat(sizes[-1], begin)
@@ -152,7 +152,7 @@ def _places(written: list[Bool], begins: list[_Index], size: int) -> list[_Index
 
 
 def _morton(cells: NDArray[np.int64], depth: int) -> _Index:
-    """Place of cells (N, 3) in ``[0, 2^depth)`` along the curve: x is the fastest bit."""
+    """Morton codes of cells (N, 3) in ``[0, 2^depth)``; x is the lowest bit."""
     code = np.zeros(len(cells), np.int64)
     for bit in range(depth):
         for axis in range(3):
@@ -161,7 +161,7 @@ def _morton(cells: NDArray[np.int64], depth: int) -> _Index:
 
 
 def file_header(*, binary: bool, nodes: int, resolution_m: float) -> bytes:
-    """The first lines of a file."""
+    """The header of a file."""
     kind = "# Octomap OcTree binary file" if binary else "# Octomap OcTree file"
     lines = [
         kind,

@@ -1,4 +1,4 @@
-"""OpenCV's stereo calibration: YAML, XML or JSON as ``cv2.FileStorage`` writes them."""
+"""OpenCV's stereo calibration: YAML, XML or JSON as written by ``cv2.FileStorage``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from recon.geometry.se3 import make_transform
 from recon.structures import CameraIntrinsics, LensModel, StereoCalibration
 from recon.structures.arrays import Float64
 
-# One spelling per line: OpenCV's samples, then what calibration tools and tutorials use.
+# Accepted names: those of OpenCV's samples first, then those of calibration tools and tutorials.
 _LEFT_MATRIX: Final = ("M1", "K1", "cameraMatrix1", "camera_matrix_left", "cameraMatrixL")
 _RIGHT_MATRIX: Final = ("M2", "K2", "cameraMatrix2", "camera_matrix_right", "cameraMatrixR")
 _LEFT_DISTORTION: Final = ("D1", "distCoeffs1", "dist_coeffs_left", "distCoeffsL")
@@ -29,10 +29,10 @@ _HEIGHT: Final = ("image_height", "imageHeight", "height")
 _MODEL: Final = ("distortion_model", "camera_model", "model")
 _FISHEYE_NAMES: Final = frozenset({"fisheye", "equidistant"})
 
-# The numbers of coefficients that OpenCV's lens model knows.
+# Numbers of coefficients that OpenCV's distortion model supports.
 _DISTORTION_COUNTS: Final = frozenset({0, 4, 5, 8, 12, 14})
 
-# Longer than any rig: a file in millimetres that was read as metres.
+# Longer than any stereo rig: a longer baseline means millimetres read as metres.
 _LONGEST_BASELINE_M: Final = 20.0
 
 Nodes = dict[str, Float64]
@@ -48,17 +48,17 @@ def read_opencv_calibration(
     """Read two raw cameras from one file, or from OpenCV's pair of files.
 
     Args:
-        intrinsics: Holds ``M1 D1 M2 D2`` (or ``cameraMatrix1`` …), perhaps also ``R T``.
-        extrinsics: Holds ``R T``. None = the same file, else a file beside it whose name has
-            ``extrinsics`` in the place of ``intrinsics``.
-        size_px: (width, height) of the pictures, for files that do not hold
-            ``image_width`` and ``image_height``.
-        metres_per_unit: Length of the unit of ``T``: 0.001 where it is in millimetres, the edge
-            of a square where the board was taken as 1.
+        intrinsics: File with ``M1 D1 M2 D2`` (or ``cameraMatrix1`` …), and possibly ``R T``.
+        extrinsics: File with ``R T``. None = the same file if it has them, else the file in the
+            same folder with ``extrinsics`` in place of ``intrinsics`` in its name.
+        size_px: (width, height) of the images, for files without ``image_width`` and
+            ``image_height``.
+        metres_per_unit: Unit of ``T`` in metres: 0.001 for millimetres, or the square size if the
+            board was calibrated with squares of size 1.
 
     Raises:
-        FormatError: A file is missing, or lacks a matrix, or the size is nowhere.
-        CalibrationError: The numbers cannot give depth.
+        FormatError: A file or matrix is missing, or the image size is unknown.
+        CalibrationError: The calibration cannot give depth.
     """
     nodes = _read_nodes(intrinsics)
     outer = _find_extrinsics(intrinsics, extrinsics, nodes)
@@ -78,9 +78,9 @@ def read_opencv_calibration(
 
 
 def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> None:
-    """Write one YAML file that OpenCV's ``FileStorage`` reads, ``T`` in metres, atomically.
+    """Write one YAML file for OpenCV's ``FileStorage``, ``T`` in metres, atomically.
 
-    OpenCV has no place for the lens model; ``distortion_model`` says it where it is no pinhole.
+    OpenCV defines no key for the lens model; fisheye cameras are marked by ``distortion_model``.
 
     Raises:
         CalibrationError: One camera is a fisheye and the other is not.
@@ -88,7 +88,7 @@ def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> N
     """
     models = {calibration.left.model, calibration.right.model}
     if len(models) > 1:
-        raise CalibrationError("an OpenCV file cannot hold two lens models", where=path)
+        raise CalibrationError("an OpenCV file cannot store two lens models", where=path)
     storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", calibration.left.width_px)
     storage.write("image_height", calibration.left.height_px)
@@ -103,7 +103,7 @@ def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> N
 
 
 def _model(path: StrPath) -> LensModel:
-    """The lens model that a file names in passing; a pinhole where it names none."""
+    """The lens model named in a file; a pinhole if none is named."""
     storage = cv2.FileStorage(read_text(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     nodes = [storage.getNode(name) for name in _MODEL]
     named = {node.string().lower() for node in nodes if node.isString()}
@@ -115,12 +115,12 @@ def _read_nodes(path: StrPath) -> Nodes:
     text = read_text(path)
     flags = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
     try:
-        # Nodes point into the storage: it stays alive until all are copied.
+        # Nodes point into the storage, so it must stay alive until all are copied.
         storage = cv2.FileStorage(text, flags)
         root = storage.root() if storage.isOpened() else cv2.FileNode()
         nodes = {name: _numbers(root.getNode(name)) for name in root.keys()}  # noqa: SIM118
     except (cv2.error, SystemError) as error:  # the bindings raise both for one syntax error
-        raise FormatError("not a file of OpenCV's FileStorage", where=path) from error
+        raise FormatError("not an OpenCV FileStorage file", where=path) from error
     return {name: numbers for name, numbers in nodes.items() if numbers is not None}
 
 
@@ -187,7 +187,7 @@ def _size(nodes: Nodes, given: tuple[int, int] | None, path: StrPath) -> tuple[i
         return int(both.ravel()[0]), int(both.ravel()[1])
     if given is None:
         raise FormatError(
-            "calibration does not tell the size of the pictures",
+            "calibration does not contain the image size",
             where=path,
             expected="image_width and image_height",
         )
@@ -195,7 +195,7 @@ def _size(nodes: Nodes, given: tuple[int, int] | None, path: StrPath) -> tuple[i
 
 
 def _find_extrinsics(intrinsics: StrPath, extrinsics: StrPath | None, nodes: Nodes) -> StrPath:
-    """The file that has ``R`` and ``T``."""
+    """The file with ``R`` and ``T``."""
     if extrinsics is not None:
         return extrinsics
     path = Path(intrinsics)
@@ -206,7 +206,7 @@ def _find_extrinsics(intrinsics: StrPath, extrinsics: StrPath | None, nodes: Nod
 def _check_baseline(baseline_m: float, path: StrPath) -> None:
     if baseline_m > _LONGEST_BASELINE_M:
         raise CalibrationError(
-            "baseline is longer than any rig",
+            "baseline is implausibly long",
             where=path,
             got=f"{baseline_m:g} m",
             expected=f"at most {_LONGEST_BASELINE_M:g} m",

@@ -1,4 +1,4 @@
-"""PFM: disparity as 32-bit floats. In the file inf is unknown; here NaN is."""
+"""PFM: disparity as 32-bit floats; unknown is inf in the file and NaN in memory."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _HEADER: Final = re.compile(rb"(Pf|PF)\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s")
 def read_pfm(path: StrPath) -> Float32:
     """Read a grey PFM file.
 
-    The sign of the scale tells the byte order. Its magnitude is ignored, as Middlebury's own
-    reader does: their files carry 1/255 there and mean pixels.
+    The sign of the scale gives the byte order. Its magnitude is ignored, as in Middlebury's own
+    reader: their files have 1/255 there, but the values are pixels.
 
     Returns:
         float32 (H, W), first row at the top; NaN where the file has ±inf or NaN.
 
     Raises:
-        FormatError: The file is missing, no PFM, a colour PFM, or truncated.
+        FormatError: The file is missing, truncated, not a PFM, or a colour PFM.
     """
     content = read_bytes(path)
     header = _HEADER.match(content)
@@ -33,7 +33,7 @@ def read_pfm(path: StrPath) -> Float32:
         raise FormatError("not a PFM file", where=path, expected="header 'Pf', width height, scale")
     kind, width, height, scale = header.groups()
     if kind == b"PF":
-        raise FormatError("PFM file has colours", where=path, expected="grey (header 'Pf')")
+        raise FormatError("PFM file is in colour", where=path, expected="grey (header 'Pf')")
     order = "<f4" if _parse_scale(scale, path) < 0 else ">f4"
     shape = (int(height), int(width))
     return _unpack(content[header.end() :], order, shape, path)
@@ -62,7 +62,7 @@ def _parse_scale(word: bytes, path: StrPath) -> float:
     except ValueError:
         scale = 0.0
     if scale == 0 or not np.isfinite(scale):
-        raise FormatError("scale of the PFM file is no number but 0", where=path, got=word.decode())
+        raise FormatError("scale of the PFM file is invalid", where=path, got=word.decode())
     return scale
 
 

@@ -1,4 +1,4 @@
-"""Point clouds as PLY files that MeshLab, CloudCompare and Open3D read."""
+"""Point clouds as PLY files for MeshLab, CloudCompare and Open3D."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from recon.structures.arrays import Float32, UInt8
 _XYZ: Final = ("x", "y", "z")
 _NORMAL: Final = ("nx", "ny", "nz")
 _COLOUR: Final = ("red", "green", "blue")
-#: Scalars of a point: field of `PointCloud`, property of the file, type. MeshLab shows `quality`.
+#: Scalars of a point: field of `PointCloud`, PLY property, type. MeshLab shows `quality`.
 _SCALARS: Final = (
     ("confidence", "quality", "<f4"),
     ("sigma_m", "sigma", "<f4"),
@@ -45,16 +45,16 @@ def write_ply(
     quality: Float32 | None = None,
     ascii: bool = False,  # noqa: A002 - what the format calls it
 ) -> None:
-    """Write a cloud, binary little endian unless ``ascii``.
+    """Write a cloud atomically, binary little endian unless ``ascii``.
 
-    Positions and normals are float, colours uchar; ``quality`` is the confidence, and sigma,
-    weight and count follow under their names where the cloud has them. The frame is a comment.
+    Positions and normals are float, colours uchar; ``quality`` is the confidence; sigma, weight and
+    count are written under their names if the cloud has them. The frame is a comment.
 
     Args:
-        path: The file to write; it appears whole or not at all.
+        path: The file.
         cloud: The cloud.
-        quality: float32 (N,), written as ``quality`` in the place of the confidence.
-        ascii: Write text (larger, slower, the same numbers).
+        quality: float32 (N,), written as ``quality`` instead of the confidence.
+        ascii: Write text (larger and slower, with the same values).
 
     Raises:
         OutputError: The file cannot be written.
@@ -66,12 +66,12 @@ def write_ply(
 def write_ply_tiles(
     path: str | PathLike[str], clouds: Iterable[PointCloud], *, frame: Frame
 ) -> int:
-    """Write clouds one after the other into one file, as `write_ply` writes one.
+    """Write several clouds into one file, in the format of `write_ply`.
 
     Args:
-        path: The file to write; it appears whole or not at all.
-        clouds: All in one frame and with the same fields. One at a time is held.
-        frame: Frame of the file where there is no cloud.
+        path: The file, written atomically.
+        clouds: Clouds in the same frame and with the same fields; one is in memory at a time.
+        frame: Frame of the file if there is no cloud.
 
     Returns:
         The number of points.
@@ -96,18 +96,18 @@ def write_ply_tiles(
 def read_ply(path: str | PathLike[str]) -> PointCloud:
     """Read the vertices of a cloud or mesh, in ascii or binary, float or double.
 
-    Points with a coordinate that is not finite are dropped: organised clouds hold their gaps so.
-    ``quality`` (or ``confidence``) becomes the confidence if all of it lies in [0, 1].
+    Points with a non-finite coordinate are dropped; organised clouds mark their gaps that way.
+    ``quality`` (or ``confidence``) becomes the confidence if all values lie in [0, 1].
 
     Args:
         path: The file.
 
     Returns:
-        The cloud, in the frame that the file names, else ``camera``. It may be empty.
+        The cloud, in the frame named in the file, else ``camera``. It may be empty.
 
     Raises:
-        FormatError: The file is missing, no PLY, truncated, without x, y, z, or holds no finite
-            point though it holds points.
+        FormatError: The file is missing, truncated, not a PLY, has no x, y, z, or has points none
+            of which is finite.
     """
     header, tables = read_tables(path, ["vertex"])
     vertex = _vertices(tables.get("vertex"), path)
@@ -126,16 +126,16 @@ def read_ply(path: str | PathLike[str]) -> PointCloud:
 def read_ply_pieces(
     path: str | PathLike[str], points_each: int = _PIECE_POINTS
 ) -> Iterator[PointCloud]:
-    """Read a cloud as `read_ply` does, so many points at a time: places, normals and colours.
+    """Read positions, normals and colours like `read_ply`, one piece at a time.
 
-    Other numbers are left out: what ``quality`` is, only all of it can tell.
+    Other fields are left out, as the meaning of ``quality`` depends on all its values.
 
     Args:
         path: The file.
-        points_each: Points of a piece, before those that are not finite are dropped.
+        points_each: Points per piece, before non-finite ones are dropped.
 
     Raises:
-        FormatError: As in `read_ply`, when it is come upon.
+        FormatError: As in `read_ply`, at the piece where the fault is found.
     """
     vertex: Table | None = None
     points, kept = 0, 0
@@ -148,7 +148,7 @@ def read_ply_pieces(
 
 
 def vertex_dtype(*, normals: bool, colours: bool) -> list[tuple[str, str]]:
-    """Fields of a vertex table: place, and normal and colour if there are any."""
+    """Fields of a vertex table: position, and optionally normal and colour."""
     fields = [(name, "<f4") for name in _XYZ + (_NORMAL if normals else ())]
     return fields + [(name, "u1") for name in (_COLOUR if colours else ())]
 
@@ -156,7 +156,7 @@ def vertex_dtype(*, normals: bool, colours: bool) -> list[tuple[str, str]]:
 def fill_vertices(
     table: Table, xyz: NDArray[Any], normals: NDArray[Any] | None, rgb: UInt8 | None
 ) -> None:
-    """Copy places, normals and colours into the fields that `vertex_dtype` gave the table."""
+    """Copy positions, normals and colours into the fields of `vertex_dtype`."""
     for names, values in ((_XYZ, xyz), (_NORMAL, normals), (_COLOUR, rgb)):
         if values is not None:
             for column, name in enumerate(names):
@@ -169,7 +169,7 @@ def normals_of(vertex: Table) -> NDArray[np.float32] | None:
 
 
 def colours_of(vertex: Table) -> UInt8 | None:
-    """uint8 (N, 3), the colours of a vertex table, or None; floats mean [0, 1]."""
+    """uint8 (N, 3), the colours of a vertex table, or None; float colours are in [0, 1]."""
     if not _has(vertex, _COLOUR):
         return None
     if vertex.dtype["red"].kind == "f":
@@ -189,14 +189,14 @@ def _table(cloud: PointCloud) -> Table:
 
 
 def _vertices(vertex: Table | None, path: str | PathLike[str]) -> Table:
-    """The table of vertices, which must have places."""
+    """Check that the vertex table exists and has positions."""
     if vertex is None or not _has(vertex, _XYZ):
         raise FormatError("the PLY file has no vertices with x, y and z", where=path)
     return vertex
 
 
 def _shape(vertex: Table, header: PlyHeader) -> PointCloud:
-    """Places, normals and colours of vertices."""
+    """Positions, normals and colours of vertices."""
     return PointCloud(
         xyz=_stacked(vertex, _XYZ, np.float32),
         rgb=colours_of(vertex),

@@ -1,4 +1,4 @@
-"""The PLY container: a header, and a table for each of its elements.
+"""The PLY container: a header and one table per element.
 
 Ref: G. Turk, "The PLY polygon file format", 1994.
 """
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from recon.errors import FormatError
 from recon.formats.atomic import atomic_path
 
-#: A table: a structured array with one field per property. A list of three indices, the only kind
-#: of list that is known, is a field of shape (3,) after a field of its length (`list_length`).
+#: A structured array with one field per property. Lists are supported only with three entries, as
+#: a field of shape (3,) that follows a field with the length (`list_length`).
 Table = NDArray[Any]
 
 _TYPES: Final[dict[str, str]] = {
@@ -34,12 +34,12 @@ _LONGEST_NUMBER: Final = 20
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a PLY file says of itself.
+    """The header of a PLY file.
 
     Attributes:
         encoding: ``ascii``, ``binary_little_endian`` or ``binary_big_endian``.
         elements: Name, number of rows and dtype of each element, in the order of the file.
-        comments: The comment lines, without the word.
+        comments: The comment lines, without the keyword.
     """
 
     encoding: str
@@ -48,24 +48,25 @@ class PlyHeader:
 
 
 def list_length(name: str) -> str:
-    """Name of the field that holds the length of the list property ``name``."""
+    """Name of the field with the length of the list property ``name``."""
     return f"{name} length"
 
 
 def read_tables(
     path: str | PathLike[str], wanted: Sequence[str]
 ) -> tuple[PlyHeader, dict[str, Table]]:
-    """Read some elements of a PLY file.
+    """Read the wanted elements of a PLY file.
 
     Args:
         path: The file.
-        wanted: Names of the elements; what follows the last of them is not looked at.
+        wanted: Names of the elements; whatever follows the last of them is not read.
 
     Returns:
         The header, and a table for each wanted element that the file has.
 
     Raises:
-        FormatError: The file is missing, no PLY, truncated, or has lists that are not of three.
+        FormatError: The file is missing, truncated, not a PLY, or has lists of a length other
+            than three.
     """
     try:
         with Path(path).open("rb") as stream:
@@ -78,12 +79,12 @@ def read_tables(
 def read_table_pieces(
     path: str | PathLike[str], wanted: str, rows_each: int
 ) -> Iterator[tuple[PlyHeader, Table]]:
-    """Read an element of a PLY file so many rows at a time, each time with the header.
+    """Read an element of a PLY file piece by piece, each with the header.
 
     Args:
         path: The file.
-        wanted: Name of the element; a file without it gives nothing.
-        rows_each: Most rows that are in memory.
+        wanted: Name of the element; nothing is yielded if the file lacks it.
+        rows_each: Largest number of rows per piece.
 
     Raises:
         FormatError: As in `read_tables`.
@@ -129,12 +130,12 @@ def write_tables(
 def write_table_parts(
     path: str | PathLike[str], elements: Mapping[str, tuple[int, Iterable[Table]]]
 ) -> None:
-    """Write elements whose rows come in parts, binary little endian, atomically.
+    """Write elements whose rows arrive in parts, binary little endian, atomically.
 
     Args:
         path: The file.
-        elements: For each the number of its rows, and its tables, all of one dtype; one is held
-            at a time. The first of each is made before the header is written.
+        elements: For each element the total number of rows, and its tables, all of one dtype;
+            one is held at a time. The first of each is taken before the header is written.
 
     Raises:
         OutputError: The file cannot be written.
@@ -153,12 +154,12 @@ def write_table_parts(
 
 
 class TableStream:
-    """Rows of one element, written to a file as they come; the header follows at the end.
+    """Writes the rows of one element as they arrive; the row count is filled in at the end.
 
     Args:
-        stream: A file that can be written from its begin, and nothing else writes to.
+        stream: A seekable file at its start, which nothing else writes to.
         name: The element.
-        dtype: Of its rows.
+        dtype: Dtype of its rows.
         comments: Comment lines.
     """
 
@@ -170,17 +171,17 @@ class TableStream:
         self._stream.write(self._header())
 
     def append(self, table: Table) -> None:
-        """Write some more rows."""
+        """Write more rows."""
         self._stream.write(table.astype(self._dtype, copy=False).tobytes())
         self.rows += len(table)
 
     def close(self) -> None:
-        """Write how many rows there are."""
+        """Write the final number of rows into the header."""
         self._stream.seek(0)
         self._stream.write(self._header())
 
     def _header(self) -> bytes:
-        """Of the same length whatever the number: a comment takes up what that leaves."""
+        """The header, padded with a comment to the same length for every number of rows."""
         number = str(self.rows)
         lines = [
             "ply",
@@ -210,7 +211,7 @@ def _fields(dtype: np.dtype[Any]) -> list[tuple[str, np.dtype[Any]]]:
 
 
 def _write_rows(stream: IO[bytes], table: Table) -> None:
-    """Rows of text; nine digits give a float32 back bit by bit."""
+    """Write rows of text; nine digits reproduce a float32 exactly."""
     columns, formats = [], []
     for name, field in _fields(table.dtype):
         column = table[name].reshape(len(table), int(np.prod(field.shape)))
@@ -220,7 +221,7 @@ def _write_rows(stream: IO[bytes], table: Table) -> None:
 
 
 def _read_header(stream: IO[bytes], path: str | PathLike[str]) -> PlyHeader:
-    """Parse the header and leave the stream behind it."""
+    """Parse the header and leave the stream just after it."""
     if stream.readline(8).strip() != b"ply":
         raise FormatError("not a PLY file: it does not start with 'ply'", where=path)
     encoding, comments = "", []
@@ -243,7 +244,7 @@ def _read_header(stream: IO[bytes], path: str | PathLike[str]) -> PlyHeader:
     else:
         raise FormatError("the PLY header does not end", where=path)
     if not encoding:
-        raise FormatError("the PLY header names no format", where=path)
+        raise FormatError("the PLY header has no format line", where=path)
     try:
         typed = tuple((name, count, np.dtype(fields)) for name, count, fields in elements)
     except ValueError as error:
@@ -258,7 +259,7 @@ def _is_property(words: list[str]) -> bool:
 
 
 def _property_fields(words: list[str], order: str) -> list[tuple[Any, ...]]:
-    """Fields of one property line."""
+    """The fields of one property line."""
     name = words[-1]
     if words[0] == "list":
         length, entry = (order + _TYPES[word] for word in words[1:-1])
@@ -269,7 +270,7 @@ def _property_fields(words: list[str], order: str) -> list[tuple[Any, ...]]:
 def _read_body(
     stream: IO[bytes], header: PlyHeader, wanted: Sequence[str], path: str | PathLike[str]
 ) -> dict[str, Table]:
-    """Read element by element until all that is wanted has been seen."""
+    """Read element by element until all wanted ones are found."""
     tables: dict[str, Table] = {}
     missing = {name for name, _, _ in header.elements} & set(wanted)
     for name, count, dtype in header.elements:
@@ -287,7 +288,7 @@ def _pieces(
     rows_each: int,
     path: str | PathLike[str],
 ) -> Iterator[Table]:
-    """The rows of an element, so many at a time; one table at least."""
+    """The rows of an element in pieces; at least one table."""
     name, count, dtype = element
     read = _read_text if header.encoding == "ascii" else _read_binary
     rows = 0
@@ -308,17 +309,17 @@ def _pieces(
 
 
 def _read_binary(stream: IO[bytes], count: int, dtype: np.dtype[Any]) -> Table:
-    """As many whole rows as there are, at most ``count``."""
+    """Read at most ``count`` rows, fewer if the file ends early."""
     here = stream.tell()
     left = stream.seek(0, SEEK_END) - here
     stream.seek(here)
-    # A damaged header may promise more than memory holds.
+    # A damaged header may announce more rows than fit in memory.
     content = stream.read(min(count * dtype.itemsize, left))
     return np.frombuffer(content, dtype, len(content) // max(dtype.itemsize, 1))
 
 
 def _read_text(stream: IO[bytes], count: int, dtype: np.dtype[Any]) -> Table:
-    """Rows of text up to the first that is missing or does not hold numbers of that many."""
+    """Read rows of text up to the first that is missing or malformed."""
     width = sum(int(np.prod(field.shape)) for _, field in _fields(dtype))
     rows = []
     for _ in range(count):

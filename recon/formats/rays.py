@@ -1,7 +1,7 @@
-"""The rays of a drive, frame after frame, in one file that only grows.
+"""The rays of a drive, frame by frame, in one append-only file.
 
-It is private to this project. Every frame has a checksum, for the file of a killed run may end
-anywhere: such a run cuts it to where its checkpoint says, and goes on.
+The format is private to this project. Every frame has a checksum, as the file of a killed run may
+end anywhere; a resumed run truncates it to the size in its checkpoint and continues.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ class RayWriter:
     """Appends frames to a file.
 
     Args:
-        path: The file; its folder exists.
-        grain: Of the rays.
-        size: Bytes to keep of a file that is there; None = begin a new one.
+        path: The file, in an existing folder.
+        grain: Grain of the rays.
+        size: Bytes to keep of an existing file; None = start a new one.
 
     Raises:
-        FormatError: The file is shorter than what is to be kept.
+        FormatError: The file is shorter than ``size``.
     """
 
     def __init__(self, path: Path, grain: RayGrain, size: int | None = None) -> None:
@@ -60,25 +60,25 @@ class RayWriter:
         self._file.write(content)
 
     def sync(self) -> int:
-        """Wait until all is on the disk; the bytes so far."""
+        """Flush everything to disk and return the size in bytes."""
         self._file.flush()
         os.fsync(self._file.fileno())
         return self._file.tell()
 
     def close(self) -> None:
-        """Nothing more is written."""
+        """Flush and close the file."""
         self.sync()
         self._file.close()
 
 
 class RayFile:
-    """The frames of a file.
+    """The frames of a ray file.
 
     Args:
-        path: What a `RayWriter` wrote.
+        path: A file written by `RayWriter`.
 
     Raises:
-        FormatError: The file is missing, or is no such file.
+        FormatError: The file is missing or not a ray file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -86,7 +86,7 @@ class RayFile:
         with self._open() as file:
             header = file.read(_HEADER.size)
         if len(header) != _HEADER.size or not header.startswith(_MAGIC):
-            raise FormatError("the file holds no rays of a run", where=path)
+            raise FormatError("not a ray file of a run", where=path)
         self.grain = RayGrain(*_HEADER.unpack(header)[1:])
 
     def __len__(self) -> int:
@@ -104,7 +104,7 @@ class RayFile:
         return frames
 
     def __iter__(self) -> Iterator[RayCloud]:
-        """One frame after the other.
+        """Yield one frame after the other.
 
         Raises:
             FormatError: The file is truncated or damaged.
@@ -125,7 +125,7 @@ class RayFile:
             raise FormatError("cannot read the rays", where=self._path, got=error) from error
 
     def _head(self, file: IO[bytes]) -> tuple[int, int] | None:
-        """Number of rays and checksum of the whole frame that begins here; None at the end."""
+        """Number of rays and checksum of the frame that starts here; None at the end."""
         head = file.read(_FRAME.size)
         if not head:
             return None

@@ -1,4 +1,4 @@
-"""Our own calibration file: YAML with the unit in every name."""
+"""Our own calibration format: YAML with the unit in every name."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ def write_recon_calibration(
     calibration: StereoCalibration | RectifiedCamera,
     quality: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a calibration atomically; `read_recon_calibration` gives it back to the last bit.
+    """Write a calibration atomically; `read_recon_calibration` restores it bit by bit.
 
     Args:
         path: The file.
-        calibration: Raw cameras, or a rectified one.
-        quality: Figures to keep with it, plain values; not read back.
+        calibration: A raw stereo calibration or a rectified camera.
+        quality: Quality figures to store with it, as plain values; not read back.
 
     Raises:
         OutputError: The file cannot be written.
@@ -70,13 +70,13 @@ def read_recon_calibration(path: StrPath) -> StereoCalibration | RectifiedCamera
     """Read what `write_recon_calibration` wrote.
 
     Raises:
-        FormatError: The file is damaged, or of a version or kind that is not known.
-        CalibrationError: The numbers cannot give depth.
+        FormatError: The file is damaged, or of an unknown version or kind.
+        CalibrationError: The calibration cannot give depth.
     """
     fields = Fields(read_yaml(path), path)
     if fields.text("format") != MARK or fields.number("version") != _VERSION:
         raise FormatError(
-            "calibration is of another version",
+            "version of the calibration file is not supported",
             where=path,
             got=f"{fields.get('format')} {fields.get('version')}",
             expected=f"{MARK} {_VERSION}",

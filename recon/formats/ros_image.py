@@ -1,4 +1,4 @@
-"""Pixels of ROS images: ``sensor_msgs/Image`` in its common encodings."""
+"""Decodes ROS images: ``sensor_msgs/Image`` in its common encodings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from recon.errors import FormatError
 from recon.structures.arrays import UInt8
 
-# Encoding: channels and bits of a channel.
+# Encoding: channels and bits per channel.
 _LAYOUT: Final = {
     "mono8": (1, 8),
     "8uc1": (1, 8),
@@ -32,7 +32,7 @@ _LAYOUT: Final = {
     "yuv422_yuy2": (2, 8),
     "yuyv": (2, 8),
 }
-# OpenCV names a Bayer pattern by its second row and column, ROS by its first.
+# OpenCV names a Bayer pattern from pixel (1, 1) on, ROS from pixel (0, 0) on.
 _TO_RGB: Final = {
     "bgr8": cv2.COLOR_BGR2RGB,
     "8uc3": cv2.COLOR_BGR2RGB,
@@ -59,30 +59,30 @@ def pixels_of_ros_image(
     big_endian: bool = False,
     where: str = "",
 ) -> UInt8:
-    """Turn the bytes of an image message into a picture.
+    """Decode the bytes of an image message.
 
-    16-bit pixels are scaled from their whole range to 8 bits, as in picture files.
+    16-bit pixels are scaled over their full range to 8 bits, as in image files.
 
     Args:
         data: uint8 (N,), all rows, each ``step`` bytes long.
-        encoding: ROS's name of the encoding.
+        encoding: Name of the encoding in ROS.
         shape: Height and width.
-        step: Bytes per row, padding included.
-        big_endian: Order of bytes of 16-bit pixels.
-        where: Named in the error.
+        step: Bytes per row, including padding.
+        big_endian: Whether 16-bit pixels are big-endian.
+        where: Topic or message, for the error message.
 
     Returns:
-        uint8 (H, W) where the encoding is grey, else (H, W, 3) RGB.
+        uint8 (H, W) if the encoding is grey, else (H, W, 3) RGB.
 
     Raises:
-        FormatError: The encoding is not understood, or there are too few bytes.
+        FormatError: The encoding is not supported, or there are too few bytes.
 
     Ref: ``sensor_msgs/image_encodings.hpp``.
     """
     name = encoding.lower()
     if name not in _LAYOUT:
         raise FormatError(
-            "image encoding is not understood",
+            "image encoding is not supported",
             where=where,
             got=encoding,
             expected=", ".join(sorted(_LAYOUT)),
@@ -104,7 +104,7 @@ def _unpack(
     big_endian: bool,
     where: str,
 ) -> NDArray[Any]:
-    """(H, W) or (H, W, channels), without the padding of rows."""
+    """Pixels (H, W) or (H, W, channels), without the padding of rows."""
     height_px, width_px = shape
     channels, bits = _LAYOUT[name]
     row = width_px * channels * bits // 8

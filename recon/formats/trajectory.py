@@ -1,4 +1,4 @@
-"""Trajectories: KITTI (12 numbers of the 3×4 pose a line) and TUM (``t x y z qx qy qz qw``)."""
+"""Trajectories: KITTI (a 3×4 pose per line) and TUM (``t x y z qx qy qz qw`` per line)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from recon.geometry.se3 import make_transform, orthonormalise
 from recon.structures import Trajectory
 from recon.structures.arrays import Float64
 
-# Files print rotations with four to seven digits; what is further off is no rotation.
+# Files print rotations with four to seven digits; a larger deviation means it is not a rotation.
 _RIGID_TOLERANCE = 1e-3
 _UNIT_TOLERANCE = 1e-2
 # Geocentric and map coordinates stay under 1e7 m; a number beyond is none of a place.
@@ -20,11 +20,11 @@ _FARTHEST_M = 1e8
 
 
 def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
-    """Read a KITTI or a TUM trajectory, told apart by the number of columns (12 or 8).
+    """Read a KITTI or TUM trajectory, recognised by the number of columns (12 or 8).
 
     Args:
         path: The text file.
-        timestamps_s: float64 (N,), the times of a KITTI file; TUM files have their own.
+        timestamps_s: float64 (N,), the times for a KITTI file; TUM files contain theirs.
 
     Raises:
         FormatError: As in `read_kitti_poses` and `read_tum`.
@@ -36,42 +36,42 @@ def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Traje
 
 
 def holds_times(path: StrPath) -> bool:
-    """Whether a trajectory file has a time for each pose: TUM's has, KITTI's has not.
+    """Whether a trajectory file has timestamps: TUM files do, KITTI files do not.
 
     Raises:
-        FormatError: The file is missing or neither.
+        FormatError: The file is missing or in neither format.
     """
     return bool(read_table(path, (12, 8))[0].shape[1] == 8)
 
 
 def read_kitti_poses(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
-    """Read poses of the left camera, one row-major 3×4 matrix a line.
+    """Read poses of the left camera, one row-major 3×4 matrix per line.
 
-    The printed rotations are made orthonormal again.
+    The rotations are re-orthonormalised, as they are printed with few digits.
 
     Args:
         path: The text file.
         timestamps_s: float64 (N,), one time per pose; without it pose ``i`` gets ``i`` seconds.
 
     Raises:
-        FormatError: The file is missing, a line has not 12 finite numbers or is no rigid
-            motion, or the number of poses is not that of the timestamps.
+        FormatError: The file is missing, a line is not 12 finite numbers or not a rigid
+            transform, or the numbers of poses and timestamps differ.
     """
     return _from_kitti(*read_table(path, (12,)), path, timestamps_s)
 
 
 def read_tum(path: StrPath) -> Trajectory:
-    """Read timestamped poses, ``t tx ty tz qx qy qz qw`` a line.
+    """Read timestamped poses, ``t tx ty tz qx qy qz qw`` per line.
 
     Raises:
-        FormatError: The file is missing, a line has not 8 finite numbers, a quaternion is not of
+        FormatError: The file is missing, a line is not 8 finite numbers, a quaternion is not of
             unit length, or time runs backwards.
     """
     return _from_tum(*read_table(path, (8,)), path)
 
 
 def write_kitti_poses(path: StrPath, trajectory: Trajectory) -> None:
-    """Write poses in KITTI's form, 13 digits, atomically; the timestamps have no place there.
+    """Write poses in KITTI's format, 13 digits, atomically; it has no timestamps.
 
     Raises:
         OutputError: The file cannot be written.
@@ -81,7 +81,7 @@ def write_kitti_poses(path: StrPath, trajectory: Trajectory) -> None:
 
 
 def write_tum(path: StrPath, trajectory: Trajectory) -> None:
-    """Write poses in TUM's form, 12 decimals (9 of the time), ``qw ≥ 0``, atomically.
+    """Write poses in TUM's format, 12 decimals (9 for the time), ``qw ≥ 0``, atomically.
 
     Raises:
         OutputError: The file cannot be written.
@@ -106,7 +106,7 @@ def _from_kitti(
     times = np.arange(len(table), dtype=np.float64) if timestamps_s is None else timestamps_s
     if len(times) != len(table):
         raise FormatError(
-            "number of poses is not that of the timestamps",
+            "numbers of poses and timestamps differ",
             where=path,
             got=f"{len(table)} poses",
             expected=f"{len(times)}",
@@ -152,7 +152,7 @@ def _check_rotation(rotation: Float64, where: str) -> None:
     orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_RIGID_TOLERANCE)
     if not orthonormal or np.linalg.det(rotation) < 0:
         raise FormatError(
-            "pose is no rigid motion",
+            "pose is not a rigid transform",
             where=where,
             expected="a row-major 3x4 matrix of rotation and translation",
         )

@@ -1,7 +1,6 @@
-"""Trees of arrays and plain values in one file, for states that a run goes on from.
+"""Trees of arrays and plain values in one file, for the checkpoints of a run.
 
-A zip of ``.npy`` files and one JSON text. It is private to this project: what other programs
-read has formats of its own.
+A zip of ``.npy`` files and one JSON file. The format is private to this project.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ _ARRAY: Final = "array"
 
 
 def write_tree(path: str | PathLike[str], tree: Mapping[str, Any]) -> None:
-    """Write a tree of mappings and lists of arrays, numbers (NaN too), texts and None.
+    """Write a tree of mappings and lists of arrays, numbers (including NaN), strings and None.
 
     Args:
-        path: The file to write; it appears whole or not at all.
-        tree: Keys are texts. Tuples come back as lists.
+        path: The file, written atomically.
+        tree: Keys are strings. Tuples are read back as lists.
 
     Raises:
         OutputError: The file cannot be written.
     """
     arrays: list[np.ndarray[Any, Any]] = []
     text = json.dumps(_without_arrays(tree, arrays))
-    # Not compressed: sums of measurements shrink by a third, and take twenty times as long.
+    # Not compressed: sums of measurements would shrink by a third and take twenty times as long.
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as file:
         file.writestr(_TEXT, text)
         for number, array in enumerate(arrays):
@@ -46,7 +45,7 @@ def read_tree(path: str | PathLike[str]) -> dict[str, Any]:
     """Read what `write_tree` wrote.
 
     Raises:
-        FormatError: The file is missing, damaged, or no such file.
+        FormatError: The file is missing, damaged or of another kind.
     """
     try:
         with zipfile.ZipFile(Path(path)) as file:
@@ -59,7 +58,7 @@ def read_tree(path: str | PathLike[str]) -> dict[str, Any]:
 
 
 def _without_arrays(value: Any, arrays: list[np.ndarray[Any, Any]]) -> Any:
-    """The tree with ``{"array": n}`` in place of each array, which goes into the list."""
+    """Replace each array by ``{"array": n}`` and append it to ``arrays``."""
     if isinstance(value, np.ndarray):
         arrays.append(value)
         return {_ARRAY: len(arrays) - 1}

@@ -1,4 +1,4 @@
-"""Video files, frame by frame. Decoded with OpenCV's FFmpeg; nothing is kept in memory."""
+"""Video files, decoded frame by frame with OpenCV's FFmpeg."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from recon.structures.arrays import UInt8
 VIDEOS: Final = frozenset(
     {".avi", ".m4v", ".mjpeg", ".mjpg", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".ts", ".webm"}
 )
-# A container may know its number of frames by its duration alone, and round it.
+# A container may derive its number of frames from its duration, with rounding.
 _COUNT_TOLERANCE: Final = 2
 
 
 @dataclass(frozen=True)
 class VideoFile:
-    """What the container says, checked by walking through its packets once.
+    """A video file as its container describes it, checked against its packets.
 
     Attributes:
         path: The file.
         frames: Number of frames.
-        width_px: Width of a frame, as recorded: an orientation tag is ignored.
+        width_px: Width of a frame as recorded; an orientation tag is ignored.
         height_px: Height of a frame.
         rate_hz: Frames per second.
     """
@@ -42,7 +42,7 @@ class VideoFile:
     rate_hz: float
 
     def read(self, start: int = 0) -> Iterator[tuple[float, UInt8]]:
-        """Decode the frames from number ``start`` on; those before are decoded and dropped.
+        """Decode the frames from number ``start`` on; earlier ones are decoded and dropped.
 
         Yields:
             Seconds from the start of the file, and uint8 (H, W, 3) RGB.
@@ -73,10 +73,10 @@ class VideoFile:
 
 
 def open_video(path: StrPath) -> VideoFile:
-    """Look at a video file, and count its frames without decoding them.
+    """Open a video file and count its frames without decoding them.
 
     Raises:
-        FormatError: The file is missing, no video, cut off, or of a codec that is not understood.
+        FormatError: The file is missing, truncated, not a video, or its codec is not supported.
     """
     file = Path(path)
     if not file.is_file():
@@ -100,9 +100,9 @@ def open_video(path: StrPath) -> VideoFile:
 
 
 def _count(path: Path) -> int:
-    """Number of packets: of a video stream, one for each frame."""
+    """Number of packets; a video stream has one per frame."""
     with _opened(path) as capture:
-        capture.set(cv2.CAP_PROP_FORMAT, -1)  # packets as they are, not decoded
+        capture.set(cv2.CAP_PROP_FORMAT, -1)  # raw packets, not decoded
         count = 0
         while capture.grab():
             count += 1
@@ -111,16 +111,16 @@ def _count(path: Path) -> int:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[cv2.VideoCapture]:
-    # FFmpeg would write to standard error what is raised as an error anyway.
+    # Stop FFmpeg from logging to standard error what we raise as an exception anyway.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     with silent_opencv():
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():
             raise FormatError(
-                "not a video that can be read",
+                "not a readable video",
                 where=path,
-                hint="it may be cut off or of an unknown codec; try: ffmpeg -i FILE copy.mkv",
+                hint="it may be truncated or use an unknown codec; try: ffmpeg -i FILE copy.mkv",
             )
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         yield capture

@@ -1,4 +1,4 @@
-"""YAML files of settings; OpenCV's dialect is another matter, see `opencv_yaml`."""
+"""YAML files with settings; for OpenCV's dialect see `opencv_yaml`."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from recon.formats.files import StrPath, read_text
 
 
 def read_yaml(path: StrPath) -> dict[str, Any]:
-    """Read a YAML file whose top level maps names to values.
+    """Read a YAML file whose top level is a mapping.
 
     Raises:
-        FormatError: The file is missing, no YAML, or no mapping.
+        FormatError: The file is missing, not YAML, or not a mapping.
     """
     try:
         content = yaml.safe_load(read_text(path))
     except yaml.YAMLError as error:
         raise FormatError("not a YAML file", where=_place(path, error)) from error
     if not isinstance(content, dict):
-        raise FormatError("YAML file is no mapping", where=path, got=type(content).__name__)
+        raise FormatError("YAML file is not a mapping", where=path, got=type(content).__name__)
     return {str(key): value for key, value in content.items()}
 
 
@@ -31,12 +31,12 @@ def write_yaml(path: StrPath, values: Mapping[str, Any]) -> None:
     """Write plain values as YAML, in their order, atomically.
 
     Raises:
-        OutputError: A value has no YAML form, or the file cannot be written.
+        OutputError: A value cannot be written as YAML, or the file cannot be written.
     """
     try:
         text = yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True)
     except yaml.YAMLError as error:
-        raise OutputError("a value has no YAML form", where=path, got=str(error)) from error
+        raise OutputError("value cannot be written as YAML", where=path, got=str(error)) from error
     write_text(path, text)
 
 

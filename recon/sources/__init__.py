@@ -1,4 +1,4 @@
-"""Where stereo pairs come from: one module per kind of input."""
+"""Sources of stereo pairs: one module per kind of input."""
 
 from recon.sources.protocol import KnowsOccupancy, StampedSource, StereoSource
 from recon.sources.registry import SOURCES, open_source, recognise_source

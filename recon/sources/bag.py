@@ -1,4 +1,4 @@
-"""Drives in bags of ROS 1, ROS 2 and MCAP."""
+"""Drives in ROS 1 bags, ROS 2 bags and MCAP files."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ _S: Final = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class BagSource:
-    """A drive in a recording; each camera's messages are read one at a time.
+    """A drive in a recording; messages are read one at a time.
 
     Attributes:
         name: Name of the file or folder.
-        description: What it was taken for, and which topics were chosen.
+        description: Recognised kind, and the chosen topics.
         calibration: The rectified camera, or the two raw ones.
         bag: The recording.
         topics: Left and right image topic.
-        pairs: Which messages belong together.
-        left_s: float64 (M,), stamps of the left messages, all of them.
-        recorded_ns: int64 (M,) and (K,), when left and right messages were recorded.
-        texts: The calibration file, where one was given.
+        pairs: Pairs of left and right messages.
+        left_s: float64 (M,), timestamps of all left messages.
+        recorded_ns: int64 (M,) and (K,), recording times of the left and right messages.
+        texts: The calibration file, if one was given.
     """
 
     name: str
@@ -57,7 +57,7 @@ class BagSource:
 
     @property
     def truth(self) -> SequenceTruth | None:
-        """None: which of a bag's poses are true, only its maker knows."""
+        """None: a bag does not say which of its poses are ground truth."""
         return None
 
     @property
@@ -71,7 +71,7 @@ class BagSource:
 
     @property
     def stamps_s(self) -> Float64:
-        """float64 (N,), times of the left pictures of the pairs."""
+        """float64 (N,), times of the left images of the pairs."""
         return self.left_s[list(self.pairs.left)]
 
     def __len__(self) -> int:
@@ -81,15 +81,15 @@ class BagSource:
         return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Read the pairs from number ``start`` on; the recording is entered there.
+        """Read the pairs from number ``start`` on, without reading the messages before.
 
         Raises:
-            FormatError: A message is damaged, of another size than the calibration, or of an
-                encoding that is not understood.
+            FormatError: A message is damaged, has another size than the calibration, or an
+                unsupported encoding.
         """
         if start >= len(self):
             return
-        # One reader for each camera: a pair whose messages lie far apart needs no memory.
+        # One reader per camera, so that pairs with messages far apart need no buffer.
         views = zip(
             self._pictures(0, self.pairs.left[start:]),
             self._pictures(1, self.pairs.right[start:]),
@@ -100,7 +100,7 @@ class BagSource:
             yield join_pair(left, right, stamp_s, index, f"{self.topics[0]}, pair {index}")
 
     def _pictures(self, side: int, wanted: Sequence[int]) -> Iterator[UInt8]:
-        """The pictures of one camera whose positions are wanted, in order."""
+        """Yield the wanted images of one camera, given by their indices in order."""
         times, topic = self.recorded_ns[side], self.topics[side]
         start_ns = int(times[wanted[0]])
         position = int(np.searchsorted(times, start_ns))
@@ -118,13 +118,13 @@ class BagSource:
 
 
 def open_bag(path: Path, settings: SourceSettings) -> BagSource:
-    """Open a recording. Its times are read through once, so that pairs and length are known.
+    """Open a recording, and read all its timestamps to pair the messages.
 
     Raises:
         MissingDependencyError: The extra ``ros`` is not installed.
-        SourceError: There are no image topics of two cameras, or none of the names given, their
-            stamps are out of order, or no messages belong together; or there is no calibration.
-        FormatError: The recording is cut off or damaged.
+        SourceError: The image topics of two cameras are missing, their timestamps are out of
+            order, no messages can be paired, or there is no calibration.
+        FormatError: The recording is truncated or damaged.
         CalibrationError: The calibration cannot give depth.
     """
     bag = Bag(_find_files(path))
@@ -148,7 +148,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
 
 
 def find_bags(folder: Path) -> list[Path]:
-    """The recording in a folder: itself, the parts of a ROS 1 bag, or the one file of ROS 2."""
+    """The recording in a folder: the folder itself, split ROS 1 bags, or the only ROS 2 file."""
     if (folder / "metadata.yaml").is_file():
         return [folder]
     parts = sorted(folder.glob("*.bag"))
@@ -157,10 +157,10 @@ def find_bags(folder: Path) -> list[Path]:
 
 
 def decode_message(message: BagImage, where: str) -> UInt8:
-    """Turn an image message into a picture.
+    """Decode an image message.
 
     Raises:
-        FormatError: It is damaged, or of an encoding that is not understood.
+        FormatError: The message is damaged or its encoding is not supported.
     """
     if not message.step:
         return decode_image(message.data.tobytes(), where)
@@ -190,7 +190,7 @@ def _find_files(path: Path) -> list[Path]:
 def _stamps(
     times: dict[str, NDArray[np.int64]], topics: tuple[str, str], path: Path
 ) -> tuple[tuple[Float64, Float64], str]:
-    """Seconds of both cameras' messages; those of recording where the headers have none."""
+    """Timestamps of the messages of both cameras; recording times if the headers have none."""
     empty = next((topic for topic in topics if not len(times[topic])), None)
     if empty is not None:
         raise SourceError("topic has no message", where=path, got=empty)
@@ -200,7 +200,7 @@ def _stamps(
     )
     for topic, stamps in zip(topics, (left, right), strict=True):
         check_increasing(stamps, f"{path}: {topic}")
-    return (left, right), "" if stamped else ", times of recording: the headers have none"
+    return (left, right), "" if stamped else ", recording times as the headers have none"
 
 
 def _read_rig(
@@ -210,7 +210,7 @@ def _read_rig(
     settings: SourceSettings,
     path: Path,
 ) -> tuple[Rig, tuple[Path, ...], str]:
-    """The calibration, the files it was read from, and what to say of it."""
+    """The calibration, the files it was read from, and a note on its origin."""
     infos = [camera_info_topic(bag, topic) for topic in topics]
     if settings.calibration is not None:
         first = next(islice(bag.images(topics[0]), pairs.left[0], None))

@@ -1,4 +1,4 @@
-"""The rig that two CameraInfo messages describe."""
+"""Builds a rig from two CameraInfo messages."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from recon.structures import CameraIntrinsics, RectifiedCamera
 
 
 def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rectified: bool) -> Rig:
-    """Two CameraInfo messages as a rig.
+    """Build a rig from two CameraInfo messages.
 
     Args:
-        left: Of the left camera.
-        right: Of the right camera.
-        where: Named in errors.
-        rectified: Whether the pictures are rectified: then ``P`` alone counts.
+        left: Message of the left camera.
+        right: Message of the right camera.
+        where: The recording, for error messages.
+        rectified: Whether the images are rectified, so that only ``P`` is used.
 
     Raises:
-        FormatError: The lens model is not understood.
-        CalibrationError: The numbers cannot give depth, such as of a camera never calibrated.
+        FormatError: The lens model is not supported.
+        CalibrationError: The calibration cannot give depth, as with an uncalibrated camera.
     """
     for info in (left, right):
         if not info.P[0, 0] > 0 or not info.K[0, 0] > 0:
@@ -56,7 +56,7 @@ def _rectified(left: BagCameraInfo, right: BagCameraInfo, where: Path) -> Rectif
 
 
 def _camera(info: BagCameraInfo, where: Path) -> CameraIntrinsics:
-    # A driver of rectified pictures may leave the name empty.
+    # Drivers of rectified images may leave the model empty.
     name = info.model or "plumb_bob"
     model, distortion = lens_of(ROS_MODELS, name, np.asarray(info.D), where)
     with naming(where):

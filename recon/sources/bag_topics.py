@@ -1,4 +1,4 @@
-"""Which topics of a bag are the two cameras."""
+"""Finds the topics of the two cameras in a bag."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ _PICTURES = (IMAGE, COMPRESSED)
 
 
 def choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], str]:
-    """The left and right image topic: as named, else guessed by their names.
+    """The left and right image topic: from the settings, else guessed from the topic names.
 
-    Of several pairs, the first of: rectified, uncompressed, in the order of the alphabet.
+    Of several pairs, rectified ones are preferred, then uncompressed ones, then alphabetical order.
 
     Returns:
-        The topics, and what to say of other pairs that might have been meant.
+        The topics, and a note on other candidate pairs.
 
     Raises:
-        SourceError: A name is not there, or no two topics look like a left and a right camera.
+        SourceError: A topic does not exist, or no two topics look like a left and a right camera.
     """
     if settings.left or settings.right:
         return _named(bag, settings), ""
@@ -49,7 +49,7 @@ def choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], 
 
 
 def list_topics(bag: Bag, kinds: Sequence[str]) -> str:
-    """The topics of some kinds with their numbers of messages, for a message."""
+    """List the topics of some types with their message counts, for error messages."""
     return ", ".join(
         f"{topic.name} ({topic.messages})"
         for topic in sorted(bag.topics.values(), key=lambda topic: topic.name)
@@ -58,7 +58,7 @@ def list_topics(bag: Bag, kinds: Sequence[str]) -> str:
 
 
 def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
-    """The calibration that belongs to an image topic: beside it, or one level up."""
+    """The CameraInfo topic of an image topic: at the same level, or one level up."""
     place = PurePosixPath(image_topic.removesuffix("/compressed")).parent
     for candidate in (place / "camera_info", place.parent / "camera_info"):
         topic = bag.topics.get(str(candidate))
@@ -68,7 +68,7 @@ def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
 
 
 def names_rectified(image_topic: str) -> bool:
-    """Whether the name of a topic says that its pictures are rectified, as ROS names them."""
+    """Whether a topic has rectified images, according to ROS naming conventions."""
     return "rect" in image_topic.removesuffix("/compressed").rsplit("/", 1)[-1]
 
 

@@ -1,8 +1,8 @@
-"""Recording from two cameras, or from one that gives both views side by side.
+"""Records from two cameras, or from one that gives both views side by side.
 
-Both are grabbed before either is decoded, so that decoding does not come between them. What is
-recorded is the layout of plain folders (see `folders`); a pair counts when its line in
-``frames.csv`` stands, and that is written last.
+Both cameras are grabbed before either frame is decoded, to keep the exposures close. Recordings
+have the layout of plain folders (see `folders`); the line of a pair in ``frames.csv`` is written
+last and marks it as complete.
 """
 
 from __future__ import annotations
@@ -21,46 +21,46 @@ from recon.sources.settings import SourceSettings
 from recon.sources.video import split_views
 from recon.structures.arrays import UInt8
 
-# A driver that does not tell its rate: most cameras have this one.
+# Assumed if a driver does not report its rate; the most common one.
 _USUAL_RATE_HZ: Final = 30.0
 
 
 class CaptureSettings(Settings):
-    """What is recorded."""
+    """Settings of a recording."""
 
     width_px: int | None = Field(
-        default=None, ge=16, description="Frame width to ask the driver for. none = as it is."
+        default=None, ge=16, description="Requested frame width. none = the driver's default."
     )
-    height_px: int | None = Field(default=None, ge=16, description="Frame height to ask for.")
-    rate_hz: float | None = Field(default=None, gt=0, description="Frames per second to ask for.")
-    frames: int | None = Field(default=None, ge=1, description="Stop after so many pairs.")
-    seconds: float | None = Field(default=None, gt=0, description="Stop after so long.")
+    height_px: int | None = Field(default=None, ge=16, description="Requested frame height.")
+    rate_hz: float | None = Field(default=None, gt=0, description="Requested frame rate.")
+    frames: int | None = Field(default=None, ge=1, description="Stop after this many pairs.")
+    seconds: float | None = Field(default=None, gt=0, description="Stop after this many seconds.")
     warm_up: int = Field(
-        default=15, ge=0, description="Frames dropped first, while a camera finds its exposure."
+        default=15, ge=0, description="Frames dropped at the start, while exposure settles."
     )
     lock_exposure: bool = Field(
-        default=True, description="Hold exposure and white balance where the driver can."
+        default=True, description="Lock exposure and white balance if the driver supports it."
     )
     side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = Field(
-        default="left-right", description="Where the views are in the frames of a single device."
+        default="left-right", description="Arrangement of the views in the frames of one device."
     )
     suffix: Literal["png", "jpg"] = Field(
-        default="png", description="Png = lossless; jpg where the disk is too slow."
+        default="png", description="File format: png = lossless, jpg = for a slow disk."
     )
     preview_every: int | None = Field(
-        default=None, ge=1, description="Every n-th pair also replaces preview.jpg. none = none."
+        default=None, ge=1, description="Update preview.jpg every N pairs. none = no preview."
     )
 
 
 @dataclass(frozen=True, eq=False)
 class CapturedPair:
-    """One pair as it comes from the cameras.
+    """One pair of frames from the cameras.
 
     Attributes:
-        left: uint8 (H, W, 3) RGB.
-        right: The same of the right one.
-        left_s: When the left one was taken.
-        right_s: When the right one was taken.
+        left: Left image, uint8 (H, W, 3) RGB.
+        right: Right image, likewise.
+        left_s: Time of the left image.
+        right_s: Time of the right image.
     """
 
     left: UInt8
@@ -72,17 +72,17 @@ class CapturedPair:
 def capture_pairs(
     cameras: tuple[Camera, ...], settings: CaptureSettings, stopped: Callable[[], bool]
 ) -> Iterator[CapturedPair]:
-    """Yield pairs until enough are there, a file ends, or it is told to stop.
+    """Yield pairs until the limit is reached, a file ends, or ``stopped`` returns True.
 
-    Where one camera has lost a frame, the other drops one too: pairs are the nearest in time.
+    If one camera loses a frame, the other drops its frame too, so that pairs are nearest in time.
 
     Args:
-        cameras: Left and right, or one with both views.
-        settings: When to stop.
-        stopped: Asked before every pair.
+        cameras: Left and right camera, or one with both views.
+        settings: Includes the limits.
+        stopped: Called before every pair.
 
     Raises:
-        SourceError: A live camera gives no more frames, or the two differ in size.
+        SourceError: A live camera gives no more frames, or the cameras differ in frame size.
     """
     period_s = 1 / _rate_hz(cameras, settings)
     first_s: float | None = None
@@ -100,12 +100,12 @@ def capture_pairs(
 
 
 def warm_up(cameras: tuple[Camera, ...], settings: CaptureSettings) -> bool:
-    """Drop the first frames, then hold the exposure: the left one's on both sides.
+    """Drop the first frames, then lock the exposure of the left camera on both.
 
-    Files need no warming up, and keep all their frames.
+    Video files need no warm-up and keep all their frames.
 
     Returns:
-        Whether every driver holds it.
+        Whether the exposure is locked on every camera.
     """
     if not all(camera.live for camera in cameras):
         return False
@@ -124,7 +124,7 @@ def _rate_hz(cameras: tuple[Camera, ...], settings: CaptureSettings) -> float:
 
 
 def _grab(cameras: tuple[Camera, ...], period_s: float) -> list[float] | None:
-    """Stamps of frames that were taken together; None where a file ends."""
+    """Grab frames taken together and return their timestamps; None at the end of a file."""
     stamps = [camera.grab() for camera in cameras]
     while all(stamp is not None for stamp in stamps):
         times = [stamp for stamp in stamps if stamp is not None]
@@ -135,7 +135,7 @@ def _grab(cameras: tuple[Camera, ...], period_s: float) -> list[float] | None:
     silent = cameras[stamps.index(None)]
     if silent.live:
         raise SourceError(
-            "camera gives no more frames", where=silent.name, hint="check its cable and its power"
+            "camera gives no more frames", where=silent.name, hint="check its cable and power"
         )
     return None
 
@@ -148,10 +148,10 @@ def _retrieve(cameras: tuple[Camera, ...], settings: CaptureSettings) -> tuple[U
     if images[0].shape != images[1].shape:
         sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in images]
         raise SourceError(
-            "cameras differ in size",
+            "cameras differ in frame size",
             where=cameras[1].name,
             got=f"left {sizes[0]}, right {sizes[1]}",
-            hint="ask both for one size with --size",
+            hint="request the same size from both with --size",
         )
     return images[0], images[1]
 

@@ -1,4 +1,4 @@
-"""The folder that a capture is written to, pair by pair; whole at any moment."""
+"""The folder a capture is written to, pair by pair; valid at any moment."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from recon.sources.capture import CapturedPair
 
 
 class CaptureFolder:
-    """Appends pairs; where a picture or a line cannot be written, the pair is taken back whole.
+    """Appends pairs; a pair that cannot be written completely is removed again.
 
     Args:
-        folder: Where to; made where it is missing.
-        suffix: Format of the pictures, without the point.
+        folder: Output folder, created if missing.
+        suffix: Suffix of the image files, without the dot.
 
     Raises:
-        OutputError: The folder holds something already, or cannot be written.
+        OutputError: The folder is not empty, or cannot be written.
     """
 
     def __init__(self, folder: Path, suffix: str) -> None:
@@ -55,10 +55,10 @@ class CaptureFolder:
         os.close(self._list)
 
     def add(self, pair: CapturedPair) -> None:
-        """Write both pictures, then the line that makes them count.
+        """Write both images, then their line in the list.
 
         Raises:
-            OutputError: Something cannot be written, such as on a full disk.
+            OutputError: A file cannot be written, for instance because the disk is full.
         """
         name = f"{self.frames:06d}.{self._suffix}"
         frame = CapturedFrame(f"left/{name}", f"right/{name}", pair.left_s, pair.right_s)
@@ -73,17 +73,17 @@ class CaptureFolder:
         self.frames += 1
 
     def preview(self, pair: CapturedPair) -> None:
-        """Replace ``preview.jpg`` by both pictures side by side.
+        """Replace ``preview.jpg`` by both images side by side.
 
         Raises:
-            OutputError: It cannot be written.
+            OutputError: The file cannot be written.
         """
         write_image(self.folder / "preview.jpg", np.hstack([pair.left, pair.right]))
 
     def _append(self, line: bytes) -> None:
         try:
             written = os.write(self._list, line)
-            if written < len(line):  # the disk was filled by its first part
+            if written < len(line):  # a short write: the disk became full
                 written += os.write(self._list, line[written:])
         except OSError as error:
             os.ftruncate(self._list, self._length)

@@ -1,14 +1,14 @@
-"""Drives in the layout of EuRoC (ASL), which TUM VI and others use as well.
+"""Drives in the layout of EuRoC (ASL), also used by TUM VI and others.
 
 ::
 
     folder/
-      mav0/                            (or the folder itself is it)
+      mav0/                            (or its content directly)
         cam0/ cam1/
           data.csv                     time [ns], file name
           data/1403636579763555584.png
           sensor.yaml                  lens, size, T_BS
-        state_groundtruth_estimate0/   optional: the true path of the body
+        state_groundtruth_estimate0/   optional: ground truth trajectory of the body
           data.csv
 """
 
@@ -35,12 +35,12 @@ _TRUTH: Final = "state_groundtruth_estimate0"
 
 
 def open_euroc(folder: Path, settings: SourceSettings) -> PictureSource:
-    """Open a drive; its pictures are paired by their stamps.
+    """Open a drive; its images are paired by timestamp.
 
-    The true path is known where it covers every frame; it is interpolated to their stamps.
+    The ground truth is interpolated to the timestamps; it is used only if it covers every frame.
 
     Raises:
-        SourceError: A folder is missing, or no pictures belong together.
+        SourceError: A folder is missing, or no images can be paired.
         FormatError: A file is damaged.
         CalibrationError: The calibration cannot give depth.
     """
@@ -74,7 +74,7 @@ def _read_list(view: Path) -> list[tuple[float, Path]]:
     listed = [(stamp, view / "data" / name) for stamp, name in entries]
     missing = next((picture for _, picture in listed if not picture.is_file()), None)
     if missing is not None:
-        raise SourceError("picture is missing", where=missing, hint=f"{path} lists it")
+        raise SourceError("image is missing", where=missing, hint=f"{path} lists it")
     return listed
 
 
@@ -90,7 +90,7 @@ def _read_rig(
 
 
 def _read_truth(root: Path, left: Path, stamps_s: Float64) -> tuple[SequenceTruth | None, str]:
-    """Truth at the frames' stamps, and what to say where it does not reach them all."""
+    """Ground truth at the timestamps of the frames, and a note if it does not cover them all."""
     path, sensor = root / _TRUTH / "data.csv", left / "sensor.yaml"
     if not (path.is_file() and sensor.is_file()):
         return None, ""

@@ -1,4 +1,4 @@
-"""One pair, given as two picture files and a calibration file."""
+"""One pair, given as two image files and a calibration file."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from recon.structures.arrays import UInt8
 
 
 class FilesSource:
-    """One pair of pictures.
+    """One pair of images.
 
     Args:
-        left: Left picture.
-        right: Right picture.
-        calibration: Calibration file of any kind that `read_calibration` understands; None = the
-            pictures are rectified, and a camera stands in that is fit for matching alone.
+        left: Left image.
+        right: Right image.
+        calibration: Any calibration file that `read_calibration` supports; None = the images are
+            rectified, and a placeholder camera is used, valid only for matching.
         metres_per_unit: Unit of the translation in an OpenCV file.
 
     Raises:
-        SourceError: The pictures differ in size.
-        FormatError: A file is missing, damaged or not what it should be.
+        SourceError: The images differ in size.
+        FormatError: A file is missing, damaged or of another format.
         CalibrationError: The calibration cannot give depth.
     """
 
@@ -50,17 +50,17 @@ class FilesSource:
 
     @property
     def name(self) -> str:
-        """Name of the left picture."""
+        """Name of the left image."""
         return self._pair.name
 
     @property
     def description(self) -> str:
         """One line."""
-        return "two pictures"
+        return "two images"
 
     @property
     def calibration(self) -> RectifiedCamera | StereoCalibration:
-        """A `RectifiedCamera` where the pictures are rectified already."""
+        """A `RectifiedCamera` if the images are already rectified."""
         return self._calibration
 
     @property
@@ -70,7 +70,7 @@ class FilesSource:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Left picture, right picture, calibration."""
+        """Left image, right image, calibration."""
         return self._files
 
     def __len__(self) -> int:
@@ -85,17 +85,17 @@ class FilesSource:
 
 
 def read_pair(left: StrPath, right: StrPath) -> StereoPair:
-    """Read two pictures of one moment; where one is grey and one in colours, both become colour.
+    """Read the two images of a pair; if only one is in colour, the other is converted.
 
     Raises:
-        SourceError: The pictures differ in size.
-        FormatError: A picture is missing or damaged.
+        SourceError: The images differ in size.
+        FormatError: An image is missing or damaged.
     """
     pictures = [read_image(path) for path in (left, right)]
     sizes = [f"{picture.shape[1]}x{picture.shape[0]}" for picture in pictures]
     if sizes[0] != sizes[1]:
         raise SourceError(
-            "left and right picture differ in size",
+            "left and right images differ in size",
             where=right,
             got=f"left {sizes[0]}, right {sizes[1]}",
             hint="both cameras must record the same size",
@@ -106,10 +106,10 @@ def read_pair(left: StrPath, right: StrPath) -> StereoPair:
 def join_pair(
     left: UInt8, right: UInt8, timestamp_s: float = 0.0, index: int = 0, name: str = ""
 ) -> StereoPair:
-    """Two pictures of one size as a pair; where one is grey and one in colours, both get colours.
+    """Join two images of equal size; if only one is in colour, the other is converted.
 
     Raises:
-        ShapeError: They differ in size.
+        ShapeError: The images differ in size.
     """
     if left.ndim != right.ndim:
         left, right = (p if p.ndim == 3 else p[:, :, None].repeat(3, axis=2) for p in (left, right))

@@ -1,13 +1,13 @@
-"""Plain folders of pictures: one for each camera, or both cameras' pictures in one.
+"""Plain folders of images: one per camera, or one with the images of both.
 
 ::
 
     folder/
-      left/ right/     pictures (or cam0 cam1, infra1 infra2, image_left image_right …)
-      frames.csv       optional, what `recon capture` writes: left file, right file, their times
+      left/ right/     images (or cam0 cam1, infra1 infra2, image_left image_right …)
+      frames.csv       optional, written by `recon capture`: left file, right file, their times
       times.txt        optional: seconds, one line per pair
       groundtruth.txt  optional: t tx ty tz qx qy qz qw of the left camera
-      calib.txt        or any other calibration that is understood
+      calib.txt        or any other supported calibration file
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _INSIDE: Final = ("", "data", "images", "image", "img")
 
 @dataclass(frozen=True)
 class _Pairing:
-    """Pairs in order; ``stamps_s`` is None where nothing tells their times."""
+    """Pairs in order; ``stamps_s`` is None if their times are unknown."""
 
     pairs: list[tuple[Path, Path]]
     stamps_s: Float64 | None
@@ -55,10 +55,10 @@ class _Pairing:
 
 
 def open_folders(folder: Path, settings: SourceSettings) -> PictureSource:
-    """Open plain folders; how the pictures are paired is told in the description.
+    """Open plain folders; the description says how the images are paired.
 
     Raises:
-        SourceError: No two cameras are found, the pictures cannot be paired, or the calibration
+        SourceError: Two cameras are not found, the images cannot be paired, or the calibration
             is missing.
         FormatError: A file is damaged.
         CalibrationError: The calibration cannot give depth.
@@ -81,7 +81,7 @@ def open_folders(folder: Path, settings: SourceSettings) -> PictureSource:
 
 
 def find_views(folder: Path, settings: SourceSettings) -> tuple[Path, Path] | None:
-    """The folders of the left and right pictures; both are ``folder`` where it holds all."""
+    """The folders of the left and right images; both are ``folder`` if it contains both."""
     if settings.right is not None:
         left = folder / settings.left if settings.left else folder
         inside = folder / settings.right
@@ -103,7 +103,7 @@ def find_views(folder: Path, settings: SourceSettings) -> tuple[Path, Path] | No
 
 
 def _with_pictures(folder: Path) -> Path | None:
-    """The folder itself, or the one in it that holds the pictures."""
+    """The folder itself or its subfolder with the images, or None."""
     places = [folder / name for name in _INSIDE]
     return next((p for p in places if p.is_dir() and any(map(is_picture, p.iterdir()))), None)
 
@@ -114,9 +114,9 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
     views = find_views(folder, settings)
     if views is None:
         raise SourceError(
-            "folder has no pictures of two cameras",
+            "folder does not contain images of two cameras",
             where=folder,
-            expected="left/ and right/, cam0/ and cam1/, or the like",
+            expected="left/ and right/, cam0/ and cam1/, or similar",
             hint="name them with --left and --right",
         )
     left, right = _list_both(*views)
@@ -125,7 +125,7 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
     if stamps is not None:
         return _pair_by_stamp(left, right, stamps, settings, folder)
     if by == "stamp":
-        raise SourceError("names of the pictures are no time stamps", where=left[0])
+        raise SourceError("names of the images are not timestamps", where=left[0])
     named = _by_name(left, right) if by in {"auto", "name"} else None
     how = "by name"
     if named is None:
@@ -149,13 +149,13 @@ def _pair_as_listed(folder: Path) -> _Pairing:
     pairs = [(folder / frame.left, folder / frame.right) for frame in frames]
     missing = next((path for pair in pairs for path in pair if not path.is_file()), None)
     if missing is not None:
-        raise SourceError("picture is missing", where=missing, hint=f"{FRAMES} lists it")
+        raise SourceError("image is missing", where=missing, hint=f"{FRAMES} lists it")
     stamps_s = np.array([frame.left_s for frame in frames])
-    return _Pairing(pairs, stamps_s, f"paired as {FRAMES} says", (folder / FRAMES,))
+    return _Pairing(pairs, stamps_s, f"paired according to {FRAMES}", (folder / FRAMES,))
 
 
 def _stamps(left: list[Path], right: list[Path]) -> tuple[Float64, Float64] | None:
-    """The stamps that all names tell, or None."""
+    """The timestamps in the file names, or None unless all names have one."""
     found = [[stamp_of_name(path.stem) for path in paths] for paths in (left, right)]
     if any(stamp is None for stamps in found for stamp in stamps):
         return None
@@ -178,7 +178,7 @@ def _pair_by_stamp(
 
 
 def _by_name(left: list[Path], right: list[Path]) -> list[tuple[Path, Path]] | None:
-    """Pairs of equal names, or of names that differ in the side alone; None if one has none."""
+    """Pair names that are equal or differ only in the side; None if one has no partner."""
     rights = {path.stem: path for path in right}
     pairs = []
     for path in left:
@@ -195,12 +195,12 @@ def _by_index(
 ) -> list[tuple[Path, Path]]:
     if len(left) != len(right) or by == "name":
         raise SourceError(
-            "left and right pictures cannot be paired by name"
+            "left and right images cannot be paired by name"
             if by == "name"
-            else "numbers of left and right pictures differ",
+            else "numbers of left and right images differ",
             where=folder,
-            got=f"{len(left)} left and {len(right)} right pictures",
-            hint="name both pictures of a pair alike, or by their time stamps",
+            got=f"{len(left)} left and {len(right)} right images",
+            hint="give both images of a pair the same name, or their timestamps as names",
         )
     return list(zip(left, right, strict=True))
 
@@ -211,7 +211,7 @@ def _listed_times(folder: Path, pairs: int) -> tuple[Float64 | None, tuple[Path,
 
 
 def _times(found: _Pairing, settings: SourceSettings) -> tuple[Float64, str]:
-    """Stamps of the pairs, and what to say where they are assumed."""
+    """Timestamps of the pairs, and a note if they are assumed."""
     if found.stamps_s is not None and settings.rate_hz is None:
         return found.stamps_s, ""
     rate_hz = settings.rate_hz or DEFAULT_RATE_HZ

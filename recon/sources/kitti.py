@@ -3,13 +3,13 @@
 ::
 
     folder/
-      image_0/ image_1/     left and right picture of each frame, same names (or image_2, image_3)
+      image_0/ image_1/     left and right image of each frame, same names (or image_2, image_3)
       calib.txt             P0 P1 (or P2 P3)
       times.txt             seconds, one line per frame
       poses.txt             optional: T_world_camera0, 12 numbers per frame
 
-In KITTI's own download the poses lie apart, in ``poses/06.txt`` for ``sequences/06``; they are
-found there too.
+KITTI's own download has the poses in a separate folder, ``poses/06.txt`` for ``sequences/06``;
+they are found there too.
 """
 
 from __future__ import annotations
@@ -44,18 +44,18 @@ def open_kitti(
 ) -> PictureSource:
     """Open a drive in KITTI's odometry layout.
 
-    All but the pictures is read and checked at once: names and number of the pictures on both
-    sides, calibration, times, poses. The pictures are read while iterating. Lines of times.txt
-    and poses.txt beyond the last picture are ignored, so a drive may be cut short.
+    File names, calibration, times and poses are read and checked at once; the images are read
+    while iterating. Lines of times.txt and poses.txt beyond the last image are ignored, so a
+    drive may be shortened by deleting images.
 
     Args:
         folder: The folder of the drive.
-        settings: Perhaps name another calibration, or a rate in place of times.
-        cameras: (0, 1) for the grey, (2, 3) for the colour pair; None = grey where there is one.
+        settings: May name another calibration, or a frame rate in place of times.
+        cameras: (0, 1) for the grey pair, (2, 3) for the colour pair; None = grey if present.
 
     Raises:
-        SourceError: A folder or picture is missing, or there are fewer times or poses than
-            pictures.
+        SourceError: A folder or image is missing, or there are fewer times or poses than
+            images.
         FormatError: A file is damaged.
         CalibrationError: The calibration cannot give depth.
     """
@@ -82,10 +82,10 @@ def open_kitti(
 
 
 def choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
-    """The grey pair of cameras, unless only the colour pair is whole.
+    """The grey pair of cameras, or the colour pair if only that is complete.
 
     Raises:
-        SourceError: There is none.
+        SourceError: There is no complete pair.
     """
     pairs = (GREY_CAMERAS, COLOUR_CAMERAS)
     for pair in pairs:
@@ -98,21 +98,21 @@ def choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
                     "folder of the other camera is missing",
                     where=folder,
                     got=pattern.format(here),
-                    expected=f"{pattern.format(missing)} beside it",
+                    expected=f"{pattern.format(missing)} as well",
                 )
     names = [pattern.format(camera) for camera in range(4)]
     raise SourceError(
-        "folder has no pictures in KITTI's layout",
+        "folder has no images in KITTI's layout",
         where=folder,
         expected=f"{names[0]} and {names[1]}, or {names[2]} and {names[3]}",
     )
 
 
 def list_pairs(left: Path, right: Path) -> list[tuple[Path, Path]]:
-    """Left and right picture of each frame, by name; a name on one side alone is an error.
+    """Left and right image of each frame, paired by equal names.
 
     Raises:
-        SourceError: A picture has no partner, or there are none.
+        SourceError: An image has no partner, or there are no images.
     """
     folders = (left, right)
     names = [_names(folder) for folder in folders]
@@ -120,10 +120,10 @@ def list_pairs(left: Path, right: Path) -> list[tuple[Path, Path]]:
         missing = sorted(names[here] - names[there])
         if missing:
             raise SourceError(
-                "picture is missing",
+                "image is missing",
                 where=folders[there] / missing[0],
-                got=f"{len(names[0])} left and {len(names[1])} right pictures",
-                hint="each frame needs a left and a right picture of the same name",
+                got=f"{len(names[0])} left and {len(names[1])} right images",
+                hint="each frame needs a left and a right image of the same name",
             )
     return [(left / path.name, right / path.name) for path in list_pictures(left)]
 
@@ -154,7 +154,7 @@ def _read_times(
 def _read_rig(
     folder: Path, settings: SourceSettings, cameras: tuple[int, int], picture: Path
 ) -> tuple[Rig, tuple[Path, ...]]:
-    """The file does not tell the size of the pictures."""
+    """Read the calibration; the file does not contain the image size."""
     path, size = folder / "calib.txt", picture_size(picture)
     if settings.calibration is not None:
         return read_rig(settings, folder, size)
@@ -172,13 +172,13 @@ def _read_truth(folder: Path, times: Float64, camera: int) -> SequenceTruth | No
     poses = read_kitti_poses(path).T_world_camera
     if len(poses) < len(times):
         raise SourceError(
-            "fewer poses than pictures",
+            "fewer poses than images",
             where=path,
             got=f"{len(poses)} poses",
             expected=f"{len(times)}",
         )
     calibration = folder / "calib.txt"
-    # KITTI's poses are those of camera 0, which may not be the left one of this pair.
+    # KITTI's poses are those of camera 0, which need not be the left camera of this pair.
     offset = read_kitti_offset(calibration, camera) if calibration.exists() else np.eye(4)
     left = poses[: len(times)] @ invert(offset)
     return SequenceTruth(Trajectory(invert(left[0]) @ left, times))

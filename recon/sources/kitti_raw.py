@@ -7,7 +7,7 @@
       2011_09_26_drive_0013_sync/
         image_00/ image_01/           (or image_02, image_03)
           data/0000000000.png
-          timestamps.txt              date and time, one line per picture
+          timestamps.txt              date and time, one line per image
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _CALIBRATION: Final = "calib_cam_to_cam.txt"
 
 
 def open_kitti_raw(folder: Path, settings: SourceSettings) -> PictureSource:
-    """Open a raw drive; its pictures are paired by their stamps.
+    """Open a raw drive; its images are paired by timestamp.
 
     Raises:
-        SourceError: A folder, the times or the calibration are missing, or no pictures belong
-            together.
+        SourceError: A folder, the times or the calibration are missing, or no images can be
+            paired.
         FormatError: A file is damaged.
         CalibrationError: The calibration cannot give depth.
     """
@@ -64,7 +64,7 @@ def _read_stamps(view: Path, pictures: int) -> Float64:
     stamps = read_dates(path)
     if len(stamps) != pictures:
         raise SourceError(
-            "number of times is not that of the pictures",
+            "numbers of times and images differ",
             where=path,
             got=f"{len(stamps)} times",
             expected=f"{pictures}",

@@ -12,17 +12,17 @@ from recon.structures import RectifiedCamera, SequenceTruth, StereoPair
 
 
 class MiddleburySource:
-    """One pair with published geometry.
+    """One pair with a published calibration.
 
     Args:
-        folder: Folder of a scene of 2005 (with ``dmin.txt``), 2006 (the same), 2014 or MiddEval3.
+        folder: A scene of 2005 or 2006 (with ``dmin.txt``), 2014 or MiddEval3.
 
     Attributes:
-        scene: All that the folder says, the true disparity among it.
+        scene: All data of the folder, including the true disparity.
 
     Raises:
-        FormatError: The folder is no Middlebury scene, or a file in it is damaged.
-        CalibrationError: The scene's geometry is not published, or cannot give depth.
+        FormatError: The folder is not a Middlebury scene, or a file in it is damaged.
+        CalibrationError: No calibration is published for the scene, or it cannot give depth.
     """
 
     def __init__(self, folder: StrPath) -> None:
@@ -53,7 +53,7 @@ class MiddleburySource:
 
     @property
     def truth(self) -> SequenceTruth | None:
-        """None: what is true here is a disparity, see ``scene``."""
+        """None: the ground truth is a disparity, see ``scene``."""
         return None
 
     @property

@@ -1,4 +1,4 @@
-"""Which pictures belong together: by name, or by time."""
+"""Pairs left and right images by name or by timestamp."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from recon.errors import SourceError
 from recon.structures.arrays import Float64
 
-# What names the left camera, and what the right one is called then.
+# Parts of names that mark the left camera, each with its counterpart for the right one.
 SIDES: Final = (
     ("left", "right"),
     ("Left", "Right"),
@@ -36,12 +36,12 @@ _STAMP: Final = re.compile(r"\d{10}(\.\d+)?|\d{13}|\d{16}|\d{19}|\d+\.\d+")
 
 @dataclass(frozen=True, eq=False)
 class StampPairs:
-    """Which of two series of stamps belong together.
+    """Pairs of entries of two series of timestamps.
 
     Attributes:
-        left: Positions in the left series, increasing.
-        right: Their partners in the right series, increasing.
-        alone: How many of (left, right) have no partner.
+        left: Indices into the left series, increasing.
+        right: Indices of their partners in the right series, increasing.
+        alone: Numbers of entries (left, right) without a partner.
     """
 
     left: Sequence[int]
@@ -61,12 +61,12 @@ def natural_key(name: str) -> list[tuple[int, str]]:
 
 
 def partner_names(name: str) -> list[str]:
-    """What the right camera may be called where the left one is called so, likeliest first."""
+    """Possible names of the right camera for a name of the left one, most likely first."""
     found = []
     for left, right in SIDES:
         bounded = rf"(?<![A-Za-z0-9]){left}(?![A-Za-z0-9])" if len(left) == 1 else left
         matches = list(re.finditer(bounded, name))
-        # All places together ("left/left_raw"), else the last alone ("cam0/cam0_0").
+        # All occurrences at once ("left/left_raw"), else only the last ("cam0/cam0_0").
         if matches:
             found.append(re.sub(bounded, right, name))
             last = matches[-1]
@@ -75,7 +75,7 @@ def partner_names(name: str) -> list[str]:
 
 
 def find_partners(names: Iterable[str]) -> list[tuple[str, str]]:
-    """All (left, right) among some names, in natural order."""
+    """All (left, right) pairs among some names, in natural order."""
     known = set(names)
     pairs = []
     for name in sorted(known, key=natural_key):
@@ -86,9 +86,10 @@ def find_partners(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def stamp_of_name(stem: str) -> float | None:
-    """Seconds that a file's name tells: seconds, or an integer of ms, µs or ns since 1970.
+    """Timestamp in a file name: seconds, or an integer number of ms, µs or ns since 1970.
 
-    None where it is no stamp.
+    Returns:
+        Seconds, or None if the name is not a timestamp.
     """
     if _STAMP.fullmatch(stem) is None:
         return None
@@ -98,34 +99,34 @@ def stamp_of_name(stem: str) -> float | None:
 
 
 def check_increasing(stamps_s: Float64, where: str) -> None:
-    """Refuse stamps that stand still or run backwards.
+    """Check that timestamps are strictly increasing.
 
     Raises:
-        SourceError: They do.
+        SourceError: They are not.
     """
     backwards = np.flatnonzero(np.diff(stamps_s) <= 0)
     if backwards.size:
         at = int(backwards[0]) + 1
         still = stamps_s[at] == stamps_s[at - 1]
         raise SourceError(
-            "two pictures have one time stamp" if still else "time stamps are out of order",
-            where=f"{where}, picture {at}",
+            "two images have the same timestamp" if still else "timestamps are out of order",
+            where=f"{where}, image {at}",
             got=f"{stamps_s[at]:.6f} s after {stamps_s[at - 1]:.6f} s",
-            hint="each camera's pictures must be in the order of their exposure",
+            hint="the images of each camera must be in the order of their exposure",
         )
 
 
 def pair_stamps(left_s: Float64, right_s: Float64, tolerance_s: float, where: str) -> StampPairs:
-    """Pair two series by their stamps: each with the nearest of the other, and it with it.
+    """Pair two series of timestamps that are mutual nearest neighbours.
 
     Args:
         left_s: float64 (N,), seconds, increasing.
         right_s: float64 (M,), seconds, increasing.
         tolerance_s: Largest difference within a pair.
-        where: Named in the error.
+        where: The source, for the error message.
 
     Raises:
-        SourceError: No two are near enough.
+        SourceError: No two are close enough.
     """
     to_right, to_left = _nearest(left_s, right_s), _nearest(right_s, left_s)
     mutual = to_left[to_right] == np.arange(len(left_s))
@@ -133,18 +134,18 @@ def pair_stamps(left_s: Float64, right_s: Float64, tolerance_s: float, where: st
     chosen = np.flatnonzero(mutual & (apart_s <= tolerance_s))
     if not chosen.size:
         raise SourceError(
-            "no left and right picture were taken at one time",
+            "no left and right images were taken at the same time",
             where=where,
             got=f"at best {apart_s.min():.4g} s apart",
             expected=f"at most {tolerance_s:g} s",
-            hint="raise the tolerance if that is the cameras' true skew",
+            hint="raise --set source.tolerance_s= if that is the true skew of the cameras",
         )
     alone = (len(left_s) - len(chosen), len(right_s) - len(chosen))
     return StampPairs(chosen.tolist(), to_right[chosen].tolist(), alone)
 
 
 def _nearest(of_s: Float64, among_s: Float64) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """For each stamp, the position of the nearest among others; both increase."""
+    """For each timestamp, the index of the nearest of the others; both series increase."""
     after = np.clip(np.searchsorted(among_s, of_s), 1, max(1, len(among_s) - 1))
     before = after - 1
     after = np.minimum(after, len(among_s) - 1)

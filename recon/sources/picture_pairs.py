@@ -1,4 +1,4 @@
-"""Which left picture belongs to which right one."""
+"""Pairs the image files of two cameras by their names."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ Key = tuple[object, ...]
 
 @dataclass(frozen=True)
 class PicturePairs:
-    """Pictures of two cameras, paired.
+    """Images of two cameras, paired.
 
     Attributes:
         pairs: Left and right file of each pair, in natural order.
-        by_order: Whether names told nothing, so that the order of the files had to.
+        by_order: Whether files were paired by order, as their names gave no clue.
     """
 
     pairs: tuple[tuple[Path, Path], ...]
@@ -32,26 +32,26 @@ class PicturePairs:
 
 
 def pair_pictures(left: str | Path, right: str | Path) -> PicturePairs:
-    """Find the pictures of two cameras and pair them.
+    """Find the images of two cameras and pair them.
 
-    Pictures belong together whose names are the same but for numbers and words that are the same
-    for a whole side, as ``left01.jpg`` and ``right01.jpg`` or ``cam0/17.png`` and ``cam1/17.png``.
-    Where the names have nothing in common, and both sides have as many, their order decides.
+    Names match if they are equal apart from words and constant numbers of each side, such as
+    ``left01.jpg`` and ``right01.jpg`` or ``cam0/17.png`` and ``cam1/17.png``. If no names match
+    and both sides have as many images, they are paired by order.
 
     Args:
-        left: A folder, a picture, or a pattern with ``*``, ``?``, ``[]`` or ``**``.
+        left: A folder, an image, or a pattern with ``*``, ``?``, ``[]`` or ``**``.
         right: The same for the right camera.
 
     Raises:
-        SourceError: A side has no pictures, or a picture no partner, or both sides the same files.
+        SourceError: A side has no images, an image has no partner, or the sides share files.
     """
     sides = (list_pictures(left), list_pictures(right))
     both = set(sides[0]) & set(sides[1])
     if both:
         raise SourceError(
-            "left and right are the same pictures",
+            "left and right are the same images",
             where=sorted(both)[0],
-            hint="two patterns or folders that have no file in common",
+            hint="give two patterns or folders without a common file",
         )
     for keyed in (_by_name, _by_numbers):
         keys = [keyed(side) for side in sides]
@@ -59,16 +59,16 @@ def pair_pictures(left: str | Path, right: str | Path) -> PicturePairs:
             return PicturePairs(_match(keys[0], keys[1]), by_order=False)
     if len(sides[0]) != len(sides[1]):
         raise SourceError(
-            "pictures do not pair up",
+            "images do not pair up",
             where=left,
             got=f"{len(sides[0])} left, {len(sides[1])} right",
-            expected="as many left as right, or names that tell the pairs",
+            expected="as many left as right, or names that identify the pairs",
         )
     return PicturePairs(tuple(zip(*sides, strict=True)), by_order=len(sides[0]) > 1)
 
 
 def list_pictures(where: str | Path) -> list[Path]:
-    """The pictures of a folder or pattern, 2 before 10.
+    """The images of a folder or pattern in natural order: 2 before 10.
 
     Raises:
         SourceError: There are none.
@@ -82,7 +82,7 @@ def list_pictures(where: str | Path) -> list[Path]:
     pictures = [path for path in found if path.suffix.lower() in PICTURES and path.is_file()]
     if not pictures:
         raise SourceError(
-            "no pictures there",
+            "no images found",
             where=where,
             expected=", ".join(sorted(PICTURES)),
             hint='put patterns in quotes: "left*.png"',
@@ -95,7 +95,7 @@ def _by_name(side: Sequence[Path]) -> dict[Key, Path]:
 
 
 def _by_numbers(side: Sequence[Path]) -> dict[Key, Path]:
-    """Pictures by those numbers in their names that are not the same for the whole side."""
+    """Images by those numbers in their names that vary within the side."""
     numbers = [tuple(int(word) for word in _NUMBER.findall(path.stem)) for path in side]
     if len({len(each) for each in numbers}) != 1:
         return {}
@@ -116,9 +116,9 @@ def _match(left: dict[Key, Path], right: dict[Key, Path]) -> tuple[tuple[Path, P
     if lonely:
         names = ", ".join(path.name for path in lonely[:3]) + (" …" if len(lonely) > 3 else "")
         raise SourceError(
-            "pictures do not pair up: these have no partner",
+            "images do not pair up: these have no partner",
             where=lonely[0].parent,
             got=names,
-            hint="move them away, or correct their names",
+            hint="remove them, or correct their names",
         )
     return tuple((path, right[key]) for key, path in left.items())

@@ -1,4 +1,4 @@
-"""Drives whose pictures lie in folders: one file per camera and frame."""
+"""Drives stored as image files, one per camera and frame."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ class PictureFrame:
     """The two files of one frame.
 
     Attributes:
-        left: Left picture.
-        right: Right picture.
-        timestamp_s: Time of exposure of the left one.
+        left: Left image.
+        right: Right image.
+        timestamp_s: Exposure time stamp of the left image.
     """
 
     left: Path
@@ -36,15 +36,15 @@ class PictureFrame:
 
 @dataclass(frozen=True, eq=False)
 class PictureSource:
-    """A drive in picture files, read one pair at a time.
+    """A drive in image files, read one pair at a time.
 
     Attributes:
         name: Name of the folder.
-        description: What it was taken for, in one line.
+        description: Recognised kind and layout, in one line.
         calibration: The rectified camera, or the two raw ones.
         pictures: The files of each frame, in order.
-        truth: What is known of the true path.
-        texts: Files other than pictures that were read.
+        truth: Ground truth trajectory, if known.
+        texts: Files other than images that were read.
     """
 
     name: str
@@ -56,13 +56,13 @@ class PictureSource:
 
     @property
     def files(self) -> Sequence[Path]:
-        """Calibration and the like, then the pictures."""
+        """Calibration and other text files, then the images."""
         pictures = (path for frame in self.pictures for path in (frame.left, frame.right))
         return [*self.texts, *pictures]
 
     @property
     def stamps_s(self) -> Float64:
-        """float64 (N,), times of the left pictures."""
+        """float64 (N,), times of the left images."""
         return np.array([frame.timestamp_s for frame in self.pictures])
 
     def __len__(self) -> int:
@@ -75,7 +75,7 @@ class PictureSource:
         """Read the pairs from number ``start`` on.
 
         Raises:
-            FormatError: A picture is missing, damaged or of another size than the calibration.
+            FormatError: An image is missing, damaged or of another size than the calibration.
         """
         for index in range(start, len(self.pictures)):
             frame = self.pictures[index]
@@ -89,7 +89,7 @@ class PictureSource:
 
 
 def size_of(calibration: RectifiedCamera | StereoCalibration) -> tuple[int, int]:
-    """Width and height of the pictures that a calibration belongs to."""
+    """Image width and height of a calibration."""
     camera = calibration if isinstance(calibration, RectifiedCamera) else calibration.left
     return camera.width_px, camera.height_px
 
@@ -97,16 +97,16 @@ def size_of(calibration: RectifiedCamera | StereoCalibration) -> tuple[int, int]
 def check_size(
     image: UInt8, calibration: RectifiedCamera | StereoCalibration, where: Path | str
 ) -> None:
-    """Refuse a picture of another size than the calibration.
+    """Check that an image has the size of the calibration.
 
     Raises:
-        FormatError: It is.
+        FormatError: It has another size.
     """
     size = (image.shape[1], image.shape[0])
     expected = size_of(calibration)
     if size != expected:
         raise FormatError(
-            "picture has another size than the calibration, or than the first of the drive",
+            "image size differs from the calibration, or from the first image of the drive",
             where=where,
             got=f"{size[0]}x{size[1]}",
             expected=f"{expected[0]}x{expected[1]}",
@@ -114,29 +114,29 @@ def check_size(
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height of a picture file.
+    """Width and height of an image file.
 
     Raises:
-        FormatError: It is missing or damaged.
+        FormatError: The file is missing or damaged.
     """
     height_px, width_px = read_image(path).shape[:2]
     return width_px, height_px
 
 
 def list_pictures(folder: Path) -> list[Path]:
-    """The pictures of a folder in natural order: 2 before 10.
+    """The images of a folder in natural order: 2 before 10.
 
     Raises:
-        SourceError: The folder does not exist or holds no pictures.
+        SourceError: The folder does not exist or contains no images.
     """
     if not folder.is_dir():
         raise SourceError("folder does not exist", where=folder)
     paths = [path for path in folder.iterdir() if is_picture(path)]
     if not paths:
-        raise SourceError("folder holds no pictures", where=folder, expected="PNG, JPEG or PGM")
+        raise SourceError("folder contains no images", where=folder, expected="PNG, JPEG or PGM")
     return sorted(paths, key=lambda path: natural_key(path.name))
 
 
 def is_picture(path: Path) -> bool:
-    """Tell a picture by its suffix; hidden files are none."""
+    """Whether a file is an image by its suffix; hidden files do not count."""
     return path.suffix.lower() in PICTURES and not path.name.startswith(".")

@@ -1,4 +1,4 @@
-"""What every source of stereo pairs promises."""
+"""The interfaces of sources of stereo pairs."""
 
 from __future__ import annotations
 
@@ -18,31 +18,31 @@ from recon.structures.arrays import Float64
 
 @runtime_checkable
 class StereoSource(Protocol):
-    """An ordered series of stereo pairs from one rig, read lazily."""
+    """An ordered sequence of stereo pairs from one rig, read lazily."""
 
     @property
     def name(self) -> str:
-        """What a user calls it: the folder or device."""
+        """Name for the user: the folder or device."""
         ...
 
     @property
     def description(self) -> str:
-        """What it was taken for and how it was read, in one line for the user."""
+        """The recognised kind and how it is read, in one line for the user."""
         ...
 
     @property
     def calibration(self) -> RectifiedCamera | StereoCalibration:
-        """A `RectifiedCamera` where the pictures are already rectified."""
+        """A `RectifiedCamera` if the images are already rectified."""
         ...
 
     @property
     def truth(self) -> SequenceTruth | None:
-        """What is known of the true path and surface, or None."""
+        """Ground truth of the trajectory and surface, as far as known, or None."""
         ...
 
     @property
     def files(self) -> Sequence[Path]:
-        """The files that its pairs and its calibration are read from, for the record of a run."""
+        """The files that pairs and calibration are read from, for the record of a run."""
         ...
 
     def __len__(self) -> int:
@@ -50,24 +50,24 @@ class StereoSource(Protocol):
         ...
 
     def __iter__(self) -> Iterator[StereoPair]:
-        """Yield all pairs, as ``frames()``."""
+        """Yield all pairs, like ``frames()``."""
         ...
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Yield the pairs in order, one in memory at a time, from pair ``start`` on.
 
-        The pairs before ``start`` are skipped as cheaply as the input allows: pictures are not
-        read, a bag is entered by its index, a video is decoded up to there.
+        Earlier pairs are skipped as cheaply as the input allows: image files are not read, a bag
+        is entered by its index, a video is decoded up to there.
 
         Raises:
-            FormatError: A picture is missing, truncated or of another size.
+            FormatError: An image is missing, truncated or of another size.
         """
         ...
 
 
 @runtime_checkable
 class KnowsOccupancy(Protocol):
-    """A source that knows what is really occupied."""
+    """A source with ground truth of the occupancy."""
 
     def occupancy_truth(
         self,
@@ -78,13 +78,13 @@ class KnowsOccupancy(Protocol):
         least_frames: int,
         T_map_world: Float64 | None,
     ) -> OccupancyTruth:
-        """Where obstacles stand, and what of it the drive saw, in the cells and axes of a map."""
+        """True obstacles, and which of them the drive saw, in the cells and axes of a map."""
         ...
 
 
 @runtime_checkable
 class StampedSource(Protocol):
-    """A source that knows the times of all pairs without reading one."""
+    """A source that knows the times of all pairs without reading them."""
 
     @property
     def stamps_s(self) -> Float64:

@@ -1,4 +1,4 @@
-"""Which kinds of source there are, and which of them a path is."""
+"""The kinds of source, and how the kind of a path is recognised."""
 
 from __future__ import annotations
 
@@ -52,14 +52,13 @@ def open_source(
     Args:
         path: The folder or file.
         kind: A key of `SOURCES`; None = recognise it by its files.
-        settings: What its files do not tell.
+        settings: What cannot be derived from its files.
 
     Raises:
-        SourceError: The path is missing, empty or of no kind that is understood, or cannot
-            give pairs.
+        SourceError: The path is missing, empty, of an unknown kind, or gives no pairs.
         FormatError: A file in it is damaged.
         CalibrationError: Its calibration cannot give depth.
-        MissingDependencyError: A bag, and the extra ``ros`` is not installed.
+        MissingDependencyError: It is a bag, and the extra ``ros`` is not installed.
     """
     settings = settings or SourceSettings()
     if kind is None:
@@ -70,10 +69,10 @@ def open_source(
 
 
 def recognise_source(path: StrPath, settings: SourceSettings | None = None) -> str:
-    """Tell by its files which kind of source (a key of `SOURCES`) a path is.
+    """Recognise the kind of source (a key of `SOURCES`) of a path by its files.
 
     Raises:
-        SourceError: The path is missing, empty or of no kind that is understood.
+        SourceError: The path is missing, empty or of an unknown kind.
     """
     place = Path(path)
     if place.is_file():
@@ -84,7 +83,7 @@ def recognise_source(path: StrPath, settings: SourceSettings | None = None) -> s
         raise SourceError("folder is empty", where=path)
     kind = next((kind for kind, fits in _signs(place, settings or SourceSettings()) if fits), None)
     if kind is None:
-        raise SourceError("folder is no source of stereo pairs", where=path, expected=EXPECTED)
+        raise SourceError("folder is not a source of stereo pairs", where=path, expected=EXPECTED)
     return kind
 
 
@@ -94,11 +93,11 @@ def _recognise_file(path: Path) -> str:
         return "video"
     if suffix in BAGS:
         return "bag"
-    raise SourceError("file is no source of stereo pairs", where=path, expected=EXPECTED)
+    raise SourceError("file is not a source of stereo pairs", where=path, expected=EXPECTED)
 
 
 def _signs(folder: Path, settings: SourceSettings) -> tuple[tuple[str, bool], ...]:
-    """What each kind is known by; the surest signs come first."""
+    """Kinds and whether a folder looks like them, most distinctive first."""
     views = range(4)
     return (
         ("bag", bool(find_bags(folder))),

@@ -1,4 +1,4 @@
-"""Where the calibration of a source comes from, and whether its pictures are rectified already."""
+"""Finds the calibration of a source, and whether its images are already rectified."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ _NAME: Final = re.compile(
 )
 # Focal lengths, skew and principal row: all of a camera matrix but the principal column.
 _ROWS: Final = ([0, 0, 1, 1], [0, 1, 1, 2])
-# What a rotation of a rectified pair may be off: the digits that files print.
+# Largest deviation from a rectified pair, given the digits that files print.
 _DIGITS_TOLERANCE: Final = 1e-9
 
 
 def read_rig(
     settings: SourceSettings, folder: Path, size: tuple[int, int]
 ) -> tuple[Rig, tuple[Path, ...]]:
-    """Read the calibration that the settings name, else the one that lies in a folder.
+    """Read the calibration named in the settings, else the one in a folder.
 
     Args:
-        settings: Perhaps name a file.
-        folder: Where to look otherwise.
-        size: Width and height of the pictures, for files that do not tell.
+        settings: May name a file.
+        folder: The folder to search otherwise.
+        size: Image width and height, for files that do not contain them.
 
     Returns:
         The calibration, and the files it was read from.
 
     Raises:
-        SourceError: None is named, and none found.
-        FormatError: It is damaged.
-        CalibrationError: It cannot give depth.
+        SourceError: No file is named and none is found.
+        FormatError: The file is damaged.
+        CalibrationError: The calibration cannot give depth.
     """
     path = find_calibration(folder) if settings.calibration is None else Path(settings.calibration)
     if path is None:
@@ -55,7 +55,7 @@ def read_rig(
 
 
 def find_calibration(folder: Path) -> Path | None:
-    """The calibration file of a folder, by its name; the first in the alphabet of several."""
+    """The calibration file of a folder, recognised by name; the first in alphabetical order."""
     if not folder.is_dir():
         return None
     found = [path for path in folder.iterdir() if _NAME.fullmatch(path.name.lower())]
@@ -63,9 +63,9 @@ def find_calibration(folder: Path) -> Path | None:
 
 
 def as_rectified(rig: Rig) -> Rig:
-    """The rectified camera that two raw ones make which need no rectification; else what it was.
+    """Convert two raw cameras that are already rectified; return any other rig unchanged.
 
-    Rectifying such a pair once more would resample every picture for nothing.
+    Rectifying such a pair again would resample every image for nothing.
     """
     if isinstance(rig, RectifiedCamera) or not _is_rectified(rig):
         return rig
@@ -82,7 +82,7 @@ def as_rectified(rig: Rig) -> Rig:
 
 
 def _is_rectified(rig: StereoCalibration) -> bool:
-    """No distortion, no rotation, no step but to the right, and one focal length and row."""
+    """No distortion or rotation, a baseline along x only, and equal focal length and rows."""
     left, right = rig.left, rig.right
     step_m = rig.T_right_left[:3, 3]
     near = _DIGITS_TOLERANCE

@@ -1,4 +1,4 @@
-"""What a user may have to say about a source that its files do not tell."""
+"""Settings of a source that cannot be derived from its files."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from recon.settings import Settings
 
 
 class SourceSettings(Settings):
-    """How pairs are found in a source. What a layout defines itself is not asked here."""
+    """How cameras, pairs and times are found in a source, where its layout leaves that open."""
 
     left: str | None = Field(
         default=None,
-        description="The left camera: a folder in the source, or a topic. none = found by name.",
+        description="Left camera: a folder in the source, or a topic. none = found by name.",
     )
     right: str | None = Field(
         default=None,
-        description="The right camera: a folder, or a topic; where the source is a left folder or "
-        "a left video, the path of the right one. none = found by name.",
+        description="Right camera: a folder or topic, or the path of the right folder or video if "
+        "the source is the left one. none = found by name.",
     )
     calibration: str | None = Field(
         default=None,
-        description="Calibration file, in place of the one that the source has. none = its own.",
+        description="Calibration file to use instead of that of the source. none = its own.",
     )
     metres_per_unit: float = Field(
         default=1.0,
@@ -32,20 +32,20 @@ class SourceSettings(Settings):
     )
     pair_by: Literal["auto", "stamp", "name", "index"] = Field(
         default="auto",
-        description="How pictures of plain folders are paired. auto = by time stamps where there "
-        "are any, else by equal names, else by their order where there are as many of each.",
+        description="How images of plain folders are paired. auto = by timestamps if the names "
+        "have them, else by equal names, else by order if both cameras have as many.",
     )
     tolerance_s: float = Field(
         default=0.01,
         gt=0,
-        description="Largest difference between the stamps of a pair; others have no partner.",
+        description="Largest difference between the timestamps of a pair.",
     )
     rate_hz: float | None = Field(
         default=None,
         gt=0,
-        description="Frames per second of a source without times. none = 10 for pictures, and "
-        "what the file says for videos.",
+        description="Frame rate of a KITTI drive, plain folders or videos, in place of their "
+        "times. none = their times, or 10 Hz for plain folders without times.",
     )
     side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = Field(
-        default="left-right", description="Where the two views are in the frames of one video."
+        default="left-right", description="Arrangement of the two views in the frames of one video."
     )

@@ -1,4 +1,4 @@
-"""The synthetic street drive as a source, and written out in the layout of KITTI."""
+"""The synthetic street drive as a source, and as files in the layout of KITTI."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ _BT601 = np.array([0.299, 0.587, 0.114])
 
 
 class SyntheticSource:
-    """A drive through a street that never was, with the whole truth about it.
+    """A rendered drive through a synthetic street, with complete ground truth.
 
-    Nothing is built before it is asked for; pictures are rendered while iterating.
+    The street is built on first use; images are rendered while iterating.
 
     Args:
-        settings: Street, rig and path.
-        surface_range_m: Depth up to which a surface that was in view counts as true surface.
+        settings: Street, rig and trajectory.
+        surface_range_m: Depth up to which a visible surface is part of the true surface.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class SyntheticSource:
 
     @property
     def name(self) -> str:
-        """The seed and the length."""
+        """Seed and number of frames."""
         return f"synthetic street {self.settings.seed}, {self.settings.frames} frames"
 
     @property
@@ -62,7 +62,7 @@ class SyntheticSource:
 
     @cached_property
     def camera(self) -> StreetCamera:
-        """The rig in the street; gives any frame with its truth."""
+        """The rig in the street, which renders any frame with its ground truth."""
         return StreetCamera(self.world)
 
     @property
@@ -72,18 +72,18 @@ class SyntheticSource:
 
     @property
     def trajectory(self) -> Trajectory:
-        """True poses; unlike `truth` they cost nothing."""
+        """True poses; cheap, unlike `truth`."""
         return self.world.trajectory
 
     @cached_property
     def truth(self) -> SequenceTruth:
-        """True poses, and the surfaces that were in view within the range, every 5 cm."""
+        """True poses, and the surfaces seen within the range, sampled every 5 cm."""
         surface = true_surface(self.camera, range_m=self._surface_range_m)
         return SequenceTruth(self.trajectory, surface)
 
     @property
     def files(self) -> Sequence[Path]:
-        """None: the settings alone decide the pictures."""
+        """Empty: the images depend only on the settings."""
         return ()
 
     def __len__(self) -> int:
@@ -121,7 +121,7 @@ class SyntheticSource:
         least_frames: int = 3,
         T_map_world: Float64 | None = None,
     ) -> OccupancyTruth:
-        """Where obstacles stand, and what of it was seen; see `true_occupancy`."""
+        """True obstacles, and which of them were seen; see `true_occupancy`."""
         return true_occupancy(
             self.camera,
             resolution_m=resolution_m,
@@ -144,8 +144,8 @@ def write_kitti(source: SyntheticSource, folder: StrPath, *, grey: bool = True) 
 
     Args:
         source: The drive.
-        folder: Where to write; made where it is missing.
-        grey: Also write the grey pictures.
+        folder: Output folder, created if missing.
+        grey: Also write the grey images.
 
     Raises:
         OutputError: A file cannot be written.
@@ -168,7 +168,7 @@ def _grey(image: UInt8) -> UInt8:
 
 
 def _calibration_text(camera: RectifiedCamera) -> str:
-    """P0 and P2 of the left, P1 and P3 of the right camera; all stand at the same two places."""
+    """P0 and P2 of the left, P1 and P3 of the right camera; grey and colour coincide."""
     left = np.hstack([camera.matrix, np.zeros((3, 1))])
     right = left.copy()
     right[0, 2] = camera.cx_right_px

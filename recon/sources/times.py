@@ -1,4 +1,4 @@
-"""Times of exposure, as the layouts write them down."""
+"""Reads exposure times in the formats of the various layouts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def read_times(path: Path, frames: int) -> Float64:
 
     Raises:
         SourceError: The file is missing or too short.
-        FormatError: A line is no number, or time runs backwards.
+        FormatError: A line is not a number, or time runs backwards.
     """
     if not path.exists():
         raise SourceError("file does not exist", where=path)
@@ -28,7 +28,7 @@ def read_times(path: Path, frames: int) -> Float64:
     times: Float64 = table[:frames, 0].copy()
     if len(times) < frames:
         raise SourceError(
-            "fewer times than pictures",
+            "fewer times than images",
             where=path,
             got=f"{len(times)} times",
             expected=f"{frames}",
@@ -45,10 +45,10 @@ def read_dates(path: Path) -> Float64:
     """Read KITTI raw's ``timestamps.txt``: a date and a time of day per line.
 
     Returns:
-        float64 (N,), seconds since 1970. A double resolves them to 0.2 µs.
+        float64 (N,), seconds since 1970, which a double resolves to 0.2 µs.
 
     Raises:
-        FormatError: The file is missing, or a line is no date.
+        FormatError: The file is missing, or a line is not a date.
     """
     stamps = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -58,7 +58,7 @@ def read_dates(path: Path) -> Float64:
 
 
 def _parse_date(text: str, where: str) -> float:
-    # Python before 3.11 reads six decimals at most.
+    # Python before 3.11 parses at most six decimals.
     whole, _, fraction = text.partition(".")
     try:
         day = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
@@ -70,17 +70,17 @@ def _parse_date(text: str, where: str) -> float:
 
 
 def read_stamped_names(path: Path, *, unit_s: float = 1.0) -> list[tuple[float, str]]:
-    """Read a list of pictures: a stamp and a file name per line, apart by spaces or a comma.
+    """Read a list of images: timestamp and file name per line, separated by spaces or a comma.
 
     Args:
         path: TUM's ``rgb.txt`` or EuRoC's ``data.csv``; ``#`` starts a comment.
-        unit_s: Unit of the stamps: 1e-9 for EuRoC.
+        unit_s: Unit of the timestamps: 1e-9 for EuRoC.
 
     Returns:
         (seconds, name) of each line.
 
     Raises:
-        FormatError: The file is missing or empty, or a line is no stamp and name.
+        FormatError: The file is missing or empty, or a line is not a timestamp and a name.
     """
     entries = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -88,7 +88,7 @@ def read_stamped_names(path: Path, *, unit_s: float = 1.0) -> list[tuple[float, 
         if words:
             entries.append(_parse_entry(words, unit_s, f"{path}:{number}"))
     if not entries:
-        raise FormatError("file lists no pictures", where=path)
+        raise FormatError("file lists no images", where=path)
     return entries
 
 
@@ -96,7 +96,7 @@ def _parse_entry(words: list[str], unit_s: float, where: str) -> tuple[float, st
     try:
         stamp = float(words[0]) if unit_s == 1 else int(words[0]) * unit_s
     except ValueError as error:
-        raise FormatError("not a time stamp", where=where, got=words[0][:40]) from error
+        raise FormatError("not a timestamp", where=where, got=words[0][:40]) from error
     if len(words) < 2 or not np.isfinite(stamp):
-        raise FormatError("not a time stamp and a file name", where=where, got=" ".join(words)[:60])
+        raise FormatError("not a timestamp and a file name", where=where, got=" ".join(words)[:60])
     return stamp, words[1]

@@ -1,4 +1,4 @@
-"""A true path that was measured at other times than the pictures were taken."""
+"""Ground truth trajectories, interpolated to the timestamps of the images."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from recon.structures.arrays import Float64
 def truth_at(
     path: Trajectory, stamps_s: Float64, T_body_camera: Float64 | None = None
 ) -> tuple[SequenceTruth | None, str]:
-    """The true pose of the left camera in each frame, the first one the identity.
+    """True pose of the left camera in each frame; the first one is the identity.
 
     Args:
-        path: ``T_world_body`` at the times of the instrument.
-        stamps_s: float64 (N,), the frames' times.
-        T_body_camera: float64 (4, 4), where the left camera is; None = it is the body.
+        path: ``T_world_body`` at the times of the measuring instrument.
+        stamps_s: float64 (N,), times of the frames.
+        T_body_camera: float64 (4, 4), pose of the left camera in the body; None = identity.
 
     Returns:
-        The truth, or None where it does not cover every frame; and then what to say about it.
+        The ground truth and an empty note, or None and a note if it does not cover every frame.
     """
     covered = (stamps_s >= path.timestamps_s[0]) & (stamps_s <= path.timestamps_s[-1])
     if not covered.all():
-        return None, f", true path for {covered.sum()} of {len(stamps_s)} frames alone: not used"
+        return None, f", ground truth for only {covered.sum()} of {len(stamps_s)} frames: not used"
     poses = interpolate_poses(path, stamps_s)
     if T_body_camera is not None:
         poses = poses @ T_body_camera
@@ -36,7 +36,7 @@ def truth_at(
 
 
 def read_tum_truth(folder: Path, stamps_s: Float64) -> tuple[SequenceTruth | None, str]:
-    """Truth from TUM's ``groundtruth.txt`` of the left camera, where a folder has one.
+    """Ground truth from ``groundtruth.txt`` (TUM format, left camera), if a folder has one.
 
     Raises:
         FormatError: The file is damaged.

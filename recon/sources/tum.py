@@ -1,12 +1,12 @@
-"""Drives whose pictures are listed with their times, as the TUM benchmarks do.
+"""Drives with lists of images and their times, as in the TUM benchmarks.
 
 ::
 
     folder/
-      left.txt right.txt        time [s] and file, one line per picture (or cam0.txt cam1.txt …)
+      left.txt right.txt        time [s] and file, one line per image (or cam0.txt cam1.txt …)
       left/1305031102.175304.png …
       groundtruth.txt           optional: t tx ty tz qx qy qz qw of the left camera
-      calib.txt                 or any other calibration that is understood
+      calib.txt                 or any other supported calibration file
 """
 
 from __future__ import annotations
@@ -25,11 +25,10 @@ from recon.sources.truth import read_tum_truth
 
 
 def open_tum(folder: Path, settings: SourceSettings) -> PictureSource:
-    """Open a drive with two lists; its pictures are paired by their stamps.
+    """Open a drive with two lists; its images are paired by timestamp.
 
     Raises:
-        SourceError: A list, a picture or the calibration is missing, or no pictures belong
-            together.
+        SourceError: A list, an image or the calibration is missing, or no images can be paired.
         FormatError: A file is damaged.
         CalibrationError: The calibration cannot give depth.
     """
@@ -54,13 +53,13 @@ def open_tum(folder: Path, settings: SourceSettings) -> PictureSource:
 
 
 def list_files(folder: Path) -> list[tuple[str, str]]:
-    """The (left, right) names of text files in a folder that list pictures."""
+    """Names (left, right) of the text files in a folder that list images."""
     names = [path.name for path in folder.iterdir() if path.suffix == ".txt" and _lists(path)]
     return find_partners(names)
 
 
 def _lists(path: Path) -> bool:
-    """Tell a list by its first entry: a number, then the name of a picture."""
+    """Whether a file is a list, by its first entry: a number, then the name of an image."""
     with path.open(encoding="utf-8", errors="replace") as lines:
         words = next((line.split() for line in lines if line.strip() and line[0] != "#"), [])
     return len(words) >= 2 and is_picture(Path(words[1]))
@@ -72,9 +71,9 @@ def _find_lists(folder: Path, settings: SourceSettings) -> tuple[Path, Path]:
     found = list_files(folder)
     if not found:
         raise SourceError(
-            "folder has no lists of pictures of two cameras",
+            "folder has no image lists of two cameras",
             where=folder,
-            expected="left.txt and right.txt, or the like",
+            expected="left.txt and right.txt, or similar",
             hint="name them with --left and --right",
         )
     return folder / found[0][0], folder / found[0][1]
@@ -85,5 +84,5 @@ def _read_list(path: Path) -> list[tuple[float, Path]]:
     check_increasing(np.array([stamp for stamp, _ in listed]), str(path))
     missing = next((picture for _, picture in listed if not picture.is_file()), None)
     if missing is not None:
-        raise SourceError("picture is missing", where=missing, hint=f"{path} lists it")
+        raise SourceError("image is missing", where=missing, hint=f"{path} lists it")
     return listed

@@ -1,4 +1,4 @@
-"""Drives in video files: one for each camera, or one with both views in each frame."""
+"""Drives in video files: one per camera, or one with both views in each frame."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class VideoSource:
 
     Attributes:
         name: Name of the file or folder.
-        description: What it was taken for.
+        description: Recognised kind and frame rate.
         calibration: The rectified camera, or the two raw ones.
         videos: One file with both views, or left and right.
-        settings: Where the views are, and the rate if the file's is not to be believed.
+        settings: Arrangement of the views, and the frame rate if that of the file is overridden.
         texts: The calibration file.
     """
 
@@ -43,7 +43,7 @@ class VideoSource:
 
     @property
     def truth(self) -> SequenceTruth | None:
-        """None: videos have no place for it."""
+        """None: videos contain no ground truth."""
         return None
 
     @property
@@ -61,8 +61,8 @@ class VideoSource:
         """Decode the pairs from number ``start`` on.
 
         Raises:
-            SourceError: The times of the two files run apart.
-            FormatError: A frame cannot be decoded, or times stand still or run backwards.
+            SourceError: The times of the two files drift apart.
+            FormatError: A frame cannot be decoded, or its time does not increase.
         """
         last_s = -np.inf
         for index, (stamp_s, left, right) in enumerate(self._views(start), start=start):
@@ -71,7 +71,7 @@ class VideoSource:
             time_s = index / self.settings.rate_hz if self.settings.rate_hz else stamp_s
             if time_s <= last_s:
                 raise FormatError(
-                    "times of the video stand still or run backwards",
+                    "times of the video do not increase",
                     where=f"{self.videos[0].path}, frame {index}",
                     hint="give the rate with --set source.rate_hz=",
                 )
@@ -86,7 +86,7 @@ class VideoSource:
         pairs = zip(*(video.read(start) for video in self.videos), strict=True)
         apart_s: float | None = None
         for index, ((left_s, left), (right_s, right)) in enumerate(pairs, start=start):
-            # Two containers may begin at different times; what counts is that both go on alike.
+            # Two containers may start at different times, but must then advance alike.
             apart_s = right_s - left_s if apart_s is None else apart_s
             self._check_pace(index, right_s - left_s - apart_s)
             yield left_s, left, right
@@ -95,7 +95,7 @@ class VideoSource:
         period_s = 1 / self.videos[0].rate_hz
         if abs(drift_s) > period_s / 2 and self.settings.rate_hz is None:
             raise SourceError(
-                "left and right video run apart",
+                "left and right videos drift apart",
                 where=f"{self.videos[1].path}, frame {index}",
                 got=f"{drift_s:+.4g} s since the start",
                 expected=f"less than half a frame, {period_s / 2:.4g} s",
@@ -104,12 +104,12 @@ class VideoSource:
 
 
 def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
-    """Open a file with both views, a left file (``settings.right`` names the other), or a folder.
+    """Open a file with both views, a left file (``settings.right`` is the other), or a folder.
 
     Raises:
         SourceError: A file is missing, the two differ in number, rate or size of frames, or the
             calibration is missing.
-        FormatError: A file is no video, or damaged.
+        FormatError: A file is not a video, or is damaged.
         CalibrationError: The calibration cannot give depth.
     """
     videos = tuple(open_video(file) for file in _find_videos(path, settings))
@@ -141,7 +141,7 @@ def view_size(video: VideoFile, settings: SourceSettings) -> tuple[int, int]:
     """Width and height of one of the two views in a video.
 
     Raises:
-        SourceError: The frame cannot be halved.
+        SourceError: The frame size is odd.
     """
     stacked = settings.side_by_side in _STACKED
     whole = video.height_px if stacked else video.width_px
@@ -150,14 +150,14 @@ def view_size(video: VideoFile, settings: SourceSettings) -> tuple[int, int]:
             "frames of the video cannot be halved",
             where=video.path,
             got=f"{video.width_px}x{video.height_px}",
-            hint="two videos are given as: recon map LEFT --right RIGHT",
+            hint="for two videos: recon map LEFT --right RIGHT",
         )
     width_px, height_px = _size(video)
     return (width_px, height_px // 2) if stacked else (width_px // 2, height_px)
 
 
 def split_views(image: UInt8, settings: SourceSettings) -> tuple[UInt8, UInt8]:
-    """Left and right view of a frame that holds both."""
+    """Split a frame into its left and right view."""
     axis = 0 if settings.side_by_side in _STACKED else 1
     first, second = (np.ascontiguousarray(view) for view in np.split(image, 2, axis=axis))
     swapped = settings.side_by_side in {"right-left", "bottom-top"}
@@ -197,7 +197,7 @@ def _check_alike(left: VideoFile, right: VideoFile) -> None:
     ):
         if ours != theirs:
             raise SourceError(
-                f"left and right video have different {what}",
+                f"left and right videos have different {what}",
                 where=right.path,
                 got=f"left {ours}, right {theirs}",
                 hint="cut both to the frames that were taken together",

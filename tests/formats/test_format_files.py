@@ -15,7 +15,7 @@ from recon.formats.yaml_file import read_yaml, write_yaml
     [
         (None, "file does not exist"),
         (b"", "file is empty"),
-        (b"\xff\xfe\x00", r"not a text file \(got byte 0 is no UTF-8\)"),
+        (b"\xff\xfe\x00", r"not a text file \(got byte 0 is not UTF-8\)"),
     ],
 )
 def test_unreadable_text_is_one_clear_line_with_the_file(
@@ -52,7 +52,7 @@ def test_table_skips_comments_and_empty_lines_and_remembers_line_numbers(tmp_pat
         ("1 2\n1 2 3\n", r":2: wrong number of columns \(got 3, expected 2\)"),
         ("1 2\n1 nan\n", r":2: number is not finite \(got 1 nan\)"),
         ("1 x\n", r":1: not a number \(got 1 x\)"),
-        ("# nothing\n", ": file holds no numbers"),
+        ("# nothing\n", ": file contains no numbers"),
     ],
 )
 def test_a_bad_row_is_named_by_file_and_line(tmp_path: Path, text: str, message: str) -> None:
@@ -79,7 +79,7 @@ def test_yaml_comes_back_as_it_was_written_and_in_order(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("a: [1\nb: 2\n", r"c\.yaml:2: not a YAML file"),
-        ("- 1\n", r"c\.yaml: YAML file is no mapping \(got list\)"),
+        ("- 1\n", r"c\.yaml: YAML file is not a mapping \(got list\)"),
     ],
 )
 def test_bad_yaml_is_one_clear_line(tmp_path: Path, text: str, message: str) -> None:

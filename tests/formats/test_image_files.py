@@ -80,7 +80,7 @@ def test_grey_stored_as_three_equal_channels_is_grey_and_colours_are_refused(
     write_image(tmp_path / "grey.png", np.repeat(grey[:, :, None], 3, axis=2))
     np.testing.assert_array_equal(read_grey_levels(tmp_path / "grey.png"), grey)
     write_image(tmp_path / "rgb.png", picture(4, 5, 3))
-    with pytest.raises(FormatError, match=r"rgb\.png: image has colours"):
+    with pytest.raises(FormatError, match=r"rgb\.png: image is in colour"):
         read_grey_levels(tmp_path / "rgb.png")
 
 

@@ -136,5 +136,5 @@ def test_a_cloud_is_no_mesh(tmp_path: Path) -> None:
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
         "property float z\nend_header\n0 0 0\n"
     )
-    with pytest.raises(FormatError, match="it is a cloud"):
+    with pytest.raises(FormatError, match="it is a point cloud"):
         read_mesh(tmp_path / "a.ply")

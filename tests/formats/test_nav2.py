@@ -73,10 +73,10 @@ def test_writing_into_a_file_is_an_output_error(tmp_path: Path) -> None:
     ("change", "words"),
     [
         ({"mode": "scale"}, "mode"),
-        ({"origin": [0, 0, 0.5]}, "turned"),
-        ({"origin": "here"}, "no number"),
-        ({"resolution": None}, "no number"),
-        ({"image": "other.pgm"}, "picture"),
+        ({"origin": [0, 0, 0.5]}, "rotated"),
+        ({"origin": "here"}, "not a number"),
+        ({"resolution": None}, "not a number"),
+        ({"image": "other.pgm"}, "image"),
     ],
 )
 def test_maps_that_cannot_be_read_rightly_are_refused(

@@ -97,7 +97,9 @@ def test_millimetres_become_metres(tmp_path: Path) -> None:
 
 def test_millimetres_taken_for_metres_are_noticed(tmp_path: Path) -> None:
     path = write_nodes(tmp_path / "stereo.yml", **both_cameras(), **pose(1000.0))
-    with pytest.raises(CalibrationError, match=r"stereo\.yml: baseline is longer.*got 120\.\d+ m"):
+    with pytest.raises(
+        CalibrationError, match=r"stereo\.yml: baseline is implausibly.*got 120\.\d+ m"
+    ):
         read_opencv_calibration(path, size_px=(640, 480))
 
 
@@ -126,7 +128,7 @@ def test_extrinsics_may_have_any_name_when_given(tmp_path: Path) -> None:
         ({"M1": -LEFT}, CalibrationError, "focal length is not positive"),
         ({"T": np.zeros((3, 1))}, CalibrationError, "baseline is zero"),
         ({"R": 2 * np.eye(3)}, CalibrationError, "rotation of the right camera is not orthonormal"),
-        ({"image_width": None}, FormatError, "does not tell the size of the pictures"),
+        ({"image_width": None}, FormatError, "does not contain the image size"),
     ],
 )
 def test_a_bad_calibration_is_one_clear_line_with_the_file(
@@ -145,7 +147,7 @@ def test_a_bad_calibration_is_one_clear_line_with_the_file(
 )
 def test_what_file_storage_cannot_parse_is_one_clear_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "stereo.yml").write_text(text)
-    with pytest.raises(FormatError, match=r"stereo\.yml: not a file of OpenCV's FileStorage"):
+    with pytest.raises(FormatError, match=r"stereo\.yml: not an OpenCV FileStorage file"):
         read_opencv_calibration(tmp_path / "stereo.yml", size_px=(640, 480))
 
 

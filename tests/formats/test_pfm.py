@@ -54,7 +54,7 @@ def test_both_byte_orders_are_read_and_the_magnitude_of_the_scale_changes_nothin
         (None, "file does not exist"),
         (b"", "file is empty"),
         (b"P5\n1 1\n255\n\x00", "not a PFM file"),
-        (b"PF\n1 1\n-1\n" + bytes(12), "PFM file has colours"),
+        (b"PF\n1 1\n-1\n" + bytes(12), "PFM file is in colour"),
         (b"Pf\n2 2\n-1\n" + bytes(12), r"truncated \(got 12 bytes, expected 16 for 2x2 pixels\)"),
         (b"Pf\n0 2\n-1\n" + bytes(12), "truncated"),
         (b"Pf\n1 1\n0\n" + bytes(4), r"scale .* \(got 0\)"),

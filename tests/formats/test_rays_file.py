@@ -106,7 +106,7 @@ def test_a_flipped_bit_is_told(tmp_path: Path, place: int) -> None:
 def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "rays.bin"
     path.write_bytes(content)
-    with pytest.raises(FormatError, match="holds no rays"):
+    with pytest.raises(FormatError, match="not a ray file"):
         RayFile(path)
 
 

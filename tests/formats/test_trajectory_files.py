@@ -110,9 +110,9 @@ def test_the_kind_is_told_by_the_columns(tmp_path: Path) -> None:
         ("", ": file is empty"),
         (IDENTITY + "1 0 0 0 0 1 0 0 0 0 1\n", ":2: wrong number of columns .got 11, expected 12"),
         (IDENTITY + IDENTITY.replace("1 0\n", "1 nan\n"), ":2: number is not finite"),
-        (IDENTITY.replace("1 0 0 0 0", "2 0 0 0 0"), ":1: pose is no rigid motion"),
-        (IDENTITY.replace("1 0\n", "-1 0\n"), ":1: pose is no rigid motion"),
-        ("0 " * 11 + "0\n", ":1: pose is no rigid motion"),
+        (IDENTITY.replace("1 0 0 0 0", "2 0 0 0 0"), ":1: pose is not a rigid transform"),
+        (IDENTITY.replace("1 0\n", "-1 0\n"), ":1: pose is not a rigid transform"),
+        ("0 " * 11 + "0\n", ":1: pose is not a rigid transform"),
         (IDENTITY + "0 0 0 0 0 0 0 1\n", ":2: wrong number of columns .got 8, expected 12"),
         ("1 2 3\n", ":1: wrong number of columns .got 3, expected 12 or 8"),
         ("0 0 0 0 0 0 0 0\n", ":1: quaternion is not of unit length .got 0"),
@@ -131,7 +131,7 @@ def test_a_bad_trajectory_is_one_line_that_names_the_place(
 
 def test_a_number_of_poses_that_is_not_that_of_the_times_is_told(tmp_path: Path) -> None:
     (tmp_path / "p.txt").write_text(IDENTITY * 2)
-    with pytest.raises(FormatError, match=r"p\.txt: number of poses .* \(got 2 poses, expected 3"):
+    with pytest.raises(FormatError, match=r"p\.txt: numbers of poses .*\(got 2 poses, expected 3"):
         read_trajectory(tmp_path / "p.txt", np.arange(3.0))
 
 

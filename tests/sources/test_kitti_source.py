@@ -147,10 +147,10 @@ def empty_both(folder: Path) -> None:
     ("spoil", "error", "message"),
     [
         (remove("image_1/000001.png"), SourceError,
-         r"image_1/000001\.png: picture is missing \(got 3 left and 2 right pictures\)"),
-        (remove("image_0/000002.png"), SourceError, r"image_0/000002\.png: picture is missing"),
-        (empty("image_1"), SourceError, r"image_1/000000\.png: picture is missing"),
-        (empty_both, SourceError, "image_0: folder holds no pictures"),
+         r"image_1/000001\.png: image is missing \(got 3 left and 2 right images\)"),
+        (remove("image_0/000002.png"), SourceError, r"image_0/000002\.png: image is missing"),
+        (empty("image_1"), SourceError, r"image_1/000000\.png: image is missing"),
+        (empty_both, SourceError, "image_0: folder contains no images"),
         (drop_folder("image_1"), SourceError, "folder of the other camera is missing.*image_1"),
         (remove("calib.txt"), SourceError, r"calib\.txt: calibration is missing; .*--calib"),
         (write("calib.txt", f"P0: {CALIB[0]}\n"), FormatError, r"calib\.txt: .*has no P1"),
@@ -160,14 +160,14 @@ def empty_both(folder: Path) -> None:
          r"calib\.txt: baseline is negative.*swapped"),
         (remove("times.txt"), SourceError, r"times\.txt: times are missing; .*source\.rate_hz="),
         (write("times.txt", "0\n0.1\n"), SourceError,
-         r"times\.txt: fewer times than pictures \(got 2 times, expected 3\)"),
+         r"times\.txt: fewer times than images \(got 2 times, expected 3\)"),
         (write("times.txt", "0\n0.2\n0.1\n"), FormatError, r"times\.txt:3: time runs backwards"),
         (write("times.txt", "0\nnan\n1\n"), FormatError, r"times\.txt:2: number is not finite"),
         (write("poses.txt", IDENTITY), SourceError,
-         r"poses\.txt: fewer poses than pictures \(got 1 poses, expected 3\)"),
+         r"poses\.txt: fewer poses than images \(got 1 poses, expected 3\)"),
         (write("poses.txt", IDENTITY * 2 + "nan " * 12), FormatError,
          r"poses\.txt:3: number is not finite"),
-        (write("poses.txt", "2" + IDENTITY[1:]), FormatError, r"poses\.txt:1: .*no rigid motion"),
+        (write("poses.txt", "2" + IDENTITY[1:]), FormatError, r"poses\.txt:1: .*rigid transform"),
         (write("image_0/000000.png", "text"), FormatError, r"000000\.png: not an image"),
     ],
 )  # fmt: skip
@@ -195,7 +195,9 @@ def test_a_picture_of_another_size_is_named_when_its_turn_comes(tmp_path: Path, 
     folder = make_drive(tmp_path)
     write_image(folder / name, np.zeros((16, 31), dtype=np.uint8))
     source = open_kitti(folder)
-    with pytest.raises(FormatError, match=rf"{name}: .*another size.*got 31x16, expected 32x16"):
+    with pytest.raises(
+        FormatError, match=rf"{name}: .*image size differs.*got 31x16, expected 32x16"
+    ):
         list(source)
 
 
@@ -215,7 +217,7 @@ def test_a_missing_folder_is_told(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="image_2: folder does not exist"):
         open_kitti(make_drive(tmp_path), cameras=(2, 3))
     (tmp_path / "other").mkdir()
-    with pytest.raises(SourceError, match="other: folder has no pictures in KITTI's layout"):
+    with pytest.raises(SourceError, match="other: folder has no images in KITTI's layout"):
         open_kitti(tmp_path / "other")
 
 

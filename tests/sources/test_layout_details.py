@@ -44,7 +44,7 @@ def test_an_unrectified_kitti_drive_gets_its_raw_lenses(
     # xyz_1 = xyz_0 + T_01: the right camera is half a metre to the right.
     np.testing.assert_allclose(rig.T_right_left[:3, 3], [-0.5, 0, 0], atol=1e-12)
     calib.write_text(text)
-    with pytest.raises(ReconError, match=r"got 64x32, expected 60x30 rectified, 1392x512 not"):
+    with pytest.raises(ReconError, match=r"got 64x32, expected 60x30 rectified, 1392x512 raw"):
         open_source(drive)
 
 
@@ -72,7 +72,7 @@ def test_the_true_path_of_euroc_is_that_of_the_left_camera(
     truth.write_text("\n".join(rows[3:]) + "\n")
     source = open_source(tmp_path)
     assert source.truth is None
-    assert "true path for 10 of 12 frames alone: not used" in source.description
+    assert "ground truth for only 10 of 12 frames: not used" in source.description
 
 
 def test_a_true_path_beside_plain_folders_is_read(pairs: list[StereoPair], tmp_path: Path) -> None:

@@ -132,9 +132,9 @@ def make_other(folder: Path) -> None:
     ("make", "message"),
     [
         (make_nothing, "folder does not exist"),
-        (make_file, "file is no source of stereo pairs"),
+        (make_file, "file is not a source of stereo pairs"),
         (make_empty, "folder is empty"),
-        (make_other, "folder is no source of stereo pairs.*KITTI drive.*Middlebury scene"),
+        (make_other, "folder is not a source of stereo pairs.*KITTI drive.*Middlebury scene"),
     ],
 )
 def test_what_is_no_source_is_one_clear_line(tmp_path: Path, make: type, message: str) -> None:

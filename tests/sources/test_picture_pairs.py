@@ -77,11 +77,11 @@ def test_pictures_without_a_partner_are_named(
 
 def test_a_pattern_that_takes_both_sides_is_refused(tmp_path: Path) -> None:
     touch(tmp_path, "left1.png", "right1.png")
-    with pytest.raises(SourceError, match=r"left1\.png: left and right are the same pictures"):
+    with pytest.raises(SourceError, match=r"left1\.png: left and right are the same images"):
         pair_pictures(str(tmp_path / "*"), str(tmp_path / "*"))
 
 
 def test_a_pattern_without_pictures_is_told_and_to_be_quoted(tmp_path: Path) -> None:
     touch(tmp_path, "left1.txt")
-    with pytest.raises(SourceError, match=r"no pictures there.*in quotes"):
+    with pytest.raises(SourceError, match=r"no images found.*in quotes"):
         list_pictures(str(tmp_path / "left*"))

@@ -81,7 +81,7 @@ def test_stamps_out_of_order_are_told_with_topic_and_place(
             bag.write(TOPICS[0], number * 10**8, bag.image(stamp, pair.left))
             bag.write(TOPICS[1], number * 10**8, bag.image(stamp, pair.right))
     path = next(p for p in tmp_path.rglob("*") if p.suffix in {".bag", ".mcap", ".db3"})
-    fails(path, r"image_rect, picture 6: time stamps are out of order")
+    fails(path, r"image_rect, image 6: timestamps are out of order")
 
 
 def test_a_missing_topic_is_told_with_those_that_are_there(drive: Drive, tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_a_recording_without_calibration_asks_for_a_file(drive: Drive, tmp_path:
 
 def test_other_encodings_are_told(drive: Drive, tmp_path: Path) -> None:
     path = write_bag(*drive, tmp_path, Recording("ros1", encoding="32FC1"))
-    fails(path, "message 0: image encoding is not understood.*got 32FC1")
+    fails(path, "message 0: image encoding is not supported.*got 32FC1")
 
 
 def test_of_several_pairs_of_topics_the_rectified_one_is_taken_and_the_other_named(
@@ -128,14 +128,14 @@ def test_of_several_pairs_of_topics_the_rectified_one_is_taken_and_the_other_nam
     assert f"also there: {raw[0]}" in description
 
 
-def test_headers_without_stamps_fall_back_to_the_times_of_recording(
+def test_headers_without_stamps_fall_back_to_the_recording_times(
     drive: Drive, tmp_path: Path
 ) -> None:
     path = write_bag(*drive, tmp_path, Recording("ros1", stamped=False))
     # The right pictures are recorded 104 ms late here: nothing pairs within 10 ms ...
     source = open_source(path, settings=SourceSettings(tolerance_s=0.11))
     # ... and where the recording alone tells the times, that is said.
-    assert "times of recording" in source.description
+    assert "recording times" in source.description
 
 
 def spoil_video(write: drives.Writer, victim: str, share: float) -> Callable[[Drive, Path], Path]:
@@ -150,9 +150,9 @@ def spoil_video(write: drives.Writer, victim: str, share: float) -> Callable[[Dr
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (spoil_video(drives.write_lossy_videos, "left.mp4", 0.5), "not a video that can be read"),
+        (spoil_video(drives.write_lossy_videos, "left.mp4", 0.5), "not a readable video"),
         (spoil_video(drives.write_two_videos, "right.avi", 0.5), "video is truncated"),
-        (spoil_video(drives.write_side_by_side, "", 0.0), "not a video that can be read"),
+        (spoil_video(drives.write_side_by_side, "", 0.0), "not a readable video"),
         (spoil_video(drives.write_two_videos, "left.avi", 0.01), "video"),
     ],
 )
@@ -172,14 +172,16 @@ def test_videos_of_different_length_are_refused(drive: Drive, tmp_path: Path) ->
 def test_numbers_of_pictures_that_differ_are_refused(drive: Drive, tmp_path: Path) -> None:
     drives.write_folders(*drive, tmp_path)
     (tmp_path / "right" / "right3.png").unlink()
-    fails(tmp_path, r"numbers of left and right pictures differ \(got 12 left and 11 right")
+    fails(tmp_path, r"numbers of left and right images differ \(got 12 left and 11 right")
 
 
 def test_stamps_that_never_meet_tell_how_far_they_are_apart(drive: Drive, tmp_path: Path) -> None:
     pairs, camera = drive
     drives.write_stamped(pairs[:1], camera, tmp_path)
     settings = SourceSettings(tolerance_s=0.001)
-    fails(tmp_path, r"no left and right picture were taken at one time.*0\.002 s apart", settings)
+    fails(
+        tmp_path, r"no left and right images were taken at the same time.*0\.002 s apart", settings
+    )
 
 
 def test_a_video_that_cannot_be_halved_is_told() -> None:
@@ -193,7 +195,7 @@ def test_a_calibration_of_another_size_is_told(drive: Drive, tmp_path: Path) -> 
     drives.write_euroc(*drive, tmp_path)
     for path in tmp_path.rglob("*.png"):
         write_image(path, np.zeros((16, 32), np.uint8))
-    with pytest.raises(ReconError, match=r"another size.*got 32x16, expected 64x32"):
+    with pytest.raises(ReconError, match=r"image size differs.*got 32x16, expected 64x32"):
         list(open_source(tmp_path))
 
 
@@ -201,7 +203,7 @@ def test_a_listed_picture_that_is_missing_is_named(drive: Drive, tmp_path: Path)
     drives.write_tum(*drive, tmp_path)
     victim = sorted((tmp_path / "right").iterdir())[4]
     victim.unlink()
-    with pytest.raises(ReconError, match=rf"{victim.name}: picture is missing"):
+    with pytest.raises(ReconError, match=rf"{victim.name}: image is missing"):
         open_source(tmp_path)
 
 
