@@ -1,4 +1,4 @@
-"""What `recon paper` tries."""
+"""Settings of `recon paper`."""
 
 from __future__ import annotations
 
@@ -11,18 +11,21 @@ class PaperSettings(Settings):
     """How the seed paper's experiments are repeated."""
 
     as_printed: bool = Field(
-        default=False, description="Try the method as printed too, beside the corrected one."
+        default=False, description="Run the method as printed as well as the corrected one."
     )
     patch_px: int = Field(
-        default=11, ge=3, le=61, description="Patch of the printed method; odd. Our choice."
+        default=11,
+        ge=3,
+        le=61,
+        description="Patch size of the printed method, odd. The paper does not give one.",
     )
     patches_px: tuple[int, ...] = Field(
         default=tuple(range(3, 22, 2)),
         min_length=1,
-        description="Patches, and windows of the matcher `sad`, that are compared; odd.",
+        description="Patch sizes, and window sizes of the matcher `sad`, to compare; odd.",
     )
     bad_px: float = Field(
-        default=1.0, gt=0, description="Disparity error from which a pixel counts as wrong."
+        default=1.0, gt=0, description="Disparity error above which a pixel counts as wrong."
     )
 
     @field_validator("patch_px", "patches_px")

@@ -1,4 +1,4 @@
-"""What a run looks like: figures, tables and one HTML file that needs no network."""
+"""Reports of runs: figures, tables and one self-contained HTML file."""
 
 from recon.reports.calibration_report import present_calibration
 from recon.reports.html import ReportContent, render_html

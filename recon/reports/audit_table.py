@@ -1,4 +1,4 @@
-"""An audit as a person reads it: one line for each thing that was looked at."""
+"""The result of an audit as text: one line per check."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ _UNKNOWN = "not known"
 
 
 def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
-    """What was measured, in words.
+    """Describe the measurements of an audit.
 
     Args:
-        summary: What `recon audit --json` prints.
+        summary: The output of `recon audit --json`.
 
     Returns:
-        Subject and text, in the order in which they are read.
+        Subject and text of each line, in display order.
     """
     lines = {
         "frames": _frames(summary),
@@ -80,7 +80,7 @@ def _time(summary: Mapping[str, Any]) -> str:
     if summary["lag_frames"]:
         return f"right camera {summary['lag_frames']:+d} frames late"
     skew = summary["time_skew_frames"]
-    # No minus before a zero.
+    # Avoids a negative zero.
     return _known("right camera {:+.2f} frames late", skew and round(skew, 2) + 0.0)
 
 
@@ -95,7 +95,7 @@ def _known(text: str, *values: float | None) -> str:
 
 
 def _length(metres: float) -> str:
-    """Three digits, in the unit that a person would take."""
+    """A length in a readable unit."""
     for unit, factor, under in (("mm", 1000.0, 0.01), ("cm", 100.0, 1.0)):
         if metres < under:
             return f"{metres * factor:.2g} {unit}"

@@ -1,4 +1,4 @@
-"""Parts that the reports of several commands share."""
+"""Parts shared by the reports of several commands."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _HOW_TO_TURN: Final = (
 
 
 def known_figures(summary: Mapping[str, Any], formats: FigureFormats) -> list[tuple[str, str]]:
-    """Label and text of each figure of ``formats`` that the summary has as a finite number."""
+    """Label and text of each figure of ``formats`` that is a finite number in the summary."""
     return [
         (label, template.format(summary[key]))
         for key, (label, template) in formats.items()
@@ -39,7 +39,7 @@ def known_figures(summary: Mapping[str, Any], formats: FigureFormats) -> list[tu
 
 
 def stereo_blocks(pair: RectifiedPair, disparity: Disparity) -> list[Block]:
-    """A pair and all that was found for its pixels."""
+    """A pair and the results for its pixels."""
     wide = is_wide(disparity.values.shape)
     share = f"{100 * disparity.valid.mean():.1f} %"
     depth_m = depth_from_disparity(disparity.values, pair.camera)
@@ -72,7 +72,7 @@ def stereo_blocks(pair: RectifiedPair, disparity: Disparity) -> list[Block]:
 
 
 def scene_blocks(scene: Scene, caption: str) -> list[Block]:
-    """The view in 3-D, or nothing where there is nothing to see."""
+    """The 3-D view, or nothing if the scene is empty."""
     empty_cloud = scene.cloud is None or not len(scene.cloud)
     empty_mesh = scene.mesh is None or not len(scene.mesh.faces)
     if empty_cloud and empty_mesh:
@@ -81,7 +81,7 @@ def scene_blocks(scene: Scene, caption: str) -> list[Block]:
 
 
 def run_blocks(summary: Mapping[str, Any]) -> list[Block]:
-    """Where the time went, and every figure of the summary."""
+    """Timing, and every figure of the summary."""
     blocks: list[Block] = []
     stages = {
         name: float(s) for name, s in dict(summary.get("stages") or {}).items() if is_number(s)
@@ -96,7 +96,7 @@ def run_blocks(summary: Mapping[str, Any]) -> list[Block]:
 
 
 def metrics_table(metrics: TrajectoryMetrics) -> TableBlock:
-    """How far a path is from the true one."""
+    """Errors of a path compared with the true one."""
     lengths = ", ".join(f"{length:.3g}" for length in metrics.segment_lengths_m)
     return TableBlock(
         "Path against truth",
@@ -119,7 +119,7 @@ def is_number(value: Any) -> bool:
 
 
 def _rows(summary: Mapping[Any, Any], prefix: str = "") -> Iterable[tuple[str, str]]:
-    """Names and texts of a nested mapping, one row for each leaf."""
+    """Names and texts of a nested mapping, one row per leaf."""
     for key, value in summary.items():
         if not prefix and key in _NOT_TABULATED:
             continue

@@ -1,4 +1,4 @@
-"""A calibration board as a sheet to print: PDF or PNG, to scale."""
+"""A calibration board as a printable sheet, to scale: PDF or PNG."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _CUSTOM: Final = re.compile(r"(\d+(?:\.\d*)?)\s*[x×]\s*(\d+(?:\.\d*)?)\s*mm", r
 _KINDS: Final = (".pdf", ".png")
 _MM_PER_IN: Final = 25.4
 _POINT_MM: Final = _MM_PER_IN / 72
-# A detector wants light around the pattern; and printers leave a few millimetres blank.
+# Detectors need a white border around the pattern, and printers leave a few millimetres blank.
 _MARGIN_SQUARES: Final = 0.4
 _SMALLEST_MARGIN_MM: Final = 10.0
 _RULER_MM: Final = 100.0
@@ -40,10 +40,10 @@ _LARGEST_PNG_PX: Final = 40_000
 
 @dataclass(frozen=True)
 class Sheet:
-    """Paper, turned so that a board fits.
+    """Paper, oriented so that a board fits.
 
     Attributes:
-        name: What it is called.
+        name: Name of the paper size.
         width_mm: Width.
         height_mm: Height.
     """
@@ -56,20 +56,20 @@ class Sheet:
 def write_board(
     path: Path, board: CalibrationBoard, paper: str | None = None, dpi: float = 300.0
 ) -> dict[str, Any]:
-    """Draw a board to scale, in the middle of a sheet, with a ruler to check the print by.
+    """Draw a board to scale in the centre of a sheet, with a ruler to check the print.
 
     Args:
         path: ``.pdf`` or ``.png``.
-        board: The board; its squares have a size.
-        paper: Name of a paper, or ``600x400mm``; None = the smallest A paper that it fits on.
-        dpi: Pixels per inch of a PNG, about: a square has a whole number of pixels.
+        board: The board, with a square size.
+        paper: Name of a paper size, or ``600x400mm``; None = the smallest A size that fits.
+        dpi: Approximate resolution of a PNG; a square has a whole number of pixels.
 
     Returns:
-        What was drawn, plain values.
+        A description of the sheet as plain values.
 
     Raises:
         SettingsError: The board has no size, or does not fit on the paper.
-        OutputError: The file is of another kind, or cannot be written.
+        OutputError: The suffix is neither, or the file cannot be written.
     """
     kind = path.suffix.lower()
     if kind not in _KINDS:
@@ -105,7 +105,7 @@ def write_board(
 
 
 def choose_sheet(board: CalibrationBoard, paper: str | None = None) -> Sheet:
-    """The paper that a board is drawn on, upright or across.
+    """The paper for a board, in portrait or landscape orientation.
 
     Raises:
         SettingsError: The paper is unknown, or the board does not fit.
@@ -140,7 +140,7 @@ def _turned(name: str, board: CalibrationBoard) -> Sheet:
 
 
 def _scale_to_fit(board: CalibrationBoard, sheet: Sheet) -> float:
-    """By how much the squares could grow (above 1) or must shrink on a sheet."""
+    """The factor by which the squares could grow (above 1) or must shrink on a sheet."""
     scales = []
     sides = zip((sheet.width_mm, sheet.height_mm), board.squares, strict=True)
     for paper_mm, squares in sides:
@@ -151,7 +151,7 @@ def _scale_to_fit(board: CalibrationBoard, sheet: Sheet) -> float:
 
 
 def _whole_pixels(board: CalibrationBoard, dpi: float) -> float:
-    """The resolution next to ``dpi`` at which a square has a whole number of pixels."""
+    """The resolution nearest to ``dpi`` at which a square has a whole number of pixels."""
     square_in = 1e3 * board.square_m / _MM_PER_IN
     return max(round(square_in * dpi), 1) / square_in
 
@@ -172,23 +172,23 @@ def _draw(board: CalibrationBoard, sheet: Sheet, kind: str, dpi: float) -> bytes
     axes = _page(figure, sheet)
     width_mm, height_mm = (1e3 * length for length in board.size_m)
     left_mm, top_mm = (sheet.width_mm - width_mm) / 2, (sheet.height_mm - height_mm) / 2
-    if kind == "png":  # squares begin and end with a pixel
+    if kind == "png":  # align squares with pixels
         pixel_mm = _MM_PER_IN / dpi
         left_mm, top_mm = (round(mm / pixel_mm) * pixel_mm for mm in (left_mm, top_mm))
-    # The first inner corner is one square in from the corner of the pattern.
+    # The first inner corner is one square inside the corner of the pattern.
     first_mm = np.array([left_mm, top_mm]) + 1e3 * board.square_m
     dark_mm = 1e3 * dark_rectangles(board) + np.tile(first_mm, 2)
     axes.add_patch(PathPatch(_outline(dark_mm), facecolor="black", linewidth=0))
     _note(axes, board, sheet, top_mm)
     buffer = io.BytesIO()
-    # Without the date, the same board is the same file.
+    # Without the date, equal boards give equal files.
     undated = {"CreationDate": None} if kind == "pdf" else {}
     figure.savefig(buffer, format=kind, dpi=dpi, metadata=undated)
     return buffer.getvalue()
 
 
 def _page(figure: Figure, sheet: Sheet) -> Axes:
-    """Axes over the whole sheet: millimetres from its upper left corner."""
+    """Axes over the whole sheet, in millimetres from its upper left corner."""
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
     axes.set_xlim(0, sheet.width_mm)
@@ -197,7 +197,7 @@ def _page(figure: Figure, sheet: Sheet) -> Axes:
 
 
 def _outline(boxes_mm: Float64) -> Outline:
-    """All boxes (N, 4) as one path: filled at once, neighbours show no seam between them."""
+    """All boxes (N, 4) as one path, so that neighbours are filled without a seam."""
     x0, y0, x1, y1 = boxes_mm.T
     corners = np.stack([x0, y0, x1, y0, x1, y1, x0, y1, x0, y0], axis=1).reshape(-1, 2)
     one = [Outline.MOVETO, Outline.LINETO, Outline.LINETO, Outline.LINETO, Outline.CLOSEPOLY]
@@ -205,7 +205,7 @@ def _outline(boxes_mm: Float64) -> Outline:
 
 
 def _note(axes: Axes, board: CalibrationBoard, sheet: Sheet, margin_mm: float) -> None:
-    """What the board is, and a ruler that shows whether a print has its scale."""
+    """A description of the board, and a ruler to check the scale of a print."""
     size_mm = min(2.5, 0.2 * margin_mm)
     y = sheet.height_mm - max(0.4 * margin_mm, 5.0)
     ruler_mm = min(_RULER_MM, 10 * (sheet.width_mm // 25))

@@ -1,4 +1,4 @@
-"""Figures of a calibration: where the board was, how well each view fits, what depth is worth."""
+"""Figures of a calibration: board coverage, error of each view, and depth error."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CELLS = (8, 6)
 
 
 def coverage_figure(run: CalibrationRun) -> bytes:
-    """PNG: every corner that was seen, in both pictures, over the cells that coverage counts."""
+    """PNG of all detected corners in both images, over the cells of the coverage measure."""
     width, height = run.seen.size_px
     figure = new_figure(WIDE_IN, WIDE_IN / 2 * height / width + 0.5)
     for side, axes in enumerate(figure.subplots(1, 2)):
@@ -38,7 +38,7 @@ def coverage_figure(run: CalibrationRun) -> bytes:
 
 
 def errors_figure(run: CalibrationRun) -> bytes:
-    """PNG: rms error of each view in both pictures, and of those that were dropped."""
+    """PNG of the RMS error of each view in both images, including dropped views."""
     names = [*(view.name for view in run.fit.views), *run.fit.dropped]
     used = len(run.fit.views)
     figure = new_figure(WIDE_IN, 3.4)
@@ -58,7 +58,7 @@ def errors_figure(run: CalibrationRun) -> bytes:
 
 
 def rows_figure(run: CalibrationRun) -> bytes:
-    """PNG: how far apart the rows of a corner are after rectification."""
+    """PNG of the row differences of the corners after rectification."""
     figure = new_figure(HALF_IN, 3.4)
     axes = figure.subplots()
     reach = max(float(np.quantile(np.abs(run.rows_px), 0.999)), 0.05)
@@ -69,7 +69,7 @@ def rows_figure(run: CalibrationRun) -> bytes:
 
 
 def depth_error_figure(run: CalibrationRun) -> bytes:
-    """PNG: depth error by depth: of matching, and of the calibration with its interval."""
+    """PNG of the depth error by depth: from matching, and from calibration with its interval."""
     known = [each for each in run.spread.depths if np.isfinite(each.calibration_m)]
     figure = new_figure(HALF_IN, 3.4)
     axes = figure.subplots()

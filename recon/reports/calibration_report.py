@@ -34,7 +34,7 @@ from recon.structures import StereoPair
 
 
 def present_calibration(run: CalibrationRun, directory: RunDirectory) -> None:
-    """Write ``report.html`` of a calibration, and its pictures beside it.
+    """Write ``report.html`` of a calibration, and its pictures.
 
     Raises:
         OutputError: A file cannot be written.
@@ -54,7 +54,7 @@ def present_calibration(run: CalibrationRun, directory: RunDirectory) -> None:
 
 
 def epipolar_pictures(run: CalibrationRun) -> tuple[bytes, bytes]:
-    """PNG of the view of median error: raw with its epipolar curves, rectified with its rows."""
+    """PNGs of the view with median error: raw with epipolar curves, rectified with rows."""
     view = run.fit.views[int(np.argsort(run.fit.errors_px.sum(axis=1))[len(run.fit.views) // 2])]
     left_px, right_px = shared_pixels(view)
     chosen = spread_points(left_px)

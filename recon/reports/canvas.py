@@ -1,4 +1,4 @@
-"""The look that all figures share, drawn without pyplot: no display and no global state."""
+"""The common style of all figures, drawn without pyplot: no display and no global state."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LINES: Final = "#d8dee4"
 def new_figure(
     width_in: float, height_in: float, layout: Literal["constrained"] | None = "constrained"
 ) -> Figure:
-    """An empty figure of the shared look; ``layout`` None = the caller places its axes."""
+    """An empty figure in the common style; ``layout`` None = the caller places the axes."""
     figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout=layout)
     figure.set_facecolor("white")
     FigureCanvasAgg(figure)
@@ -33,14 +33,14 @@ def new_figure(
 
 
 def to_png(figure: Figure) -> bytes:
-    """Draw a figure to the bytes of a PNG file."""
+    """Render a figure to the bytes of a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=DPI)
     return buffer.getvalue()
 
 
 def style_plot(axes: Axes, x_label: str, y_label: str) -> None:
-    """Give axes of numbers their labels, a faint mesh and no box."""
+    """Style a plot: axis labels, a faint grid and no box."""
     axes.set_xlabel(x_label, color=INK)
     axes.set_ylabel(y_label, color=INK)
     axes.grid(visible=True, color=_LINES, linewidth=0.8)
@@ -53,13 +53,13 @@ def style_plot(axes: Axes, x_label: str, y_label: str) -> None:
 
 
 def style_picture(axes: Axes, title: str) -> None:
-    """Give axes that hold a picture their title and take the pixel numbers away."""
+    """Style an image: a title and no axis ticks."""
     axes.set_title(title, loc="left", fontsize=11, color=INK)
     axes.set_axis_off()
 
 
 def write_note(axes: Axes, text: str) -> None:
-    """Say in the middle of empty axes why they are empty."""
+    """Write a note in the centre of empty axes."""
     axes.text(0.5, 0.5, text, ha="center", va="center", color=FAINT, transform=axes.transAxes)
 
 

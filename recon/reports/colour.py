@@ -1,4 +1,4 @@
-"""From values to colours: one scale, and one colour for what is not known, per kind of value."""
+"""Colours for values: one scale per kind of value, and one colour for unknown."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CONFIDENCE_SCALE: Final = "viridis"
 ERROR_SCALE: Final = "RdYlBu_r"
 MISSING: Final[Rgb] = (20, 22, 26)
 
-# Valid pixels recede, each way of failing stands out; told apart by lightness too.
+# Valid pixels recede and each failure stands out, also in lightness.
 REASON_COLOURS: Final[Mapping[Reason, Rgb]] = MappingProxyType(
     {
         Reason.VALID: (226, 232, 236),
@@ -53,7 +53,7 @@ _GRID_PICTURE_PX: Final = 1500
 GRID_FREE: Final[Rgb] = (247, 249, 250)
 GRID_OCCUPIED: Final[Rgb] = (24, 28, 34)
 GRID_UNKNOWN: Final[Rgb] = (190, 197, 204)
-# Right cells keep the colours of a grid; what is not counted is darker than what is.
+# Correct cells keep the colours of a grid; cells that do not count are darker.
 GRID_ERRORS: Final[Mapping[tuple[int, int], Rgb]] = MappingProxyType(
     {
         (FREE, FREE): GRID_FREE,
@@ -70,7 +70,7 @@ GRID_NOT_COUNTED: Final[Rgb] = (120, 128, 136)
 def colour_disparity(
     values: NDArray[Any], low: float | None = None, high: float | None = None
 ) -> UInt8:
-    """Colour a disparity map: far is blue, near is red, unknown is almost black.
+    """Colour a disparity map: far is blue, near is red, invalid is almost black.
 
     Args:
         values: (H, W), pixels; NaN = no match.
@@ -84,17 +84,17 @@ def colour_disparity(
 
 
 def colour_confidence(confidence: NDArray[Any]) -> UInt8:
-    """Colour a confidence map (H, W) in [0, 1]; 0, which is no match, is almost black."""
+    """Colour a confidence map (H, W) in [0, 1]; 0 (no match) is almost black."""
     known = np.where(confidence > 0, confidence, np.nan)
     return colour_values(known, CONFIDENCE_SCALE, (0.0, 1.0))
 
 
 def colour_error(error: NDArray[Any], limit: float) -> UInt8:
-    """Colour errors by their size: 0 is blue, ``limit`` and more is red, NaN almost black.
+    """Colour absolute errors: 0 is blue, ``limit`` and above is red, NaN is almost black.
 
     Args:
         error: (H, W), of either sign.
-        limit: The error, in the same unit, that gets the last colour.
+        limit: Error of the last colour, in the same unit.
     """
     return colour_values(np.abs(error), ERROR_SCALE, (0.0, limit))
 
@@ -103,7 +103,7 @@ def colour_reasons(reason: UInt8) -> UInt8:
     """Colour a map of `Reason` codes (H, W) by `REASON_COLOURS`.
 
     Raises:
-        ShapeError: A code is no `Reason`.
+        ShapeError: A code is not a `Reason`.
     """
     table = np.zeros((len(Reason), 3), dtype=np.uint8)
     for code, colour in REASON_COLOURS.items():
@@ -115,7 +115,7 @@ def colour_reasons(reason: UInt8) -> UInt8:
 
 
 def colour_grid(grid: OccupancyGrid) -> UInt8:
-    """Colour a grid as a map is read: row 0 of the picture is the largest y.
+    """Colour a grid as a map with y up: row 0 of the image is the largest y.
 
     Returns:
         uint8 (rows, columns, 3) RGB: free is almost white, occupied almost black.
@@ -127,13 +127,13 @@ def colour_grid(grid: OccupancyGrid) -> UInt8:
 
 
 def colour_grid_errors(grid: OccupancyGrid, truth: OccupancyTruth) -> UInt8:
-    """Colour a grid by what is true, over the cells that are compared.
+    """Colour a grid by comparison with ground truth.
 
     Returns:
-        uint8 (rows, columns, 3) RGB, row 0 = the largest y. Right cells are almost white (free)
-        or almost black; an obstacle that is called free is red, one that is not known blue, an
-        invented one orange, free ground that is not known green; what was not seen is grey.
-        A cell is a square of whole pixels, so that a small grid can be looked at too.
+        uint8 (rows, columns, 3) RGB, row 0 = the largest y. Correct cells are almost white (free)
+        or almost black (occupied); an obstacle marked free is red, one marked unknown blue, a
+        false obstacle orange, free ground marked unknown green; unseen cells are grey. Each cell
+        is a square of whole pixels, so that small grids are enlarged.
     """
     cells = grid_on_truth(grid, truth)
     picture = np.full((*cells.shape, 3), GRID_NOT_COUNTED, dtype=np.uint8)
@@ -146,7 +146,7 @@ def colour_grid_errors(grid: OccupancyGrid, truth: OccupancyTruth) -> UInt8:
 def colour_values(
     values: NDArray[Any], scale: str, limits: tuple[float, float], missing: Rgb = MISSING
 ) -> UInt8:
-    """Colour numbers of any shape by a named scale of matplotlib; NaN gets ``missing``."""
+    """Colour values of any shape by a matplotlib colormap; NaN gets ``missing``."""
     low, high = limits
     span = max(high - low, np.finfo(np.float32).tiny)
     unit = np.clip((np.asarray(values, dtype=np.float64) - low) / span, 0.0, 1.0)
@@ -156,7 +156,7 @@ def colour_values(
 
 
 def scale_colours(scale: str) -> UInt8:
-    """uint8 (256, 3): the colours of a named scale of matplotlib, from low to high."""
+    """uint8 (256, 3): the colours of a matplotlib colormap, from low to high."""
     table = colormaps[scale](np.linspace(0.0, 1.0, 256), bytes=True)
     return np.asarray(table[:, :3], dtype=np.uint8)
 
@@ -164,7 +164,7 @@ def scale_colours(scale: str) -> UInt8:
 def value_range(
     values: NDArray[Any], low: float | None = None, high: float | None = None
 ) -> tuple[float, float]:
-    """Limits of a colour scale: what is given, else the 1st and 99th percentile; never empty."""
+    """Limits of a colour scale: as given, else the 1st and 99th percentile; never empty."""
     finite = np.asarray(values)[np.isfinite(values)]
     if finite.size:
         found_low, found_high = np.percentile(finite, (1.0, 99.0))
@@ -176,6 +176,6 @@ def value_range(
 
 
 def unit_colour(colour: Rgb) -> tuple[float, float, float]:
-    """A colour as matplotlib takes it: each part in [0, 1]."""
+    """A colour for matplotlib, with components in [0, 1]."""
     red, green, blue = colour
     return red / 255, green / 255, blue / 255

@@ -1,4 +1,4 @@
-"""Figures that show whether a confidence means what it says. All return PNG bytes."""
+"""Figures that show whether a confidence is calibrated. All return PNG bytes."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from recon.reports.canvas import FAINT, HALF_IN, new_figure, style_plot, to_png
 
 Curves = Mapping[str, Any]
-"""Of one matcher, as ``summary.json`` has them: ``reliability`` and ``sparsification``."""
+"""Curves of one matcher, as in ``summary.json``: ``reliability`` and ``sparsification``."""
 
 _COLOURS: Final = ("#0b6bcb", "#e07a1f", "#1a7f37", "#8250df", "#cf222e")
 _LEAST_SHARE: Final = 0.001
 
 
 def reliability_figure(matchers: Mapping[str, Curves]) -> bytes:
-    """How often pixels are right, against how sure the matcher is of them.
+    """Fraction of correct pixels by confidence (reliability diagram).
 
-    Bins with less than a thousandth of the pixels are left out; the bars show how the pixels are
-    spread over the bins.
+    Bins with less than a thousandth of the pixels are left out; the bars show the distribution of
+    the pixels over the bins.
     """
     figure = new_figure(HALF_IN, 5.0)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(4, 1))
@@ -43,7 +43,7 @@ def reliability_figure(matchers: Mapping[str, Curves]) -> bytes:
 
 
 def sparsification_figure(matchers: Mapping[str, Curves]) -> bytes:
-    """The share of wrong pixels among those left, as the least certain are removed."""
+    """Fraction of wrong pixels among the rest as the least confident ones are removed."""
     figure = new_figure(HALF_IN, 5.0)
     axes = figure.subplots()
     for number, (name, curves) in enumerate(matchers.items()):
@@ -61,5 +61,5 @@ def sparsification_figure(matchers: Mapping[str, Curves]) -> bytes:
 
 
 def _floats(values: Any) -> Any:
-    """float64, NaN for None."""
+    """float64 array, with NaN for None."""
     return np.array(values, dtype=np.float64)

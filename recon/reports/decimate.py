@@ -1,4 +1,4 @@
-"""Fewer points, triangles and cells, evenly and always the same ones, for pictures."""
+"""Reduces points, triangles and cells for display, evenly and deterministically."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from recon.structures.arrays import UInt8
 
 
 def thin_cloud(cloud: PointCloud, limit: int) -> PointCloud:
-    """At most ``limit`` points, spread evenly: the first one of each cell of a coarse grid."""
+    """At most ``limit`` points, evenly spread: the first one of each cell of a coarse grid."""
     return cloud.select(_even_subset(cloud.xyz, limit))
 
 
 def thin_mesh(mesh: TriangleMesh, limit: int) -> TriangleMesh:
-    """About ``limit`` triangles at most: vertices that share a cell become one.
+    """At most about ``limit`` triangles, by merging vertices that share a cell.
 
-    Triangles whose corners meet disappear. Good enough to look at, not to measure.
+    Degenerate triangles are removed. For display, not for measurement.
     """
     size = 0.0
     thinned = mesh
     while len(thinned.faces) > limit:
-        # Triangles of a surface grow with the square of the cell.
+        # The number of triangles falls with the square of the cell size.
         grown = size * math.sqrt(len(thinned.faces) / limit) * 1.05
         size = max(grown, _typical_edge(mesh))
         thinned = _merge_vertices(mesh, size)
@@ -33,16 +33,16 @@ def thin_mesh(mesh: TriangleMesh, limit: int) -> TriangleMesh:
 
 
 def thin_grid(grid: OccupancyGrid, limit: int) -> OccupancyGrid:
-    """A grid of larger cells with at most ``limit`` a side: for pictures of large maps.
+    """A grid of larger cells, at most ``limit`` per side, for pictures of large maps.
 
-    A larger cell is occupied where one of its cells is, else free where one is, so that no
-    obstacle is lost.
+    A larger cell is occupied if any of its cells is, else free if any is, so that no obstacle is
+    lost.
     """
     factor = math.ceil(max(grid.cells.shape) / limit)
     if factor <= 1:
         return grid
     rows, columns = (np.arange(0, size, factor) for size in grid.cells.shape)
-    # Unknown is -1 and free 0, so the largest value is the one to keep.
+    # Unknown is -1, free 0 and occupied larger, so the maximum is kept.
     cells = np.maximum.reduceat(np.maximum.reduceat(grid.cells, rows, axis=0), columns, axis=1)
     return OccupancyGrid(cells, grid.resolution_m * factor, grid.origin_m)
 
@@ -52,7 +52,7 @@ def quantise_colours(rgb: UInt8, depth: int = 8) -> tuple[UInt8, UInt8]:
 
     Args:
         rgb: uint8 (N, 3).
-        depth: Number of times that the colours are halved; at most 8.
+        depth: Number of successive halvings; at most 8.
 
     Returns:
         The palette, uint8 (P, 3) with 1 <= P <= 2**depth, and uint8 (N,) indices into it.
@@ -76,7 +76,7 @@ def _median_cut(rgb: UInt8, members: NDArray[np.intp], depth: int) -> list[NDArr
     axis = int(np.argmax(sides))
     values = rgb[members, axis]
     upper = values > np.median(values)
-    if not upper.any():  # more than half have the largest value: those are the upper part
+    if not upper.any():  # at least half have the largest value: these form the upper part
         upper = values == values.max()
     lower_boxes = _median_cut(rgb, members[~upper], depth - 1)
     return lower_boxes + _median_cut(rgb, members[upper], depth - 1)
@@ -92,7 +92,7 @@ def _even_subset(xyz: NDArray[Any], limit: int) -> NDArray[np.intp]:
 
 
 def _first_cell(xyz: NDArray[Any], limit: int) -> float:
-    """A cell so small that the box of all points could hold ``limit`` cells on one face."""
+    """An initial cell size, with more than ``limit`` cells on a face of the bounding cube."""
     if not len(xyz):
         return 1.0
     longest = float(np.ptp(xyz, axis=0).max())
@@ -100,7 +100,7 @@ def _first_cell(xyz: NDArray[Any], limit: int) -> float:
 
 
 def _cell_numbers(xyz: NDArray[Any], size: float) -> NDArray[np.int64]:
-    """int64 (N,): the number of the cell that holds each point."""
+    """int64 (N,): the number of the cell of each point."""
     keys = np.floor((xyz - xyz.min(axis=0)) / size).astype(np.int64)
     extent = keys.max(axis=0) + 1
     return np.asarray((keys[:, 0] * extent[1] + keys[:, 1]) * extent[2] + keys[:, 2])
@@ -123,5 +123,5 @@ def _merge_vertices(mesh: TriangleMesh, size: float) -> TriangleMesh:
 def _typical_edge(mesh: TriangleMesh) -> float:
     corners = mesh.vertices[mesh.faces[:, :2]]
     lengths = np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1)
-    # No more than 1e5 cells a side, so that their numbers fit in an int64.
+    # At most 1e5 cells per side, so that cell numbers fit in an int64.
     return max(float(np.median(lengths)), float(np.ptp(mesh.vertices, axis=0).max()) * 1e-5, 1e-6)

@@ -1,4 +1,4 @@
-"""Pairs with epipolar lines, before and after rectification."""
+"""Figures of pairs with epipolar lines, before and after rectification."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from recon.structures.arrays import Float64, UInt8
 
 @dataclass(frozen=True, eq=False)
 class EpipolarPicture:
-    """One picture with points and the lines on which they should lie.
+    """One image with points and the epipolar lines they should lie on.
 
     Attributes:
         image: uint8 (H, W) or (H, W, 3).
         pixels: float64 (N, 2), the points.
-        lines: A curve (M, 2) for each of them; NaN = outside.
-        title: What it shows.
+        lines: One curve (M, 2) per point; NaN = outside the image.
+        title: Title of the figure.
     """
 
     image: UInt8
@@ -31,12 +31,12 @@ class EpipolarPicture:
 
 
 def level_lines(pixels: Float64, width_px: int) -> list[Float64]:
-    """The rows of points as lines across a picture."""
+    """The rows of the points, as lines across the image."""
     return [np.array([[0.0, y], [width_px - 1.0, y]]) for _, y in pixels]
 
 
 def epipolar_figure(left: EpipolarPicture, right: EpipolarPicture) -> bytes:
-    """PNG: both pictures side by side; a point and its line have one colour in both."""
+    """PNG of both images side by side; a point and its line have the same colour in both."""
     height, width = left.image.shape[:2]
     figure = new_figure(WIDE_IN, WIDE_IN / 2 * height / width + 0.4)
     for axes, picture in zip(figure.subplots(1, 2), (left, right), strict=True):
@@ -45,7 +45,7 @@ def epipolar_figure(left: EpipolarPicture, right: EpipolarPicture) -> bytes:
 
 
 def spread_points(pixels: Float64, count: int = 10) -> Float64:
-    """int64 (M,), indices of at most so many points that lie at different heights."""
+    """int64 (M,), indices of at most ``count`` points, evenly spread by row."""
     order = np.argsort(pixels[:, 1])
     picked = np.unique(np.linspace(0, len(order) - 1, min(count, len(order))).astype(int))
     return np.asarray(order[picked])

@@ -1,4 +1,4 @@
-"""Figures of pictures: the pair, and what was found for its pixels. All return PNG bytes."""
+"""Figures of a pair and the results for its pixels. All return PNG bytes."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ from recon.reports.colour import (
 from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import UInt8
 
-# The strip below a picture: axis label and numbers, the bar, and depths above it.
+# Height of the strip below an image: axis label and ticks, colour bar, and depths above it.
 _BELOW_IN = 1.0
 _BAR_BOTTOM_IN = 0.5
 _BAR_IN = 0.16
 _WIDE_ASPECT = 2.0
-_LABEL_ROOM = 0.07  # of the length of a scale
-# Marks of a depth scale, the roundest first; the others fill what room is left.
+_LABEL_ROOM = 0.07  # fraction of the length of a scale
+# Ticks of a depth scale, the roundest first; the others fill the remaining space.
 _DEPTH_STEPS = ((1.0, 2.0, 5.0), (3.0, 4.0, 6.0, 8.0), (1.5, 2.5, 3.5, 4.5, 7.0, 9.0))
 
 
 def is_wide(shape: tuple[int, ...]) -> bool:
-    """Whether pictures of this shape (H, W, …) need the whole width of a page."""
+    """Whether images of this shape (H, W, …) need the whole width of a page."""
     return shape[1] >= _WIDE_ASPECT * shape[0]
 
 
 def pair_figure(pair: RectifiedPair) -> bytes:
-    """Both rectified pictures: stacked where they are wide, else side by side."""
+    """Both rectified images: stacked if they are wide, else side by side."""
     height, width = pair.left.shape
     stacked = is_wide(pair.left.shape)
     columns = 1 if stacked else 2
@@ -81,7 +81,7 @@ def depth_figure(depth_m: NDArray[Any]) -> bytes:
     limits = (math.log(low), math.log(max(high, low * 1.01)))
     with np.errstate(invalid="ignore", divide="ignore"):
         logarithm = np.log(np.where(depth_m > 0, depth_m, np.nan))
-    # Reversed, so that near has the same colour here and in the disparity map.
+    # Reversed, so that near has the same colour as in the disparity map.
     scale = f"{DISPARITY_SCALE}_r"
     figure, _ = _picture(colour_values(logarithm, scale, limits))
     bar = _colour_bar(figure, scale, limits)
@@ -100,7 +100,7 @@ def confidence_figure(disparity: Disparity) -> bytes:
 
 
 def error_figure(error_px: NDArray[Any], limit_px: float) -> bytes:
-    """The size of the disparity error of each pixel, up to ``limit_px``; NaN = not compared."""
+    """Absolute disparity error of each pixel, up to ``limit_px``; NaN = not compared."""
     figure, _ = _picture(colour_error(error_px, limit_px))
     bar = _colour_bar(figure, ERROR_SCALE, (0.0, limit_px), extend="max")
     bar.set_label("absolute disparity error in pixels (dark: not compared)", color=INK)
@@ -108,7 +108,7 @@ def error_figure(error_px: NDArray[Any], limit_px: float) -> bytes:
 
 
 def reasons_figure(disparity: Disparity) -> bytes:
-    """Why each pixel has, or has not, a disparity, and the share of each reason."""
+    """Why each pixel has a disparity or not, and the share of each reason."""
     figure, _ = _picture(colour_reasons(disparity.reason))
     handles = [
         Patch(
@@ -129,16 +129,16 @@ def reasons_figure(disparity: Disparity) -> bytes:
 def depth_marks(
     low_m: float, high_m: float, place: Callable[[float], float], limits: tuple[float, float]
 ) -> list[float]:
-    """Round depths to mark on a scale, as many as leave room for their labels.
+    """Round depths to mark on a scale, as many as there is room for labels.
 
     Args:
-        low_m: Least depth on the scale, > 0.
+        low_m: Smallest depth on the scale, > 0.
         high_m: Largest depth.
-        place: Where on the scale a depth lies.
-        limits: Where the scale begins and ends.
+        place: Maps a depth to its position on the scale.
+        limits: Start and end of the scale.
 
     Returns:
-        The depths, rising; the roundest are preferred.
+        The depths, increasing; the roundest are preferred.
     """
     powers = range(math.floor(math.log10(low_m)), math.ceil(math.log10(high_m)) + 1)
     choices = [step * 10.0**power for tier in _DEPTH_STEPS for power in powers for step in tier]
@@ -166,11 +166,11 @@ def _reason_shares(reason: UInt8) -> list[tuple[Reason, str]]:
 
 
 def _picture(picture: UInt8) -> tuple[Figure, Axes]:
-    """A picture that fills the width of its figure, with room for a scale or legend below."""
+    """An image that fills the width of its figure, with room for a scale or legend below."""
     height, width = picture.shape[:2]
     width_in = WIDE_IN if is_wide(picture.shape) else HALF_IN
     height_in = width_in * height / width + _BELOW_IN
-    # Placed by hand: a layout engine does not see the marks on the upper side of a scale.
+    # Placed by hand, as layout engines ignore the ticks on the upper side of a scale.
     figure = new_figure(width_in, height_in, layout=None)
     axes = figure.add_axes((0.0, _BELOW_IN / height_in, 1.0, 1.0 - _BELOW_IN / height_in))
     axes.imshow(picture, aspect="auto")
@@ -199,7 +199,7 @@ def _depth_ticks(bar: Colorbar, limits: tuple[float, float], camera: RectifiedCa
     near = float(near_far[0])
     if not np.isfinite(near):
         return
-    # A disparity of about 0 is a depth without end; 1 km is far enough for marks.
+    # A disparity near 0 is an unbounded depth; ticks up to 1 km are enough.
     far = min(float(near_far[1]), 1000.0) if np.isfinite(near_far[1]) else 1000.0
 
     def place(depth_m: float) -> float:

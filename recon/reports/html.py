@@ -1,4 +1,4 @@
-"""A report as one HTML file that loads nothing: pictures, 3-D and style are inside it."""
+"""A report as one self-contained HTML file with pictures, 3-D views and style."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from typing import Any, Final
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
-# The browser itself refuses whatever is not inside the file. plotly.js compiles its shaders'
-# helpers at run time, hence 'unsafe-eval'; there is no foreign text that could become code.
+# The browser itself blocks anything that is not in the file. plotly.js compiles shader helpers at
+# run time, hence 'unsafe-eval'; there is no foreign text that could become code.
 _POLICY: Final = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
     "script-src 'unsafe-inline' 'unsafe-eval'"
 )
 _WEBP_QUALITY: Final = 80
-# plotly.js travels compressed: a third of its size, and no address in it is ever text here.
+# plotly.js is embedded compressed: a third of its size, and no URL of it appears in the file.
 _DRAW_SCENES: Final = """
 const views = document.querySelectorAll(".view");
 
@@ -63,10 +63,10 @@ loadPlotly().then(() => Promise.all([...views].map(drawView))).catch((error) => 
 
 @dataclass(frozen=True)
 class FigureBlock:
-    """A picture.
+    """A figure.
 
     Attributes:
-        title: What one sees.
+        title: What it shows.
         png: Bytes of a PNG file.
         caption: How to read it.
         wide: Whether it needs the whole width of the page.
@@ -100,10 +100,10 @@ class TextBlock:
 
 @dataclass(frozen=True)
 class SceneBlock:
-    """A view in 3-D.
+    """A 3-D view.
 
     Attributes:
-        title: What one sees.
+        title: What it shows.
         scene: ``data``, ``layout``, ``config`` and ``colourings``, see `plot_scene`.
         caption: How to read it.
     """
@@ -118,7 +118,7 @@ Block = FigureBlock | TableBlock | TextBlock | SceneBlock
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with what belongs below it."""
+    """A heading with its content."""
 
     title: str
     blocks: Sequence[Block]
@@ -127,17 +127,17 @@ class Section:
 
 @dataclass(frozen=True)
 class ReportContent:
-    """All that a report tells.
+    """The content of a report.
 
     Attributes:
         title: Heading and window title.
         subtitle: One line below it: source, size, time.
-        command: The command that made the run, or "".
-        warnings: What a reader must know before the figures; shown first.
-        figures: The few numbers that matter most, as (label, value).
+        command: The command of the run, or "".
+        warnings: Warnings, shown before the figures.
+        figures: The key figures, as (label, value).
         sections: The body.
-        config: The effective configuration, shown folded.
-        versions: Versions of what made the run, shown folded.
+        config: The effective configuration, shown collapsed.
+        versions: Versions of the software used, shown collapsed.
     """
 
     title: str
@@ -151,9 +151,9 @@ class ReportContent:
 
 
 def render_html(content: ReportContent) -> str:
-    """Write a report as one HTML document without any external resource.
+    """Render a report as one HTML document without any external resource.
 
-    All text is escaped. plotly.js is put in once, and only where there is a scene.
+    All text is escaped. plotly.js is included once, and only if there is a 3-D view.
     """
     sections = [section for section in content.sections if section.blocks]
     scene_numbers = count()
@@ -233,7 +233,7 @@ def _section(number: int, section: Section, scene_numbers: count[int]) -> str:
 
 
 def _smaller(png: bytes) -> tuple[str, bytes]:
-    """A picture as WebP, which is a fourth of the size where it has noise, or else as it is."""
+    """A picture as WebP if that is smaller (a quarter of the size for noisy ones), else as PNG."""
     buffer = io.BytesIO()
     with Image.open(io.BytesIO(png)) as picture:
         picture.convert("RGB").save(buffer, "WEBP", quality=_WEBP_QUALITY)
@@ -278,12 +278,12 @@ def _row(cells: Sequence[str]) -> str:
 
 
 def _breakable(name: str) -> str:
-    """The name of a figure, which a narrow page may break between its words alone."""
+    """The name of a figure, with line breaks allowed only between its words."""
     return re.sub(r"([._])(?=[a-z])", r"\1<wbr>", escape(name))
 
 
 def _scene(block: SceneBlock, name: str) -> str:
-    # "<" is written as an escape, so that no text in it can end the script element.
+    # "<" is escaped, so that no text can end the script element.
     data = json.dumps(block.scene, separators=(",", ":")).replace("<", "\\u003c")
     return (
         f'<div class="view">{_colouring_buttons(block.scene)}'

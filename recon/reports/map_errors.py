@@ -1,4 +1,4 @@
-"""Clouds coloured by their distance from each other."""
+"""Clouds coloured by their distance to each other."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from recon.reports.colour import ERROR_SCALE, colour_values
 from recon.structures import PointCloud
 
 _SCALE_THRESHOLDS: Final = 2.0
-"""The last colour stands for this many times the largest threshold."""
+"""The last colour of the scale corresponds to this multiple of the largest threshold."""
 
 
 def present_map_errors(comparison: MapComparison, directory: RunDirectory) -> None:

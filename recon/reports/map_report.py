@@ -66,25 +66,25 @@ _OCCUPANCY_ROWS: Final = (
 
 @dataclass(frozen=True, eq=False)
 class MapReportInputs:
-    """All that the report of a drive is made from; None = the run does not have it.
+    """Inputs of the report of a drive; None = the run does not have it.
 
     Attributes:
-        source: What a user calls the source.
-        trajectory: The path that was found.
-        T_map_world: float64 (4, 4), turns world to map axes (x forward, z up).
+        source: Name of the source for the user.
+        trajectory: The estimated path.
+        T_map_world: float64 (4, 4), from world to map axes (x forward, z up).
         samples: One or a few pairs with their disparities.
         health: One record per frame.
         truth: True path in the same world.
-        metrics: How far the two paths are apart.
-        grid: The flat map.
+        metrics: Comparison of the two paths.
+        grid: The occupancy grid.
         cloud: The fused cloud, frame ``map``.
         mesh: The surface, map axes.
-        summary: The figures of ``summary.json``.
+        summary: The content of ``summary.json``.
         command: The command line, or "".
         config: The effective configuration as text.
-        loops: What loop closure did to the path.
-        warnings: What went less than well.
-        versions: Versions of the packages that took part.
+        loops: Result of the loop closure.
+        warnings: Warnings of the run.
+        versions: Versions of the packages used.
     """
 
     source: str
@@ -106,7 +106,7 @@ class MapReportInputs:
 
 
 def map_report(inputs: MapReportInputs) -> ReportContent:
-    """Compose the report of a drive: the map and the path first, then what they rest on."""
+    """Compose the report of a drive: map and path first, then the data behind them."""
     sections = [
         Section("Map", _map_blocks(inputs)),
         Section("Path", _path_blocks(inputs)),
@@ -163,7 +163,7 @@ def _map_blocks(inputs: MapReportInputs) -> list[Block]:
 
 
 def _occupancy_table(found: Mapping[str, Any] | None) -> list[Block]:
-    """Voxels and grid against the truth, where it is known."""
+    """Voxels and grid compared with ground truth, if it is known."""
     if not found:
         return []
     rows = [

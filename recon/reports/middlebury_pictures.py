@@ -1,4 +1,4 @@
-"""What an evaluation on Middlebury scenes leaves to look at: tables and pictures."""
+"""Tables and pictures of an evaluation on Middlebury scenes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from recon.reports.middlebury_tables import csv_table, markdown_tables, text_tab
 from recon.reports.present import command_line
 
 ERROR_LIMIT_PX: Final = 4.0
-"""Error that gets the last colour, full-size pixels: the largest limit of the table."""
+"""Error of the last colour, in full-size pixels: the largest threshold of the table."""
 
 
 def present_middlebury(summary: Mapping[str, Any], directory: RunDirectory) -> None:
@@ -34,10 +34,10 @@ def present_middlebury(summary: Mapping[str, Any], directory: RunDirectory) -> N
 
 
 def draw_result(result: SceneResult, directory: RunDirectory) -> None:
-    """Write the disparity and the error of a result as pictures in colour.
+    """Write the disparity and the error of a result as colour images.
 
-    In the error, blue is right, red is off by `ERROR_LIMIT_PX` full-size pixels or more, and dark
-    is where the truth is unknown; holes are filled. Colours of disparities span the truth's range.
+    In the error, blue is correct, red is wrong by `ERROR_LIMIT_PX` full-size pixels or more, and
+    dark is unknown ground truth; holes are filled. Disparity colours span the range of the truth.
 
     Raises:
         OutputError: A file cannot be written.

@@ -18,7 +18,7 @@ from recon.reports.middlebury_tables import report_tables
 from recon.structures.arrays import UInt8
 
 _WIDTH_PX: Final = 300
-"""Pictures in the report are at most as wide."""
+"""Largest width of pictures in the report."""
 
 _GAP_PX: Final = 6
 _MANY_COLUMNS: Final = 7
@@ -32,11 +32,11 @@ _HOW_TO_READ: Final = (
 def middlebury_report(
     summary: Mapping[str, Any], directory: RunDirectory, *, config: str = "", command: str = ""
 ) -> ReportContent:
-    """Compose the report: tables, whether confidences are true, and the maps of each scene.
+    """Compose the report: tables, calibration of the confidences, and the maps of each scene.
 
     Args:
-        summary: The figures of ``summary.json``.
-        directory: Where the pictures of all results are.
+        summary: The content of ``summary.json``.
+        directory: Directory with the pictures of all results.
         config: The effective configuration as text.
         command: The command line, or "".
     """
@@ -96,7 +96,7 @@ def _confidence_blocks(summary: Mapping[str, Any]) -> list[Block]:
 
 
 def _scene_block(scene: str, summary: Mapping[str, Any], directory: RunDirectory) -> FigureBlock:
-    """A row of pictures for each matcher: what it found, and how far it is off."""
+    """One row of pictures per matcher: its disparity and error."""
     rows = [_both_pictures(directory, name, scene) for name in summary["matchers"]]
     buffer = io.BytesIO()
     Image.fromarray(np.concatenate(_spaced(rows, 0), axis=0)).save(buffer, "PNG")
@@ -111,7 +111,7 @@ def _both_pictures(directory: RunDirectory, matcher: str, scene: str) -> UInt8:
     """Disparity and error side by side: uint8 (H, W, 3)."""
     stem = f"pictures/{matcher}/{scene}"
     found = read_image(directory.path(f"{stem}_disparity.png"))
-    # The error has the size of the truth, which may be another.
+    # The error has the size of the ground truth, which may differ.
     error = read_image(directory.path(f"{stem}_error.png"))
     width = min(_WIDTH_PX, found.shape[1])
     size = (max(1, round(found.shape[0] * width / found.shape[1])), width)
@@ -119,7 +119,7 @@ def _both_pictures(directory: RunDirectory, matcher: str, scene: str) -> UInt8:
 
 
 def _sized(picture: UInt8, size: tuple[int, int]) -> UInt8:
-    """The nearest pixels of a picture: uint8 (H, W, 3) with ``size`` rows and columns."""
+    """Resize a picture by nearest neighbour: uint8 (H, W, 3) with ``size`` rows and columns."""
     rows, columns = (
         np.arange(n) * old // n for n, old in zip(size, picture.shape[:2], strict=True)
     )
@@ -127,7 +127,7 @@ def _sized(picture: UInt8, size: tuple[int, int]) -> UInt8:
 
 
 def _spaced(pictures: list[UInt8], axis: int) -> list[UInt8]:
-    """The pictures with a white gap after each but the last."""
+    """Insert a white gap between pictures."""
     shape = list(pictures[0].shape)
     shape[axis] = _GAP_PX
     gap = np.full(shape, 255, np.uint8)

@@ -20,7 +20,7 @@ _KINDS: Final = (("nonocc", "dense"), ("nonocc", "sparse"), ("all", "dense"), ("
 
 
 def text_tables(summary: Figures) -> str:
-    """The tables in columns, to read in a terminal."""
+    """The tables in columns, for a terminal."""
     return "\n\n".join(f"{title}\n{_columns(rows)}" for title, rows in _tables(summary)) + "\n"
 
 
@@ -35,9 +35,9 @@ def report_tables(summary: Figures) -> list[tuple[str, list[Row]]]:
 
 
 def csv_table(summary: Figures) -> str:
-    """All figures of all matchers: a row per scene, mask and filling.
+    """All figures of all matchers: one row per scene, mask and filling.
 
-    Those of the confidence stand where they are counted: all pixels with a value.
+    Figures of the confidence are in the rows they refer to: all pixels that have a value.
     """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -91,7 +91,7 @@ def _confidence_rows(matchers: Figures) -> list[Row]:
 
 
 def _rated(figures: Figures, name: str) -> float | None:
-    """A figure of the confidence; None of a matcher that has none."""
+    """A figure of the confidence; None if the matcher has no confidence."""
     return (figures.get("confidence") or {}).get(name)
 
 
@@ -106,7 +106,7 @@ def _scene_rows(matchers: Figures, pick: Any, digits: int = 2) -> list[Row]:
 
 
 def _cells(figures: Figures, mask: str, holes: str) -> list[Any]:
-    """In the order of the head; the share without a value is that of the unfilled map."""
+    """Cells in the order of the header; the invalid share is that of the unfilled map."""
     one = figures[mask][holes]
     bad = [one["bad"][limit] for limit in _LIMITS]
     return [*bad, figures[mask]["invalid"], *(one[name] for name in _LENGTHS)]

@@ -42,21 +42,21 @@ _FIGURES: Final[FigureFormats] = MappingProxyType(
 
 @dataclass(frozen=True, eq=False)
 class PairReportInputs:
-    """All that the report of one pair is made from; None = the run does not have it.
+    """Inputs of the report of one pair; None = the run does not have it.
 
     Attributes:
-        source: What a user calls the pair.
+        source: Name of the pair for the user.
         pair: The rectified pair.
-        disparity: What was found in it.
-        truth: True disparity of the left view.
-        metrics: How far the two are apart.
+        disparity: The estimated disparity.
+        truth: True disparity of the left image.
+        metrics: Comparison of the two.
         cloud: The points, frame ``camera``.
         mesh: The surface, frame ``camera``.
-        summary: The figures of ``summary.json``.
+        summary: The content of ``summary.json``.
         command: The command line, or "".
         config: The effective configuration as text.
-        warnings: What went less than well.
-        versions: Versions of the packages that took part.
+        warnings: Warnings of the run.
+        versions: Versions of the packages used.
     """
 
     source: str
@@ -74,7 +74,7 @@ class PairReportInputs:
 
 
 def pair_report(inputs: PairReportInputs) -> ReportContent:
-    """Compose the report of one pair: what was found, how good it is, and how it looks in 3-D."""
+    """Compose the report of one pair: disparity, accuracy and 3-D view."""
     camera = inputs.pair.camera
     scene = Scene(T_UPRIGHT_CAMERA, inputs.cloud, inputs.mesh, eye_m=_beside_camera(inputs))
     sections = (
@@ -99,7 +99,7 @@ def pair_report(inputs: PairReportInputs) -> ReportContent:
 
 
 def _beside_camera(inputs: PairReportInputs) -> tuple[float, float, float]:
-    """A little behind, left of and above the camera: the picture, but with its depth to be seen."""
+    """A viewpoint slightly behind, left of and above the camera, from which depth is visible."""
     depth_m = depth_from_disparity(inputs.disparity.values, inputs.pair.camera)
     known = depth_m[np.isfinite(depth_m)]
     far = float(np.median(known)) if known.size else 1.0

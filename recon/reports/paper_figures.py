@@ -37,7 +37,7 @@ _AZIMUTH_DEG: Final = -72.0
 
 
 def surface_figure(disparity: Disparity) -> bytes:
-    """The disparity map as a surface over the picture, height = disparity; gaps stay open.
+    """The disparity map as a surface over the image, height = disparity; gaps stay open.
 
     Ref: Fig. 6 of the seed paper.
     """
@@ -67,12 +67,12 @@ def surface_figure(disparity: Disparity) -> bytes:
 def depth_curve_figure(
     camera: RectifiedCamera, believed: RectifiedCamera | None, disparities_px: NDArray[Any]
 ) -> bytes:
-    """Depth against disparity: by the true geometry, and with Table 1's focal length.
+    """Depth against disparity, with the true camera and with the focal length of Table 1.
 
     Args:
-        camera: The true geometry.
-        believed: What Table 1 makes of it, or None.
-        disparities_px: Any shape, disparities that occur; they shade the range in use.
+        camera: The true camera.
+        believed: The camera according to Table 1, or None.
+        disparities_px: Disparities that occur, of any shape; their range is shaded.
 
     Ref: Fig. 24-26 of the seed paper.
     """
@@ -103,7 +103,7 @@ def depth_curve_figure(
 
 
 def patches_figure(patches: Mapping[str, Sequence[PatchFigure]], bad_px: float) -> bytes:
-    """What the size of the patch does: wrong pixels, mean error, pixels with a value."""
+    """Effect of the patch size: wrong pixels, mean error, pixels with a value."""
     figure = new_figure(WIDE_IN, 3.8)
     panels = (
         (f"off by more than {bad_px:g} px (%)", "bad_percent"),
@@ -133,7 +133,7 @@ def _plot_patches(axes: Axes, patches: Mapping[str, Sequence[PatchFigure]], name
 
 
 def _line(method: str) -> dict[str, Any]:
-    """The look of a method's line; dashed where it lies on another's."""
+    """Line style of a method; dashed if it coincides with another line."""
     # Both printed methods give a value to the same pixels.
     dashes = "--" if method == AS_PRINTED else "-"
     look = {"marker": "o", "markersize": 4, "linewidth": 1.6}
@@ -141,7 +141,7 @@ def _line(method: str) -> dict[str, Any]:
 
 
 def _style_surface(axes: Any, width: int, height: int) -> None:
-    """Look at the surface as at the picture: row 0 is far and on top."""
+    """View the surface like the image: row 0 is far and on top."""
     axes.set_ylim(height, 0)
     axes.set_box_aspect((1.0, height / width, 0.45), zoom=1.0)
     axes.view_init(elev=_ELEVATION_DEG, azim=_AZIMUTH_DEG)

@@ -37,7 +37,7 @@ from recon.structures import PointCloud, RectifiedCamera
 _ERROR_LIMIT_PX: Final = 4.0
 _MAX_POINTS: Final = 20_000
 _NEAR_SHARE: Final = 0.9
-_LOOK_FROM: Final = (-1.15, 0.4, 0.4)  # from the middle of a cloud, in lengths of its longest side
+_LOOK_FROM: Final = (-1.15, 0.4, 0.4)  # relative to the centre of a cloud, in its longest side
 _UNKNOWN: Final = "–"
 _TABLE_1_HEADER: Final = (
     "",
@@ -51,7 +51,7 @@ _TABLE_1_HEADER: Final = (
 
 
 def paper_report(run: PaperRun, command: str = "") -> ReportContent:
-    """Compose the report: Table 1, then each experiment with every method that was tried."""
+    """Compose the report: Table 1, then each experiment with all its methods."""
     tried = "the corrected method"
     if run.config.paper.as_printed:
         tried = "the method as printed beside the corrected one"
@@ -73,12 +73,12 @@ def paper_report(run: PaperRun, command: str = "") -> ReportContent:
 
 
 def _of_the_run(run: PaperRun) -> dict[str, object]:
-    """What the summary says of the run itself; its experiments have their own sections."""
+    """The part of the summary about the run itself; experiments have their own sections."""
     return {k: v for k, v in run.summary.items() if k not in {"experiments", "table_1"}}
 
 
 def _figures(run: PaperRun) -> list[tuple[str, str]]:
-    """Each experiment's depth error, by the corrected and by the last method that was tried."""
+    """Depth error of each experiment, with the corrected and the last method."""
     figures = []
     for result in run.experiments:
         for one in dict.fromkeys((result.methods[0], result.methods[-1])):
@@ -217,7 +217,7 @@ def _curve_block(result: ExperimentResult) -> FigureBlock:
 
 
 def believed_camera(camera: RectifiedCamera) -> RectifiedCamera | None:
-    """What Table 1 makes of a camera, or None where doffs cannot be a focal length."""
+    """The camera according to Table 1, or None if doffs cannot be a focal length."""
     try:
         return camera_of_table_1(camera)
     except CalibrationError:
@@ -244,7 +244,7 @@ def _percent(value: float | None) -> str:
 
 
 def _worth_turning(result: ExperimentResult) -> list[MethodResult]:
-    """The corrected cloud, and beside it that of the printed geometry with absolute differences."""
+    """The corrected result, and that of the printed geometry with absolute differences."""
     return [one for one in result.methods if one.method != AS_PRINTED and len(one.cloud)]
 
 
@@ -252,7 +252,7 @@ def _scene_block(one: MethodResult) -> SceneBlock:
     cloud = one.cloud
     caption = "Seen from the side of the left camera, turned so that z is up. Drag to turn."
     if one.method != CORRECTED:
-        # Whole disparities near 0 are layers far behind all else, which would make the rest small.
+        # Integer disparities near 0 give layers far behind everything, which would shrink the rest.
         cloud = cloud.select(cloud.xyz[:, 2] <= np.quantile(cloud.xyz[:, 2], _NEAR_SHARE))
         caption += f" The farthest {1 - _NEAR_SHARE:.0%} of the points are left out here."
     scene = Scene(T_UPRIGHT_CAMERA, cloud, eye_m=_beside_camera(cloud))
@@ -260,7 +260,7 @@ def _scene_block(one: MethodResult) -> SceneBlock:
 
 
 def _beside_camera(cloud: PointCloud) -> tuple[float, float, float]:
-    """Where all of a cloud is seen, view axes: from the camera's side, a little left and above."""
+    """A viewpoint that shows the whole cloud, view axes: slightly left of and above the camera."""
     low, high = np.quantile(apply(T_UPRIGHT_CAMERA, cloud.xyz), (0.01, 0.99), axis=0)
     x, y, z = ((low + high) / 2 + float((high - low).max()) * np.array(_LOOK_FROM)).tolist()
     return x, y, z

@@ -1,4 +1,4 @@
-"""Figures of a run: path, drift, map, health and time. All return PNG bytes."""
+"""Figures of a run: path, drift, map, odometry health and timing. All return PNG bytes."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def trajectory_figure(
     T_map_world: NDArray[Any],
     health: Sequence[OdometryHealth] = (),
 ) -> bytes:
-    """The path seen from above, in map axes; poses that are not trusted are marked.
+    """Top view of the path in map axes; poses that are not trusted are marked.
 
     Args:
-        estimate: The path that was found.
+        estimate: The estimated path.
         truth: The true path, in the same world, or None.
-        T_map_world: (4, 4), turns world to map axes.
+        T_map_world: (4, 4), from world to map axes.
         health: One record per pose of ``estimate``, or none.
     """
     paths = [_seen_from_above(estimate, T_map_world)]
@@ -78,13 +78,13 @@ def loops_figure(
     loops: Sequence[tuple[int, int]],
     T_map_world: NDArray[Any],
 ) -> bytes:
-    """The path before and after its loops were closed, and the gaps that they closed.
+    """The path before and after loop closure, and the gaps that were closed.
 
     Args:
-        before: By odometry.
-        after: The same frames.
+        before: The path by odometry.
+        after: The corrected path of the same frames.
         loops: The two frames of each loop.
-        T_map_world: (4, 4), turns world to map axes.
+        T_map_world: (4, 4), from world to map axes.
     """
     paths = [_seen_from_above(path, T_map_world) for path in (before, after)]
     figure = new_figure(WIDE_IN, height_for(np.concatenate(paths)))
@@ -105,11 +105,11 @@ def loops_figure(
 def path_error_figure(
     estimate: Trajectory, truth: Trajectory, health: Sequence[OdometryHealth] = ()
 ) -> bytes:
-    """How position and direction drift from the truth, both starting at the identity.
+    """Drift of position and rotation from ground truth, with both paths starting at the identity.
 
     Args:
-        estimate: The path that was found.
-        truth: The true path; a pose for each pose of ``estimate``.
+        estimate: The estimated path.
+        truth: The true path, with one pose per pose of ``estimate``.
         health: One record per pose, or none.
     """
     figure = new_figure(WIDE_IN, 4.6)
@@ -133,12 +133,12 @@ def path_error_figure(
 def grid_figure(
     grid: OccupancyGrid, trajectory: Trajectory | None, T_map_world: NDArray[Any]
 ) -> bytes:
-    """The flat map with the path on it; axes in metres, cropped to what is known.
+    """The occupancy grid with the path; axes in metres, cropped to the known cells.
 
     Args:
         grid: The map.
         trajectory: The path of the camera, or None.
-        T_map_world: (4, 4), turns world to map axes.
+        T_map_world: (4, 4), from world to map axes.
     """
     grid = thin_grid(_crop_to_known(grid), _MOST_CELLS)
     x, y = grid.origin_m
@@ -165,7 +165,7 @@ def grid_figure(
 
 
 def timing_figure(stages: Mapping[str, float]) -> bytes:
-    """Seconds and share of each stage, in the order of the mapping."""
+    """Time and share of each stage, in the order of the mapping."""
     figure = new_figure(HALF_IN, max(1.6, 0.42 * len(stages) + 0.9))
     axes = figure.subplots()
     seconds = np.asarray(list(stages.values()), dtype=np.float64)
@@ -181,7 +181,7 @@ def timing_figure(stages: Mapping[str, float]) -> bytes:
 
 
 def health_figure(health: Sequence[OdometryHealth]) -> bytes:
-    """What each frame's pose rests on; frames whose pose is not trusted are shaded red."""
+    """Odometry health of each frame; frames whose pose is not trusted are shaded red."""
     rows = (
         ("inlier tracks", [float(record.inliers) for record in health]),
         ("overlap with\nthe map (share)", [record.overlap for record in health]),
@@ -193,7 +193,7 @@ def health_figure(health: Sequence[OdometryHealth]) -> bytes:
     for axes, (label, values) in zip(all_axes, rows, strict=True):
         known = np.isfinite(values)
         if known.any():
-            # What is measured every few frames has no neighbours that a line could join.
+            # Values measured only every few frames have no neighbours to connect by a line.
             marker = "" if known.all() else "."
             axes.plot(frames, values, color=ESTIMATE, linewidth=1.3, marker=marker)
             axes.set_ylim(bottom=0)
@@ -223,7 +223,7 @@ def mark_ends(axes: Axes, path: NDArray[Any]) -> None:
     if len(path):
         axes.plot(*path[0], "o", color=ESTIMATE, markersize=9, markeredgecolor="white", zorder=5)
         axes.plot(*path[-1], "s", color=ESTIMATE, markersize=7, markeredgecolor="white", zorder=5)
-        # One above and one below: a drive may end where it began.
+        # One label above and one below, as a drive may end where it started.
         for place, text, up in ((path[0], "start", 9), (path[-1], "end", -18)):
             label = axes.annotate(
                 text, place, textcoords="offset points", xytext=(0, up), ha="center", color=INK
@@ -243,7 +243,7 @@ def _shade(axes: Axes, places: NDArray[Any], width: float) -> None:
 
 
 def _crop_to_known(grid: OccupancyGrid) -> OccupancyGrid:
-    """The part of a grid that holds all known cells, and a margin."""
+    """The part of a grid with all known cells, and a margin."""
     known = grid.cells != UNKNOWN
     if not known.any():
         return grid

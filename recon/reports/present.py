@@ -1,4 +1,4 @@
-"""What a run leaves to look at in its folder: the report, and pictures in colour."""
+"""Writes the report and the colour pictures of a run into its folder."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def present_map(run: MapRun, directory: RunDirectory) -> None:
     """Write ``report.html`` of a drive.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The file cannot be written.
     """
     mapped = run.mapped
     content = map_report(
@@ -78,7 +78,7 @@ def present_pair(run: PairRun, directory: RunDirectory) -> None:
 
 
 def present_disparity(run: PairRun, directory: RunDirectory) -> None:
-    """Write disparity, confidence and reasons of a pair as pictures in colour.
+    """Write disparity, confidence and reasons of a pair as colour images.
 
     Raises:
         OutputError: A file cannot be written.
@@ -106,7 +106,7 @@ def present_paper(run: PaperRun, directory: RunDirectory) -> None:
 
 
 def command_line() -> str:
-    """The command that this process was started with, or "" where that was not ours."""
+    """The command line of this process, or "" if it is not one of recon."""
     program = Path(sys.argv[0] if sys.argv else "")
     started = program.name in {"recon", "recon.exe"} or program.parts[-2:] == (
         "recon",
@@ -116,5 +116,5 @@ def command_line() -> str:
 
 
 def _short(name: str) -> str:
-    """The last part of a path; a name that is no path stays."""
+    """The last part of a path; any other name unchanged."""
     return Path(name).name or name

@@ -1,7 +1,7 @@
 """A cloud, a mesh and paths in 3-D, as plain data for plotly.js.
 
-Numbers travel as base64 of their bytes, and a point's colour as one byte: its place in a scale
-of at most 256 colours. A list of ``rgb()`` texts would be ten times the size.
+Arrays are base64-encoded, and the colour of a point is one byte: its index in a palette of at
+most 256 colours. A list of ``rgb()`` strings would be ten times the size.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from recon.structures.arrays import Float32, Float64, UInt8
 MAX_POINTS: Final = 120_000
 MAX_FACES: Final = 80_000
 HEIGHT_SCALE: Final = "turbo"
-# Camera axes (x right, y down, z forward) turned so that forward is x and up is z.
+# From camera axes (x right, y down, z forward) to x forward and z up.
 T_UPRIGHT_CAMERA: Final[Float64] = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
@@ -31,20 +31,20 @@ _BACKGROUND = "#14181d"
 _PATH_COLOURS = ("#ff5252", "#ffb74d", "#81c784")
 _OUTLIER_SHARE = 0.002
 _BEHIND_AND_ABOVE = (-0.95, -1.15, 0.75)
-_LOOK_AT = (-0.1, -0.1, -0.1)  # nearer than the middle: what is near takes more of the view
+_LOOK_AT = (-0.1, -0.1, -0.1)  # nearer than the centre, as near objects fill more of the view
 Json = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is to be seen in 3-D, all in one frame.
+    """The content of a 3-D view, all in one frame.
 
     Attributes:
-        T_view_frame: float64 (4, 4), turns that frame so that x is forward and z is up.
+        T_view_frame: float64 (4, 4), rotates that frame to x forward and z up.
         cloud: Points, or None.
         mesh: A surface, or None.
-        paths: Named positions of the camera, float64 (N, 3).
-        eye_m: Where it is first looked at from, view axes; None = from behind and above.
+        paths: Named camera paths, float64 (N, 3).
+        eye_m: Initial viewpoint, view axes; None = behind and above.
     """
 
     T_view_frame: Float64
@@ -57,11 +57,11 @@ class Scene:
 def plot_scene(scene: Scene, max_points: int = MAX_POINTS, max_faces: int = MAX_FACES) -> Json:
     """The ``data``, ``layout`` and ``config`` that plotly.js draws, and ``colourings``.
 
-    All are plain JSON values. Each colouring has a ``label`` and the ``marker`` fields that the
-    first trace, the cloud, gets when it is chosen.
+    All are plain JSON values. Each colouring has a ``label`` and the ``marker`` fields that are
+    applied to the first trace, the cloud, when it is chosen.
 
     Args:
-        scene: What to draw. The mesh is hidden at first where there is a cloud as well.
+        scene: What to draw. The mesh is initially hidden if there is also a cloud.
         max_points: The cloud is thinned evenly to at most this number.
         max_faces: The mesh is simplified to about this number of triangles.
     """
@@ -83,7 +83,7 @@ def plot_scene(scene: Scene, max_points: int = MAX_POINTS, max_faces: int = MAX_
 
 
 def pack(array: NDArray[Any]) -> Json:
-    """An array (N,) as plotly.js reads it: the name of its type, and base64 of its bytes."""
+    """Encode an array (N,) for plotly.js: the name of its type, and base64 of its bytes."""
     little = np.asarray(array, dtype=array.dtype.newbyteorder("<"))
     return {
         "dtype": array.dtype.str[1:],
@@ -92,7 +92,7 @@ def pack(array: NDArray[Any]) -> Json:
 
 
 def _cloud_trace(cloud: PointCloud, T: Float64, max_points: int) -> tuple[Json, list[Json]]:
-    """The points, and each way to colour them."""
+    """The points, and the available colourings."""
     thinned = thin_cloud(cloud, max_points)
     xyz = apply(T, thinned.xyz)
     colourings = [("height", _height_colouring(xyz))]
@@ -114,7 +114,7 @@ def _mesh_trace(mesh: TriangleMesh, T: Float64, *, hidden: bool) -> Json:
     if mesh.rgb is None:
         colouring: Json = {"color": "#b8c4ce"}
     else:
-        # One colour per face: between two places of a palette there is no colour to blend.
+        # One colour per face, as palette indices cannot be interpolated.
         of_faces = mesh.rgb[mesh.faces].mean(axis=1)
         palette, index = quantise_colours(np.rint(of_faces).astype(np.uint8))
         scale = _colouring(palette, index)
@@ -151,7 +151,7 @@ def _xyz(points: NDArray[Any]) -> Json:
 
 
 def _colouring(palette: UInt8, index: UInt8) -> Json:
-    """A scale of one colour per palette entry, and each point's place in it."""
+    """A scale with one colour per palette entry, and the index of each point in it."""
     colours = palette if len(palette) > 1 else np.repeat(palette, 2, axis=0)
     last = len(colours) - 1
     scale = [[n / last, f"rgb({r},{g},{b})"] for n, (r, g, b) in enumerate(colours.tolist())]
@@ -165,7 +165,7 @@ def _height_colouring(xyz: Float32) -> Json:
 
 
 def _without_outliers(cloud: PointCloud) -> PointCloud:
-    """Drop the few points far from all others, which would make the rest small."""
+    """Drop the few points far from all others, which would shrink the rest."""
     if not len(cloud):
         return cloud
     low, high = np.quantile(cloud.xyz, (_OUTLIER_SHARE, 1.0 - _OUTLIER_SHARE), axis=0)
@@ -175,7 +175,7 @@ def _without_outliers(cloud: PointCloud) -> PointCloud:
 
 
 def _bounding_box(cloud: PointCloud | None, scene: Scene, T: Float64) -> Float64:
-    """float64 (2, 3): least and largest coordinates of what is seen at first, view axes."""
+    """float64 (2, 3): bounds of the initially visible content, view axes."""
     parts = [path for _, path in scene.paths]
     if cloud is not None and len(cloud):
         parts.append(cloud.xyz.astype(np.float64))
@@ -195,7 +195,7 @@ def _scale(box: Float64) -> float:
 
 
 def _eye(scene: Scene, box: Float64) -> Float64:
-    """float64 (3,): where to look from, in plotly's units from the middle of the box."""
+    """float64 (3,): viewpoint, in units of plotly relative to the centre of the box."""
     if scene.eye_m is None:
         return np.array(_BEHIND_AND_ABOVE)
     return np.asarray((np.asarray(scene.eye_m) - box.mean(axis=0)) * _scale(box))
@@ -230,6 +230,6 @@ def _layout(eye: Float64, box: Float64) -> Json:
             "itemsizing": "constant",
             "bgcolor": "rgba(20,24,29,0.8)",
         },
-        "uirevision": "kept",  # another colouring does not turn the view back
+        "uirevision": "kept",  # changing the colouring does not reset the view
         "scene": {"aspectmode": "manual", "aspectratio": aspect, "camera": camera, **axes},
     }

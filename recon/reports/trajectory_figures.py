@@ -1,4 +1,4 @@
-"""Figures of a path against the true one. All return PNG bytes."""
+"""Figures of a trajectory compared with ground truth. All return PNG bytes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _NAMES: Final = ("x", "y", "z")
 
 
 def paths_figure(comparison: TrajectoryComparison) -> bytes:
-    """Both paths in the two directions of the world in which the true one goes farthest."""
+    """Both paths, projected on the two world axes along which the true one extends farthest."""
     across, up = widest_axes(comparison.truth.positions_m)
     drawn = [path.positions_m[:, [across, up]] for path in (comparison.truth, comparison.estimate)]
     figure = new_figure(WIDE_IN, height_for(np.concatenate(drawn)))
@@ -40,7 +40,7 @@ def paths_figure(comparison: TrajectoryComparison) -> bytes:
 
 
 def errors_along_figure(comparison: TrajectoryComparison) -> bytes:
-    """Position and rotation error of each pose, after the alignment, along the true path."""
+    """Position and rotation error of each aligned pose, along the true path."""
     truth, estimate = comparison.truth, comparison.estimate
     turned = angle_rad(invert(truth.T_world_camera) @ estimate.T_world_camera)
     figure = new_figure(WIDE_IN, 4.6)
@@ -57,7 +57,7 @@ def errors_along_figure(comparison: TrajectoryComparison) -> bytes:
 
 
 def errors_by_length_figure(comparison: TrajectoryComparison, *, rotation: bool) -> bytes:
-    """Relative error of the segments of each length: mean, and the middle half of them."""
+    """Relative error of the segments by length: mean and interquartile range."""
     values = comparison.segment_deg_per_100m if rotation else comparison.segment_percent
     label = "rotation error (°/100 m)" if rotation else "translation error (%)"
     lengths = np.unique(comparison.segments.length_m)
@@ -65,7 +65,7 @@ def errors_by_length_figure(comparison: TrajectoryComparison, *, rotation: bool)
     quarters = np.array([np.percentile(group, (25, 75)) for group in groups])
     figure = new_figure(HALF_IN, 3.4)
     axes = figure.subplots()
-    # A bar for each length: with one or two lengths a line would show nothing.
+    # One bar per length, as a line shows nothing for one or two lengths.
     axes.vlines(lengths, *quarters.T, color=ESTIMATE, alpha=0.35, linewidth=8)
     means = [float(np.mean(group)) for group in groups]
     axes.plot(lengths, means, "o-", color=ESTIMATE, markersize=6)
@@ -77,6 +77,6 @@ def errors_by_length_figure(comparison: TrajectoryComparison, *, rotation: bool)
 
 
 def widest_axes(positions_m: Float64) -> tuple[int, int]:
-    """The two axes along which a path reaches farthest, in their order."""
+    """The two axes along which a path extends farthest, in order of the axes."""
     first, second = sorted(np.argsort(-np.ptp(positions_m, axis=0), kind="stable")[:2].tolist())
     return first, second

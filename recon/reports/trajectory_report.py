@@ -1,4 +1,4 @@
-"""The report of a trajectory against the true one."""
+"""The report of a trajectory compared with ground truth."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ALIGNED: Final[Mapping[str, str]] = {
 
 
 def present_trajectory(run: TrajectoryRun, directory: RunDirectory) -> None:
-    """Write ``report.html`` of a comparison, and its figures as PNG beside it.
+    """Write ``report.html`` of a comparison, and its figures as PNG files.
 
     Raises:
         OutputError: A file cannot be written.

@@ -1,7 +1,7 @@
-"""A rendered street drive with exact truth, and planes with exact disparity.
+"""A rendered street drive with exact ground truth, and planes with exact disparity.
 
-`build_street` lays out a street, `StreetCamera` photographs it, `truth` gives the surfaces and
-the obstacles that were really there. Only the settings are imported here: the rest needs Open3D.
+`build_street` lays out a street, `StreetCamera` renders it, and `truth` gives the true surfaces
+and obstacles. Only the settings are imported here, as the rest needs Open3D.
 """
 
 from recon.synthetic.settings import StreetSettings

@@ -1,4 +1,4 @@
-"""Calibration boards seen through lenses with known distortion: exact truth for calibration."""
+"""Calibration boards seen through lenses of known distortion: ground truth for calibration."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from recon.structures.board import CalibrationBoard
 
 Lens = Literal["radtan", "rational", "fisheye"]
 
-_TEXELS: Final = 48  # per square: corners fall on borders between them
+_TEXELS: Final = 48  # per square; corners lie on the borders between texels
 _WHITE, _DARK, _WALL = 225.0, 28.0, 120.0
 _MARGIN_PX: Final = 6.0
 _MAX_TILT_RAD: Final = math.radians(50)
@@ -36,8 +36,8 @@ class BoardView:
 
     Attributes:
         T_left_board: float64 (4, 4).
-        left_px: float64 (N, 2), true pixels of the board's corners in the left picture.
-        right_px: The same in the right picture.
+        left_px: float64 (N, 2), true positions of the board corners in the left image.
+        right_px: The same in the right image.
     """
 
     T_left_board: Float64
@@ -45,7 +45,7 @@ class BoardView:
     right_px: Float64
 
     def noisy(self, sigma_px: float, rng: np.random.Generator) -> BoardView:
-        """The view with Gaussian noise on every pixel coordinate."""
+        """The view with Gaussian noise added to every pixel coordinate."""
         left, right = (p + rng.normal(0, sigma_px, p.shape) for p in (self.left_px, self.right_px))
         return BoardView(self.T_left_board, left, right)
 
@@ -53,7 +53,7 @@ class BoardView:
 def board_rig(
     lens: Lens = "radtan", width_px: int = 640, height_px: int = 480, baseline_m: float = 0.12
 ) -> StereoCalibration:
-    """A rig of two cameras that are not quite alike and not quite parallel."""
+    """A rig of two slightly different, slightly misaligned cameras."""
     model, focal, coefficients = _LENSES[lens]
     distortion = np.array(coefficients)
 
@@ -71,16 +71,16 @@ def board_rig(
 def place_boards(
     rig: StereoCalibration, board: CalibrationBoard, count: int, seed: int = 0
 ) -> list[BoardView]:
-    """Positions of a board that fill both pictures, at many tilts and distances.
+    """Board poses that together cover both images, at various tilts and distances.
 
     Args:
         rig: The true rig.
         board: The board.
-        count: How many.
-        seed: Another seed, other positions.
+        count: Number of poses.
+        seed: Seed of the poses.
 
     Raises:
-        CalibrationError: The board does not fit into both pictures.
+        CalibrationError: The board does not fit into both images.
     """
     rng = np.random.default_rng(seed)
     views: list[BoardView] = []
@@ -90,16 +90,16 @@ def place_boards(
             views.append(view)
         if len(views) == count:
             return views
-    raise CalibrationError("board does not fit into both pictures", got=str(board))
+    raise CalibrationError("board does not fit into both images", got=str(board))
 
 
 class BoardRenderer:
-    """Pictures of a board as one camera sees it.
+    """Renders images of a board as seen by one camera.
 
     Args:
         camera: The raw camera.
         board: The board, printed on white paper with a margin of one square.
-        samples: Samples along each side of a pixel, averaged.
+        samples: Samples per pixel along each axis, averaged.
     """
 
     def __init__(self, camera: CameraIntrinsics, board: CalibrationBoard, samples: int = 4) -> None:
@@ -108,13 +108,13 @@ class BoardRenderer:
         pixels = np.stack([u.ravel(), v.ravel()], axis=1)
         rays = unproject(camera, pixels)[:, :2]
         self._rays = rays.reshape(camera.height_px, camera.width_px, 2)
-        # Rays are smooth: within a pixel they are straight lines to far below what can be seen.
+        # Rays vary smoothly, so linear interpolation within a pixel has no visible error.
         self._by_v = np.asarray(np.gradient(self._rays, axis=0))
         self._by_u = np.asarray(np.gradient(self._rays, axis=1))
         self._texture = _texture(board)
 
     def render(self, T_camera_board: Float64, sigma_grey: float = 0.0, seed: int = 0) -> UInt8:
-        """uint8 (H, W), the board at a place before a grey wall, with noise of that size."""
+        """uint8 (H, W), the board at a pose in front of a grey wall, with noise of that sigma."""
         offsets = (np.arange(self._samples) + 0.5) / self._samples - 0.5
         grey = np.full((self._camera.height_px, self._camera.width_px), _WALL)
         box = self._box(T_camera_board)
@@ -129,7 +129,7 @@ class BoardRenderer:
         return np.asarray(np.clip(np.rint(grey), 0, 255), dtype=np.uint8)
 
     def _box(self, T_camera_board: Float64) -> tuple[slice, slice]:
-        """Rows and columns that the paper may reach; all where a part of it is behind."""
+        """Rows and columns that the paper may cover; all if part of it is behind the camera."""
         pixels = project(self._camera, apply(T_camera_board, _outline(self._board, margin=1.0)))
         if not np.isfinite(pixels).all():
             return slice(None), slice(None)
@@ -138,8 +138,8 @@ class BoardRenderer:
         return slice(low[1], high[1]), slice(low[0], high[0])
 
     def _sample(self, T_camera_board: Float64, rays: Float64) -> Float64:
-        """Grey of the board where rays (H, W, 2) meet it, of the wall elsewhere."""
-        # A point of the board is R[:, 0] x + R[:, 1] y + t; the ray's own scale cancels.
+        """Grey level of the board where rays (H, W, 2) hit it, of the wall elsewhere."""
+        # A point of the board is R[:, 0] x + R[:, 1] y + t; the scale of the ray cancels.
         H = np.linalg.inv(
             np.stack([T_camera_board[:3, 0], T_camera_board[:3, 1], T_camera_board[:3, 3]], axis=1)
         )
@@ -147,7 +147,7 @@ class BoardRenderer:
             w = rays @ H[2, :2] + H[2, 2]
             x = (rays @ H[0, :2] + H[0, 2]) / w / self._board.square_m
             y = (rays @ H[1, :2] + H[1, 2]) / w / self._board.square_m
-            # Two squares before the first inner corner begins the paper.
+            # The paper begins two squares before the first inner corner.
             column, row = np.floor((x + 2) * _TEXELS), np.floor((y + 2) * _TEXELS)
         rows, columns = self._texture.shape
         hit = (w > 0) & (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
@@ -162,7 +162,7 @@ def render_views(
     *,
     sigma_grey: float = 2.0,
 ) -> list[tuple[UInt8, UInt8]]:
-    """Left and right picture, uint8 (H, W), of each view."""
+    """Left and right image, uint8 (H, W), of each view."""
     left, right = (BoardRenderer(camera, board) for camera in (rig.left, rig.right))
     return [
         (
@@ -174,7 +174,7 @@ def render_views(
 
 
 def _texture(board: CalibrationBoard) -> Float64:
-    """The board with a margin of one square on each side."""
+    """Texture of the board with a margin of one square on each side."""
     columns, rows = board.squares
     texture = np.full(((rows + 2) * _TEXELS, (columns + 2) * _TEXELS), _WHITE)
     texels = np.rint((dark_rectangles(board) / board.square_m + 2) * _TEXELS).astype(int)
@@ -186,7 +186,7 @@ def _texture(board: CalibrationBoard) -> Float64:
 def _try_place(
     rig: StereoCalibration, board: CalibrationBoard, rng: np.random.Generator
 ) -> BoardView | None:
-    """One random position, or None where a corner is out of a picture."""
+    """One random pose, or None if a corner is outside an image."""
     left = rig.left
     aim = rng.uniform((0.05, 0.05), (0.95, 0.95)) * (left.width_px, left.height_px)
     ray = unproject(left, aim[None])[0]
@@ -208,7 +208,7 @@ def _try_place(
 
 
 def _facing(ray: Float64) -> Float64:
-    """float64 (3, 3), turns the axis z along a ray by the shortest way."""
+    """float64 (3, 3), the smallest rotation that turns the z axis along a ray."""
     towards = ray / np.linalg.norm(ray)
     axis = np.cross([0.0, 0.0, 1.0], towards)
     sine = float(np.linalg.norm(axis))
@@ -216,7 +216,7 @@ def _facing(ray: Float64) -> Float64:
 
 
 def _outline(board: CalibrationBoard, margin: float = 0.0) -> Float64:
-    """float64 (N, 3), the border of the pattern, or of its paper, in steps of a quarter square."""
+    """float64 (N, 3), outline of the pattern or its paper, in steps of a quarter square."""
     columns, rows = board.squares
     x = np.linspace(-1 - margin, columns - 1 + margin, 4 * columns + 1)
     y = np.linspace(-1 - margin, rows - 1 + margin, 4 * rows + 1)

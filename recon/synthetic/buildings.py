@@ -1,6 +1,6 @@
 """Houses: a facade with recessed windows and doors, ledges, roof and blind walls.
 
-Axes of a house: x along the facade from its left end (seen from the street, its right end),
+Axes of a house: x along the facade from its left end (its right end as seen from the street),
 y into the house, z up.
 """
 
@@ -16,8 +16,8 @@ from recon.structures.arrays import Float64
 from recon.synthetic.shapes import boxes, quads
 from recon.synthetic.soup import Material, Paint, TriangleSoup, merge, painted
 
-_REVEAL_M: Final = 0.18  # windows lie this deep in the wall
-_OVERLAP_M: Final = 5e-4  # pieces of wall overlap by this, so that no ray slips between them
+_REVEAL_M: Final = 0.18  # depth of the windows in the wall
+_OVERLAP_M: Final = 5e-4  # overlap of pieces of wall, so that no ray passes between them
 _FRAME_M: Final = 0.07
 
 _PLASTERS = [
@@ -37,16 +37,16 @@ _TRIM = [(0.84, 0.82, 0.78), (0.62, 0.58, 0.52), (0.45, 0.42, 0.40)]
 
 @dataclass(frozen=True)
 class HousePlan:
-    """Measures and colours of one house, metres.
+    """Dimensions (metres) and colours of one house.
 
     Attributes:
-        width: Of the facade.
-        depth: Of the house.
+        width: Width of the facade.
+        depth: Depth of the house.
         floors: Number of storeys.
-        storey: Height of one.
+        storey: Height of a storey.
         window: Width and height of a window.
-        sill: Height of its lower edge above the floor.
-        pitched: A gable roof rather than a parapet.
+        sill: Height of the lower edge of a window above the floor.
+        pitched: Gable roof rather than parapet.
         wall: Paint of the walls.
         trim: Paint of ledges and frames.
         door: Paint of the door.
@@ -94,7 +94,7 @@ def draw_plan(width: float, rng: np.random.Generator) -> HousePlan:
 
 
 def house(plan: HousePlan, rng: np.random.Generator) -> TriangleSoup:
-    """Build a house: its axes are those of the module."""
+    """Build a house, in the axes described above."""
     holes, door = _openings(plan, rng)
     parts = [_facade(plan, np.vstack([holes, door])), _leaf(door, plan.door)]
     parts += [_windows(holes, rng), _reveals(np.vstack([holes, door]), plan.trim)]
@@ -127,7 +127,7 @@ def _openings(plan: HousePlan, rng: np.random.Generator) -> tuple[Float64, Float
 
 
 def _facade(plan: HousePlan, holes: Float64) -> TriangleSoup:
-    """The wall y = 0 with rectangular holes, cut along the edges of all holes."""
+    """The wall y = 0 with rectangular holes, split along the edges of all holes."""
     xs = np.unique(np.concatenate([[0.0, plan.width], holes[:, 0], holes[:, 2]]))
     zs = np.unique(np.concatenate([[0.0, plan.eaves], holes[:, 1], holes[:, 3]]))
     x_mid, z_mid = 0.5 * (xs[:-1] + xs[1:]), 0.5 * (zs[:-1] + zs[1:])
@@ -154,7 +154,7 @@ def _leaf(door: Float64, paint: Paint) -> TriangleSoup:
 
 
 def _windows(holes: Float64, rng: np.random.Generator) -> TriangleSoup:
-    """Glass behind frames with one mullion and one transom; each window has its own number."""
+    """Glass behind frames with one mullion and one transom; each window is its own object."""
     parts = rng.integers(1, 2**30, len(holes))
     x0, z0, x1, z1 = holes.T
     w, h, f = x1 - x0, z1 - z0, np.full(len(holes), _FRAME_M)
@@ -195,7 +195,7 @@ def _upright(rectangles: Float64, y: float, paint: Paint, parts: NDArray[Any]) -
 
 
 def _reveals(holes: Float64, paint: Paint) -> TriangleSoup:
-    """The four sides of each hole."""
+    """The four inner sides of each hole."""
     x0, z0, x1, z1 = holes.T
     zero = np.zeros(len(holes))
     inwards = [0.0, _REVEAL_M, 0.0]

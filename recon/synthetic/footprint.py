@@ -1,4 +1,4 @@
-"""Where obstacles stand on a street: what reaches into a band of heights above the road."""
+"""True obstacles of a street: surfaces within a band of heights above the road."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ def footprint(
     band_m: tuple[float, float],
     raster: tuple[NDArray[np.int64], tuple[int, int], float],
 ) -> OccupancyGrid:
-    """OCCUPIED where an obstacle reaches into the height band, else FREE.
+    """OCCUPIED where a surface lies in the height band, else FREE.
 
-    What is taller than the band, such as a house, is hollow.
+    Objects taller than the band, such as houses, are hollow.
 
     Args:
         world: The street.
-        T_map_street: float64 (4, 4), the map axes to draw in.
+        T_map_street: float64 (4, 4), the map axes to use.
         band_m: Heights above the road.
-        raster: Smallest column and row (in cells from the map's origin), rows and columns, edge
-            of a cell in metres.
+        raster: Smallest column and row (in cells from the map origin), rows and columns, cell
+            size in metres.
     """
     low, (rows, columns), resolution_m = raster
     origin = (float(low[0] * resolution_m), float(low[1] * resolution_m))
@@ -47,7 +47,7 @@ def footprint(
 
 
 def _outlines(vertices: Float64, band_m: tuple[float, float], step_m: float) -> Float64:
-    """Points (N, 3) every ``step_m`` along the level cuts through triangles in a height band."""
+    """Points (N, 3) every ``step_m`` along horizontal cuts through triangles in a height band."""
     levels = np.arange(band_m[0], band_m[1] + 1e-9, _SLICE_M)
     lowest, highest = vertices[..., 2].min(axis=1), vertices[..., 2].max(axis=1)
     cuts = [
@@ -60,7 +60,7 @@ def _outlines(vertices: Float64, band_m: tuple[float, float], step_m: float) -> 
 def _level_cut(triangles: Float64, z: float) -> tuple[Float64, Float64]:
     """Ends (N, 3) of the segments in which triangles cross the plane at height ``z``."""
     above = triangles[..., 2] > z
-    # The corner that is alone on its side; both edges from it cross the plane.
+    # The corner that is alone on its side of the plane; both edges from it cross the plane.
     lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
     row = np.arange(len(triangles))
     apex = triangles[row, lone]
@@ -73,7 +73,7 @@ def _level_cut(triangles: Float64, z: float) -> tuple[Float64, Float64]:
 
 
 def _sample_segments(start: Float64, end: Float64, step_m: float) -> Float64:
-    """Points (M, 3) on segments, at most ``step_m`` apart, ends included."""
+    """Points (M, 3) on segments, at most ``step_m`` apart, including the ends."""
     pieces = np.ceil(np.linalg.norm(end - start, axis=1) / step_m).astype(int) + 1
     segment = np.repeat(np.arange(len(start)), pieces + 1)
     first = np.cumsum(pieces + 1) - (pieces + 1)
@@ -94,7 +94,7 @@ def _quarter_centres(
 def _covered(
     world: StreetWorld, T_map_street: Float64, xy_map: Float64, band_m: tuple[float, float]
 ) -> Bool:
-    """Whether a plumb line between the two heights meets a surface, for points (N, 2)."""
+    """Whether a vertical line between the two heights hits a surface, for points (N, 2)."""
     level = np.column_stack([xy_map, np.full(len(xy_map), T_map_street[2, 3])])
     feet = se3.apply(se3.invert(T_map_street), level)
     feet[:, 2] = band_m[1]

@@ -1,4 +1,4 @@
-"""The recipe of each material: from a place on a surface to its colour (Lambertian albedo)."""
+"""Procedural materials: from a position on a surface to its colour (Lambertian albedo)."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from recon.synthetic.patterns import both, stripe, stripes, tile_joints, tile_to
 from recon.synthetic.soup import Material, TriangleSoup
 
 GAMMA: Final = 2.2
-"""Displayed colour to linear light."""
+"""Exponent from display values to linear light."""
 _OCTAVES: Final = 7
-_ROUGHNESS: Final = 0.92  # amplitude of each octave relative to the next coarser
+_ROUGHNESS: Final = 0.92  # amplitude of each octave relative to the next coarser one
 ROAD_HALF_M: Final = 5.2
 _LANE_HALF_M = 3.05
 
 
 class Grain(NamedTuple):
-    """How rough a material looks.
+    """Grain of a material.
 
     Attributes:
-        wavelength_m: Coarsest blotches.
+        wavelength_m: Coarsest wavelength.
         contrast: Strength, in the exponent of the brightness.
     """
 
@@ -58,7 +58,7 @@ _CONTRASTS = np.array([GRAIN[m].contrast for m in Material])
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """The points of one material, as a recipe sees them.
+    """Points of one material, the input of its recipe.
 
     Attributes:
         uv: float64 (N, 2), metres on the surface.
@@ -95,9 +95,9 @@ def albedo(soup: TriangleSoup, faces: Int32, hits: SurfaceHits, seed: int) -> Fl
 
     Args:
         soup: The scene.
-        faces: int32 (N,), the triangles that rays met.
-        hits: Where they met them.
-        seed: Of the grain.
+        faces: int32 (N,), the triangles hit by the rays.
+        hits: The hit points.
+        seed: Seed of the grain.
 
     Returns:
         float64 (N, 3), linear light, in [0, 1].
@@ -120,7 +120,7 @@ def albedo(soup: TriangleSoup, faces: Int32, hits: SurfaceHits, seed: int) -> Fl
 
 
 def _blend(rgb: Float64, paint: tuple[float, float, float], share: Float64) -> Float64:
-    """Cover a share (N,) of each footprint with a displayed colour."""
+    """Cover a fraction (N,) of each footprint with a display colour."""
     cover = share[:, None]
     return np.asarray(rgb * (1.0 - cover) + np.array(paint) ** GAMMA * cover)
 
@@ -132,7 +132,7 @@ def _variation(patch: Patch, channel: int) -> Float64:
 
 
 def _asphalt(p: Patch) -> Float64:
-    """Wheel tracks, patches, joints and worn markings; u runs along the road, v to the left."""
+    """Wheel tracks, patches, joints and worn markings; u is along the road, v to the left."""
     v, spread_v = p.v, p.spread[:, 1]
     tracks = sum(np.exp(-(((v - c) / 0.35) ** 2)) for c in (-2.3, -0.8, 0.8, 2.3))
     repairs = tile_tone(p.uv, (5.3, 2.1), p.spread, np.zeros(len(v), dtype=int))
@@ -153,7 +153,7 @@ def _asphalt(p: Patch) -> Float64:
 
 
 def _paving(p: Patch) -> Float64:
-    """Slabs in a running bond, with a row of darker setts along the kerb."""
+    """Slabs in running bond, with a row of darker setts along the kerb."""
     tile = (0.6, 0.4)
     tone = tile_tone(p.uv, tile, p.spread, np.zeros(len(p.uv), dtype=int), bond=0.5)
     rgb = p.rgb * (1.0 + 0.16 * tone)[:, None]
@@ -161,14 +161,14 @@ def _paving(p: Patch) -> Float64:
 
 
 def _kerb(p: Patch) -> Float64:
-    """Stones of one metre."""
+    """Stones one metre long."""
     tone = tile_tone(p.uv, (1.0, 1.0), p.spread, np.zeros(len(p.uv), dtype=int))
     rgb = p.rgb * (1.0 + 0.12 * tone)[:, None]
     return _blend(rgb, (0.2, 0.2, 0.2), 0.8 * stripes(p.u, 1.0, 0.02, p.spread[:, 0]))
 
 
 def _weather(p: Patch) -> Float64:
-    """Splash water at the foot of walls and streaks of rain below."""
+    """Splash marks at the foot of walls, and vertical rain streaks."""
     foot = np.exp(-np.maximum(p.height_m, 0.0) / 0.5)
     cell = np.stack([p.u, np.zeros_like(p.u)], axis=1)
     narrow = np.stack([p.spread[:, 0], np.zeros_like(p.u)], axis=1)
@@ -181,7 +181,7 @@ def _plaster(p: Patch) -> Float64:
 
 
 def _brick(p: Patch) -> Float64:
-    """Bricks of 24 × 7.5 cm, in fields of slightly different firing."""
+    """Bricks of 24 × 7.5 cm, in areas of slightly different colour."""
     tile = (0.25, 0.083)
     tone = 0.28 * tile_tone(p.uv, tile, p.spread, p.part, bond=0.5)
     tone += 0.07 * tile_tone(p.uv, (0.9, 0.4), p.spread, p.part + 1)
@@ -190,7 +190,7 @@ def _brick(p: Patch) -> Float64:
 
 
 def _glass(p: Patch) -> Float64:
-    """Dark rooms, painted reflections of the sky, curtains in some."""
+    """Dark rooms, painted sky reflections, and some curtains."""
     rgb = p.rgb * np.clip(1.0 + 0.5 * (p.v - 0.7), 0.5, 2.5)[:, None]
     curtain = (_variation(p, 1) > 0.1) * stripe(p.u % 1.1, 0.0, 0.36, p.spread[:, 0])
     folds = 0.5 + 0.25 * np.sin(p.u * 42.0) * np.exp(-((p.spread[:, 0] / 0.06) ** 2))
@@ -219,7 +219,7 @@ def _roof(p: Patch) -> Float64:
 
 
 def _car_paint(p: Patch) -> Float64:
-    """Gaps around the doors, a strip of trim, road dirt below."""
+    """Door gaps, a trim strip, and road dirt at the bottom."""
     gaps = both(
         stripe(np.abs(p.u + 0.25), 0.0, 0.012, p.spread[:, 0]),
         stripe(np.abs(p.u - 0.80), 0.0, 0.012, p.spread[:, 0]),
@@ -231,7 +231,7 @@ def _car_paint(p: Patch) -> Float64:
 
 
 def _car_glass(p: Patch) -> Float64:
-    """Dark panes between pillars of the body's colour."""
+    """Dark panes between pillars in the colour of the body."""
     pillars = stripe(np.abs(p.u + 0.25), 0.0, 0.05, p.spread[:, 0])
     pillars = both(pillars, stripe(p.v, 1.36, 9.0, p.spread[:, 1]))
     cover = pillars[:, None]
@@ -241,19 +241,19 @@ def _car_glass(p: Patch) -> Float64:
 
 
 def _leaves(p: Patch) -> Float64:
-    """Sunlit leaves are yellower than those in the depth of the crown."""
+    """Leaves; sunlit ones are yellower than those deep in the crown."""
     tint = np.clip(0.5 + 0.6 * p.grain, 0.0, 1.0)[:, None]
     return np.asarray(p.rgb * (tint * [1.25, 1.1, 0.7] + (1.0 - tint) * [0.7, 0.85, 0.9]))
 
 
 def _metal(p: Patch) -> Float64:
-    """Seams, so that a pole is not one smear."""
+    """Seams, so that poles have some texture."""
     seams = stripes(p.v, 0.9, 0.05, p.spread[:, 1])
     return _blend(p.rgb, (0.75, 0.74, 0.7), 0.5 * seams)
 
 
 def _poster(p: Patch) -> Float64:
-    """Fields of strong colour within a white border, and lines of print."""
+    """Strongly coloured areas within a white border, and lines of text."""
     zero = np.zeros(len(p.uv), dtype=np.int64)
     tones = [tile_tone(p.uv, (0.23, 0.31), p.spread, p.part + k) for k in (0, 1, 2)]
     rgb = p.rgb * (1.0 + 0.3 * tones[0][:, None] + 0.3 * np.stack(tones, axis=1))
@@ -286,7 +286,7 @@ def sky_colour(directions: Float64, pixel: float, seed: int) -> Float64:
     Args:
         directions: (N, 3), z up, any length.
         pixel: Width of a pixel, radians.
-        seed: Of the clouds.
+        seed: Seed of the clouds.
     """
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     climb = np.clip(unit[:, 2:], 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Where the street runs and where the cameras are on it.
+"""The course of the street, and the camera poses along it.
 
 Street axes: x along the street at its start, y left, z up, the road at z = 0.
 """
@@ -20,22 +20,22 @@ from recon.synthetic.settings import CORNER_M, StreetSettings
 LANE_M = -1.55  # the car keeps to the right of the centre line
 _STEP_M = 0.25
 _BEFORE_M = 60.0
-_BARE_M: Final = 60.0  # at the end of an open road, behind the closing row of trees
-BEHIND_M: Final = 30.0  # objects stand from so far behind the start
+_BARE_M: Final = 60.0  # without objects, at the end of an open road behind the last row of trees
+BEHIND_M: Final = 30.0  # objects begin this far behind the start
 # Columns are the camera's axes (right, down, forward) in street axes.
 R_STREET_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
 class CentreLine:
-    """The middle of the road, by the distance along it.
+    """The centre line of the road, parametrised by the distance along it.
 
     Attributes:
-        along_m: float64 (N,), distances, increasing; 0 is where the drive begins.
+        along_m: float64 (N,), distances, increasing; the drive begins at 0.
         xy_m: float64 (N, 2), street axes.
         heading_rad: float64 (N,), direction, counter-clockwise from x.
-        span_m: Where objects stand along it; a repeated street is laid out over one period.
-        loop_m: Length of one lap where the line closes, else None.
+        span_m: Range of distances with objects; a repeated street is laid out over one period.
+        loop_m: Length of one lap if the line is closed, else None.
     """
 
     along_m: Float64
@@ -45,11 +45,11 @@ class CentreLine:
     loop_m: float | None = None
 
     def heading(self, along_m: float) -> float:
-        """Direction of the road at a distance."""
+        """Direction of the road at a distance along it."""
         return float(np.interp(self._in_lap(along_m), self.along_m, self.heading_rad))
 
     def points(self, along_m: NDArray[np.float64], lateral_m: NDArray[np.float64]) -> Float64:
-        """Points (N, 2) at distances and to the left (positive) of the centre line."""
+        """Points (N, 2) at distances along the centre line and offsets to its left (positive)."""
         s = self._in_lap(along_m)
         x = np.interp(s, self.along_m, self.xy_m[:, 0])
         y = np.interp(s, self.along_m, self.xy_m[:, 1])
@@ -57,25 +57,25 @@ class CentreLine:
         return np.stack([x - lateral_m * np.sin(heading), y + lateral_m * np.cos(heading)], axis=-1)
 
     def place(self, along_m: float, lateral_m: float, height_m: float = 0.0) -> Float64:
-        """``T_street_object`` of an object that faces along the road there."""
+        """``T_street_object`` of an object at that position that faces along the road."""
         x, y = self.points(np.array([along_m]), np.array([lateral_m]))[0]
         return se3.make_transform(
             se3.exp_so3(np.array([0.0, 0.0, self.heading(along_m)])), np.array([x, y, height_m])
         )
 
     def bends(self, from_m: float, to_m: float) -> bool:
-        """Whether a stretch lies on a corner, if only in part."""
+        """Whether any part of a stretch lies on a corner."""
         return abs(self.heading(to_m) - self.heading(from_m)) > 1e-6
 
     def _in_lap(self, along_m: Any) -> Any:
-        """Distances along one lap; its very end is its end, not its start."""
+        """Distances within one lap; the end of the lap does not wrap to its start."""
         if self.loop_m is None:
             return along_m
         return np.where(along_m == self.loop_m, along_m, np.mod(along_m, self.loop_m))
 
 
 def centre_line(settings: StreetSettings, length_m: float) -> CentreLine:
-    """The road from 60 m before the start to ``length_m`` beyond it, or once around a block."""
+    """The road from 60 m before the start to ``length_m`` after it, or once around a block."""
     if settings.path == "block":
         return _block(*settings.block_m)
     along = np.arange(-_BEFORE_M, length_m + _STEP_M, _STEP_M)
@@ -87,7 +87,7 @@ def centre_line(settings: StreetSettings, length_m: float) -> CentreLine:
 
 
 def _walk(along_m: Float64, heading_rad: Float64) -> Float64:
-    """Points (N, 2) of a line of given directions."""
+    """Integrate directions along a line to points (N, 2)."""
     middle = 0.5 * (heading_rad[:-1] + heading_rad[1:])
     steps = np.diff(along_m)[:, None] * np.stack([np.cos(middle), np.sin(middle)], axis=1)
     return np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
@@ -97,7 +97,7 @@ def _heading(along_m: Float64, settings: StreetSettings) -> Float64:
     if settings.path == "straight":
         return np.zeros_like(along_m)
     rate = math.radians(settings.turn_deg_per_100m) / 100.0
-    # A road is no perfect arc: it winds a little about it.
+    # A real road is not a perfect arc but winds slightly around it.
     winding = 0.35 * rate * 18.0 * np.sin(along_m / 18.0)
     return np.asarray(rate * along_m + winding)
 
@@ -109,7 +109,7 @@ def _block(length_m: float, width_m: float) -> CentreLine:
     ends = np.cumsum([[side, arc_m] for side in sides])
     knots = np.concatenate([[0.0], ends])
     turns = 0.5 * math.pi * np.repeat(np.arange(5), 2)[:-1]
-    # The knots are among the samples, so each piece has its exact length and the lap closes.
+    # The knots are samples too, so that each piece has its exact length and the lap closes.
     pieces = [np.linspace(a, b, int((b - a) / _STEP_M) + 2)[:-1] for a, b in pairwise(knots)]
     along = np.concatenate([*pieces, knots[-1:]])
     heading = np.interp(along, knots, turns)
@@ -124,7 +124,7 @@ def camera_poses(settings: StreetSettings, road: CentreLine) -> Float64:
 
 
 def _camera_pose(along_m: float, settings: StreetSettings, road: CentreLine) -> Float64:
-    """The car's place on the road, its small motions, and how the rig is mounted on it."""
+    """Position of the car on the road, its small motions, and the mounting of the rig."""
     phase = 0.7 * (settings.seed % 997)
     drift = 0.2 * settings.sway * math.sin(along_m / 11.0 + phase)
     slope = 0.2 * settings.sway / 11.0 * math.cos(along_m / 11.0 + phase)

@@ -1,4 +1,4 @@
-"""From light to pixels: smooth edges, display curve, sensor."""
+"""From radiance to pixels: antialiasing, tone curve, sensor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from recon.synthetic.stage import Sample, Stage
 from recon.synthetic.view import View
 
 _QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-_CREASE: Final = 0.92  # cosine between normals below which there is an edge
+_CREASE: Final = 0.92  # cosine of the angle between normals, below which there is an edge
 _EXPOSURE: Final = 0.9
 
 
@@ -22,7 +22,7 @@ def take_picture(stage: Stage, view: View, smooth_edges: bool) -> Float64:
     Args:
         stage: The lit scene.
         view: The camera.
-        smooth_edges: Four rays for each pixel at an edge.
+        smooth_edges: Cast four rays per pixel at edges.
 
     Returns:
         float64 (H, W, 3), display values in [0, 1].
@@ -40,14 +40,17 @@ def take_picture(stage: Stage, view: View, smooth_edges: bool) -> Float64:
 def record(
     picture: Float64, *, gain: float, offset_dn: float, noise_dn: float, key: list[int]
 ) -> UInt8:
-    """What a sensor makes of display values: uint8 (H, W, 3).
+    """Apply a sensor model to display values.
 
     Args:
         picture: float64 (H, W, 3) in [0, 1].
         gain: Factor on brightness.
         offset_dn: Grey levels added.
-        noise_dn: Standard deviation of normal noise, grey levels.
-        key: Seeds the noise; equal keys give equal noise.
+        noise_dn: Standard deviation of Gaussian noise, grey levels.
+        key: Seed of the noise; equal keys give equal noise.
+
+    Returns:
+        uint8 (H, W, 3).
     """
     levels = 255.0 * gain * picture + offset_dn
     if noise_dn > 0:
@@ -60,14 +63,14 @@ def _expose(light: Float64) -> Float64:
 
 
 def _four_rays(stage: Stage, view: View, pixels: Float64) -> Float64:
-    """Mean light (N, 3) of the four quarters of pixels (N, 2)."""
+    """Mean radiance (N, 3) over the four quarters of pixels (N, 2)."""
     quarters = (pixels[:, None, :] + np.array(_QUARTERS)).reshape(-1, 2)
     sample = stage.look(view.origin, view.directions(quarters), 0.5 / view.focal_px)
     return np.asarray(_expose(sample.rgb).reshape(-1, 4, 3).mean(axis=1))
 
 
 def _edges(sample: Sample, size: tuple[int, int]) -> Bool:
-    """bool (H·W,), pixels that see another object, material, light or slope than a neighbour."""
+    """bool (H·W,), pixels that differ from a neighbour in object, material, shadow or normal."""
     label = sample.label.reshape(size)
     normal = sample.normal.reshape(*size, 3)
     edge = np.zeros(size, dtype=np.bool_)

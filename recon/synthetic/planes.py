@@ -1,4 +1,4 @@
-"""Textured planes with exact disparity: the simplest scenes that a stage can be tested on."""
+"""Textured planes with exact disparity: the simplest scenes to test a stage on."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _GAIN = 0.9
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane, or a window of one, in left camera axes.
+    """A plane, or a rectangular part of one, in left camera axes.
 
     Attributes:
-        normal: Any vector that is perpendicular to it; ``normal · xyz = offset_m`` on the plane.
+        normal: Any vector perpendicular to the plane; ``normal · xyz = offset_m`` on it.
         offset_m: See ``normal``.
-        window_m: x and y between which it exists, ``(x0, x1, y0, y1)``; None = endless.
+        window_m: Extent in x and y, ``(x0, x1, y0, y1)``; None = infinite.
     """
 
     normal: tuple[float, float, float]
@@ -36,7 +36,7 @@ class Plane:
 
 
 class _Texture(NamedTuple):
-    """The noise on all planes."""
+    """The noise texture of all planes."""
 
     spacing_m: float
     seed: int
@@ -44,11 +44,11 @@ class _Texture(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlanePair:
-    """A grey pair with its truth.
+    """A grey pair with its ground truth.
 
     Attributes:
-        pair: The pictures.
-        truth: Disparity of the left view, NaN where it sees no plane; points seen by both.
+        pair: The images.
+        truth: Disparity of the left image, NaN where it sees no plane; and which points both see.
     """
 
     pair: RectifiedPair
@@ -58,7 +58,7 @@ class PlanePair:
 def fronto_parallel_pair(
     camera: RectifiedCamera, depth_m: float, *, seed: int = 0, noise_dn: float = 0.0
 ) -> PlanePair:
-    """A textured wall straight ahead: one disparity everywhere."""
+    """A fronto-parallel textured wall: constant disparity."""
     return plane_pair(camera, [Plane((0.0, 0.0, 1.0), depth_m)], seed=seed, noise_dn=noise_dn)
 
 
@@ -84,14 +84,14 @@ def step_pair(
     seed: int = 0,
     noise_dn: float = 0.0,
 ) -> PlanePair:
-    """A square in the middle of the left view in front of a wall, with its occluded strip.
+    """A square in the centre of the left image in front of a wall, with an occluded strip.
 
     Args:
         camera: The rectified camera.
         near_m: Depth of the square.
         far_m: Depth of the wall.
-        half_width_px: Half the edge of the square in the left view.
-        seed: Of the texture.
+        half_width_px: Half the side of the square in the left image.
+        seed: Seed of the texture.
         noise_dn: Sensor noise, grey levels.
     """
     half = half_width_px * near_m / camera.focal_px
@@ -105,12 +105,12 @@ def step_pair(
 def plane_pair(
     camera: RectifiedCamera, planes: Sequence[Plane], *, seed: int = 0, noise_dn: float = 0.0
 ) -> PlanePair:
-    """Render planes; the nearest hides the others.
+    """Render planes; the nearest occludes the others.
 
     Args:
         camera: The rectified camera.
-        planes: What there is to see.
-        seed: Of texture and noise.
+        planes: The planes.
+        seed: Seed of texture and noise.
         noise_dn: Sensor noise, standard deviation in grey levels.
 
     Raises:
@@ -121,9 +121,9 @@ def plane_pair(
     left, right = stereo_views(camera, np.eye(4))
     depth, nearest = _first_plane(planes, left.origin, left.directions(left.pixels()))
     if not np.isfinite(depth).any():
-        raise SettingsError("no plane is in view", hint="they must lie in front of the camera")
+        raise SettingsError("no plane is in view", hint="place them in front of the camera")
     size = (camera.height_px, camera.width_px)
-    # Lattice spacings from 16 pixels in the left view downwards, whatever the depth.
+    # Coarsest lattice spacing of 16 pixels in the left image, at any depth.
     texture = _Texture(16.0 * float(np.nanmedian(depth)) / camera.focal_px, seed)
     pictures = [
         _picture(view, planes, texture, np.random.default_rng([seed, side]), noise_dn)
@@ -148,7 +148,7 @@ def _picture(
     known = np.isfinite(depth)
     grey = np.full(len(rays), 127.5)
     xyz = view.origin + depth[known, None] * rays[known]
-    # Each plane has its own texture: they are told apart along an axis the noise does not use up.
+    # Offset each plane along the third axis of the noise, so that each has its own texture.
     xyz[:, 2] += 1000.0 * nearest[known]
     width, spacing = depth[known] / view.focal_px, np.full(len(xyz), texture.spacing_m)
     grain = fractal_noise(xyz, np.zeros_like(xyz), width, spacing, _OCTAVES, _GAIN, texture.seed)
@@ -161,7 +161,7 @@ def _picture(
 def _first_plane(
     planes: Sequence[Plane], origin: Float64, rays: Float64
 ) -> tuple[Float64, Float64]:
-    """Depth (N,) of the nearest plane on each ray, NaN = none, and its number."""
+    """Depth (N,) of the nearest plane on each ray, NaN = none, and its index."""
     depths = np.stack([_plane_depth(plane, origin, rays) for plane in planes])
     nearest = depths.argmin(axis=0)
     depth = depths[nearest, np.arange(len(rays))]

@@ -1,6 +1,6 @@
-"""What stands in a street: parked cars, trees, lamp posts, signs, bollards, bins, hedges.
+"""Objects in a street: parked cars, trees, lamp posts, signs, bollards, bins and others.
 
-Axes of an object: x along the street, y left, z up, its foot on z = 0.
+Axes of an object: x along the street, y left, z up, its base at z = 0.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def car(rng: np.random.Generator) -> TriangleSoup:
 
 
 def _body(length: float, width: float, paint: Paint, van: bool) -> TriangleSoup:
-    """The lower body: sills, bumpers, bonnet and boot."""
+    """The lower body with sills, bumpers, bonnet and boot."""
     a = length / 2
     boot = (
         [(-a + 0.06, 0.92), (-a, 0.6)] if van else [(-a + 0.55, 0.97), (-a + 0.08, 0.9), (-a, 0.6)]
@@ -77,7 +77,7 @@ def _cabin(length: float, width: float, height: float, paint: Paint, van: bool) 
 def _wheel(x: float, y: float, part: int) -> TriangleSoup:
     tyre = Paint(Material.PLAIN, (0.11, 0.11, 0.12), part + 1)
     rim = Paint(Material.METAL, (0.55, 0.56, 0.58), part + 2)
-    # The tyre stands 1 cm out of the body, the rim 1 cm out of the tyre.
+    # The tyre protrudes 1 cm from the body, the rim 1 cm from the tyre.
     out = float(np.sign(y))
     lie = se3.exp_so3(np.array([out * np.pi / 2, 0.0, 0.0]))
     outer = move(disc(0.31, tyre), _at(x, y + 0.01 * out, 0.31))
@@ -102,7 +102,7 @@ def _lamps(length: float, width: float, part: int) -> list[TriangleSoup]:
 
 
 def tree(rng: np.random.Generator) -> TriangleSoup:
-    """A trunk and a crown of several bumpy balls."""
+    """A tree: a trunk and a crown of several bumpy balls."""
     part = int(rng.integers(1, 2**30))
     height = float(rng.uniform(2.1, 2.9))
     bark = Paint(Material.BARK, (0.36, 0.30, 0.24), part)
@@ -121,7 +121,7 @@ def tree(rng: np.random.Generator) -> TriangleSoup:
 
 
 def lamp_post(side: float, rng: np.random.Generator) -> TriangleSoup:
-    """A post of 6 m with an arm over the road, which lies towards ``-side``."""
+    """A 6 m post with an arm over the road, which is towards ``-side``."""
     paint = Paint(Material.METAL, (0.30, 0.33, 0.32), int(rng.integers(1, 2**30)))
     arm = boxes([-0.04, min(0.0, -side * 1.4), 5.9], [0.04, max(0.0, -side * 1.4), 5.98], paint)
     y0, y1 = sorted((-side * 1.0, -side * 1.6))
@@ -181,5 +181,5 @@ def _at(x: float, y: float, z: float) -> Float64:
 
 
 def _flip() -> Float64:
-    """Half a turn about x: what narrowed to the top narrows to the foot."""
+    """Half a turn about x, for shapes that narrow towards the base instead of the top."""
     return se3.make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))

@@ -1,4 +1,4 @@
-"""Takes the pictures of a street drive, with the truth behind each pixel."""
+"""Renders the images of a street drive, with ground truth for each pixel."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from recon.synthetic.view import View, stereo_views
 
 @dataclass(frozen=True, eq=False)
 class SyntheticFrame:
-    """One stereo pair with its exact truth.
+    """One stereo pair with its exact ground truth.
 
     Attributes:
-        pair: The pictures, uint8 (H, W, 3) RGB.
-        depth_m: float32 (H, W), depth of the left view; NaN = sky.
-        truth: Disparity of the left view, NaN = sky; and which points the right camera sees too.
-        T_world_camera: float64 (4, 4), pose of the left camera; the first frame's is the identity.
-        ground_plane: float64 (4,), ``(a, b, c, d)``: ``a·x + b·y + c·z + d`` is the height above
-            the road of a point in left camera axes.
+        pair: The images, uint8 (H, W, 3) RGB.
+        depth_m: float32 (H, W), depth of the left image; NaN = sky.
+        truth: Disparity of the left image, NaN = sky; and which points the right camera also sees.
+        T_world_camera: float64 (4, 4), pose of the left camera; that of frame 0 is the identity.
+        ground_plane: float64 (4,), ``(a, b, c, d)``: ``a·x + b·y + c·z + d`` is the height of a
+            point in left camera axes above the road.
     """
 
     pair: StereoPair
@@ -45,7 +45,7 @@ class SyntheticFrame:
 
 
 class StreetCamera:
-    """The rig in a street. Frames may be asked for in any order.
+    """The rig in a street; renders frames in any order.
 
     Args:
         world: The street.
@@ -62,12 +62,12 @@ class StreetCamera:
 
     @cached_property
     def stage(self) -> Stage:
-        """The lit scene, prepared at first use."""
+        """The lit scene, prepared on first use."""
         settings = self.world.settings
         return make_stage(self.world.soup, self.world.to_sun, settings.seed, settings.threads)
 
     def render(self, index: int) -> SyntheticFrame:
-        """Take one stereo pair, with its truth.
+        """Render one stereo pair with its ground truth.
 
         Raises:
             SettingsError: There is no such frame.
@@ -82,15 +82,15 @@ class StreetCamera:
         )
 
     def pair(self, index: int) -> StereoPair:
-        """Take the pictures alone.
+        """Render only the images.
 
         Raises:
             SettingsError: There is no such frame.
         """
-        # Prepared before the threads start, lest both do it.
+        # Prepared before the threads start, so that it is done only once.
         views, stage = self.views(index), self.stage
         smooth, threads = self.world.settings.smooth_edges, self.world.settings.threads
-        # The two views are independent, so the number of threads changes no pixel.
+        # The two views are independent, so the number of threads does not affect the result.
         with ThreadPoolExecutor(max_workers=1 if threads == 1 else 2) as pool:
             pictures = list(pool.map(lambda view: take_picture(stage, view, smooth), views))
         left, right = (self._record(picture, index, side) for side, picture in enumerate(pictures))
@@ -103,7 +103,7 @@ class StreetCamera:
         )
 
     def depth(self, index: int) -> Float32:
-        """True depth of the left view.
+        """True depth of the left image.
 
         Returns:
             float32 (H, W), metres; NaN = sky.
@@ -116,7 +116,7 @@ class StreetCamera:
         return depth.reshape(view.height_px, view.width_px).astype(np.float32)
 
     def disparity_truth(self, index: int) -> DisparityTruth:
-        """True disparity of the left view, without taking the pictures.
+        """True disparity of the left image, without rendering the images.
 
         Raises:
             SettingsError: There is no such frame.
@@ -124,7 +124,7 @@ class StreetCamera:
         return self._truth(index, self.depth(index))
 
     def views(self, index: int) -> tuple[View, View]:
-        """Left and right camera of a frame, in street axes.
+        """Left and right view of a frame, in street axes.
 
         Raises:
             SettingsError: There is no such frame.
@@ -136,7 +136,7 @@ class StreetCamera:
         return stereo_views(self.world.camera, self.world.T_street_camera[index])
 
     def _truth(self, index: int, depth_m: Float32) -> DisparityTruth:
-        """Disparity, and a look back from the right camera at each point."""
+        """Disparity, and whether the right camera sees each point."""
         camera = self.world.camera
         left, right = self.views(index)
         known = np.flatnonzero(np.isfinite(depth_m))
@@ -148,7 +148,7 @@ class StreetCamera:
         return DisparityTruth(disparity_from_depth(depth_m, camera), nonocc.reshape(depth_m.shape))
 
     def _record(self, picture: Float64, index: int, side: int) -> UInt8:
-        """What the sensor of one side makes of a picture."""
+        """Apply the sensor model of one camera to an image."""
         settings = self.world.settings
         return record(
             picture,

@@ -1,4 +1,4 @@
-"""Simple bodies: quads, boxes, cylinders, extruded profiles, bumpy balls."""
+"""Simple shapes: quads, boxes, cylinders, extruded profiles, bumpy balls."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ FAR_UV = 100.0
 def quads(
     origins: Any, edges_u: Any, edges_v: Any, paint: Paint, uv_origins: Any = (0.0, 0.0)
 ) -> TriangleSoup:
-    """Parallelograms in one paint; the arguments are broadcast against each other.
+    """Parallelograms in one paint; the array arguments are broadcast.
 
     Args:
         origins: (N, 3) or (3,), one corner of each.
-        edges_u: (N, 3) or (3,), from that corner along u.
-        edges_v: (N, 3) or (3,), from that corner along v.
-        paint: Of all.
-        uv_origins: (N, 2) or (2,), surface coordinates of that corner, metres.
+        edges_u: (N, 3) or (3,), edge from that corner along u.
+        edges_v: (N, 3) or (3,), edge from that corner along v.
+        paint: Paint of all.
+        uv_origins: (N, 2) or (2,), texture coordinates of that corner, metres.
     """
     p, u, v = np.broadcast_arrays(*np.atleast_2d(origins, edges_u, edges_v))
     p, u, v = p.astype(np.float64), u.astype(np.float64), v.astype(np.float64)
@@ -46,13 +46,13 @@ def boxes(low: Any, high: Any, paint: Paint) -> TriangleSoup:
 
 
 def frustum(low: Any, high: Any, inset: tuple[float, float, float], paint: Paint) -> TriangleSoup:
-    """The four walls of a box that narrows to the top.
+    """The four walls of a box that narrows towards the top.
 
     Args:
         low: (3,) lower corner.
-        high: (3,) upper corner of the box around it.
-        inset: By how much the top is shorter at the back (-x), at the front (+x), at each side.
-        paint: Of the walls.
+        high: (3,) upper corner of its bounding box.
+        inset: Inset of the top at the back (-x), at the front (+x) and at each side.
+        paint: Paint of the walls.
     """
     (x0, y0, z0), (x1, y1, z1), (back, front, side) = low, high, inset
     bottom = np.array([[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]], dtype=np.float64)
@@ -76,7 +76,7 @@ def frustum(low: Any, high: Any, inset: tuple[float, float, float], paint: Paint
 def cylinder(
     radii_m: tuple[float, float], height_m: float, paint: Paint, sides: int = 10
 ) -> TriangleSoup:
-    """The mantle of an upright cone frustum on the origin; no caps."""
+    """The lateral surface of an upright cone frustum standing at the origin, without caps."""
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(sides + 1)], axis=1)
     rise = np.array([0.0, 0.0, height_m])
@@ -99,7 +99,7 @@ def disc(radius_m: float, paint: Paint, sides: int = 14) -> TriangleSoup:
 
 
 def extrusion(profile: Any, width_m: float, paint: Paint) -> TriangleSoup:
-    """A star-shaped profile (K, 2) of (x, z) swept along y, centred on y = 0, with both caps."""
+    """A star-shaped profile (K, 2) of (x, z) extruded along y, centred on y = 0, with both caps."""
     outline = np.asarray(profile, dtype=np.float64)
     closed = np.vstack([outline, outline[:1]])
     left = np.stack([closed[:, 0], np.full(len(closed), width_m / 2), closed[:, 1]], axis=1)
@@ -108,7 +108,7 @@ def extrusion(profile: Any, width_m: float, paint: Paint) -> TriangleSoup:
     along = np.concatenate([[0.0], np.cumsum(steps)])
     a, b = slice(None, -1), slice(1, None)
     mantle = _split(left[a], left[b], right[b], right[a])
-    # Far from the caps' coordinates, so that what is painted on the caps stays there.
+    # Far from the texture coordinates of the caps, so that patterns on the caps stay there.
     uv = [np.stack([FAR_UV + along, np.full(len(along), FAR_UV + y)], 1) for y in (0.0, width_m)]
     parts = [painted(mantle, _split(uv[0][a], uv[0][b], uv[1][b], uv[1][a]), paint)]
     for rim in (left, right):
@@ -121,15 +121,15 @@ def extrusion(profile: Any, width_m: float, paint: Paint) -> TriangleSoup:
 def bumpy_ball(
     radii_m: Any, paint: Paint, *, bump: float, wavelength: float, seed: int, splits: int = 3
 ) -> TriangleSoup:
-    """A ball with hills: the crown of a tree.
+    """An ellipsoid with bumps, such as the crown of a tree.
 
     Args:
-        radii_m: (3,) half axes.
-        paint: Of the surface.
-        bump: Height of the hills as a share of the radius.
-        wavelength: Their spacing as a share of the radius.
-        seed: Another seed is another shape.
-        splits: Times that an icosahedron's faces are split in four.
+        radii_m: (3,) semi-axes.
+        paint: Paint of the surface.
+        bump: Height of the bumps as a fraction of the radius.
+        wavelength: Their spacing as a fraction of the radius.
+        seed: Seed of the shape.
+        splits: Number of times that the faces of an icosahedron are split in four.
     """
     directions = icosphere(splits)
     flat, places = np.unique(directions.reshape(-1, 3), axis=0, return_inverse=True)
@@ -143,7 +143,7 @@ def bumpy_ball(
 
 
 def _smooth_normals(corners: Float64, places: NDArray[np.int64]) -> Float64:
-    """Normals (F, 3, 3), the mean of all triangles that meet at a corner, by area."""
+    """Normals (F, 3, 3), the area-weighted mean of all triangles that meet at a corner."""
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros((int(places.max()) + 1, 3))
     np.add.at(total, places, np.repeat(flat, 3, axis=0))
@@ -174,5 +174,5 @@ def _unit(v: NDArray[Any]) -> Float64:
 
 
 def _split(a: Float64, b: Float64, c: Float64, d: Float64) -> Float64:
-    """Two triangles of each quad a b c d."""
+    """Two triangles per quad a b c d."""
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])

@@ -1,4 +1,4 @@
-"""Painted triangles: the material that every synthetic scene is made of."""
+"""Painted triangles, of which every synthetic scene consists."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from recon.structures.arrays import Float64, Int32, UInt8, freeze
 
 
 class Material(IntEnum):
-    """How a surface is painted; `recon.synthetic.materials` has the recipe of each."""
+    """Kinds of surface; `recon.synthetic.materials` has a recipe for each."""
 
     PLAIN = 0
     ASPHALT = 1
@@ -35,12 +35,12 @@ class Material(IntEnum):
 
 @dataclass(frozen=True)
 class Paint:
-    """What a surface gets when it is made.
+    """Appearance of a surface.
 
     Attributes:
         material: The recipe.
         rgb: Base colour as displayed, each in [0, 1].
-        part: Number that tells one object from the next; seeds its variations.
+        part: Number of the object, which seeds its variations.
     """
 
     material: Material = Material.PLAIN
@@ -50,12 +50,12 @@ class Paint:
 
 @dataclass(frozen=True, eq=False)
 class TriangleSoup:
-    """Triangles that know how they are painted; they share no vertices.
+    """Triangles with their paint; they share no vertices.
 
     Attributes:
         vertices: float64 (F, 3, 3), corners, metres.
-        normals: float64 (F, 3, 3), unit normals at the corners, for shading alone.
-        uv: float64 (F, 3, 2), place of the corners on the painted surface, metres.
+        normals: float64 (F, 3, 3), unit normals at the corners, only for shading.
+        uv: float64 (F, 3, 2), texture coordinates of the corners, metres.
         rgb: float64 (F, 3), base colour.
         material: uint8 (F,), a `Material`.
         part: int32 (F,), number of the object.
@@ -89,7 +89,7 @@ def merge(soups: Iterable[TriangleSoup]) -> TriangleSoup:
 
 
 def move(soup: TriangleSoup, T_to_from: Float64) -> TriangleSoup:
-    """The same triangles in other axes."""
+    """Transform triangles into other axes."""
     vertices = se3.apply(T_to_from, soup.vertices.reshape(-1, 3)).reshape(-1, 3, 3)
     normals = se3.rotate(T_to_from, soup.normals.reshape(-1, 3)).reshape(-1, 3, 3)
     return replace(soup, vertices=vertices, normals=normals)
@@ -98,9 +98,9 @@ def move(soup: TriangleSoup, T_to_from: Float64) -> TriangleSoup:
 def painted(
     vertices: Float64, uv: Float64, paint: Paint, normals: Float64 | None = None
 ) -> TriangleSoup:
-    """Triangles (F, 3, 3) with surface coordinates (F, 3, 2), all in one paint.
+    """Triangles (F, 3, 3) with texture coordinates (F, 3, 2), all in one paint.
 
-    Without ``normals`` they are flat.
+    Without ``normals`` they are flat-shaded.
     """
     n = len(vertices)
     return TriangleSoup(

@@ -1,6 +1,6 @@
-"""A lit scene: answers what a ray sees, and in which colour.
+"""A lit scene: finds what each ray hits, and its colour.
 
-All surfaces are Lambertian and the light stands still, so a point has one colour, whoever looks.
+All surfaces are Lambertian and the light is static, so a point has the same colour from everywhere.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from recon.synthetic.surface import plane_distance, surface_table
 
 _SUN: Final = np.array([1.50, 1.38, 1.18])
 _SKY: Final = np.array([0.52, 0.58, 0.68])
-_SIGHT: Final = 1.0 - 1e-4  # share of the way to a surface that must be clear to see it
-_SKIN_M: Final = 2e-3  # light is traced from this far above a surface
-_REACH_M: Final = 80.0  # shadows are not thrown further
-_SHELTER_M: Final = 1.0  # a floor with something this close above it sees little sky
+_SIGHT: Final = 1.0 - 1e-4  # fraction of a line of sight that must be free
+_SKIN_M: Final = 2e-3  # shadow rays start this far above a surface
+_REACH_M: Final = 80.0  # length of shadow rays
+_SHELTER_M: Final = 1.0  # a horizontal surface with an object this close above sees little sky
 
 
 class Sample(NamedTuple):
-    """What rays see.
+    """What rays hit.
 
     Attributes:
         rgb: float64 (N, 3), linear light.
         normal: float64 (N, 3), shading normal; 0 for the sky.
-        label: int64 (N,), tells objects, materials and shadow from light.
+        label: int64 (N,), differs between objects, materials, and shadow and light.
     """
 
     rgb: Float64
@@ -46,10 +46,10 @@ class Stage:
 
     Attributes:
         soup: The triangles.
-        table: The same, solved for hits.
-        rays: The same, for the ray caster.
-        to_sun: float64 (3,), unit vector.
-        seed: Of grain and clouds.
+        table: The triangles, precomputed for hits.
+        rays: The triangles in the ray caster.
+        to_sun: float64 (3,), unit vector towards the sun.
+        seed: Seed of grain and clouds.
     """
 
     soup: TriangleSoup
@@ -59,7 +59,7 @@ class Stage:
     seed: int
 
     def depth(self, origin: Float64, directions: Float64) -> Float64:
-        """float64 (N,), depth along rays of unit depth; NaN where they meet nothing."""
+        """float64 (N,), depth along rays of unit depth; NaN where they hit nothing."""
         faces = self.rays.first_hit(origin, directions)
         hit = faces >= 0
         depth = np.full(len(directions), np.nan)
@@ -67,14 +67,14 @@ class Stage:
         return depth
 
     def sees(self, origin: Float64, xyz: Float64) -> Bool:
-        """bool (N,), whether nothing stands between ``origin`` and points."""
+        """bool (N,), whether the line of sight from ``origin`` to each point is free."""
         return ~self.rays.blocked(origin, xyz - origin, far=_SIGHT)
 
     def look(self, origin: Float64, directions: Float64, pixel: float) -> Sample:
-        """What rays see.
+        """Trace rays and shade what they hit.
 
         Args:
-            origin: (3,), centre of the camera.
+            origin: (3,), camera centre.
             directions: (N, 3), of unit depth.
             pixel: Width of a pixel at unit depth.
         """
@@ -94,7 +94,7 @@ class Stage:
         return Sample(rgb, normal, label)
 
     def _light(self, points: SurfaceHits) -> tuple[Float64, Bool]:
-        """Light (N, 3) on points, and whether the sun reaches them."""
+        """Irradiance (N, 3) at points, and whether the sun reaches them."""
         start = points.xyz + _SKIN_M * points.normal
         facing = points.normal @ self.to_sun
         lit = facing > 0
@@ -109,5 +109,5 @@ class Stage:
 
 
 def make_stage(soup: TriangleSoup, to_sun: Float64, seed: int, threads: int = 0) -> Stage:
-    """Light a scene."""
+    """Prepare a scene for rendering."""
     return Stage(soup, surface_table(soup), RayScene(soup.vertices, threads), to_sun, seed)

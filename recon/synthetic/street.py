@@ -1,4 +1,4 @@
-"""Lays out a street by its seed: ground, houses, and what stands between them."""
+"""Lays out a street from its seed: ground, houses, and the objects between them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from recon.synthetic.settings import StreetSettings
 from recon.synthetic.soup import Material, Paint, TriangleSoup, merge, move, painted
 
 KERB_M: Final = 0.12  # pavement above road
-_WALL_M: Final = 8.2  # facades from the centre line
+_WALL_M: Final = 8.2  # distance of facades from the centre line
 _AHEAD_M: Final = 110.0
 _CAR_LANE_M: Final = 4.15
 _SEEDLINGS: Final = 5
@@ -28,14 +28,14 @@ _SEEDLINGS: Final = 5
 
 @dataclass(frozen=True, eq=False)
 class StreetWorld:
-    """A street, a rig and its path: all that a picture depends on.
+    """A street, a rig and its path: everything that an image depends on.
 
     Attributes:
-        settings: What it was built from.
+        settings: The settings it was built from.
         soup: The scene, street axes (x along the street at its start, y left, z up, road at 0).
         camera: The rectified rig.
-        T_street_camera: float64 (frames, 4, 4), left camera.
-        to_sun: float64 (3,), unit vector, street axes.
+        T_street_camera: float64 (frames, 4, 4), poses of the left camera.
+        to_sun: float64 (3,), unit vector towards the sun, street axes.
     """
 
     settings: StreetSettings
@@ -65,7 +65,7 @@ class StreetWorld:
     def T_map_world(self) -> Float64:
         """float64 (4, 4); map axes: x forward along the first view, y left, z exactly up.
 
-        The origin is that of world, the first left camera.
+        The origin is that of the world, the first left camera.
         """
         forward = self.T_street_camera[0][:3, 2] * [1.0, 1.0, 0.0]
         forward /= np.linalg.norm(forward)
@@ -83,7 +83,7 @@ class StreetWorld:
 
 
 def build_street(settings: StreetSettings) -> StreetWorld:
-    """Lay out the street of a seed."""
+    """Lay out the street for some settings."""
     length = settings.frames * settings.speed_m_per_frame + _AHEAD_M
     road = centre_line(settings, length + 60.0)
     layers: list[Callable[[CentreLine, float, np.random.Generator], Iterator[TriangleSoup]]] = [
@@ -109,14 +109,14 @@ def build_street(settings: StreetSettings) -> StreetWorld:
 
 
 def _repeated(period: TriangleSoup, repeat_m: float, length_m: float) -> TriangleSoup:
-    """A period of a straight street, end to end from behind the start on."""
+    """Repeat one period of a straight street, beginning behind the start."""
     shifts = repeat_m * np.arange(-math.ceil(BEHIND_M / repeat_m), math.ceil(length_m / repeat_m))
     along = [np.array([shift, 0.0, 0.0]) for shift in shifts]
     return merge([move(period, se3.make_transform(np.eye(3), offset)) for offset in along])
 
 
 def rig(settings: StreetSettings) -> RectifiedCamera:
-    """The rectified cameras of the settings; both principal points are in the middle."""
+    """The rectified cameras of the settings, with both principal points at the image centre."""
     return RectifiedCamera(
         focal_px=settings.focal_px,
         cx_px=(settings.width_px - 1) / 2,
@@ -129,7 +129,7 @@ def rig(settings: StreetSettings) -> RectifiedCamera:
 
 
 def _sun(seed: int) -> Float64:
-    """High, and to one side of the street, so that one row of houses is lit."""
+    """Direction to the sun: high and to one side of the street, so that one row is lit."""
     rng = np.random.default_rng([seed, 99])
     azimuth = rng.choice([-1.0, 1.0]) * rng.uniform(1.1, 2.3)
     climb = rng.uniform(0.75, 1.0)
@@ -139,7 +139,7 @@ def _sun(seed: int) -> Float64:
 
 
 def _ground(road: CentreLine) -> TriangleSoup:
-    """Road, kerbs and pavements in strips of a metre, and the land beside them."""
+    """Road, kerbs and pavements in strips of one metre, and the ground beside them."""
     a, top = ROAD_HALF_M, KERB_M
     grey = Paint(Material.ASPHALT, (0.40, 0.40, 0.41))
     strips = [_strip(road, ((-a, 0.0), (a, 0.0)), grey)]
@@ -174,15 +174,15 @@ def _strip(road: CentreLine, edges: tuple[tuple[float, float], ...], paint: Pain
 
 
 def _stations(road: CentreLine) -> Float64:
-    """Where the strips of the ground are cut: every metre, and at their very ends."""
+    """Distances at which the strips of the ground are divided: every metre, and at the ends."""
     first, last = road.span_m
-    if first < 0.0:  # an open road, whose ground goes on behind the last objects
+    if first < 0.0:  # an open road, whose ground continues beyond the last objects
         return np.arange(first, float(road.along_m[-1]) - 10.0, 1.0)
     return np.linspace(first, last, math.ceil(last - first) + 1)
 
 
 def _yard(road: CentreLine, lateral_m: float, paint: Paint) -> TriangleSoup:
-    """The land inside of a block: a fan from its middle to the pavement's inner edge."""
+    """The ground inside a block: a fan from its centre to the inner edge of the pavement."""
     along = _stations(road)
     rim = road.points(along, np.full(len(along), lateral_m))
     middle = np.broadcast_to(rim.mean(axis=0), (len(rim) - 1, 2))
@@ -204,7 +204,7 @@ def _band(near: Float64, far: Float64) -> Float64:
 
 
 def _houses(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """A row of houses with set-backs, and now and then the mouth of a side street."""
+    """A row of houses with setbacks and occasional gaps for side streets."""
     at, end = road.span_m
     while at < end:
         width = float(rng.uniform(8.0, 15.0))
@@ -216,7 +216,7 @@ def _houses(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator
 
 
 def _backdrop(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Houses behind the first row, which close the views through its gaps."""
+    """Houses behind the first row, visible through its gaps."""
     at, end = road.span_m
     end += 30.0 * (at < 0.0)
     while at < end:
@@ -227,7 +227,7 @@ def _backdrop(road: CentreLine, side: float, rng: np.random.Generator) -> Iterat
 
 
 def _room(road: CentreLine, side: float, at_m: float, width_m: float) -> bool:
-    """Whether a house fits: within the lap or period, and off the inside of a corner."""
+    """Whether a house fits: within the lap or period, and not on the inside of a corner."""
     if road.span_m[0] < 0.0:
         return True
     end_m = at_m + width_m
@@ -242,7 +242,7 @@ def _stand(
     width_m: float,
     rng: np.random.Generator,
 ) -> TriangleSoup:
-    """A house on one side; its facade is a chord of the curve."""
+    """A house on one side, with its facade on a chord of the curve."""
     built = house(draw_plan(width_m, rng), rng)
     T = road.place(at_m + width_m / 2, side * (_WALL_M + setback_m), KERB_M)
     half = se3.make_transform(np.eye(3), np.array([-width_m / 2, 0.0, 0.0]))
@@ -252,7 +252,7 @@ def _stand(
 
 
 def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Cars in about half of the bays, most of them in the direction of their lane."""
+    """Parked cars in about half of the bays, most facing in the direction of their lane."""
     first, end = road.span_m
     for bay in np.arange(max(first, -18.0), end, 6.0):
         if rng.random() < 0.45:
@@ -265,7 +265,7 @@ def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Ite
 
 
 def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Street trees along the kerb, grown from a few seedlings, and a row at the far end."""
+    """Trees along the kerb, copied from a few models, and a row at the far end."""
     seedlings = [props.tree(rng) for _ in range(_SEEDLINGS)]
 
     def grow(at_m: float, lateral_m: float) -> TriangleSoup:
@@ -283,9 +283,9 @@ def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[
 
 
 def _furniture(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Lamp posts at even distances; signs, bollards, bins and pillars where chance puts them."""
+    """Lamp posts at regular distances; signs, bollards, bins and pillars at random."""
     kerb = side * (ROAD_HALF_M + 0.45)
-    # A stream of their own: the number of posts must not change what stands between them.
+    # Separate random streams, as the number of posts must not change the objects between them.
     lamps, rng = rng.spawn(2)
     first, end = road.span_m
     for at in np.arange(max(first, -12.0) + 12.0 * (side > 0), end, 24.0):

@@ -1,4 +1,4 @@
-"""Triangles made ready for rays."""
+"""Precomputed triangles for fast evaluation of ray hits."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from recon.synthetic.soup import TriangleSoup
 
 
 def surface_table(soup: TriangleSoup) -> SurfaceTable:
-    """Solve each triangle once, so that a hit costs a few products."""
-    # The ray caster rounds corners to single precision; the planes must be those that it hits.
+    """Precompute each triangle, so that a hit costs only a few products."""
+    # The ray caster uses single precision; the planes must be exactly those that it hits.
     corners = soup.vertices.astype(np.float32).astype(np.float64)
     a, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(e1, e2)
@@ -32,7 +32,7 @@ def surface_table(soup: TriangleSoup) -> SurfaceTable:
 def plane_distance(
     table: SurfaceTable, faces: Int32, origin: Float64, directions: Float64
 ) -> Float64:
-    """Where rays pierce the planes of their triangles, in units of their directions (N,)."""
+    """Distances (N,) of rays to the planes of their triangles, in units of the directions."""
     normal = table.normal[faces]
     height = np.einsum("nx,nx->n", table.anchor[faces] - origin, normal)
     return np.asarray(height / np.einsum("nx,nx->n", directions, normal))

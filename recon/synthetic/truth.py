@@ -1,4 +1,4 @@
-"""The truth about a whole drive: surfaces that were in view, and where obstacles stand."""
+"""Ground truth of a whole drive: the surfaces that were seen, and the obstacles."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from recon.synthetic.footprint import footprint
 from recon.synthetic.render import StreetCamera
 
 _BEYOND_M: Final = 2.0
-"""Surfaces this far beyond the range are true too: a map may find them a little nearer."""
+"""Surfaces this far beyond the range are included, as a map may place them slightly nearer."""
 _KEY_BITS: Final = 21
 _COMPACT_AT: Final = 4_000_000
 
@@ -27,9 +27,9 @@ def true_surface(
 
     Args:
         camera: The rig in its street.
-        range_m: Pixels deeper than this are left out.
-        voxel_m: One pixel is kept of those that fall into a voxel; it is not moved, so every
-            point lies exactly on a surface.
+        range_m: Pixels with a larger depth are left out.
+        voxel_m: Of the pixels in a voxel one is kept, unmoved, so that every point lies exactly
+            on a surface.
 
     Returns:
         Cloud in frame ``world``.
@@ -55,16 +55,16 @@ def true_occupancy(
     least_frames: int = 1,
     T_map_world: Float64 | None = None,
 ) -> OccupancyTruth:
-    """Where surfaces and obstacles are on the part of the street that was seen.
+    """True surfaces and obstacles on the part of the street that was seen.
 
     Args:
         camera: The rig in its street.
-        resolution_m: Edge of a cell; cell borders are at multiples of it.
-        band_m: Heights above the road between which something is an obstacle. The pavement is
-            0.12 m high, so a band that begins lower makes it one.
-        range_m: Distance from the camera up to which a frame sees.
-        least_frames: Frames that must have seen a cell of the grid.
-        T_map_world: The map axes to draw in; the world's own by default.
+        resolution_m: Cell size; cell borders are at multiples of it.
+        band_m: Heights above the road between which a surface is an obstacle. The pavement is
+            0.12 m high, so a lower band makes it an obstacle.
+        range_m: Largest distance from the camera that a frame sees.
+        least_frames: Least number of frames that must have seen a cell of the grid.
+        T_map_world: The map axes to use; by default those of the street world.
 
     Raises:
         EvaluationError: No surface is in view and in range.
@@ -128,18 +128,18 @@ def _thin(xyz: Float32, voxel_m: float) -> Float32:
 
 
 class _Counter:
-    """Counts the frames that each cell appears in."""
+    """Counts the frames in which each cell appears."""
 
     def __init__(self) -> None:
         self._keys = np.zeros(0, np.int64)
         self._frames = np.zeros(0, np.int64)
 
     def add(self, cells: NDArray[np.int64]) -> None:
-        """Count the cells (N, 3) of one frame, each once or many times."""
+        """Count the cells (N, 3) of one frame; duplicates count once."""
         self._merge(np.unique(_pack(cells)), 1)
 
     def know(self, cells: NDArray[np.int64]) -> None:
-        """Take cells (N, 3) that count for no frame."""
+        """Include cells (N, 3) without counting a frame."""
         self._merge(np.unique(_pack(cells)), 0)
 
     def _merge(self, keys: NDArray[np.int64], count: int) -> None:
@@ -148,13 +148,13 @@ class _Counter:
         self._frames = np.bincount(place, weights=frames).astype(np.int64)
 
     def counts(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Cells (N, 3) in order, and in how many frames each appeared."""
+        """Cells (N, 3) in order, and the number of frames in which each appeared."""
         mask = (1 << _KEY_BITS) - 1
         parts = [(self._keys >> shift) & mask for shift in (2 * _KEY_BITS, _KEY_BITS, 0)]
         return np.stack(parts, axis=1) - (1 << (_KEY_BITS - 1)), self._frames
 
 
 def _pack(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One number for each cell (N, 3)."""
+    """Pack each cell (N, 3) into one integer."""
     wide = cells + (1 << (_KEY_BITS - 1))
     return np.asarray((wide[:, 0] << (2 * _KEY_BITS)) | (wide[:, 1] << _KEY_BITS) | wide[:, 2])

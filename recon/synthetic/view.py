@@ -1,4 +1,4 @@
-"""One camera of the rig at one moment."""
+"""One camera of the rig at one pose."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class View:
 
     @property
     def origin(self) -> Float64:
-        """float64 (3,), the camera's centre in the scene."""
+        """float64 (3,), the camera centre in the scene."""
         return self.T_scene_camera[:3, 3]
 
     def pixels(self) -> Float64:
@@ -51,7 +51,7 @@ class View:
         return np.asarray(self.focal_px * local[:, :2] / depth + self.centre_px)
 
     def inside(self, pixels: Float64) -> Bool:
-        """bool (N,), True where a position lies on a pixel of the picture."""
+        """bool (N,), True where a position lies within the image."""
         u, v = pixels[:, 0], pixels[:, 1]
         with np.errstate(invalid="ignore"):
             in_u = (u >= -0.5) & (u < self.width_px - 0.5)
@@ -59,7 +59,7 @@ class View:
 
 
 def stereo_views(camera: RectifiedCamera, T_scene_left: Float64) -> tuple[View, View]:
-    """The left and the right view of a rig whose left camera stands at ``T_scene_left``."""
+    """The left and right view of a rig with its left camera at ``T_scene_left``."""
     T_scene_right = T_scene_left.copy()
     T_scene_right[:3, 3] += camera.baseline_m * T_scene_left[:3, 0]
     size = camera.width_px, camera.height_px

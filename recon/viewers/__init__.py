@@ -1,4 +1,4 @@
-"""Observers of a run."""
+"""Observers that show the progress of a run."""
 
 from recon.viewers.announce import announce, warn
 from recon.viewers.progress import JsonLines, Quiet, RichProgress, choose_viewer

@@ -1,4 +1,4 @@
-"""Says what a source was taken for and what is wrong with it, before anything is done with it."""
+"""Announces the recognised source and its warnings before a run starts."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from recon.sources import StereoSource
 
 
 def announce(source: StereoSource, *, quiet: bool = False, stream: TextIO | None = None) -> None:
-    """Write one line: text on a terminal, a JSON object anywhere else, nothing where ``quiet``.
+    """Write one line: text on a terminal, else a JSON object.
 
     Args:
         source: The source.
         quiet: Whether to write nothing.
-        stream: Where to; None = standard error, so that standard output stays for results.
+        stream: Output stream; None = standard error, as standard output is for results.
     """
     event = {
         "event": "source",
@@ -28,7 +28,7 @@ def announce(source: StereoSource, *, quiet: bool = False, stream: TextIO | None
 
 
 def warn(lines: Iterable[str], *, quiet: bool = False, stream: TextIO | None = None) -> None:
-    """Write warnings while there is still time to act on them, each as `announce` does."""
+    """Write warnings before the run starts, each in the form of `announce`."""
     for line in lines:
         _tell(f"warning: {line}", {"event": "warning", "text": line}, quiet, stream)
 

@@ -12,7 +12,7 @@ from recon.pipeline.doctor import Check
 
 
 def print_checks(checks: Sequence[Check], console: Console | None = None) -> None:
-    """Print one line per check, and below the table what to do about those that failed."""
+    """Print one line per check, and below the table the hints for those that failed."""
     out = console or Console()
     table = Table(show_edge=False, pad_edge=False)
     for title in ("", "check", "found"):

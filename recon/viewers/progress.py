@@ -1,4 +1,4 @@
-"""Observers that tell how far a run is: a bar for people, JSON lines for programs."""
+"""Observers that show the progress of a run: a bar for people, JSON lines for programs."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from recon.pipeline.observer import FrameResult, Observer
 
-# How much the newest frame counts in the shown rate: steady enough to read, quick to follow.
+# Weight of the newest frame in the displayed rate: steady enough to read, yet responsive.
 _RATE_WEIGHT: Final = 0.2
 
 
 def choose_viewer(*, quiet: bool = False, stream: TextIO | None = None) -> Observer:
-    """Nothing where ``quiet``; else a bar on a terminal, and JSON lines anywhere else.
+    """Choose a progress bar on a terminal, else JSON lines.
 
     Args:
         quiet: Whether to show no progress.
-        stream: Where to; None = standard error, so that standard output stays for results.
+        stream: Output stream; None = standard error, as standard output is for results.
     """
     out = sys.stderr if stream is None else stream
     if quiet:
@@ -46,10 +46,10 @@ class Quiet:
 
 
 class JsonLines:
-    """Writes one JSON object per event and line; a number that is NaN becomes null.
+    """Writes one JSON object per event and line; NaN becomes null.
 
     Args:
-        stream: Where to; each line is flushed, so that a reader sees it at once.
+        stream: Output stream; flushed after each line, so that a reader sees it at once.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -60,7 +60,7 @@ class JsonLines:
         self._write({"event": "start", "name": name, "frames": total})
 
     def on_frame(self, result: FrameResult) -> None:
-        """Write what became of a frame."""
+        """Write the result of a frame."""
         health = result.health
         self._write(
             {
@@ -79,7 +79,7 @@ class JsonLines:
         )
 
     def on_stage(self, name: str) -> None:
-        """Write the name of the stage that begins."""
+        """Write the name of the stage that starts."""
         self._write({"event": "stage", "name": name})
 
     def on_finish(self) -> None:
@@ -92,10 +92,10 @@ class JsonLines:
 
 
 class RichProgress:
-    """Shows a bar with frames, rate, share of valid pixels and whether the pose is measured.
+    """Shows a bar with frames, rate, valid pixels and whether the pose is trusted.
 
     Args:
-        console: Where to draw.
+        console: The console to draw on.
     """
 
     def __init__(self, console: Console) -> None:
@@ -129,7 +129,7 @@ class RichProgress:
         self._progress.update(task, advance=1, rate=self._rate(result), state=self._state(result))
 
     def on_stage(self, name: str) -> None:
-        """Name the stage that begins."""
+        """Print the name of the stage that starts."""
         self._console.print(f"{name} …", style="dim", markup=False, highlight=False)
 
     def on_finish(self) -> None:

@@ -1,4 +1,4 @@
-"""Observers that tell how far an evaluation of scenes is: a bar for people, lines for programs."""
+"""Observers that show the progress of an evaluation: a bar for people, lines for programs."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from recon.pipeline.middlebury_run import SceneObserver
 
 
 def choose_scene_viewer(*, quiet: bool = False, stream: TextIO | None = None) -> SceneObserver:
-    """Nothing where ``quiet``; else a bar on a terminal, and JSON lines anywhere else.
+    """Choose a progress bar on a terminal, else JSON lines.
 
     Args:
         quiet: Whether to show no progress.
-        stream: Where to; None = standard error, so that standard output stays for results.
+        stream: Output stream; None = standard error, as standard output is for results.
     """
     out = sys.stderr if stream is None else stream
     if quiet:
@@ -43,7 +43,7 @@ class SceneLines:
     """Writes one JSON object per event and line.
 
     Args:
-        stream: Where to; each line is flushed, so that a reader sees it at once.
+        stream: Output stream; flushed after each line, so that a reader sees it at once.
     """
 
     def __init__(self, stream: TextIO) -> None:
@@ -54,7 +54,7 @@ class SceneLines:
         self._write({"event": "start", "name": name, "scenes": total})
 
     def on_scene(self, name: str, figures: Mapping[str, Any]) -> None:
-        """Write the seconds that each matcher took; none = no truth."""
+        """Write the seconds of each matcher; empty if the scene has no ground truth."""
         seconds = {matcher: one["seconds"] for matcher, one in figures.items()}
         self._write({"event": "scene", "name": name, "seconds": seconds})
 
@@ -68,10 +68,10 @@ class SceneLines:
 
 
 class SceneBar:
-    """Shows a bar with the scene that was done last.
+    """Shows a bar with the last finished scene.
 
     Args:
-        console: Where to draw.
+        console: The console to draw on.
     """
 
     def __init__(self, console: Console) -> None:

@@ -53,5 +53,5 @@ def test_one_seed_gives_one_set_of_pictures() -> None:
 
 
 def test_a_rig_whose_cameras_share_no_view_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="does not fit into both pictures"):
+    with pytest.raises(CalibrationError, match="does not fit into both images"):
         place_boards(board_rig(baseline_m=50.0), BOARD, 2)
