@@ -1,4 +1,4 @@
-"""What all tests share: the real data, where there is any."""
+"""Fixtures shared by all tests: the real data, if available."""
 
 from __future__ import annotations
 

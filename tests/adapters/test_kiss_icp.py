@@ -129,7 +129,7 @@ def test_no_foreign_exception_leaks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_threshold_is_that_of_kiss_icp() -> None:
-    """Ours can be saved; it gives the same numbers."""
+    """Our threshold, unlike that of kiss-icp, can be saved; it gives the same values."""
     from kiss_icp.pybind import kiss_icp_pybind
 
     from recon.adapters.kiss_icp import _AdaptiveThreshold

@@ -1,4 +1,4 @@
-"""Open3D at arm's length: read-only arrays in, our arrays and errors out."""
+"""The Open3D adapter takes read-only arrays, and returns our arrays and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Open3D's mesh surgery on meshes small enough to count."""
+"""Mesh editing with Open3D, on meshes small enough to count by hand."""
 
 from __future__ import annotations
 

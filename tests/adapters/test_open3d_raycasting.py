@@ -1,4 +1,4 @@
-"""Rays meet the nearest triangle; segments know what stands on them."""
+"""Rays hit the nearest triangle; segments report occlusions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ICP gives the motion back, far from the origin too, and its failures are ours."""
+"""ICP recovers the motion, also far from the origin, and failures raise our errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MeshLab in its child process: its failures become one line of ours."""
+"""MeshLab in its child process: failures become one clear line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The OctoMap adapter: what pyoctomap wrote as ``.bt`` comes back, and no foreign errors."""
+"""The OctoMap adapter reads a ``.bt`` written by pyoctomap, and raises only our errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The project's own files, as its house rules see them."""
+"""Fixtures for tests of the project's own files."""
 
 from __future__ import annotations
 

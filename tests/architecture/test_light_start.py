@@ -1,4 +1,4 @@
-"""The command line answers at once: heavy libraries load only when a command needs them."""
+"""The command line starts fast: heavy libraries are imported only when a command needs them."""
 
 from __future__ import annotations
 

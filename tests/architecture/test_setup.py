@@ -1,4 +1,4 @@
-"""A fresh machine gets what a run needs, and `recon doctor` asks for the same."""
+"""The setup script installs what a run needs, and `recon doctor` checks for the same."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ten faults that recordings have, planted into a drive that has none."""
+"""Ten common faults of recordings, injected into a drive without faults."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from recon.structures.arrays import Float64
 
 @dataclass(frozen=True, eq=False)
 class Spoiled:
-    """A source whose pairs are made of those of another one; ``take(i)`` gives pair i."""
+    """A source with modified pairs of another one; ``take(i)`` gives pair i."""
 
     camera: RectifiedCamera | StereoCalibration
     count: int
@@ -69,7 +69,7 @@ def changed(
 
 
 def turned(source: StereoSource, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Spoiled:
-    """The right camera turned about x and z: its picture is another view from the same place."""
+    """The right camera turned about x and z: its image is another view from the same place."""
     camera = rectified(source)
     K = camera.matrix.copy()
     K[0, 2] = camera.cx_right_px
@@ -82,7 +82,7 @@ def turned(source: StereoSource, pitch_deg: float = 0.0, roll_deg: float = 0.0) 
 def unrectified(
     source: StereoSource, left_rad: Float64, right_rad: Float64, pitch_deg: float = 0.0
 ) -> Spoiled:
-    """Cameras that are turned from where they look when rectified, and calibrated so.
+    """Cameras rotated relative to their rectified orientation, and calibrated so.
 
     The right one is off its calibration by ``pitch_deg``.
     """
@@ -120,7 +120,7 @@ def row_shift(source: StereoSource, rows: int) -> Spoiled:
 
 
 def duplicated(source: StereoSource, every: int = 5) -> Spoiled:
-    """Every fifth frame is written twice; the times go on."""
+    """Every fifth frame is written twice, with increasing times."""
     order = [k for k in range(len(source)) for _ in range(2 if k % every == every - 1 else 1)]
     step_s = at(source, 1).timestamp_s - at(source, 0).timestamp_s
 
@@ -131,7 +131,7 @@ def duplicated(source: StereoSource, every: int = 5) -> Spoiled:
 
 
 def wrong_size(source: StereoSource) -> Spoiled:
-    """The pictures are half as large as those that were calibrated."""
+    """The images are half as large as those that were calibrated."""
     half = changed(source, lambda left, right: (left[::2, ::2].copy(), right[::2, ::2].copy()))
 
     def take(index: int) -> StereoPair:
@@ -146,7 +146,7 @@ def wrong_size(source: StereoSource) -> Spoiled:
 
 
 def silently_wrong_size(source: StereoSource) -> Spoiled:
-    """The same, and the calibration file does not tell what size it is for."""
+    """The same, with a calibration file that does not contain the image size."""
     half = changed(source, lambda left, right: (left[::2, ::2].copy(), right[::2, ::2].copy()))
     height, width = half.take(0).left.shape[:2]
     return replace(half, camera=replace(rectified(half), width_px=width, height_px=height))

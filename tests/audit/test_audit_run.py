@@ -1,4 +1,4 @@
-"""The audit finds each planted fault, and nothing where nothing was planted."""
+"""The audit finds each injected fault, and nothing in a drive without faults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The measures of an audit, each on something whose answer is known."""
+"""The measures of an audit, each on data with a known answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views of synthetic boards whose truth is exact."""
+"""Views of synthetic boards with exact ground truth."""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ def test_a_larger_board_is_told_although_parts_of_it_passed_for_the_claimed_one(
 
 
 def test_views_of_a_part_of_the_claimed_board_are_no_other_board() -> None:
-    """Most pictures cut the board off: what is left of it is no proof."""
+    """Most images cut the board off: what is left of it is no proof."""
     view, left, _ = rendered("chess:9x6:25mm")[0]
     cut = left.copy()
     cut[:, : int(view.left_px.reshape(6, 9, 2)[:, 1].max())] = 90

@@ -89,7 +89,7 @@ def spoil(view: View, side: int, sigma_px: float) -> View:
 def test_views_that_do_not_fit_are_dropped_and_named(make_views) -> None:
     rig, views = make_views(count=15)
     views[3], views[8] = spoil(views[3], 0, 3.0), spoil(views[8], 1, 5.0)
-    # A pair of pictures of different moments: each fits its own camera well.
+    # A pair of images of different moments: each fits its own camera well.
     views[12] = replace(views[12], seen=(views[12].seen[0], views[11].seen[1]))
     fit = calibrate_stereo(views, SIZE, CalibrationSettings())
     assert sorted(fit.dropped) == ["v03", "v08", "v12"]

@@ -1,4 +1,4 @@
-"""`recon audit` as it is typed: its table, its JSON, the file it mends, one line for bad input."""
+"""`recon audit` on the command line: table, JSON, corrected calibration, one line for bad input."""
 
 from __future__ import annotations
 

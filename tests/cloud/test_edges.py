@@ -1,4 +1,4 @@
-"""Flying edges: what hangs between two surfaces goes, what lies on one stays."""
+"""Flying edges: points between two surfaces are removed, points on a surface stay."""
 
 from __future__ import annotations
 

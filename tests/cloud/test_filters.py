@@ -1,4 +1,4 @@
-"""Filters: planted outliers go, the planted surface stays, attributes travel along."""
+"""Filters remove planted outliers, keep the surface, and keep attributes with their points."""
 
 from __future__ import annotations
 

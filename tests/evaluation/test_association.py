@@ -1,4 +1,4 @@
-"""Poses of two clocks find their partners."""
+"""Poses of two trajectories are associated by time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reliability and sparsification on maps whose confidence is right, wrong or useless by make."""
+"""Reliability and sparsification on maps with a correct, wrong or useless confidence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Disparity figures, counted by hand and by their own definitions."""
+"""Disparity metrics, checked by hand and against their definitions."""
 
 from __future__ import annotations
 

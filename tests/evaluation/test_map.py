@@ -1,4 +1,4 @@
-"""Map figures on clouds whose distances are known."""
+"""Map metrics on clouds with known distances."""
 
 from __future__ import annotations
 

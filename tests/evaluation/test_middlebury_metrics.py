@@ -1,4 +1,4 @@
-"""Middlebury's figures against a plain computation of the SDK's definitions, pixel by pixel."""
+"""Middlebury's metrics against a plain implementation of the SDK's definitions, pixel by pixel."""
 
 from __future__ import annotations
 

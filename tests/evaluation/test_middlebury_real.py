@@ -1,4 +1,4 @@
-"""Figures of OpenCV's matchers on real scenes, against what others measured."""
+"""Metrics of OpenCV's matchers on real scenes, compared with published values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of occupancy maps, on truths that can be counted by hand."""
+"""Metrics of occupancy maps, on ground truth that can be counted by hand."""
 
 from __future__ import annotations
 

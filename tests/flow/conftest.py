@@ -1,4 +1,4 @@
-"""A small drive with truth, mapped once."""
+"""A small drive with ground truth, mapped once."""
 
 from __future__ import annotations
 

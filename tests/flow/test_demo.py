@@ -1,4 +1,4 @@
-"""The whole flow on the rendered street, held against its truth."""
+"""The whole pipeline on the rendered street, compared with ground truth."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def test_a_shifted_scene_is_matched_nearly_everywhere(
     run: tuple[dict[str, Any], Path, str],
 ) -> None:
     for found in run[0]["matchers"].values():
-        # Only pixels at the outline of the square are hard: a tenth of the picture at most.
+        # Only pixels at the outline of the square are hard: a tenth of the image at most.
         assert 0 <= found["weighted"]["nonocc"]["dense"]["bad"]["4"] < 12
         depth = found["scenes"]["MiddEval3/trainingQ/Teddy"]["nonocc"]["dense"]["depth"]
         # OpenCV's step, a 16th of a pixel, is 25 mm at 2 m with this rig.

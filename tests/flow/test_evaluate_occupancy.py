@@ -1,4 +1,4 @@
-"""`recon evaluate occupancy`: the files of a run give the figures that the run itself gave."""
+"""`recon evaluate occupancy`: the files of a run give the same figures as the run itself."""
 
 from __future__ import annotations
 

@@ -153,7 +153,7 @@ def map_drive(pairs: Iterable[RectifiedPair], folder: Path) -> MapRun:
 
 
 def doubted(run: MapRun) -> list[int]:
-    """Numbers of the frames whose pose is not trusted."""
+    """Indices of the frames whose pose is not trusted."""
     return [index for index, record in enumerate(run.mapped.health) if not record.ok]
 
 
@@ -177,7 +177,7 @@ def test_a_bare_motorway_ends_with_a_loud_warning_and_no_map_of_it(tmp_path: Pat
 
 @pytest.mark.parametrize("grain", [1.0, 25.0])
 def test_a_confident_wrong_path_is_not_believed(grain: float) -> None:
-    """kiss-icp stands still, with texture on the road or without, and doubts nothing."""
+    """kiss-icp reports no motion and full confidence, with or without texture on the road."""
     results = register(Road(grain=grain, step_m=0.8), 5, "kiss")
     way_m = np.linalg.norm(results[-1].T_world_camera[:3, 3])
     assert way_m < 0.5 * 4 * 0.8

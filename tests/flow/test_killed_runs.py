@@ -1,4 +1,4 @@
-"""Runs of the command line that are killed, or meet a full disk, go on to the same files."""
+"""Runs that are killed, or find the disk full, resume and end with the same files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ KILLS = 10
 
 
 class Runs:
-    """One drive, and what an unbroken run makes of it."""
+    """One drive, and the result of an uninterrupted run."""
 
     def __init__(self, folder: Path) -> None:
         self.drive = folder / "drive"
@@ -41,7 +41,7 @@ class Runs:
         self.seconds = time.monotonic() - begun
 
     def arguments(self, out: Path) -> list[str]:
-        """Start the run, or go on with it where it has begun."""
+        """Start the run, or resume it if it has begun."""
         if (out / ".partial" / ".state" / "started.json").exists():
             return ["map", "--quiet", "--resume", str(out)]
         settings = [part for text in SETTINGS for part in ("--set", text)]
@@ -52,7 +52,7 @@ class Runs:
         return subprocess.run(command, capture_output=True, text=True, check=False)
 
     def finish(self, out: Path) -> None:
-        """Go on to the end, and find the files of the unbroken run."""
+        """Resume to the end and compare with the files of the uninterrupted run."""
         if not (out / "run.json").exists():
             command = [sys.executable, "-m", "recon", *self.arguments(out)]
             subprocess.run(command, check=True, capture_output=True)
@@ -61,7 +61,7 @@ class Runs:
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """All files of a run but those that hold times."""
+    """All files of a run except those with timings."""
     timed = {"summary.json", "run.json", "report.html"}
     files = [path for path in folder.rglob("*") if path.is_file() and ".partial" not in path.parts]
     return {

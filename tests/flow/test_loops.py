@@ -1,4 +1,4 @@
-"""A drive around a block closes, broken off or not; a street that repeats itself deceives none."""
+"""Loops around a block are closed, interrupted or not; a repetitive street gives no false loop."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ FILES = [
 
 
 class _Filmed:
-    """A drive whose pictures are rendered once, and whose path alone is known."""
+    """A drive whose images are rendered once, and whose path alone is known."""
 
     description = "a rendered street"
     files: tuple[Path, ...] = ()
@@ -170,5 +170,5 @@ def test_a_street_that_repeats_itself_is_mapped_as_if_nobody_looked_for_loops(
     assert looked.summary["loops"]["found"] == 0
     assert _content(tmp_path / "looked") == _content(tmp_path / "off")
     assert not (tmp_path / "looked" / "loops.json").exists()
-    # The trap is a real one: pictures and shapes alone would have closed it.
+    # The trap is a real one: images and shapes alone would have closed it.
     assert blind.summary["loops"]["found"] >= 3

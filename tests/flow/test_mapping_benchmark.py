@@ -1,4 +1,4 @@
-"""The benchmark of the mapping runs, and compares maps that are the same."""
+"""The mapping benchmark runs, and compares equal maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run takes as much memory for a long drive as for a short one, and no more than it may."""
+"""Memory does not grow with the length of a drive, and stays within its limit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From two cameras that nobody knows to a metric cloud: what a newcomer types, in that order."""
+"""From two uncalibrated cameras to a metric cloud: the commands of a newcomer, in order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`recon occupancy`: other maps of a drive, of what its run kept."""
+"""`recon occupancy`: other maps of a drive, from the data that its run kept."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_another_height_band_changes_the_grid_alone(small_demo: Path, tmp_path: 
     assert parked.sum() > 10  # cars are lower than the band
 
 
-# Few small pictures: what was measured is 0.96 and 0.53, 0.86 and 0.91, 0.91 and 0.96. At 0.1 m
+# Few small images: what was measured is 0.96 and 0.53, 0.86 and 0.91, 0.91 and 0.96. At 0.1 m
 # neighbouring rays end farther apart than voxels, so that recall is low.
 @pytest.mark.parametrize(
     ("resolution_m", "precision", "recall"), [(0.1, 0.9, 0.4), (0.25, 0.8, 0.85), (0.5, 0.85, 0.9)]

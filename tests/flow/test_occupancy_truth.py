@@ -1,4 +1,4 @@
-"""The occupancy of rendered drives against their truth: several streets, one configuration."""
+"""The occupancy of rendered drives against ground truth: several streets, one configuration."""
 
 from __future__ import annotations
 

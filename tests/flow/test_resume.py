@@ -1,4 +1,4 @@
-"""A run that was broken off goes on to the files that an unbroken one writes."""
+"""An interrupted run resumes and writes the same files as an uninterrupted one."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FILES = [
 
 
 class _Breaks:
-    """An observer that breaks a run off before a frame is reported."""
+    """An observer that aborts a run before a frame is reported."""
 
     def __init__(self, frame: int, error: BaseException) -> None:
         self.frame, self.error = frame, error
@@ -191,7 +191,7 @@ def test_a_damaged_checkpoint_is_one_line_and_stays(
 
 @contextmanager
 def _largest_file(size: int) -> Iterator[None]:
-    """A disk that takes no more of a file than this; Python is told so by an error."""
+    """A limit on the file size, which Python reports as an error."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:

@@ -1,4 +1,4 @@
-"""Written calibrations, read by the equations of those who will use them, without our readers."""
+"""Written calibrations, applied by the equations of their consumers, without our readers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""GLB: the container and its JSON hold what the specification asks for."""
+"""GLB: container and JSON follow the specification."""
 
 from __future__ import annotations
 

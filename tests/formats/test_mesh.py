@@ -1,4 +1,4 @@
-"""Mesh files: each kind holds what was written, and others open it."""
+"""Mesh files: each format keeps what was written, and other programs read it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MeshLab projects open in MeshLab, wherever the folder lies."""
+"""MeshLab projects open in MeshLab, wherever the folder is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nav2 maps: the published rules, on a scene without symmetry."""
+"""Nav2 maps follow the published rules, on an asymmetric scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PLY clouds: round trips, what others read in them, and files that are broken."""
+"""PLY clouds: round trips, other readers, and damaged files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of rays: what was written is read, and what is damaged is told."""
+"""Ray files: round trips, and errors for damaged files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Paths are brought together by the motion that made them differ."""
+"""Aligning two paths recovers the motion between them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The compiled search equals its twin, for any picture, window and range."""
+"""The compiled search equals its twin, for any image, window and range."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The compiled semi-global search equals its twin, for any picture, window and range."""
+"""The compiled semi-global search equals its twin, for any image, window and range."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ def alike() -> Filmed:
 
 
 def drifted(truth: Trajectory, *, share: float, turn_deg_per_m: float) -> Trajectory:
-    """A path whose steps are too long and turn a little too much, all alike."""
+    """A path with a constant scale and rotation error in each step."""
     poses = [np.eye(4)]
     for step in se3.invert(truth.T_world_camera[:-1]) @ truth.T_world_camera[1:]:
         length = float(np.linalg.norm(step[:3, 3]))

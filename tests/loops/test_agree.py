@@ -1,4 +1,4 @@
-"""Loops vote: what few tell, or what others contradict, bends nothing."""
+"""Loops vote: a loop with little support, or contradicted by others, has no effect."""
 
 from __future__ import annotations
 

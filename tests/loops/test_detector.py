@@ -33,7 +33,7 @@ def test_a_drive_is_recognised_in_spite_of_drift(block):
 
 
 def test_a_street_that_looks_the_same_is_refused(alike):
-    """Pictures and shapes match, but odometry cannot be wrong by a whole period."""
+    """Images and shapes match, but odometry cannot be wrong by a whole period."""
     frames = [*range(5), *range(PERIOD, PERIOD + 5)]
 
     detector, _ = alike.detect(frames, alike.truth)

@@ -1,4 +1,4 @@
-"""The path is bent so that its loops close, and not where they lie."""
+"""The path is corrected so that its loops close."""
 
 from __future__ import annotations
 

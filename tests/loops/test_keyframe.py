@@ -1,4 +1,4 @@
-"""A keyframe holds features all over the picture, and words that tell places apart."""
+"""A keyframe holds features all over the image, and words that tell places apart."""
 
 from __future__ import annotations
 

@@ -94,5 +94,5 @@ def test_a_question_after_ten_kilometres_takes_milliseconds():
         places.near(asked, LoopSettings())
         places.likeness(asked)
         seconds.append(time.perf_counter() - start)
-    # Ten milliseconds on an idle core; comparing picture with picture takes half a second.
+    # Ten milliseconds on an idle core; comparing image with image takes half a second.
     assert min(seconds) < 0.1

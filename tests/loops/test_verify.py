@@ -1,4 +1,4 @@
-"""Geometry tells two views of one place from two places."""
+"""Geometric verification separates two views of one place from two places."""
 
 from __future__ import annotations
 

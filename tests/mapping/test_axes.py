@@ -21,7 +21,7 @@ def _street(pitch_deg: float, roll_deg: float = 0.0, height: float = 1.5) -> Poi
     wall = np.stack([np.full(5000, 4.0), rng.uniform(-3, height, 5000), rng.uniform(3, 18, 5000)])
     box = np.stack([rng.uniform(-1, 1, 2000), rng.uniform(0.7, 0.7, 2000), rng.uniform(7, 9, 2000)])
     xyz = np.hstack([ground, wall, box]).T + rng.normal(0, 0.01, (13_000, 3))
-    # Camera pitched down: the ground rises in its picture.
+    # Camera pitched down: the ground rises in its image.
     turn = exp_so3(np.array([math.radians(-pitch_deg), 0, math.radians(roll_deg)]))
     return PointCloud((xyz @ turn.T).astype(np.float32))
 

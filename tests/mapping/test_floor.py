@@ -1,4 +1,4 @@
-"""Voxels tell where the ground is beyond the fused cloud, and walls are no ground."""
+"""Voxels give the ground height beyond the fused cloud, and walls are not ground."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fusion averages what frames saw, and counts frames, not points."""
+"""Fusion averages the measurements of frames, and counts frames, not points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Maps of a real street: the road is free, what stands beside it is not."""
+"""Maps of a real street: the road is free, the objects beside it are occupied."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_the_driven_road_is_free_and_has_obstacles_beside_it(recon_data: Path) -
     grid = flatten(occupancy.voxels(), ground, GridSettings())
     # KITTI's cameras are mounted 1.65 m above ground.
     assert 1.55 < ground.camera_height_m < 1.75
-    # The lane, 2 m wide; the first metres lie below the picture and are never seen.
+    # The lane, 2 m wide; the first metres lie below the image and are never seen.
     driven = path[path[:, 0] > 8]
     lane = np.concatenate(
         [driven + np.array([0.0, side, 0.0]) for side in np.arange(-1.0, 1.1, 0.2)]

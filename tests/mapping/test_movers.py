@@ -1,4 +1,4 @@
-"""Movers leave no ghosts: what was occupied is freed by rays that later see past it."""
+"""Moving objects leave no ghosts: later rays through a cell free it."""
 
 from __future__ import annotations
 

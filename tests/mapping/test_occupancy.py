@@ -1,4 +1,4 @@
-"""Occupancy from clouds with errors: what is hit, freed, kept and clamped."""
+"""Occupancy from noisy clouds: cells that are hit, freed, kept and clamped."""
 
 from __future__ import annotations
 

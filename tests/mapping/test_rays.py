@@ -1,4 +1,4 @@
-"""Rays that are kept of a frame say what the frame said."""
+"""The stored rays of a frame represent the frame."""
 
 from __future__ import annotations
 

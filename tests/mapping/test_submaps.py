@@ -1,4 +1,4 @@
-"""A drive that was cut into submaps gives the map of one that was not."""
+"""A drive divided into submaps gives the same map as an undivided one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Holes get the background beside them."""
+"""Holes are filled with the background beside them."""
 
 from __future__ import annotations
 

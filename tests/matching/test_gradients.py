@@ -42,5 +42,5 @@ def test_texture_of_a_ramp_is_its_slope() -> None:
     found = texture(
         RectifiedPair(ramp, ramp, stand_in_camera(WIDTH, HEIGHT, 8)), (5, 5), 0.1, range(4, 9)
     )
-    # Away from the border, where the gradient of a continued picture is half as large.
+    # Away from the border, where the gradient of a continued image is half as large.
     np.testing.assert_allclose(found[:, 3:-3], 3.0, rtol=1e-6)

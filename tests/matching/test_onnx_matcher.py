@@ -1,4 +1,4 @@
-"""A network that the user supplies, here a tiny one that is built on the spot."""
+"""The ONNX matcher with a tiny network built in the test."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_the_network_decides_the_disparity(difference: Path) -> None:
     assert disparity.values.shape == (40, 60)
     assert np.nanmin(disparity.values) == pytest.approx(20, abs=1e-3)
     assert np.nanmax(disparity.values) == pytest.approx(20, abs=1e-3)
-    # Left of column 20 the match lies beside the right picture.
+    # Left of column 20 the match lies beside the right image.
     assert (disparity.reason[:, :19] == Reason.BORDER).all()
     assert disparity.valid[:, 21:].all()
 
@@ -68,7 +68,7 @@ def test_a_network_of_another_size_gives_disparities_in_pixels_of_the_picture(
     difference: Path,
 ) -> None:
     fixed = {"channels": 1, "std": (1 / 255,), "width_px": 30, "height_px": 20}
-    # 8 pixels of a picture half as wide are 16 of the picture.
+    # 8 pixels of an image half as wide are 16 of the image.
     assert np.nanmedian(match(difference, pair_of(18, 10), **fixed).values) == pytest.approx(16)
 
 

@@ -1,4 +1,4 @@
-"""OpenCV's matchers as the baselines: translated rightly, and searched as far as ours."""
+"""OpenCV's matchers as baselines: conventions converted, and the same search range as ours."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def test_absolute_differences_find_a_wall_to_the_whole_pixel() -> None:
     scene = fronto_parallel_pair(camera_for(64, 40, 16), 5.0)
     found = PrintedMatcher(PrintedSettings(patch_px=7, signed=False)).match(scene.pair)
     seen = found.valid.copy()
-    seen[:, : 6 + 3] = False  # there the right picture does not show the patch
+    seen[:, : 6 + 3] = False  # there the right image does not show the patch
     assert np.mean(found.values[seen] == 6) > 0.99
     assert np.all(found.values[found.valid] == np.rint(found.values[found.valid]))
 

@@ -22,7 +22,7 @@ HEIGHT, WIDTH = 160, 480
 def plane(disparity_px: int, width: int = WIDTH) -> RectifiedPair:
     rng = np.random.default_rng(disparity_px)
     scene = rng.integers(0, 256, (HEIGHT, width + disparity_px), dtype=np.uint8)
-    # Wide enough a texture to be left when the picture is made smaller.
+    # Wide enough a texture to be left when the image is made smaller.
     scene = cv2.normalize(cv2.GaussianBlur(scene, (0, 0), 2.5), None, 0, 255, cv2.NORM_MINMAX)
     camera = stand_in_camera(width, HEIGHT)
     return RectifiedPair(scene[:, :width], scene[:, disparity_px:], camera)

@@ -1,4 +1,4 @@
-"""The SAD matcher on pictures whose disparity is known exactly."""
+"""The SAD matcher on images whose disparity is known exactly."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_fraction_of_a_pixel_is_recovered(shift: float, fit: str) -> None:
     settings = SadSettings.parse({"ndisp": 32, "subpixel": fit})
     pair = warped_pair(np.full((HEIGHT, WIDTH), shift))
     values = inner(SadMatcher(settings).match(pair).values)
-    # A tenth of a pixel is what the fits reach on clean pictures; 0.25 is the mean without a fit.
+    # A tenth of a pixel is what the fits reach on clean images; 0.25 is the mean without a fit.
     assert np.nanmedian(np.abs(values - shift)) < 0.1
     assert np.isfinite(values).mean() > 0.95
 

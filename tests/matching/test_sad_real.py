@@ -1,4 +1,4 @@
-"""The SAD matcher on real pictures with measured truth (MiddEval3, quarter size)."""
+"""The SAD matcher on real images with measured truth (MiddEval3, quarter size)."""
 
 from __future__ import annotations
 

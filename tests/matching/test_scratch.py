@@ -1,4 +1,4 @@
-"""Lent memory is never lent twice while it is referenced, and reused afterwards."""
+"""Scratch memory is never shared while it is referenced, and is reused afterwards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The semi-global matcher on pictures whose disparity is known exactly."""
+"""The semi-global matcher on images whose disparity is known exactly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vertices hang in free space where cameras looked through, and nothing occupied is near."""
+"""A vertex is in free space if cameras saw through it and nothing occupied is near."""
 
 from __future__ import annotations
 

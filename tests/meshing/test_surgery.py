@@ -1,4 +1,4 @@
-"""Cutting meshes keeps what it should and numbers it anew."""
+"""Cutting a mesh keeps the right faces and renumbers its vertices."""
 
 from __future__ import annotations
 

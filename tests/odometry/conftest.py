@@ -1,4 +1,4 @@
-"""A street of textured planes: pictures and disparity from any pose, exact."""
+"""A street of textured planes: images and disparity from any pose, exact."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ TEXELS_PER_M = 24.0
 
 
 def _render(T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Grey picture, averaged over 3 by 3 rays in a pixel, and depth, seen from a pose."""
+    """Grey image, averaged over 3 by 3 rays in a pixel, and depth, seen from a pose."""
     thirds = [(du, dv) for du in (-1 / 3, 0.0, 1 / 3) for dv in (-1 / 3, 0.0, 1 / 3)]
     grey = np.mean([_cast(T_world_camera, shift)[0] for shift in thirds], axis=0)
     return np.rint(grey).astype(np.uint8), _cast(T_world_camera, (0.0, 0.0))[1]
@@ -86,7 +86,7 @@ def make_disparity(values: np.ndarray, sigma_px: float = 0.1) -> Disparity:
 
 
 def make_frame(grey: np.ndarray, values: np.ndarray, index: int = 0) -> OdometryFrame:
-    """A frame; odometry never looks at the right picture."""
+    """A frame; odometry does not use the right image."""
     pair = RectifiedPair(grey, grey, CAMERA, timestamp_s=0.1 * index, index=index)
     return OdometryFrame(pair, make_disparity(values))
 

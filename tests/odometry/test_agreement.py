@@ -1,4 +1,4 @@
-"""Every patch of a picture is asked whether a motion explains it."""
+"""Every image patch is tested for consistency with a motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is unsure, or what the picture is against, is no pose to be trusted."""
+"""A pose is not trusted if it is uncertain or contradicts the images."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ See = Callable[..., OdometryFrame]
 
 
 class Says:
-    """An odometry that says what it was told to say."""
+    """An odometry with prescribed results."""
 
     def __init__(self, poses: np.ndarray, health: OdometryHealth) -> None:
         self._results = iter([OdometryResult(T, health) for T in poses])

@@ -16,7 +16,7 @@ See = Callable[..., OdometryFrame]
 
 
 def always() -> FusedSettings:
-    """ICP is asked in every frame."""
+    """ICP runs in every frame."""
     return FusedSettings(icp=IcpSettings(every=1))
 
 

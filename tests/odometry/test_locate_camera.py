@@ -1,4 +1,4 @@
-"""A camera is located by the points that agree, and its pose is theirs."""
+"""A camera is localised from the inliers among its points."""
 
 from __future__ import annotations
 

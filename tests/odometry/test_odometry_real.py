@@ -1,4 +1,4 @@
-"""Real drives: figures that the project promises, with its own matcher."""
+"""Real drives: the accuracy the project promises, with its own matcher."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def read_camera(path: Path, height_px: int, width_px: int) -> RectifiedCamera:
 
 
 def drive(folder: Path) -> tuple[dict[str, TrajectoryMetrics], list[OdometryHealth]]:
-    """Visual and fused odometry over the same frames, and what they say of their health."""
+    """Visual and fused odometry over the same frames, with their health."""
     if not folder.is_dir():
         pytest.skip(f"real data: no folder {folder.name}")
     odometries = {name: make_odometry(name) for name in ("visual", "fused")}

@@ -1,4 +1,4 @@
-"""A path from elsewhere tells motions: at any rate, in any world, in body axes too."""
+"""An external trajectory as motion prior: any rate, any world frame, also in body axes."""
 
 from __future__ import annotations
 
@@ -127,11 +127,11 @@ def test_a_prior_that_is_a_little_off_hardly_moves_what_is_seen(
 
 
 def test_features_that_stand_still_do_not_outvote_the_wheels(see: See) -> None:
-    """A picture that stays the same while the wheels turn, as behind a lorry or a dirty lens."""
+    """An image that stays the same while the wheels turn, as behind a lorry or a dirty lens."""
     still = [see(np.eye(4), 0)] * 3
     frames = [replace(f, pair=replace(f.pair, timestamp_s=0.1 * n)) for n, f in enumerate(still)]
     results = register(frames, path(steps(3)), "visual")
     assert off_m(results[-1], np.linalg.matrix_power(STEP, 2)) < 1e-6
     assert "features contradict the prior" in results[-1].health.notes[0]
-    # Who is right is open, and the picture is against the wheels.
+    # Who is right is open, and the image is against the wheels.
     assert not results[-1].health.ok

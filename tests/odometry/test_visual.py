@@ -30,7 +30,7 @@ def forward(distance_m: float) -> np.ndarray:
 
 def test_a_camera_that_stands_still_stays(see: See) -> None:
     poses = follow([see(np.eye(4))] * 4)
-    # Equal pictures: what is left is the optimiser's rounding.
+    # Equal images: what is left is the optimiser's rounding.
     np.testing.assert_allclose(poses, np.tile(np.eye(4), (4, 1, 1)), atol=1e-4)
 
 
@@ -94,7 +94,7 @@ def test_a_blank_wall_gives_no_motion_and_no_exception(blind: See) -> None:
 
 
 def test_an_object_that_moves_does_not_move_the_camera(see: See) -> None:
-    """A third of the picture shows the street from elsewhere, as on the side of a passing bus."""
+    """A third of the image shows the street from elsewhere, as on the side of a passing bus."""
     truth = [forward(0.4 * n) for n in range(5)]
     frames = []
     for n, T in enumerate(truth):
@@ -118,7 +118,7 @@ def _pasted(below: OdometryFrame, above: OdometryFrame) -> OdometryFrame:
 def test_frames_that_are_missing_are_bridged_by_what_looks_alike(
     street: tuple[OdometryFrame, ...], street_poses: np.ndarray
 ) -> None:
-    """2.5 m at once, with times that do not tell of it: tracks are lost, the place is not."""
+    """A jump of 2.5 m that the times do not show: tracks are lost, the pose is not."""
     late = [replace(f, pair=replace(f.pair, timestamp_s=0.1 * n)) for n, f in enumerate(street)]
     jump = [*late[:5], *(late[n] for n in (9, 10, 11))]
     odometry = VisualOdometry(VisualSettings())

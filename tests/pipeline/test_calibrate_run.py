@@ -26,7 +26,7 @@ QUICK = ["calibration.bootstrap=60"]
 
 @pytest.fixture(scope="session")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Nine views of a board through a true rig; the right picture of one is without the board."""
+    """Nine views of a board through a true rig; the right image of one is without the board."""
     folder, rig = tmp_path_factory.mktemp("board"), board_rig()
     pictures = render_views(rig, BOARD, place_boards(rig, BOARD, 9, seed=2))
     for number, (left, right) in enumerate(pictures):
@@ -48,7 +48,7 @@ def test_pictures_give_the_true_rig_in_every_format(drawn: Path, tmp_path: Path,
     summary = json.loads((tmp_path / "report" / "summary.json").read_text())
     assert summary["stereo_rms_px"] < 0.15
     assert summary["epipolar_px"] < 0.1
-    # Corners of rendered pictures are good to about 0.1 px, and eight views are few.
+    # Corners of rendered images are good to about 0.1 px, and eight views are few.
     assert summary["focal_px"] == pytest.approx(rig.left.matrix[0, 0], rel=0.01)
     assert summary["baseline_m"] == pytest.approx(rig.baseline_m, rel=0.005)
     assert (summary["views"], summary["views_used"]) == (9, 8)

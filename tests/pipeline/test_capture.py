@@ -1,4 +1,4 @@
-"""Recording: what is written can be mapped at once, and is whole whatever happens."""
+"""A recording can be mapped at once, and is valid whatever happens."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_a_full_disk_takes_the_pair_back_whole(
 
 
 def fill_the_disk(monkeypatch: pytest.MonkeyPatch, victim: str) -> None:
-    """The sixth picture of a side, or the sixth line, finds no room."""
+    """The sixth image of a side, or the sixth line, finds no room."""
     full = OSError(28, os.strerror(28))
     sync, write = atomic._sync, os.write
 

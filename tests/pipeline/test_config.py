@@ -1,4 +1,4 @@
-"""Settings come from defaults, file and overrides, in that order; what is unknown is refused."""
+"""Settings come from defaults, file and overrides, in that order; unknown ones are errors."""
 
 from __future__ import annotations
 

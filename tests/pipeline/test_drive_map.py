@@ -1,4 +1,4 @@
-"""A map that is put together tile by tile is the map."""
+"""A map assembled tile by tile equals the whole map."""
 
 from __future__ import annotations
 

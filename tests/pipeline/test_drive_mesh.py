@@ -1,4 +1,4 @@
-"""The surface of a drive is made in tiles that meet, and cut where cameras looked through."""
+"""The surface of a drive is built from adjoining tiles, and removed where cameras saw through."""
 
 from __future__ import annotations
 

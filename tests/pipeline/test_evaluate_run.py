@@ -1,4 +1,4 @@
-"""A run is compared in the axes that its record names."""
+"""A run is compared in the axes given in its record."""
 
 from __future__ import annotations
 

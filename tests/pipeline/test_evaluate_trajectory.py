@@ -1,4 +1,4 @@
-"""Trajectory files are compared by time where they tell it, and leave a report."""
+"""Trajectory files are compared by time if they have timestamps, with a report."""
 
 from __future__ import annotations
 

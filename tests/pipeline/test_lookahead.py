@@ -1,4 +1,4 @@
-"""Looking ahead changes when things are computed, never what or in which order."""
+"""Lookahead changes when results are computed, but not the results or their order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The peak memory that is told is that of the process itself."""
+"""The reported peak memory is that of the process itself."""
 
 from __future__ import annotations
 

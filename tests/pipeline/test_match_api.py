@@ -1,4 +1,4 @@
-"""`recon.match`: two pictures in, a disparity out, with any matcher."""
+"""`recon.match`: two images in, a disparity out, with any matcher."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from recon.errors import SettingsError
 
 @pytest.fixture(scope="module")
 def pictures() -> tuple[np.ndarray, np.ndarray]:
-    """Noise, six pixels further left in the right picture."""
+    """Noise, six pixels further left in the right image."""
     world = np.random.default_rng(8).integers(0, 256, (50, 130), dtype=np.uint8)
     world = cv2.GaussianBlur(world, (3, 3), 0)
     return world[:, :120], world[:, 6:126]

@@ -1,4 +1,4 @@
-"""A memory limit is read, divided, and watched."""
+"""A memory limit is parsed, divided and enforced."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of confidences of scenes, and their mean, on maps of known make."""
+"""Confidence metrics of scenes, and their mean, on maps built for the purpose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One pair: what cannot give a cloud, or gives one of wrong size, is said."""
+"""One pair: inputs that give no cloud, or one of the wrong scale, are reported."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CAMERA = RectifiedCamera(300.0, 160.0, 120.0, 160.0, 0.1, 320, 240)
 
 @pytest.fixture(scope="module")
 def pair() -> StereoPair:
-    """Blurred noise, 12 pixels further left in the right picture."""
+    """Blurred noise, 12 pixels further left in the right image."""
     world = np.random.default_rng(3).integers(0, 256, (240, 340)).astype(np.uint8)
     world = cv2.normalize(cv2.GaussianBlur(world, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX)
     world = np.asarray(world, np.uint8)

@@ -1,4 +1,4 @@
-"""Summaries hold what JSON can hold, and name the frames that were lost."""
+"""Summaries contain only valid JSON values, and list the lost frames."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ CAMERA = RectifiedCamera(
 
 
 def make_pair(disparity_px: float = 12.0, row_px: float = 0.0, seed: int = 0) -> RectifiedPair:
-    """A textured wall at one disparity; the right picture lies ``row_px`` too low."""
+    """A textured wall at one disparity; the right image lies ``row_px`` too low."""
     rng = np.random.default_rng(seed)
     wall = sum(
         cv2.GaussianBlur(rng.normal(size=(320, 520)), (0, 0), size) * size for size in (1.5, 4.0)

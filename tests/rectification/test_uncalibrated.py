@@ -65,7 +65,7 @@ def test_with_noise_rows_are_off_by_no_more_than_noise() -> None:
         - map_pixels(found.H_right, truth.right_uv)[:, 1]
     )
     assert np.abs(rows).mean() < 0.1
-    # Rows of both pictures are noisy: mean |N(0, 0.3 sqrt 2)|.
+    # Rows of both images are noisy: mean |N(0, 0.3 sqrt 2)|.
     assert found.held_out_px == pytest.approx(0.34, rel=0.3)
 
 

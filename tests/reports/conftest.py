@@ -1,4 +1,4 @@
-"""Small values that the tests of all reports share."""
+"""Small values shared by the tests of all reports."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def T_map_world() -> Float64:
 
 @pytest.fixture
 def health() -> list[OdometryHealth]:
-    """One record for each frame of `trajectory`; frame 5 rests on no measurement."""
+    """One record per frame of `trajectory`; frame 5 has no measurement."""
     good = OdometryHealth(tracks=200, inliers=150, overlap=0.8, correction_m=0.01)
     bad = OdometryHealth(ok=False, notes=("too few <tracks>",))
     return [bad if frame == 5 else good for frame in range(11)]

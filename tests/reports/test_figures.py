@@ -20,7 +20,7 @@ from recon.structures.arrays import UInt8
 
 
 def decode(png: bytes) -> UInt8:
-    """The picture in a PNG; at least 300 pixels wide, or nobody could read it."""
+    """The image in a PNG, at least 300 pixels wide to be readable."""
     assert png.startswith(b"\x89PNG")
     picture = cv2.imdecode(np.frombuffer(png, dtype=np.uint8), cv2.IMREAD_COLOR)
     assert picture.shape[1] > 300

@@ -1,4 +1,4 @@
-"""Tables of an evaluation say what the figures say."""
+"""Tables of an evaluation agree with its figures."""
 
 from __future__ import annotations
 

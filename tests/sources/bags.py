@@ -1,4 +1,4 @@
-"""Bags as recorders write them, of a drive or spoiled in some way."""
+"""Writes bags of a drive as recorders do, optionally damaged."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def recorder(folder: Path, how: Recording) -> Iterator[Recorder]:
 def write_bag(
     pairs: list[StereoPair], camera: RectifiedCamera, folder: Path, how: Recording
 ) -> Path:
-    """Left and right come apart and out of step: the right one is recorded a frame later."""
+    """Left and right messages are not adjacent: the right one is recorded a frame later."""
     with recorder(folder, how) as bag:
         late: list[tuple[int, Any]] = []
         for pair in pairs:

@@ -1,4 +1,4 @@
-"""One drive, written in every layout that is read."""
+"""Writes one drive in every supported layout."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EPOCH_S = 1_600_000_000
 
 
 def rendered(frames: int, **settings: Any) -> tuple[list[StereoPair], RectifiedCamera]:
-    """Grey pairs of a street: every layout can hold those without loss."""
+    """Grey pairs of a street, which every layout can store without loss."""
     source = SyntheticSource(StreetSettings(frames=frames, threads=1, **settings))
     grey = [
         StereoPair(
@@ -132,7 +132,7 @@ def write_folders(pairs: list[StereoPair], camera: RectifiedCamera, folder: Path
 
 
 def write_stamped(pairs: list[StereoPair], camera: RectifiedCamera, folder: Path) -> Path:
-    """Names are stamps, the right ones 2 ms late, and each side has a picture of its own."""
+    """Names are timestamps, the right ones 2 ms late, and each side has one unpaired image."""
     for pair in pairs:
         stamp_us = round((EPOCH_S + pair.timestamp_s) * 1e6)
         write_image(folder / "cam0" / f"{stamp_us}.png", pair.left)

@@ -1,4 +1,4 @@
-"""What single layouts add to pairs: raw lenses, true paths, names, encodings."""
+"""Details of single layouts: raw lenses, ground truth, names, encodings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A drive may be larger than the memory: of every layout a few pairs are held at a time."""
+"""A drive may exceed memory: every layout keeps only a few pairs in memory."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LAYOUTS: dict[str, drives.Writer] = {
 
 @pytest.fixture(scope="module")
 def drive() -> tuple[list[StereoPair], RectifiedCamera]:
-    """Shifted noise: what compresses badly is what fills a disk."""
+    """Shifted noise, which compresses badly and so fills a disk."""
     rng = np.random.default_rng(0)
     wide = rng.integers(0, 256, (HEIGHT_PX, WIDTH_PX + LONG + 8), dtype=np.uint8)
     camera = RectifiedCamera(200.0, 159.5, 119.5, 159.5, 0.2, WIDTH_PX, HEIGHT_PX)

@@ -78,7 +78,7 @@ def test_each_layout_is_recognised_and_gives_every_pixel_and_time(
 
 
 def assert_equal_picture(ours: np.ndarray, truth: np.ndarray) -> None:
-    """A video has three channels, of a grey picture three equal ones."""
+    """A video has three channels, of a grey image three equal ones."""
     expected = truth if ours.ndim == 2 else np.repeat(truth[:, :, None], 3, axis=2)
     np.testing.assert_array_equal(ours, expected)
 

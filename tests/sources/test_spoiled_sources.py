@@ -1,4 +1,4 @@
-"""What is wrong with an input is told in one line, before a run begins where that is possible."""
+"""Faulty inputs are reported in one line, before a run starts if possible."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Drive = tuple[list[StereoPair], RectifiedCamera]
 
 @pytest.fixture(scope="module")
 def drive() -> Drive:
-    """Noise: nothing here looks at what the pictures show."""
+    """Noise, as the image content does not matter here."""
     rng = np.random.default_rng(0)
     camera = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)
     pairs = [
@@ -132,7 +132,7 @@ def test_headers_without_stamps_fall_back_to_the_recording_times(
     drive: Drive, tmp_path: Path
 ) -> None:
     path = write_bag(*drive, tmp_path, Recording("ros1", stamped=False))
-    # The right pictures are recorded 104 ms late here: nothing pairs within 10 ms ...
+    # The right images are recorded 104 ms late here: nothing pairs within 10 ms ...
     source = open_source(path, settings=SourceSettings(tolerance_s=0.11))
     # ... and where the recording alone tells the times, that is said.
     assert "recording times" in source.description

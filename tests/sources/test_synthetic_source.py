@@ -1,4 +1,4 @@
-"""The synthetic drive behaves like any other source, and survives being written as KITTI."""
+"""The synthetic drive behaves like any other source, also after writing it as KITTI."""
 
 from __future__ import annotations
 

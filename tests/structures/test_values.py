@@ -189,7 +189,7 @@ def test_doffs_is_the_right_principal_point_minus_the_left() -> None:
 
 def test_a_resized_camera_sees_the_same_directions() -> None:
     half = CAMERA.resized(3, 2)
-    # Edges of the picture, at -0.5 and width - 0.5, stay at the same angle.
+    # Edges of the image, at -0.5 and width - 0.5, stay at the same angle.
     for camera in (CAMERA, half):
         edges = (np.array([-0.5, camera.width_px - 0.5]) - camera.cx_px) / camera.focal_px
         np.testing.assert_allclose(edges, [-3.5 / 700, 2.5 / 700], rtol=1e-12)

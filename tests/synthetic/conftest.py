@@ -1,4 +1,4 @@
-"""A small street, rendered once, and a world of one box whose truth is known on paper."""
+"""A small street, rendered once, and a scene of one box with analytic ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Planes have the disparity that the formula says, and both views show the same surface."""
+"""Planes have the disparity of the formula, and both images show the same surface."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_warping_by_the_truth_reproduces_the_left_view(scene):
 def test_the_occluded_strip_is_as_wide_as_the_step_in_disparity():
     scene = step_pair(CAMERA, 5.0, 10.0, 30.0)
     row = scene.truth.nonocc[50]
-    # d = 20 and 10 px: the ten columns left of the square, and the ten that leave the picture.
+    # d = 20 and 10 px: the ten columns left of the square, and the ten that leave the image.
     expected = np.ones(200, dtype=bool)
     expected[:10] = False
     square = np.flatnonzero(scene.truth.values[50] > 15)

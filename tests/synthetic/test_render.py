@@ -1,4 +1,4 @@
-"""Pictures and truth agree with each other and with geometry on paper."""
+"""Images and ground truth agree with each other and with analytic geometry."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_the_right_view_warped_by_the_truth_is_the_left_view(frame):
     # Most surfaces are smooth at this size; the tail are edges that both views blend differently.
     assert np.median(error) < 1.5
     assert np.percentile(error, 90) < 10.0
-    # One pixel off is clearly worse: the truth is where the pictures agree.
+    # One pixel off is clearly worse: the truth is where the images agree.
     shifted = cv2.remap(frame.pair.right.astype(np.float32), x + 1, v, cv2.INTER_LANCZOS4)
     worse = np.abs(shifted - frame.pair.left).mean(axis=2)[keep & (x > 3) & (x < 316)]
     assert worse.mean() > 2.0 * error.mean()
@@ -106,7 +106,7 @@ def test_nonocc_at_the_edge_of_a_box_is_that_on_paper(box_world: StreetWorld):
     hidden = np.flatnonzero(~row[box[0] - 10 : box[0]]) + box[0] - 10
     assert box[0] == 87
     assert hidden.tolist() == [84, 85, 86]
-    # Columns whose point lies left of the right picture (beyond half a pixel): u < 2.
+    # Columns whose point lies left of the right image (beyond half a pixel): u < 2.
     assert row[:4].tolist() == [False, False, True, True]
     assert row[box].all()
 

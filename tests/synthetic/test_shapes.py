@@ -1,4 +1,4 @@
-"""Bodies are closed, of the right size, and painted in metres."""
+"""Shapes are closed, of the right size, and textured in metres."""
 
 from __future__ import annotations
 

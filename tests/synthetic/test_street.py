@@ -1,4 +1,4 @@
-"""The street is a function of its settings; the rig stands where they say."""
+"""The street depends only on its settings, and so do the poses of the rig."""
 
 from __future__ import annotations
 

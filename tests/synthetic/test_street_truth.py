@@ -1,4 +1,4 @@
-"""The truth about a drive: visible surfaces and the ground plan of obstacles."""
+"""Ground truth of a drive: visible surfaces and the footprint of obstacles."""
 
 from __future__ import annotations
 

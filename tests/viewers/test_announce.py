@@ -1,4 +1,4 @@
-"""A source is announced, and warned of, in one line for each."""
+"""A source and its warnings are announced in one line each."""
 
 from __future__ import annotations
 

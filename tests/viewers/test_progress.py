@@ -14,7 +14,7 @@ from recon.viewers.progress import JsonLines, Quiet, RichProgress, choose_viewer
 
 
 class Terminal(io.StringIO):
-    """A stream that says that it is a terminal."""
+    """A stream that claims to be a terminal."""
 
     def isatty(self) -> bool:
         return True

@@ -12,7 +12,7 @@ from recon.viewers.scenes import QuietScenes, SceneBar, SceneLines, choose_scene
 
 
 class Terminal(io.StringIO):
-    """A stream that says that it is a terminal."""
+    """A stream that claims to be a terminal."""
 
     def isatty(self) -> bool:
         return True
