@@ -165,7 +165,7 @@ def test_second_best_within_the_margin_is_ambiguous() -> None:
     assert refine_one(one_pixel((20, 60, 40, 23)), rules)[3] == Reason.VALID
 
 
-def test_confidence_grows_with_the_margin_and_is_nought_without_a_rival() -> None:
+def test_confidence_grows_with_the_margin_and_is_zero_without_a_second_best() -> None:
     close, far = (refine_one(one_pixel((20, 60, 40, n)))[1] for n in (30, 100))
     assert 0 < close < far < 1
     assert refine_one(one_pixel((20, 60, 40, NO_COST)))[1] == 0
@@ -200,7 +200,7 @@ def test_sigma_is_the_limit_without_slope_and_the_floor_without_noise_or_doubt(
     assert refine_one(one_pixel(costs), sure)[2] == pytest.approx(sigma_px, abs=1e-4)
 
 
-def test_sigma_of_a_pixel_without_a_rival_is_that_of_a_wrong_one() -> None:
+def test_sigma_of_a_pixel_without_a_second_best_is_that_of_a_wrong_one() -> None:
     assert refine_one(one_pixel((20, 60, 40, NO_COST)))[2] == refine.WRONG_PX
 
 

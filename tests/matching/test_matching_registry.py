@@ -9,8 +9,13 @@ from recon.matching import MATCHERS, Matcher, MatchingSettings, field_of, make_m
 
 
 @pytest.mark.parametrize("name", MATCHERS)
-def test_every_name_gives_a_matcher_that_has_settings(name: str) -> None:
-    assert field_of(name) in MatchingSettings.model_fields
+def test_every_name_has_settings_and_gives_a_matcher(name: str) -> None:
+    settings = getattr(MatchingSettings(), field_of(name))
+    assert isinstance(MATCHERS[name](settings, 1), Matcher)
+
+
+@pytest.mark.parametrize("name", MATCHERS)
+def test_a_matcher_whose_range_is_estimated_is_a_matcher(name: str) -> None:
     assert isinstance(make_matcher(name, MatchingSettings(), threads=1), Matcher)
 
 

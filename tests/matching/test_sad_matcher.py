@@ -2,55 +2,24 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
 from recon.errors import MatchingError, SettingsError
-from recon.matching import Matcher, SadMatcher, SadSettings
+from recon.matching import SadMatcher, SadSettings
 from recon.matching.search import usual_ndisp
-from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
-from recon.structures.arrays import Float32, Float64, UInt8
+from recon.structures import Disparity, Reason, RectifiedPair
+from recon.structures.arrays import Float32, Float64
+from tests.matching.pictures import (
+    HEIGHT,
+    WIDTH,
+    inner,
+    make_pair,
+    noise,
+    warped_pair,
+)
 
-HEIGHT, WIDTH = 60, 120
 PLAIN = SadSettings(ndisp=32)
-
-
-def make_pair(left: UInt8, right: UInt8, valid: np.ndarray | None = None) -> RectifiedPair:
-    height, width = left.shape
-    camera = RectifiedCamera(
-        focal_px=100.0,
-        cx_px=width / 2,
-        cy_px=height / 2,
-        cx_right_px=width / 2,
-        baseline_m=0.5,
-        width_px=width,
-        height_px=height,
-    )
-    return RectifiedPair(left, right, camera, valid=valid)
-
-
-def noise(height: int = HEIGHT, width: int = WIDTH, seed: int = 0) -> UInt8:
-    grey = np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
-    return np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.0), dtype=np.uint8)
-
-
-def smooth_texture(x: Float64, y: Float64) -> UInt8:
-    """A texture that is known between pixels: waves of several directions and lengths."""
-    waves = np.random.default_rng(1).uniform(-1.2, 1.2, (24, 2))
-    phases = np.random.default_rng(2).uniform(0, 2 * np.pi, 24)
-    total = sum(np.sin(a * x + b * y + p) for (a, b), p in zip(waves, phases, strict=True))
-    return np.asarray(np.clip(128 + 18 * total, 0, 255).round(), dtype=np.uint8)
-
-
-def warped_pair(disparity: Float64) -> RectifiedPair:
-    """Left view of a surface whose disparity is given on the grid of the *right* view."""
-    y, x = np.mgrid[: disparity.shape[0], : disparity.shape[1]].astype(np.float64)
-    return make_pair(smooth_texture(x, y), smooth_texture(x + disparity, y))
-
-
-def inner(array: np.ndarray, left: int = 40, margin: int = 8) -> np.ndarray:
-    return array[margin:-margin, left:-margin]
 
 
 def test_whole_shift_is_found_exactly() -> None:
@@ -271,7 +240,3 @@ def test_median_keeps_holes_and_steps_and_takes_outliers(median_px: int) -> None
     assert np.nanmedian(smooth.values[25:55, 80:110]) == pytest.approx(20, abs=0.1)
     spread = [np.nanstd(found.values[25:55, 80:110]) for found in (plain, smooth)]
     assert spread[1] <= spread[0]
-
-
-def test_it_is_a_matcher() -> None:
-    assert isinstance(SadMatcher(PLAIN), Matcher)

@@ -10,48 +10,12 @@ import numpy as np
 import pytest
 
 from recon.errors import MatchingError, SettingsError
-from recon.matching import Matcher, SgmMatcher, SgmSettings
-from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
-from recon.structures.arrays import Float64, UInt8
+from recon.matching import SgmMatcher, SgmSettings
+from recon.structures import Disparity, Reason, RectifiedPair
+from recon.structures.arrays import Float64
+from tests.matching.pictures import HEIGHT, WIDTH, inner, make_pair, noise, warped_pair
 
-HEIGHT, WIDTH = 60, 120
 PLAIN = SgmSettings(ndisp=32)
-
-
-def make_pair(left: UInt8, right: UInt8, valid: np.ndarray | None = None) -> RectifiedPair:
-    height, width = left.shape
-    camera = RectifiedCamera(
-        focal_px=100.0,
-        cx_px=width / 2,
-        cy_px=height / 2,
-        cx_right_px=width / 2,
-        baseline_m=0.5,
-        width_px=width,
-        height_px=height,
-    )
-    return RectifiedPair(left, right, camera, valid=valid)
-
-
-def noise(height: int = HEIGHT, width: int = WIDTH, seed: int = 0) -> UInt8:
-    grey = np.random.default_rng(seed).integers(0, 256, (height, width), dtype=np.uint8)
-    return np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.0), dtype=np.uint8)
-
-
-def warped_pair(disparity: Float64) -> RectifiedPair:
-    """Left view of a surface whose disparity is given on the grid of the *right* view."""
-    waves = np.random.default_rng(1).uniform(-1.2, 1.2, (24, 2))
-    phases = np.random.default_rng(2).uniform(0, 2 * np.pi, 24)
-
-    def picture(x: Float64, y: Float64) -> UInt8:
-        total = sum(np.sin(a * x + b * y + p) for (a, b), p in zip(waves, phases, strict=True))
-        return np.asarray(np.clip(128 + 18 * total, 0, 255).round(), dtype=np.uint8)
-
-    y, x = np.mgrid[: disparity.shape[0], : disparity.shape[1]].astype(np.float64)
-    return make_pair(picture(x, y), picture(x + disparity, y))
-
-
-def inner(array: np.ndarray, left: int = 40, margin: int = 8) -> np.ndarray:
-    return array[margin:-margin, left:-margin]
 
 
 def test_whole_shift_is_found_exactly() -> None:
@@ -210,10 +174,6 @@ def test_range_outside_the_picture_is_an_error() -> None:
 def test_settings_that_do_not_fit_are_refused(wrong: dict[str, object]) -> None:
     with pytest.raises(SettingsError):
         SgmSettings.parse(wrong)
-
-
-def test_it_is_a_matcher() -> None:
-    assert isinstance(SgmMatcher(SgmSettings()), Matcher)
 
 
 @pytest.mark.slow
