@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.borders import continue_row
 from recon.kernels.lanes import LANES, load_row, splat, store_row, where_less
 
 PLANES: Final = 3
@@ -70,22 +71,12 @@ def write_planes(
     row = np.empty((planes.shape[1], width + LANES), np.uint8)
     for y in range(first - 2 * rows_radius, end):
         line = min(max(y + rows_radius, 0), height - 1)
-        _continue(grey[line], radius, around[(y + rows_radius) % around.shape[0]])
+        continue_row(grey[line], radius, around[(y + rows_radius) % around.shape[0]])
         if y >= first:
             _write_gradient(around, y, radius, descriptor.cap, row[0, :width])
             _write_census(around, y, radius, descriptor, width, row)
             for n in range(row.shape[0]):
-                _continue(row[n, :width], place, planes[y, n])
-
-
-@njit(cache=True, nogil=True)
-def _continue(row: NDArray[np.uint8], place: int, longer: NDArray[np.uint8]) -> None:
-    """Copy a row into a longer one from ``place`` on, continued by its end values."""
-    start = min(max(place, 0), longer.size)
-    end = min(max(place + row.size, 0), longer.size)
-    longer[:start] = row[0]
-    longer[start:end] = row[start - place : end - place]
-    longer[end:] = row[-1]
+                continue_row(row[n, :width], place, planes[y, n])
 
 
 @njit(cache=True, nogil=True)

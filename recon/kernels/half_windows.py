@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.borders import continue_row
 from recon.kernels.lanes import LANES, distance, fit, least, load, splat, store
 from recon.kernels.tiles import GROUP, Offer
 
@@ -136,20 +137,8 @@ def lay_out(
     places = views.right.shape[1] - views.left.shape[1] + 1
     right_at = search.radius + search.minimum - abs(search.lean) + places - 1
     for n in range(len(left)):
-        _continue(left[n], search.radius, views.left[first + n])
-        _continue(right[n], right_at, views.right[first + n])
-
-
-@njit(cache=True, nogil=True)
-def _continue(pixels: NDArray[np.uint8], at: int, view: NDArray[np.uint8]) -> None:
-    """Copy a row into a longer one from ``at`` on, continued by its end values."""
-    start = min(max(at, 0), view.size)
-    end = min(max(at + pixels.size, start), view.size)
-    view[:start] = pixels[0]
-    view[end:] = pixels[-1]
-    shown, inside = pixels[start - at :], view[start:end]
-    for c in range(inside.size):
-        inside[c] = shown[c]
+        continue_row(left[n], search.radius, views.left[first + n])
+        continue_row(right[n], right_at, views.right[first + n])
 
 
 def empty_scratch(search: Search, block: int) -> Scratch:
