@@ -1,1 +1,1 @@
-"""Pure functions of space: rigid motions, projection, triangulation and its error."""
+"""Geometry as pure functions: rigid transforms, projection, triangulation and depth error."""

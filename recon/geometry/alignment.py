@@ -1,4 +1,4 @@
-"""The motion that brings one set of points, or one path, closest to another."""
+"""Least-squares alignment of corresponding points and of trajectories."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from recon.geometry.se3 import make_transform
 from recon.structures import Trajectory
 from recon.structures.arrays import Float64, freeze
 
-_AXIS_M: Final = 20.0  # how far from its cameras most of a map lies
+_AXIS_M: Final = 20.0  # typical distance of a map from its cameras
 _IN_ONE_PLACE: Final = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """A change of size, then a rigid motion: ``to = T_to_from · (scale · from)``.
+    """A scaling followed by a rigid transform: ``to = T_to_from · (scale · from)``.
 
     Attributes:
         T_to_from: float64 (4, 4).
-        scale: Factor on the lengths; 1 = rigid.
+        scale: Scale factor; 1 = rigid.
     """
 
     T_to_from: Float64
@@ -31,22 +31,22 @@ class Similarity:
         freeze(self, "T_to_from", np.float64, (4, 4))
 
     def move(self, trajectory: Trajectory) -> Trajectory:
-        """A path in the other frame; its times stay."""
+        """The trajectory in the other frame; its timestamps do not change."""
         poses = trajectory.T_world_camera.copy()
         poses[:, :3, 3] *= self.scale
         return Trajectory(self.T_to_from @ poses, trajectory.timestamps_s)
 
 
 def fit_points(from_m: Float64, to_m: Float64, *, scaled: bool = False) -> Similarity:
-    """The similarity with the least squares between corresponding points.
+    """The least-squares similarity between corresponding points.
 
-    A direction that the points leave open, such as the turn about a straight line, is not
-    turned more than the others ask for.
+    A rotation that the points do not determine, such as that about a straight line, is left as
+    small as the others allow.
 
     Args:
         from_m: float64 (N, 3), N ≥ 1.
-        to_m: float64 (N, 3), where each should come to lie.
-        scaled: Whether the size may change; it does not where all points lie in one place.
+        to_m: float64 (N, 3), the corresponding points.
+        scaled: Whether to estimate the scale; it stays 1 if all points coincide.
 
     Ref: S. Umeyama, "Least-squares estimation of transformation parameters between two point
     patterns", PAMI 13(4), 1991, equations 40 to 42.
@@ -63,21 +63,21 @@ def fit_points(from_m: Float64, to_m: Float64, *, scaled: bool = False) -> Simil
 
 
 def fit_paths(from_path: Trajectory, to_path: Trajectory) -> Similarity:
-    """The rigid motion that brings a path of cameras closest to another, pose by pose.
+    """The rigid transform that brings a trajectory closest to another, pose by pose.
 
-    Each pose counts as its centre and the ends of its axes, as long as cameras map: on a street
-    that is nearly straight, centres alone leave the turn about it to their noise, and a map that
-    hangs on them turns with it.
+    Each pose contributes its camera centre and the ends of its axes, as long as the typical
+    mapping distance. On a nearly straight street, the centres alone would leave the rotation about
+    it to noise, and the map would rotate with it.
 
     Args:
         from_path: N ≥ 1 poses.
-        to_path: As many, of the same camera.
+        to_path: N corresponding poses of the same camera.
     """
     return fit_points(_axes_m(from_path), _axes_m(to_path))
 
 
 def _axes_m(path: Trajectory) -> Float64:
-    """float64 (N · 4, 3): centre and ends of the axes of each camera."""
+    """float64 (N · 4, 3): centre and axis ends of each camera."""
     poses = path.T_world_camera
     tips = np.swapaxes(poses[:, :3, :3], 1, 2) * _AXIS_M + poses[:, None, :3, 3]
     return np.concatenate([poses[:, None, :3, 3], tips], axis=1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Poses between poses."""
+"""Interpolation of poses."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from recon.structures.arrays import Float64
 
 
 def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
-    """Poses at given times: turned and moved evenly between the two around each.
+    """Poses at given times, interpolated between the poses before and after each.
 
     Args:
         trajectory: At least one pose.
-        stamps_s: float64 (N,), within the trajectory's times; beyond them its ends stand still.
+        stamps_s: float64 (N,); outside the time range of the trajectory, its first or last pose
+            is returned.
 
     Returns:
         float64 (N, 4, 4).
@@ -35,7 +36,7 @@ def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
 
 
 def pose_between(first: Float64, second: Float64, share: float) -> Float64:
-    """The pose (4, 4) at a share of the way from one to another, 0 to 1."""
+    """The pose (4, 4) at a fraction (0 to 1) of the way from one pose to another."""
     turn = log_so3(first[:3, :3].T @ second[:3, :3])
     position = (1 - share) * first[:3, 3] + share * second[:3, 3]
     return make_transform(first[:3, :3] @ exp_so3(share * turn), position)

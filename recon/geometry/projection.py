@@ -1,4 +1,4 @@
-"""From pixels to points and back, for the left view of a rectified camera."""
+"""Projection and back-projection for the left view of a rectified camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from recon.structures.camera import RectifiedCamera
 def unproject(
     u: NDArray[Any], v: NDArray[Any], depth_m: NDArray[Any], camera: RectifiedCamera
 ) -> NDArray[Any]:
-    """Points in camera axes of pixels with a depth.
+    """Back-project pixels of known depth to points in camera axes.
 
     Args:
         u: (N,) columns, pixels.

@@ -1,4 +1,4 @@
-"""Unit quaternions (x, y, z, w), as TUM files and ROS write them, and rotation matrices."""
+"""Unit quaternions (x, y, z, w), in the order of TUM files and ROS, and rotation matrices."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from recon.structures.arrays import Float64
 
 
 def rotation_from_quaternion(xyzw: NDArray[Any]) -> Float64:
-    """Rotation matrix (3, 3) of a quaternion (4,) of any length but 0."""
+    """Rotation matrix (3, 3) of a quaternion (4,) of any nonzero norm."""
     x, y, z, w = np.asarray(xyzw, dtype=np.float64) / np.linalg.norm(xyzw)
     return np.array(
         [
@@ -25,8 +25,8 @@ def rotation_from_quaternion(xyzw: NDArray[Any]) -> Float64:
 def quaternion_from_rotation(rotation: NDArray[Any]) -> Float64:
     """Unit quaternion (4,) of a rotation matrix (3, 3), with ``w ≥ 0``.
 
-    The eigenvector of the largest eigenvalue is as exact near half a turn as elsewhere, where
-    the formula by the trace divides by almost nothing.
+    The eigenvector method used is accurate at all angles; the formula based on the trace divides
+    by almost zero near 180 degrees.
 
     Ref: Bar-Itzhack, New method for extracting the quaternion from a rotation matrix, 2000.
     """

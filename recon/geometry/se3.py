@@ -1,4 +1,4 @@
-"""Rigid motions as 4×4 matrices. ``T_a_b`` maps points of frame b to frame a."""
+"""Rigid transforms as 4×4 matrices. ``T_a_b`` maps points of frame b to frame a."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def rotate(T: NDArray[Any], directions: NDArray[Any]) -> NDArray[Any]:
 
 def angle_rad(T: NDArray[Any]) -> Float64:
     """Rotation angle of one transform or of a stack, in [0, π]."""
-    # atan2 of sine and cosine keeps its precision near 0 and π, where acos of the trace loses half.
+    # atan2 is accurate near 0 and π, where acos of the trace loses half of the digits.
     R = T[..., :3, :3]
     axis = np.stack(
         [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]],
@@ -71,13 +71,13 @@ def exp_so3(w: NDArray[Any]) -> Float64:
 def log_so3(R: NDArray[Any]) -> Float64:
     """Rotation vector (3,), radians, of a rotation matrix; inverse of `exp_so3` up to an angle π.
 
-    At π the axis has two signs, both right; either may come.
+    At π the sign of the axis is ambiguous; either may be returned.
     """
     sine_axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine, cosine = float(np.linalg.norm(sine_axis)), 0.5 * (float(np.trace(R)) - 1.0)
     if cosine > 0.0:
         return sine_axis * (math.asin(min(sine, 1.0)) / sine if sine > 1e-12 else 1.0)
-    # Near π the sine vanishes; R + Rᵀ still holds the axis, but not its sign.
+    # Near π the sine vanishes; R + Rᵀ still determines the axis, but not its sign.
     outer = 0.5 * (R + R.T) - cosine * np.eye(3)
     column = outer[:, int(np.argmax(np.diag(outer)))]
     axis = column / np.linalg.norm(column)
@@ -86,17 +86,17 @@ def log_so3(R: NDArray[Any]) -> Float64:
 
 
 def as_step(T: NDArray[Any]) -> Float64:
-    """A rigid motion as a step: translation and rotation vector, radians; float64 (6,)."""
+    """A rigid transform as a step: translation and rotation vector, radians; float64 (6,)."""
     return np.concatenate([T[:3, 3], log_so3(T[:3, :3])])
 
 
 def as_transform(step: NDArray[Any]) -> Float64:
-    """The rigid motion (4, 4) of a step; inverse of `as_step`."""
+    """The rigid transform (4, 4) of a step; inverse of `as_step`."""
     return make_transform(exp_so3(step[3:]), step[:3])
 
 
 def step_jacobian(xyz: NDArray[Any]) -> Float64:
-    """Derivative (N, 3, 6) of points (N, 3) by a step of their frame: ``[I | -hat(xyz)]``."""
+    """Jacobian (N, 3, 6) of points (N, 3) for a step of their frame: ``[I | -hat(xyz)]``."""
     J = np.zeros((len(xyz), 3, 6))
     J[:, [0, 1, 2], [0, 1, 2]] = 1.0
     x, y, z = xyz.T
@@ -107,7 +107,7 @@ def step_jacobian(xyz: NDArray[Any]) -> Float64:
 
 
 def orthonormalise(T: NDArray[Any]) -> Float64:
-    """The rigid transform nearest to ``T``: its rotation part made orthonormal again (SVD)."""
+    """The rigid transform nearest to ``T``: its rotation part is made orthonormal by SVD."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     U[:, -1] *= np.sign(np.linalg.det(U @ Vt))
     return make_transform(U @ Vt, T[:3, 3])

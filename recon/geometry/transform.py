@@ -1,4 +1,4 @@
-"""Clouds from one frame to another."""
+"""Transformation of clouds between frames."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from recon.structures import Frame, PointCloud
 
 
 def transform_cloud(cloud: PointCloud, T: NDArray[Any], *, frame: Frame) -> PointCloud:
-    """Move a cloud to another frame; everything but positions and normals stays.
+    """Transform a cloud to another frame; only positions and normals change.
 
     Args:
-        cloud: Any cloud.
+        cloud: Cloud in any frame.
         T: float64 (4, 4), maps points of ``cloud.frame`` to ``frame``.
-        frame: The name of the new frame.
+        frame: Name of the new frame.
     """
     normals = None if cloud.normals is None else rotate(T, cloud.normals)
     return replace(cloud, xyz=apply(T, cloud.xyz), normals=normals, frame=frame)

@@ -1,4 +1,4 @@
-"""From disparity to depth, and what a pixel of error costs there."""
+"""Conversion between disparity and depth, and the resulting depth error."""
 
 from __future__ import annotations
 

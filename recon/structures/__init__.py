@@ -1,4 +1,4 @@
-"""Values: frozen, checked when they are made, numpy only; they neither read files nor draw."""
+"""Immutable data types: validated on construction, numpy only; no file access, no drawing."""
 
 from recon.structures.camera import CameraIntrinsics, LensModel, RectifiedCamera, StereoCalibration
 from recon.structures.cloud import Frame, PointCloud

@@ -1,4 +1,4 @@
-"""The check that every value passes: dtype, shape, and a view that cannot be written to."""
+"""Validation of array fields: dtype and shape are checked, and the array becomes read-only."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ Bool = NDArray[np.bool_]
 def frozen_array(
     name: str, value: Any, dtype: DTypeLike, shape: tuple[int | None, ...]
 ) -> NDArray[Any]:
-    """Return a read-only view of ``value`` after checking it.
+    """Check an array and return a read-only view of it.
 
     Args:
-        name: Named in the error.
-        value: An array; it is never converted silently, so a float64 passed for a float32 fails.
-        dtype: The dtype that it must have.
-        shape: The shape that it must have; ``None`` is any length.
+        name: Name used in the error message.
+        value: Array to check; never converted, so float64 in place of float32 is an error.
+        dtype: Required dtype.
+        shape: Required shape; ``None`` stands for any length.
 
     Raises:
-        ShapeError: It is no array, or has another dtype or shape.
+        ShapeError: ``value`` is not an array, or has the wrong dtype or shape.
     """
     expected = f"{np.dtype(dtype).name} {_shape_text(shape)}"
     if not isinstance(value, np.ndarray):
@@ -48,7 +48,7 @@ def frozen_array(
 
 
 def freeze(instance: object, name: str, dtype: DTypeLike, shape: tuple[int | None, ...]) -> None:
-    """Check the field ``name`` of a frozen dataclass and keep its read-only view; None passes."""
+    """Check a field of a frozen dataclass and replace it by a read-only view; None is accepted."""
     value = getattr(instance, name)
     if value is not None:
         label = f"{type(instance).__name__}.{name}"

@@ -1,4 +1,4 @@
-"""Calibration boards: a flat pattern whose corners have known places."""
+"""Calibration boards: planar patterns whose corner positions are known."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ _DEFAULT_DICTIONARY: Final = "5X5_100"
 
 @dataclass(frozen=True)
 class CalibrationBoard:
-    """A chessboard, or one with markers in its white squares (ChArUco).
+    """A chessboard, or a ChArUco board (chessboard with ArUco markers in its white squares).
 
     Attributes:
         kind: ``chess`` or ``charuco``.
-        columns: Inner corners along x of a chessboard; squares of a ChArUco board.
+        columns: Number along x of inner corners (chessboard) or squares (ChArUco).
         rows: The same along y.
-        square_m: Side of a square.
-        marker_m: Side of a marker; 0 for a chessboard.
-        dictionary: OpenCV's name of the markers without ``DICT_``; "" for a chessboard.
-        metric: Whether the size of a square was given; else a square counts as 1 m.
-        legacy: Whether a ChArUco board is of the pattern that OpenCV drew before 4.6, whose first
-            square is light where the number of rows is even.
+        square_m: Side length of a square.
+        marker_m: Side length of a marker; 0 for a chessboard.
+        dictionary: OpenCV's name of the ArUco dictionary without ``DICT_``; "" for a chessboard.
+        metric: Whether the square size is known; if not, ``square_m`` is 1.
+        legacy: Whether a ChArUco board has the layout that OpenCV used before 4.6: with an even
+            number of rows, its first square is white.
     """
 
     kind: BoardKind
@@ -58,10 +58,10 @@ class CalibrationBoard:
             raise SettingsError("board has too few inner corners", got=got, expected="2x2 or more")
         if not 0 < self.square_m <= _LARGEST_SQUARE_M:
             raise SettingsError(
-                "square of the board has no plausible size",
+                "square size of the board is implausible",
                 got=f"{self.square_m:g} m",
                 expected=f"above 0, at most {_LARGEST_SQUARE_M:g} m",
-                hint="name the unit: 25mm, 2.5cm, 1in",
+                hint="give the unit: 25mm, 2.5cm, 1in",
             )
         if self.kind == "charuco" and not 0 < self.marker_m < self.square_m:
             raise SettingsError(
@@ -71,13 +71,13 @@ class CalibrationBoard:
 
     @property
     def inner(self) -> tuple[int, int]:
-        """Inner corners along x and y."""
+        """Number of inner corners along x and y."""
         less = 1 if self.kind == "charuco" else 0
         return self.columns - less, self.rows - less
 
     @property
     def squares(self) -> tuple[int, int]:
-        """Squares along x and y."""
+        """Number of squares along x and y."""
         return self.inner[0] + 1, self.inner[1] + 1
 
     @property
@@ -87,7 +87,7 @@ class CalibrationBoard:
 
     @property
     def corners_m(self) -> Float64:
-        """float64 (N, 3), the inner corners row by row; z = 0, the first one is the origin."""
+        """float64 (N, 3), the inner corners row by row; z = 0, the first corner is the origin."""
         columns, rows = self.inner
         y, x = np.mgrid[0:rows, 0:columns]
         flat = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
@@ -102,16 +102,16 @@ class CalibrationBoard:
 
 
 def parse_board(text: str) -> CalibrationBoard:
-    """Read a board from text.
+    """Parse the text form of a board.
 
     ``chess:9x6:25mm`` has 9 by 6 inner corners and squares of 25 mm.
-    ``charuco:8x6:30mm:22mm:5x5_100`` has 8 by 6 squares and markers of 22 mm from that dictionary
-    (three quarters of a square and ``5x5_100`` if left out); ``:legacy`` after it means the pattern
-    that OpenCV drew before 4.6. Lengths are in mm, cm, m or in; a
-    bare number is metres. Without any, a square counts as 1 m: see `CalibrationBoard.metric`.
+    ``charuco:8x6:30mm:22mm:5x5_100`` has 8 by 6 squares of 30 mm, with 22 mm markers of the
+    dictionary ``5x5_100`` (defaults: three quarters of a square, and that dictionary). A trailing
+    ``:legacy`` selects the layout that OpenCV used before 4.6. Lengths are in mm, cm, m or in; a
+    bare number is in metres. Without a square size, see `CalibrationBoard.metric`.
 
     Raises:
-        SettingsError: The text is none of these, or the board cannot be.
+        SettingsError: The text does not have this form, or describes an impossible board.
     """
     kind, *parts = [part.strip() for part in text.strip().split(":")]
     if kind.lower() not in ("chess", "charuco") or not parts:

@@ -1,4 +1,4 @@
-"""Cameras: what a lens does (raw), and what is left of it after rectification."""
+"""Camera models: raw cameras with lens distortion, and rectified stereo cameras."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ LensModel = Literal["pinhole", "fisheye"]
 
 @dataclass(frozen=True, eq=False)
 class CameraIntrinsics:
-    """One raw camera.
+    """A raw camera: its matrix and lens distortion.
 
     Attributes:
         matrix: float64 (3, 3), the camera matrix in pixels; pixel centres are at integers.
-        distortion: float64 (N,). Of a pinhole in OpenCV's order (k1 k2 p1 p2 k3 …), empty =
-            none; of a fisheye always four (k1 k2 k3 k4).
+        distortion: float64 (N,). Pinhole: OpenCV's order (k1 k2 p1 p2 k3 …), empty = none;
+            fisheye: always four (k1 k2 k3 k4).
         width_px: Image width.
         height_px: Image height.
-        model: ``pinhole`` projects by the tangent of a ray's angle, ``fisheye`` by the angle
-            itself (also called equidistant, or Kannala-Brandt).
+        model: ``pinhole`` projects by the tangent of the angle to the optical axis, ``fisheye``
+            by the angle itself (also called equidistant, or Kannala-Brandt).
     """
 
     matrix: Float64
@@ -43,13 +43,13 @@ class CameraIntrinsics:
             raise CalibrationError("focal length is not positive", got=f"{self.matrix[0, 0]:g} px")
         if self.model == "fisheye" and self.distortion.size != 4:
             raise CalibrationError(
-                "a fisheye has four coefficients of distortion", got=self.distortion.size
+                "a fisheye camera has four distortion coefficients", got=self.distortion.size
             )
 
 
 @dataclass(frozen=True, eq=False)
 class StereoCalibration:
-    """Two raw cameras and how the right one stands to the left one.
+    """Two raw cameras and their relative pose.
 
     Attributes:
         left: The left camera.
@@ -67,7 +67,7 @@ class StereoCalibration:
         rotation = self.T_right_left[:3, :3]
         if not np.isfinite(self.T_right_left).all():
             raise CalibrationError("pose of the right camera is not finite")
-        # 1e-3: calibration files print six digits or fewer.
+        # 1e-3: calibration files often print no more than six digits.
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
             raise CalibrationError("rotation of the right camera is not orthonormal")
         if self.baseline_m <= 0:
@@ -85,13 +85,13 @@ class RectifiedCamera:
 
     Attributes:
         focal_px: Focal length of both views.
-        cx_px: Principal point of the left view, column.
-        cy_px: Principal point of both views, row.
-        cx_right_px: Principal point of the right view, column.
+        cx_px: Column of the principal point of the left view.
+        cy_px: Row of the principal point of both views.
+        cx_right_px: Column of the principal point of the right view.
         baseline_m: Distance between the camera centres.
         width_px: Image width.
         height_px: Image height.
-        ndisp: Number of disparities that the calibration file promises to suffice, or None.
+        ndisp: Number of disparities to search, as given by the calibration file, or None.
     """
 
     focal_px: float
@@ -131,11 +131,11 @@ class RectifiedCamera:
         return np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
 
     def resized(self, width_px: int, height_px: int) -> RectifiedCamera:
-        """The camera of the same view at another size; the baseline stays.
+        """The camera of the same view at another image size; the baseline does not change.
 
-        Pixel centres are at integers, so a principal point moves as
-        ``(c + 0.5)·s - 0.5``; Middlebury scales ``c`` and ``doffs`` plainly, which is the
-        same for ``doffs`` and half a pixel off for ``c``.
+        Pixel centres are at integers, so a principal point scales as ``(c + 0.5)·s - 0.5``.
+        Middlebury multiplies ``c`` and ``doffs`` by ``s``: the same for ``doffs``, but up to half
+        a pixel off for ``c``.
         """
         s = width_px / self.width_px
         return replace(

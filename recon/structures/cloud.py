@@ -1,4 +1,4 @@
-"""Point clouds, with what is known about each point."""
+"""Point clouds with per-point attributes."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ Frame = Literal["camera", "world", "map"]
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points in one frame. Every field but ``xyz`` and ``frame`` may be None (not known).
+    """Points in one frame. Every field but ``xyz`` and ``frame`` may be None (unknown).
 
     Attributes:
         xyz: float32 (N, 3), metres, finite.
         rgb: uint8 (N, 3).
         normals: float32 (N, 3), unit length, towards the camera that saw the point.
-        sigma_m: float32 (N,), standard deviation along the viewing depth (``sigma_z``).
+        sigma_m: float32 (N,), standard deviation of the depth (``sigma_z``).
         confidence: float32 (N,) in [0, 1].
-        weight: float32 (N,), sum of the weights of the measurements that were fused.
-        count: int32 (N,), number of frames that saw the point; in a thinned frame, of the points
-            that it stands for.
-        frame: The axes that ``xyz`` is in: camera (x right, y down, z forward), world (the
-            first rectified left camera) or map (x forward, y left, z up).
+        weight: float32 (N,), sum of the weights of the fused measurements.
+        count: int32 (N,), number of frames that saw the point; in a thinned frame, number of
+            points that it replaces.
+        frame: Frame of ``xyz``: camera (x right, y down, z forward), world (the first rectified
+            left camera) or map (x forward, y left, z up).
     """
 
     xyz: Float32
@@ -53,7 +53,7 @@ class PointCloud:
 
     def select(self, which: NDArray[Any]) -> PointCloud:
         """The points of a boolean mask (N,) or of an index array, in that order."""
-        # Taking by index is several times as fast as by mask.
+        # Indexing by position is several times faster than by mask.
         index = np.flatnonzero(which) if which.dtype == np.bool_ else which
         arrays = {
             field.name: getattr(self, field.name).take(index, axis=0)

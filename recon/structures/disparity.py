@@ -1,4 +1,4 @@
-"""Disparity maps: a number or a reason for every pixel."""
+"""Disparity maps: each pixel has a disparity, or the reason why it has none."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from recon.structures.arrays import Bool, Float32, UInt8, freeze
 
 
 class Reason(IntEnum):
-    """Why a pixel has, or has not, a disparity."""
+    """Why a pixel has no disparity, or VALID if it has one."""
 
     VALID = 0
     LOW_TEXTURE = 1
@@ -27,12 +27,12 @@ class Reason(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Disparity:
-    """A disparity for each pixel of the left view, with what is known about it.
+    """Disparity map of the left view, with confidence and uncertainty.
 
     Attributes:
         values: float32 (H, W), ``x_left - x_right`` in pixels; NaN = no match.
         confidence: float32 (H, W) in [0, 1]; 0 where ``values`` is NaN.
-        sigma_px: float32 (H, W), standard deviation of ``values``; NaN where that is NaN.
+        sigma_px: float32 (H, W), standard deviation of ``values``; NaN where ``values`` is NaN.
         reason: uint8 (H, W), a `Reason` for each pixel; VALID exactly where ``values`` is finite.
     """
 
@@ -45,7 +45,7 @@ class Disparity:
         freeze(self, "values", np.float32, (None, None))
         for name, dtype in (("confidence", "f4"), ("sigma_px", "f4"), ("reason", "u1")):
             freeze(self, name, dtype, self.values.shape)
-        # Beside a member of an enumeration numpy would compare in 64 bits, in ten times as long.
+        # Compared with the enum member itself, numpy would use 64 bits and take ten times as long.
         if not np.array_equal(self.valid, self.reason == np.uint8(Reason.VALID)):
             raise ShapeError("Disparity.reason is VALID where values is NaN, or the reverse")
 
@@ -55,7 +55,7 @@ class Disparity:
         return np.isfinite(self.values)
 
     def reject(self, mask: Bool, reason: Reason) -> Disparity:
-        """A copy without the pixels of ``mask``, which get ``reason`` if they had a value."""
+        """A copy with the pixels of ``mask`` invalidated; those that had a value get ``reason``."""
         drop = mask & self.valid
         return Disparity(
             values=np.where(drop, np.float32(np.nan), self.values),

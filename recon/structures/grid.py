@@ -1,4 +1,4 @@
-"""Occupancy: sparse voxels in 3-D, and the flat grid that robots plan on."""
+"""Occupancy maps: sparse 3-D voxels, and the 2-D grid used for path planning."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ UNKNOWN: Final = -1
 
 @dataclass(frozen=True, eq=False)
 class OccupancyVoxels:
-    """The observed cells of a 3-D map; cells that are not listed are unknown.
+    """The observed voxels of a 3-D map; voxels that are not listed are unknown.
 
     Attributes:
-        keys: int32 (N, 3); cell ``k`` spans ``[k, k + 1) · resolution_m`` on each axis of the map.
+        keys: int32 (N, 3); voxel ``k`` spans ``[k, k + 1) · resolution_m`` on each axis of the map.
         log_odds: float32 (N,), natural logarithm; above 0 = occupied.
-        resolution_m: Edge of a cell.
+        resolution_m: Edge length of a voxel.
     """
 
     keys: Int32
@@ -38,18 +38,18 @@ class OccupancyVoxels:
 
     @property
     def centres_m(self) -> Float64:
-        """float64 (N, 3), centres of the cells, map axes."""
+        """float64 (N, 3), centres of the voxels, map axes."""
         return (self.keys.astype(np.float64) + 0.5) * self.resolution_m
 
 
 @dataclass(frozen=True, eq=False)
 class OccupancyGrid:
-    """A flat grid in map axes, ROS conventions.
+    """A 2-D occupancy grid in map axes, with the conventions of ROS.
 
     Attributes:
         cells: int8 (rows, columns): FREE, OCCUPIED or UNKNOWN; row 0 has the smallest y,
             column 0 the smallest x.
-        resolution_m: Edge of a cell.
+        resolution_m: Cell size.
         origin_m: (x, y) of the outer corner of cell (0, 0).
     """
 

@@ -1,4 +1,4 @@
-"""Pairs of images: as recorded, and rectified."""
+"""Stereo image pairs: as recorded, and rectified."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from recon.structures.camera import RectifiedCamera
 
 @dataclass(frozen=True, eq=False)
 class StereoPair:
-    """Two pictures taken at one moment, as a source gives them.
+    """Two images taken at the same time, as delivered by a source.
 
     Attributes:
         left: uint8 (H, W) grey or (H, W, 3) RGB.
         right: The same shape as ``left``.
         timestamp_s: Time of exposure.
         index: Number of the frame in its source.
-        name: What a user would call it: the file name of the left image.
+        name: Name shown to the user: the file name of the left image.
     """
 
     left: UInt8
@@ -46,7 +46,7 @@ class StereoPair:
 
 @dataclass(frozen=True, eq=False)
 class RectifiedPair:
-    """Two grey pictures whose rows correspond.
+    """Two grey images with aligned rows.
 
     Attributes:
         left: uint8 (H, W), grey.
@@ -75,7 +75,7 @@ class RectifiedPair:
 
     @property
     def colours(self) -> UInt8:
-        """uint8 (H, W, 3): the left view's colours, or its grey thrice."""
+        """uint8 (H, W, 3): the left view in colour, or its grey values in all three channels."""
         if self.left_rgb is not None:
             return self.left_rgb
         return np.repeat(self.left[:, :, None], 3, axis=2)

@@ -1,4 +1,4 @@
-"""Figures that an evaluation gives."""
+"""Results of evaluations."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class LengthErrors:
-    """Relative errors of the segments of one length.
+    """Relative errors over the path segments of one length.
 
     Attributes:
-        length_m: Their length.
+        length_m: Length of the segments.
         t_rel_percent: Mean translation error, per cent of the length.
         r_rel_deg_per_100m: Mean rotation error.
-        segments: How many.
+        segments: Number of segments.
     """
 
     length_m: float
@@ -24,23 +24,23 @@ class LengthErrors:
 
 @dataclass(frozen=True)
 class TrajectoryMetrics:
-    """How far an estimated trajectory is from the true one.
+    """Errors of an estimated trajectory with respect to ground truth.
 
     Attributes:
         t_rel_percent: Mean relative translation error over all segments, per cent (KITTI).
         r_rel_deg_per_100m: Mean relative rotation error over all segments (KITTI).
-        ate_m: Root mean square distance of positions after the alignment.
-        rpe_m: Root mean square translation error from each frame to the next.
-        rpe_deg: Root mean square rotation error from each frame to the next.
+        ate_m: Root mean square distance of positions after alignment (ATE).
+        rpe_m: Root mean square translation error from each frame to the next (RPE).
+        rpe_deg: Root mean square rotation error from each frame to the next (RPE).
         path_length_m: Length of the true path.
         frames: Number of poses compared.
         segment_lengths_m: Lengths of the segments used for the relative errors.
         segments: Number of segments.
-        alignment: What was done to the estimate first: ``none``, ``origin``, ``se3``, ``sim3``.
-        scale: Factor on the estimate's lengths in that.
-        ate_median_m: Median distance of positions after the alignment.
-        ate_max_m: Largest one.
-        by_length: The relative errors for each length of segment.
+        alignment: How the estimate was aligned: ``none``, ``origin``, ``se3`` or ``sim3``.
+        scale: Scale factor applied to the estimate in the alignment.
+        ate_median_m: Median distance of positions after alignment.
+        ate_max_m: Largest distance of positions after alignment.
+        by_length: Relative errors for each segment length.
     """
 
     t_rel_percent: float
@@ -61,15 +61,15 @@ class TrajectoryMetrics:
 
 @dataclass(frozen=True)
 class MapMetrics:
-    """How far a cloud is from a reference cloud.
+    """Accuracy and completeness of a cloud with respect to a reference cloud.
 
     Attributes:
-        threshold_m: Distance below which a point counts as right.
+        threshold_m: Distance below which a point counts as correct.
         precision: Share of estimated points within the threshold of the reference.
         recall: Share of reference points within the threshold of the estimate.
-        f_score: Harmonic mean of the two.
+        f_score: Harmonic mean of precision and recall.
         median_m: Median distance from estimated points to the reference.
-        p95_m: 95th percentile of the same.
+        p95_m: 95th percentile of that distance.
         points: Number of estimated points compared.
         reference_points: Number of reference points compared.
     """
@@ -86,13 +86,13 @@ class MapMetrics:
 
 @dataclass(frozen=True)
 class VoxelMetrics:
-    """How right and how complete occupied voxels are.
+    """Accuracy and completeness of occupied voxels.
 
     Attributes:
-        precision: Share of the occupied voxels with a true surface within the tolerance.
-        recall: Share of the true surface voxels with an occupied one within the tolerance.
-        voxels: Occupied voxels compared.
-        true_voxels: True voxels compared.
+        precision: Share of the occupied voxels with a true surface voxel within the tolerance.
+        recall: Share of the true surface voxels with an occupied voxel within the tolerance.
+        voxels: Number of occupied voxels compared.
+        true_voxels: Number of true surface voxels compared.
     """
 
     precision: float
@@ -103,15 +103,15 @@ class VoxelMetrics:
 
 @dataclass(frozen=True)
 class GridMetrics:
-    """How well a flat grid covers the true one, over the cells that were seen.
+    """Agreement of a 2-D grid with the true one, over the cells that were seen.
 
     Attributes:
         iou_occupied: Intersection over union of the occupied cells.
-        iou_free: The same of the free cells.
-        occupied_called_free: Share of the truly occupied cells that the grid calls free.
-        unknown: Share of the cells compared that the grid does not know.
-        cells: Cells compared.
-        true_occupied: Truly occupied ones among them.
+        iou_free: Intersection over union of the free cells.
+        occupied_called_free: Share of the truly occupied cells that the grid marks as free.
+        unknown: Share of the compared cells that are unknown in the grid.
+        cells: Number of cells compared.
+        true_occupied: Number of those that are truly occupied.
     """
 
     iou_occupied: float
@@ -124,15 +124,15 @@ class GridMetrics:
 
 @dataclass(frozen=True)
 class OccupancyMetrics:
-    """How far an occupancy map is from the truth, with and without a tolerance of one cell.
+    """Agreement of an occupancy map with the truth, with and without a tolerance of one cell.
 
     Attributes:
-        resolution_m: Edge of a cell.
-        least_frames: Frames that must have seen what is counted.
-        voxels: In space, within one cell.
-        voxels_exact: In space, the very cell.
-        grid: On the ground, within one cell.
-        grid_exact: On the ground, the very cell.
+        resolution_m: Cell size of voxels and grid.
+        least_frames: Minimum number of frames that must have seen what is counted.
+        voxels: Voxels, with a tolerance of one cell.
+        voxels_exact: Voxels, without tolerance.
+        grid: 2-D grid, with a tolerance of one cell.
+        grid_exact: 2-D grid, without tolerance.
     """
 
     resolution_m: float
@@ -145,18 +145,19 @@ class OccupancyMetrics:
 
 @dataclass(frozen=True)
 class DisparityMetrics:
-    """How far a disparity map is from the truth, over the pixels whose truth is known.
+    """Errors of a disparity map, over the pixels whose true disparity is known.
 
     Attributes:
-        bad: Share of all pixels (per cent) that have a value off by more than the key, in pixels.
+        bad: For each threshold in pixels (key), share of all pixels (per cent) whose value has a
+            larger error.
         invalid: Share of all pixels (per cent) without a value.
         avgerr_px: Mean absolute error of the pixels with a value.
-        rms_px: Root mean square error of the same.
+        rms_px: Root mean square error of the pixels with a value.
         pixels: Number of pixels compared.
-        quantiles_px: Absolute error that so many per cent (the key) of the pixels with a value do
-            not exceed: Middlebury's A50, A90, A95 and A99.
-        d1: Share of all pixels (per cent) that have a value off by more than 3 pixels and more
-            than 5 % of the truth: KITTI's outliers.
+        quantiles_px: Percentiles (key: per cent) of the absolute error of the pixels with a
+            value: Middlebury's A50, A90, A95 and A99.
+        d1: Share of all pixels (per cent) whose value has an error above 3 pixels and above 5 %
+            of the true disparity: KITTI's D1.
     """
 
     bad: dict[float, float]
@@ -170,16 +171,16 @@ class DisparityMetrics:
 
 @dataclass(frozen=True)
 class DepthMetrics:
-    """What the errors of a disparity map mean in depth, over pixels with a value and a truth.
+    """Depth errors of a disparity map, over the pixels with both a value and a true disparity.
 
     Attributes:
         mean_m: Mean absolute error of the depth.
-        median_m: Median of the same.
-        rms_m: Root mean square of the same.
+        median_m: Median absolute error of the depth.
+        rms_m: Root mean square error of the depth.
         median_percent: Median absolute error, per cent of the true depth.
-        over_5_percent: Share of those pixels (per cent) off by more than 5 % of the true depth.
-        infinite: Share of those pixels (per cent) whose disparity gives no finite depth; they
-            count in the median and in ``over_5_percent``, not in ``mean_m`` and ``rms_m``.
+        over_5_percent: Share of the pixels (per cent) with an error above 5 % of the true depth.
+        infinite: Share of the pixels (per cent) whose disparity gives no finite depth; they count
+            in the median and in ``over_5_percent``, but not in ``mean_m`` and ``rms_m``.
     """
 
     mean_m: float

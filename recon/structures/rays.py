@@ -1,4 +1,4 @@
-"""What one frame says of free and occupied space, small enough to be kept of every frame."""
+"""Rays of one frame: its evidence of free and occupied space, compact enough to keep per frame."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _CERTAIN: Final = 255
 
 @dataclass(frozen=True)
 class RayGrain:
-    """How coarse kept rays are.
+    """Resolution of stored rays.
 
     Attributes:
-        cell_m: Edge of the cubes in which points are averaged.
-        unit_m: Places are whole multiples of this.
-        max_range_m: Points farther away were moved along their rays to just beyond it.
+        cell_m: Edge length of the cubes in which points are averaged.
+        unit_m: Quantisation step of the end points.
+        max_range_m: Points farther away are moved along their rays to just beyond this range.
     """
 
     cell_m: float
@@ -31,14 +31,14 @@ class RayGrain:
 
 @dataclass(frozen=True, eq=False)
 class RayCloud:
-    """Rays of one frame, from the camera to where points were seen; camera axes.
+    """Rays of one frame, from the camera to the observed points, in camera axes.
 
     Attributes:
-        places: int16 (N, 3), ends of the rays in units.
+        places: int16 (N, 3), end points of the rays, multiples of ``unit_m``.
         sigma_m: float16 (N,), standard deviation of the depth.
         confidence: uint8 (N,), 255 = certain.
-        count: uint8 (N,), points that were averaged; 255 = or more.
-        unit_m: What places are multiples of.
+        count: uint8 (N,), number of averaged points; 255 = 255 or more.
+        unit_m: Quantisation step of ``places``.
     """
 
     places: NDArray[np.int16]
@@ -57,7 +57,7 @@ class RayCloud:
         return len(self.places)
 
     def cloud(self) -> PointCloud:
-        """The ends as points; their ``count`` is that of the points averaged."""
+        """The end points as a cloud; ``count`` is the number of averaged points."""
         return PointCloud(
             self.places * np.float32(self.unit_m),
             sigma_m=self.sigma_m.astype(np.float32),

@@ -1,4 +1,4 @@
-"""Trajectories: where the left camera was, frame by frame."""
+"""Trajectories: the pose of the left camera in each frame."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Trajectory:
 
     @property
     def distances_m(self) -> Float64:
-        """float64 (N,), path length from the first pose to each."""
+        """float64 (N,), path length from the first pose to each pose."""
         steps = np.linalg.norm(np.diff(self.positions_m, axis=0), axis=1)
         return np.concatenate([np.zeros(min(1, len(self))), np.cumsum(steps)])
 

@@ -1,4 +1,4 @@
-"""Ground truth, where a source has it."""
+"""Ground truth, for sources that have it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class DisparityTruth:
 
     Attributes:
         values: float32 (H, W), pixels; NaN = unknown.
-        nonocc: bool (H, W), True where the point is seen by both cameras.
+        nonocc: bool (H, W), True where both cameras see the point (not occluded).
     """
 
     values: Float32
@@ -32,7 +32,7 @@ class DisparityTruth:
 
 @dataclass(frozen=True, eq=False)
 class SequenceTruth:
-    """Truth of a drive; each part may be unknown (None).
+    """Ground truth of a drive; each part may be unknown (None).
 
     Attributes:
         trajectory: True poses, one per frame; the first is the identity.
@@ -45,19 +45,19 @@ class SequenceTruth:
 
 @dataclass(frozen=True, eq=False)
 class OccupancyTruth:
-    """What is really occupied, and what of it a drive saw; map axes.
+    """True occupancy, and which part of it a drive saw; map axes.
 
     Attributes:
-        grid: OCCUPIED where an obstacle reaches into the height band, else FREE; what is taller
-            than the band, such as a house, is hollow.
-        seen: bool, the shape of the grid: in ``least_frames`` frames some pixel looked at a
-            surface in this cell, at or below the top of the band.
-        keys: int32 (N, 3), cells of the grid's resolution that hold a surface which was seen.
-        frames: int32 (N,), number of frames that saw it from within ``range_m``.
+        grid: OCCUPIED where an obstacle reaches into the height band, else FREE; obstacles taller
+            than the band, such as houses, are hollow.
+        seen: bool, same shape as the grid: True where at least ``least_frames`` frames saw a
+            surface in the cell, at or below the top of the band.
+        keys: int32 (N, 3), voxels at the resolution of the grid that contain a seen surface.
+        frames: int32 (N,), number of frames that saw each voxel from within ``range_m``.
         camera: The rectified camera.
-        T_map_camera: float64 (F, 4, 4), where it really was.
-        range_m: Distance from the camera up to which a frame sees.
-        least_frames: Frames that must have seen what is counted.
+        T_map_camera: float64 (F, 4, 4), true poses of the camera.
+        range_m: Maximum distance from the camera at which a surface counts as seen.
+        least_frames: Minimum number of frames that must have seen what is counted.
     """
 
     grid: OccupancyGrid
