@@ -1,4 +1,4 @@
-"""From pictures of a board to the cameras that took them."""
+"""Stereo calibration from images of a board."""
 
 from recon.calibration.board_size import check_charuco, check_chessboard, grown_size
 from recon.calibration.bootstrap import DepthError, Spread, measure_depth, measure_spread

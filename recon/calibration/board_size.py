@@ -1,4 +1,4 @@
-"""How many corners the board in a picture really has, whatever was claimed."""
+"""Check the size of the board in the images against the size that the user gave."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from recon.structures.board import CalibrationBoard
 
 Inner = tuple[int, int]
 
-# An inner corner has dark and light quarters crosswise; beyond the pattern this contrast is gone.
+# Least contrast of dark and light quadrants at an inner corner, relative to the median corner.
 _CORNER_CONTRAST: Final = 0.5
 _LARGEST: Final = 60
-# So many pictures that agree on a size, or markers in a picture, are no accident.
+# Images that must agree on a size, or markers per image, to rule out chance.
 _SURE: Final = 3
-# Pictures that are asked for the true size when the claimed one is found in few.
+# Images in which any board is searched if few show the given one.
 _PROBED: Final = 8
-# … and for the markers of all of OpenCV's dictionaries, of which there are twenty.
+# Fewer for markers, because all of OpenCV's twenty dictionaries are tried.
 _PROBED_MARKERS: Final = 2
 
 
 def check_chessboard(
     sizes: Sequence[Inner | None], read: Callable[[int], UInt8], board: CalibrationBoard
 ) -> None:
-    """Make sure that the board in the pictures has as many corners as was claimed.
+    """Check that the board in the images has as many corners as the user gave.
 
-    A part of a larger board is found without complaint, but not the same part in both pictures.
+    OpenCV also detects part of a larger board, but not the same part in both cameras.
 
     Args:
-        sizes: `grown_size` of what was found in each picture, None where nothing was.
-        read: Gives a picture, uint8 (H, W), by its number.
-        board: The board that was claimed.
+        sizes: `grown_size` of the board found in each image, None if none was found.
+        read: Returns the image of a given number, uint8 (H, W).
+        board: The board that the user gave.
 
     Raises:
-        CalibrationError: Most pictures show another board; its size is told.
+        CalibrationError: Most images show a board of another size, which the message gives.
     """
     claimed = _sorted(board.inner)
     seen = Counter(_sorted(size) for size in sizes if size is not None)
@@ -49,7 +49,7 @@ def check_chessboard(
         _check_no_markers([read(n) for n in _spread(range(len(sizes)), _PROBED_MARKERS)], board)
     probed: list[Inner | None] = []
     if 2 * seen.total() < len(sizes):
-        # What little was found may be a part of another board.
+        # The few detections may be parts of a larger board.
         empty = [number for number, size in enumerate(sizes) if size is None]
         probed = [probe_size(read(number)) for number in _spread(empty, _PROBED)]
     others = Counter(_sorted(size) for size in probed if size is not None)
@@ -59,28 +59,28 @@ def check_chessboard(
     ):
         size, most = next(iter(votes.most_common(1)), (claimed, 0))
         larger = any(n > m for n, m in zip(size, claimed, strict=True))
-        # Where the claimed board was seen whole, a smaller one is a part of it.
+        # If the given board was seen whole, a smaller one is part of it.
         if most >= enough and size != claimed and (larger or not seen[claimed]):
             raise _wrong_size(size, f"{most} of {voters} pictures", board)
 
 
 def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBoard) -> None:
-    """Say what is wrong where a ChArUco board is found in no picture.
+    """Explain why a ChArUco board was not found in any image.
 
     Args:
-        count: Number of pictures.
-        read: Gives a picture, uint8 (H, W), by its number.
-        board: The board that was claimed.
+        count: Number of images.
+        read: Returns the image of a given number, uint8 (H, W).
+        board: The board that the user gave.
 
     Raises:
-        CalibrationError: The markers are of another dictionary, or of a larger board, or there
-            are none but a plain chessboard.
+        CalibrationError: The markers belong to another dictionary or another layout, or the board
+            is a plain chessboard.
     """
     probed = [read(number) for number in _spread(range(count), _PROBED_MARKERS)]
     best, votes = _marker_votes(probed)
     if votes[best] and votes[board.dictionary] < votes[best] / 2:
         raise CalibrationError(
-            "markers of the board are of another dictionary",
+            "the board has markers of another dictionary",
             got=best.lower(),
             expected=board.dictionary.lower(),
             hint=f"try --board {board.kind}:{board.columns}x{board.rows}:…:{best.lower()}",
@@ -88,16 +88,16 @@ def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBo
     numbers = np.concatenate([find_markers(p, board.dictionary) for p in probed])
     if numbers.size:
         raise CalibrationError(
-            "markers are seen, but they do not stand as on this board",
-            got=f"markers up to number {numbers.max()}",
+            "markers were found, but not in the layout of this board",
+            got=f"marker ids up to {numbers.max()}",
             expected=f"0 to {marker_count(board) - 1} for {board.columns}x{board.rows} squares",
-            hint="count squares, not corners; columns come first",
+            hint="count squares, not corners; give columns first",
         )
     plain = [size for size in map(probe_size, probed) if size is not None]
     if plain:
         columns, rows = max(plain, key=lambda size: size[0] * size[1])
         raise CalibrationError(
-            "the pictures show a chessboard without markers",
+            "the images show a chessboard without markers",
             got=f"{columns}x{rows} inner corners",
             expected=str(board),
             hint=f"try --board chess:{columns}x{rows}:…",
@@ -105,12 +105,12 @@ def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBo
 
 
 def grown_size(grey: UInt8, pixels: Float64, inner: Inner) -> Inner:
-    """Columns and rows of inner corners when a grid is continued for as long as there are corners.
+    """Columns and rows of a grid of inner corners, extended as far as corners are found.
 
     Args:
         grey: uint8 (H, W).
         pixels: float64 (N, 2), corners row by row.
-        inner: Its columns and rows.
+        inner: Columns and rows of ``pixels``.
     """
     columns, rows = inner
     grid = pixels.reshape(rows, columns, 2)
@@ -128,7 +128,7 @@ def grown_size(grey: UInt8, pixels: Float64, inner: Inner) -> Inner:
 
 
 def probe_size(grey: UInt8) -> Inner | None:
-    """Columns and rows of any chessboard in a picture, or None."""
+    """Inner columns and rows of any chessboard in an image, or None."""
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(
         grey, (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     )
@@ -139,27 +139,27 @@ def probe_size(grey: UInt8) -> Inner | None:
     if len(pixels) != rows * columns:
         return None
     size = grown_size(grey, pixels, (columns, rows))
-    # What was grown must be found again as a whole: a texture of squares would not.
+    # Detecting the whole extended board again rejects mere textures of squares.
     return size if find_chessboard(grey, size) is not None else None
 
 
 def _spread(numbers: Sequence[int], count: int) -> list[int]:
-    """At most so many of the numbers, evenly from first to last."""
+    """At most ``count`` of the numbers, evenly spaced from first to last."""
     at = np.unique(np.linspace(0, len(numbers) - 1, min(count, len(numbers))).astype(int))
     return [numbers[place] for place in at]
 
 
 def _sorted(size: Inner) -> Inner:
-    """A board may be held upright or across."""
+    """The size independent of orientation: a board may be held upright or sideways."""
     return min(size), max(size)
 
 
 def _continue(grey: UInt8, grid: Float64, axis: int, usual: float) -> Float64 | None:
-    """The grid with one more line at the end of an axis, or None where no corners are there."""
+    """The grid with one more line at the end of an axis, or None if there are no corners."""
     lines = np.moveaxis(grid, axis, 0)
     if len(lines) < 3 or len(lines) >= _LARGEST:
         return None
-    # Perspective and lens bend a row: continue it by its curvature.
+    # Quadratic extrapolation: perspective and lens distortion curve the spacing.
     guess = 3 * lines[-1] - 3 * lines[-2] + lines[-3]
     step = float(np.linalg.norm(guess - lines[-1], axis=1).min())
     height, width = grey.shape
@@ -174,9 +174,9 @@ def _continue(grey: UInt8, grid: Float64, axis: int, usual: float) -> Float64 | 
 
 
 def _contrast(grey: UInt8, grid: Float64) -> Float64:
-    """float64 (R, C), how much lighter one diagonal's quarters are than the other's, each alike.
+    """float64 (R, C), brightness difference of the two diagonal pairs of quadrants of each corner.
 
-    NaN where a quarter lies outside the picture.
+    Differences within a pair count against it. NaN where a quadrant is outside the image.
     """
     down, across = np.gradient(grid, axis=(0, 1))
     quarters = [
@@ -196,7 +196,7 @@ def _sample(grey: UInt8, places: Float64) -> Float64:
 
 
 def _marker_votes(pictures: Sequence[UInt8]) -> tuple[str, Counter[str]]:
-    """The dictionary of which most markers are seen, and how many of each."""
+    """The dictionary with the most markers found, and the number found of each."""
     votes = Counter(
         {
             name: sum(len(find_markers(picture, name)) for picture in pictures)
@@ -210,10 +210,10 @@ def _check_no_markers(pictures: Sequence[UInt8], board: CalibrationBoard) -> Non
     best, votes = _marker_votes(pictures)
     if votes[best] >= _SURE * len(pictures):
         raise CalibrationError(
-            "the pictures show a board with markers (ChArUco)",
+            "the images show a board with markers (ChArUco)",
             got=f"markers of {best.lower()}",
             expected=str(board),
-            hint=f"try --board charuco:COLUMNSxROWS:SQUARE:MARKER:{best.lower()}, in squares",
+            hint=f"try --board charuco:COLUMNSxROWS:SQUARE:MARKER:{best.lower()}, counting squares",
         )
 
 
@@ -223,7 +223,7 @@ def _wrong_size(size: Inner, where: str, board: CalibrationBoard) -> Calibration
     squares = (columns + 1, rows + 1) == (board.columns, board.rows)
     why = "count inner corners, not squares" if squares else "count the inner corners again"
     return CalibrationError(
-        f"the board in the pictures does not have {claimed} inner corners",
+        f"the board in the images does not have {claimed} inner corners",
         got=f"{columns}x{rows} in {where}",
         expected=claimed,
         hint=f"{why}, or give --board chess:{columns}x{rows}:…",

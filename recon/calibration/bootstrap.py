@@ -1,7 +1,7 @@
-"""How sure a calibration is: resample its views, and see what changes.
+"""Uncertainty of a calibration, by bootstrap over its views.
 
-A resampling is one Newton step from the solution with each view counted as often as it was drawn.
-The step needs only what the solver has at hand, so hundreds take a fraction of a second.
+A resample is one Newton step from the solution, with each view weighted by how often it was drawn.
+The step reuses the solver's normal equations, so hundreds take a fraction of a second.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from recon.geometry.se3 import apply, invert
 from recon.structures import StereoCalibration
 from recon.structures.arrays import Float64
 
-# Where in the left picture depth is asked for: 3 by 3 places, in shares of its size.
+# The depth error is evaluated on a 3 by 3 grid in the left image, in fractions of its size.
 _PLACES: Final = (0.2, 0.5, 0.8)
 _MIDDLE: Final = 4
 
 
 @dataclass(frozen=True)
 class DepthError:
-    """What depth at one distance is worth.
+    """Predicted depth error at one distance.
 
     Attributes:
-        depth_m: The distance along the optical axis of the left camera.
-        calibration_m: Root mean square error that comes of the calibration, over the resamplings
-            and over the picture; NaN where the two cameras share no view at that depth.
-        low_m: Lower end of the interval of the error in the middle of the picture; negative =
-            measured too near.
-        high_m: Its upper end.
-        matching_m: Error that comes of matching with `CalibrationSettings.match_sigma_px`.
+        depth_m: Distance along the optical axis of the left camera.
+        calibration_m: Root mean square error due to calibration, over the resamples and over the
+            image; NaN if the two views do not overlap at that depth.
+        low_m: Lower end of the interval of the error at the image centre; negative = measured too
+            near.
+        high_m: Upper end of that interval.
+        matching_m: Error due to matching, with `CalibrationSettings.match_sigma_px`.
     """
 
     depth_m: float
@@ -48,13 +48,13 @@ class DepthError:
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """Intervals over the resamplings.
+    """Bootstrap intervals of the calibration.
 
     Attributes:
-        focal_px: Low and high end of the left focal length.
-        baseline_m: The same of the baseline.
-        rotation_deg: Root mean square turn of the right camera against the solution.
-        depths: What depth is worth at each distance.
+        focal_px: Interval (low, high) of the left focal length.
+        baseline_m: Interval (low, high) of the baseline.
+        rotation_deg: Root mean square rotation of the right camera relative to the solution.
+        depths: Predicted depth error at each distance.
     """
 
     focal_px: tuple[float, float]
@@ -64,15 +64,19 @@ class Spread:
 
 
 def resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibration]:
-    """The rigs that other draws of the same views would have given."""
+    """Rigs calibrated from bootstrap resamples of the views; failed resamples are left out.
+
+    Raises:
+        CalibrationError: More than half of the resamples fail.
+    """
     rng = np.random.default_rng(settings.seed)
     count, info = len(fit.views), fit.information
-    vectors = _without_own_pull(fit)
+    vectors = _jackknife_vectors(fit)
     rigs = []
     for _ in range(settings.bootstrap):
         drawn = rng.multinomial(count, np.full(count, 1 / count)).astype(np.float64)
         A = info.prior + np.tensordot(drawn, info.matrices, axes=1)
-        # At the solution the sum of all vectors is zero, up to what holds rational lenses.
+        # At the solution the vectors sum to zero, up to the prior of rational lenses.
         step = solve_scaled(A, (drawn - 1.0) @ vectors)
         rig = _try_rig(fit.state, step)
         if rig is not None:
@@ -81,13 +85,13 @@ def resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibr
         raise CalibrationError(
             "views do not determine the rig",
             got=f"{count} views",
-            hint="take more, with the board tilted, near and far, and in every corner",
+            hint="take more, with the board tilted, near and far, and in every image corner",
         )
     return rigs
 
 
 def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
-    """Intervals of what matters, over resampled views.
+    """Bootstrap intervals of focal length, baseline, rotation and depth.
 
     Raises:
         CalibrationError: The views do not determine the rig.
@@ -104,25 +108,25 @@ def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
 
 
 def measure_depth(rig: StereoCalibration, left_px: Float64, right_px: Float64) -> Float64:
-    """float64 (N,), depth in the left camera's axes where the rays of matched raw pixels meet."""
+    """float64 (N,), depth along the left optical axis, triangulated from matched raw pixels."""
     T_left_right = invert(rig.T_right_left)
     a = unproject(rig.left, left_px)
     b = unproject(rig.right, right_px) @ T_left_right[:3, :3].T
-    # Nearest point of two lines, l·a and c + m·b: normal equations by hand.
+    # Closest points of the lines l·a and c + m·b, from their normal equations.
     c = T_left_right[:3, 3]
     aa, ab, bb = (np.einsum("ni,ni->n", p, q) for p, q in ((a, a), (a, b), (b, b)))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray((bb * (a @ c) - ab * (b @ c)) / (aa * bb - ab**2))
 
 
-def _without_own_pull(fit: StereoFit) -> Float64:
-    """float64 (V, P), each view's vector as it would be had the view not pulled the solution.
+def _jackknife_vectors(fit: StereoFit) -> Float64:
+    """float64 (V, P), each view's gradient, corrected for the view's own effect on the solution.
 
     Ref: Bell and McCaffrey 2002, "Bias reduction in standard errors" (their jackknife form).
     """
     info = fit.information
     whole = info.prior + info.matrices.sum(axis=0)
-    # (1 - M / W)^-1 v = W (W - M)^-1 v, which is solved well although the numbers differ in size.
+    # (1 - M / W)^-1 v = W (W - M)^-1 v: well conditioned although the parameters differ in size.
     return np.array(
         [
             whole @ solve_scaled(whole - matrix, vector)
@@ -132,7 +136,7 @@ def _without_own_pull(fit: StereoFit) -> Float64:
 
 
 def _try_rig(state: RigState, step: Float64) -> StereoCalibration | None:
-    """The rig after a step, or None where a draw determines none."""
+    """The rig after a step, or None if the resample does not determine one."""
     try:
         return stereo_of(moved(state, step))
     except CalibrationError:
@@ -163,6 +167,6 @@ def _depth_error(
     )
     middle = errors[:, int(shared[:_MIDDLE].sum())]
     low_m, high_m = _interval(list(middle), settings)
-    # A draw that bends a lens beyond its inverse at the border has no depth there.
+    # NaN: the lens of a resample may not be invertible at the image border.
     rms_m = float(np.sqrt(np.nanmean(errors**2)))
     return DepthError(depth_m, rms_m, low_m, high_m, matching_m)

@@ -1,9 +1,9 @@
-"""Least squares over the lenses, the pose of the right camera and every position of the board.
+"""Bundle adjustment of the lenses, the pose of the right camera and every pose of the board.
 
-One solver serves one camera and two, pinholes and fisheyes, and boards that are seen in part.
-Positions of the board are eliminated view by view (Schur complement); what remains are the few
-numbers that all views share, and each view's information about them. The bootstrap over views is
-then a weighted sum of what the solver has at hand.
+One solver handles one or two cameras, pinhole and fisheye lenses, and partly visible boards. The
+board poses are eliminated view by view (Schur complement), which leaves the few parameters shared
+by all views and each view's information matrix for them. The bootstrap over views reweights these
+matrices.
 
 Ref: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6; Zhang 2000.
 """
@@ -25,10 +25,10 @@ from recon.structures.arrays import Float64, Int32
 _ROUNDS: Final = 100
 _FIRST_DAMPING: Final = 1e-3
 _LARGEST_DAMPING: Final = 1e12
-# Relative decrease of the cost below which nothing is left to gain.
+# Relative decrease of the cost at which the solver has converged.
 _STILL: Final = 1e-12
-# Eight coefficients of a rational lens are not all determined: each is held near zero as if it had
-# been measured there with this spread, against pixels measured to 0.1.
+# The eight coefficients of a rational lens are not all observable: each has a zero-mean prior of
+# this standard deviation, against corners measured to 0.1 px.
 _PRIOR_SPREAD: Final = 2.0
 _PRIOR_PX: Final = 0.1
 _POSE: Final = 6
@@ -36,12 +36,12 @@ _POSE: Final = 6
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """What one camera saw of the board in one view.
+    """Board corners that one camera saw in one view.
 
     Attributes:
-        numbers: int32 (N,), which corners of the board.
-        board_m: float64 (N, 3), where they are on it.
-        pixels: float64 (N, 2), where they were seen.
+        numbers: int32 (N,), indices of the corners on the board.
+        board_m: float64 (N, 3), their positions on the board.
+        pixels: float64 (N, 2), their positions in the image.
     """
 
     numbers: Int32
@@ -51,10 +51,10 @@ class Sighting:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One position of the board, seen by every camera.
+    """One pose of the board, seen by every camera.
 
     Attributes:
-        name: What a user calls it.
+        name: Name shown to the user.
         seen: One sighting for each camera.
     """
 
@@ -64,7 +64,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class RigState:
-    """All that is estimated.
+    """Everything that is estimated.
 
     Attributes:
         cameras: One or two cameras.
@@ -77,7 +77,7 @@ class RigState:
     T_rig_board: tuple[Float64, ...]
 
     def residuals(self, view: View, number: int) -> tuple[Float64, ...]:
-        """float64 (N, 2) for each camera: seen less predicted, pixels."""
+        """float64 (N, 2) for each camera: observed minus predicted, pixels."""
         return tuple(
             seen.pixels - project(camera, apply(T @ self.T_rig_board[number], seen.board_m))
             for camera, T, seen in zip(self.cameras, self.T_camera_rig, view.seen, strict=True)
@@ -86,17 +86,17 @@ class RigState:
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """What each view says of the shared numbers, at the solution.
+    """Information of each view about the shared parameters, at the solution.
 
-    The shared numbers are, for each camera in turn, (fx, fy, cx, cy, distortion …), then, where
-    there are two, six of the pose of the right camera (rotation, translation) as a small motion
-    after it.
+    The shared parameters are (fx, fy, cx, cy, distortion …) of each camera in turn, followed, with
+    two cameras, by the pose of the right camera: six parameters (rotation, translation) of a small
+    motion applied after it.
 
     Attributes:
-        matrices: float64 (V, P, P), the information of each view, board positions eliminated.
-        vectors: float64 (V, P), the gradient of each view; their weighted sum is zero.
-        prior: float64 (P, P), information that no view gave.
-        weights: float64 (V,).
+        matrices: float64 (V, P, P), information matrix of each view, board poses eliminated.
+        vectors: float64 (V, P), gradient of each view; their weighted sum is zero.
+        prior: float64 (P, P), information matrix of the prior.
+        weights: float64 (V,), weights of the views.
     """
 
     matrices: Float64
@@ -107,7 +107,7 @@ class Information:
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Normal equations of one view: shared, mixed, own; and both right-hand sides; the cost."""
+    """Normal equations of one view: shared (A, a), mixed (B), board pose (C, c); and its cost."""
 
     A: Float64
     B: Float64
@@ -124,23 +124,23 @@ def solve(
 
     Args:
         views: The views.
-        start: A first guess, with every point in front of every camera.
-        weights: float64 (V,), of each view's squared errors; None = 1.
+        start: Initial guess, with every point in front of every camera.
+        weights: float64 (V,), weight of each view's squared errors; None = 1.
 
     Raises:
-        CalibrationError: The first guess is none, or nothing is determined.
+        CalibrationError: The initial guess has points behind a camera.
     """
     w = np.ones(len(views)) if weights is None else weights
     state, damping = start, _FIRST_DAMPING
     blocks = _linearise(views, state)
     cost = _cost(blocks, state, w)
     if not np.isfinite(cost):
-        raise CalibrationError("no first guess puts the board in front of the cameras")
+        raise CalibrationError("no initial guess puts the board in front of the cameras")
     for _ in range(_ROUNDS):
         trial = _step(blocks, state, w, damping)
         trial_blocks = _linearise(views, trial) if trial else []
         trial_cost = _cost(trial_blocks, trial, w) if trial else np.inf
-        if trial is not None and trial_cost <= cost:  # never true of NaN: a point behind a camera
+        if trial is not None and trial_cost <= cost:  # False for NaN: a point behind a camera
             gain = cost - trial_cost
             state, blocks, cost = trial, trial_blocks, trial_cost
             damping = max(damping / 10, 1e-12)
@@ -154,15 +154,15 @@ def solve(
 
 
 def shared_size(state: RigState) -> int:
-    """Number of shared numbers, P."""
+    """Number of shared parameters, P."""
     return sum(_camera_size(camera) for camera in state.cameras) + _POSE * (len(state.cameras) - 1)
 
 
 def moved(state: RigState, step: Float64) -> RigState:
-    """The state with its shared numbers moved by ``step`` (P,); board positions stay.
+    """The state with ``step`` (P,) added to its shared parameters; board poses do not change.
 
     Raises:
-        CalibrationError: A camera would have no positive focal length.
+        CalibrationError: A focal length would not be positive.
     """
     cameras, at = [], 0
     for camera in state.cameras:
@@ -216,7 +216,7 @@ def _view_blocks(view: View, state: RigState, number: int) -> _Blocks:
 
 
 def _by_motion(xyz: Float64) -> Float64:
-    """float64 (N, 3, 6), how points move with a small rotation and translation after their pose."""
+    """float64 (N, 3, 6), Jacobian of points for a small rotation and translation after a pose."""
     J = np.zeros((len(xyz), 3, _POSE))
     x, y, z = xyz.T
     J[:, 0, 1], J[:, 0, 2] = z, -y
@@ -227,7 +227,7 @@ def _by_motion(xyz: Float64) -> Float64:
 
 
 def _prior(state: RigState) -> Float64:
-    """float64 (P, P), holds the coefficients of rational lenses near zero."""
+    """float64 (P, P), information that keeps the coefficients of rational lenses near zero."""
     diagonal, at = np.zeros(shared_size(state)), 0
     for camera in state.cameras:
         if camera.distortion.size >= 8:
@@ -237,7 +237,7 @@ def _prior(state: RigState) -> Float64:
 
 
 def _shared_numbers(state: RigState) -> Float64:
-    """float64 (P,), the distortion where the prior looks for it; the rest is not looked at."""
+    """float64 (P,), the distortion at its place; 0 elsewhere, where the prior is zero."""
     numbers = [np.concatenate([np.zeros(4), camera.distortion]) for camera in state.cameras]
     return np.concatenate([*numbers, np.zeros(_POSE * (len(state.cameras) - 1))])
 
@@ -251,7 +251,7 @@ def _cost(blocks: Sequence[_Blocks], state: RigState, weights: Float64) -> float
 def _step(
     blocks: Sequence[_Blocks], state: RigState, weights: Float64, damping: float
 ) -> RigState | None:
-    """One damped step; None where it is so long that a focal length would be negative."""
+    """The state after one damped step; None if a focal length would not be positive."""
     prior = _prior(state)
     A, a = prior.copy(), -prior @ _shared_numbers(state)
     own = []
@@ -274,9 +274,9 @@ def _step(
 
 
 def solve_scaled(A: Float64, a: Float64) -> Float64:
-    """Solve symmetric equations whose unknowns differ in size by powers of ten.
+    """Solve symmetric equations whose unknowns differ by orders of magnitude.
 
-    What is not determined stays where it is.
+    Directions that are not determined stay at 0.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
     solution, *_ = np.linalg.lstsq(A * np.outer(scale, scale), a * scale, rcond=1e-14)

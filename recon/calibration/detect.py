@@ -1,4 +1,4 @@
-"""Find a board in a picture, to a small part of a pixel."""
+"""Detection of board corners in an image, with subpixel accuracy."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from recon.calibration.bundle import Sighting
 from recon.structures.arrays import Float64, Int32, UInt8
 from recon.structures.board import CalibrationBoard
 
-# Finding corners needs no more pixels than this; they are refined in the whole picture.
+# Corners are detected at this width at most, and refined at full resolution.
 _SEARCH_WIDTH_PX: Final = 1280
-# Half the window of the sub-pixel search, in distances to the nearest corner: as wide as it can be
+# Half the window of the subpixel search, relative to the corner spacing: as wide as possible
 # without another corner in it.
 _WINDOW: Final = 0.33
 _SMALLEST_WINDOW_PX: Final = 2
@@ -23,7 +23,7 @@ _LARGEST_WINDOW_PX: Final = 25
 _SUB_PIXEL: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-5)
 _CHESS_FLAGS: Final = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _FEWEST_CORNERS: Final = 8
-# A refined corner that moved farther than this, in distances to the next, has been lost.
+# A corner that refinement moves farther than this, relative to the spacing, keeps its old position.
 _LOST: Final = 0.5
 
 
@@ -32,10 +32,10 @@ def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
 
     Args:
         grey: uint8 (H, W).
-        board: A chessboard must be seen whole, a ChArUco board may be seen in part.
+        board: A chessboard must be fully visible, a ChArUco board may be partly visible.
 
     Returns:
-        None where it is not seen, or too little of it (fewer than 8 corners, or all in one line).
+        None if the board is not found, or too little of it (fewer than 8 corners, or collinear).
 
     Raises:
         SettingsError: The dictionary of a ChArUco board is unknown or too small.
@@ -48,7 +48,7 @@ def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
         numbers = np.arange(len(pixels), dtype=np.int32)
     if not _enough(numbers, board):
         return None
-    # A marker's own edges must stay out of the window.
+    # The edges of the markers must stay outside the window.
     free = (board.square_m - board.marker_m) / (2 * board.square_m)
     window = min(_WINDOW, 0.8 * free)
     pixels = refine_corners(grey, pixels, _spacing(numbers, pixels, board), window)
@@ -56,7 +56,7 @@ def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
 
 
 def find_chessboard(grey: UInt8, inner: tuple[int, int]) -> Float64 | None:
-    """float64 (N, 2), rough inner corners row by row, or None."""
+    """float64 (N, 2), approximate inner corners row by row, or None."""
     scale = min(1.0, _SEARCH_WIDTH_PX / grey.shape[1])
     small = (
         grey
@@ -65,7 +65,7 @@ def find_chessboard(grey: UInt8, inner: tuple[int, int]) -> Float64 | None:
     )
     found, corners = cv2.findChessboardCorners(small, inner, flags=_CHESS_FLAGS)
     if not found:
-        # Slower and choosier about margins, but sees boards that are tilted or badly lit.
+        # Slower and stricter about margins, but finds tilted and badly lit boards.
         found, corners = cv2.findChessboardCornersSB(
             small, inner, flags=cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
         )
@@ -77,13 +77,13 @@ def find_chessboard(grey: UInt8, inner: tuple[int, int]) -> Float64 | None:
 def refine_corners(
     grey: UInt8, pixels: Float64, spacing_px: float, window: float = _WINDOW
 ) -> Float64:
-    """float64 (N, 2), corners at the crossing of the edges around them.
+    """float64 (N, 2), corners refined to subpixel accuracy.
 
     Args:
         grey: uint8 (H, W).
-        pixels: float64 (N, 2), where they are but for a few pixels.
-        spacing_px: Distance between neighbours.
-        window: Half of the window looked at, in such distances.
+        pixels: float64 (N, 2), corners to within a few pixels.
+        spacing_px: Distance between neighbouring corners.
+        window: Half width of the search window, relative to the spacing.
     """
     half = int(np.clip(round(window * spacing_px), _SMALLEST_WINDOW_PX, _LARGEST_WINDOW_PX))
     start = pixels.astype(np.float32).reshape(-1, 1, 2)
@@ -93,16 +93,16 @@ def refine_corners(
 
 
 def orient_like(reference: Float64, pixels: Float64, inner: tuple[int, int]) -> Float64:
-    """Renumber the corners of a whole chessboard so that they run as in another view of it.
+    """Reorder the corners of a whole chessboard as in another view of it.
 
-    A chessboard looks the same when it is turned by half a turn, and OpenCV begins where it likes.
-    Of all orders that keep the neighbours, the one is taken in which the corners lie most like
-    those of the reference, up to a shift and a scale.
+    A chessboard looks the same when rotated by 180 degrees, and OpenCV may start at either end. Of
+    all orders that preserve neighbours, this takes the one that resembles the reference most, up
+    to translation and scale.
 
     Args:
-        reference: float64 (N, 2), the left picture's corners.
-        pixels: float64 (N, 2), those of the right picture.
-        inner: Inner corners along x and y.
+        reference: float64 (N, 2), corners in the left image.
+        pixels: float64 (N, 2), corners in the right image.
+        inner: Number of inner corners along x and y.
     """
     columns, rows = inner
     grid = np.arange(columns * rows).reshape(rows, columns)
@@ -126,7 +126,7 @@ def _enough(numbers: Int32, board: CalibrationBoard) -> bool:
 
 
 def _spacing(numbers: Int32, pixels: Float64, board: CalibrationBoard) -> float:
-    """Smallest distance between corners that are neighbours on the board, pixels."""
+    """Smallest distance between neighbouring corners of the board, pixels."""
     place = np.full(len(board.corners_m) + board.inner[0], -1)
     place[numbers] = np.arange(len(numbers))
     columns = board.inner[0]

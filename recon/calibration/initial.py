@@ -1,4 +1,4 @@
-"""First guesses: one camera from its views of the board, and two cameras from one each."""
+"""Initial guesses: each camera alone from its views of the board, then both joined to a rig."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from recon.structures.arrays import Float64
 
 Size = tuple[int, int]
 
-# Half fields of view that a fisheye may have, from which the best is taken.
+# Half fields of view that are tried for a fisheye lens.
 _HALF_ANGLES: Final = tuple(math.radians(angle) for angle in (35, 45, 55, 65, 75, 85, 95, 110))
 _COEFFICIENTS: Final = {"rational": 8, "fisheye": 4}
-# Two rounds of down-weighting are enough for a view to show that it does not belong.
+# Rounds of reweighting; outlying views stand out after two.
 _REWEIGHTED: Final = 4
 
 
 def calibrate_one(
     sightings: Sequence[Sighting], size: Size, settings: CalibrationSettings
 ) -> RigState:
-    """Lens and board positions of one camera, with views that do not fit weighed down.
+    """Lens and board poses of one camera, with views that do not fit down-weighted.
 
     Raises:
-        CalibrationError: The views determine no camera.
+        CalibrationError: The views do not determine a camera.
     """
     views = [View(str(number), (seen,)) for number, seen in enumerate(sightings)]
     if settings.model == "fisheye":
@@ -48,7 +48,7 @@ def calibrate_one(
 
 
 def solve_robustly(views: Sequence[View], start: RigState) -> RigState:
-    """Solve with each view weighed by how well it fits (Cauchy weights of its rms error)."""
+    """Solve with each view weighted by how well it fits (Cauchy weights of its rms error)."""
     state, weights = start, np.ones(len(views))
     for _ in range(_REWEIGHTED):
         state, _ = solve(views, state, weights)
@@ -59,7 +59,7 @@ def solve_robustly(views: Sequence[View], start: RigState) -> RigState:
 
 
 def view_errors(views: Sequence[View], state: RigState) -> Float64:
-    """float64 (V,), rms distance of each view's corners from where they should be, pixels."""
+    """float64 (V,), rms reprojection error of each view, pixels."""
     errors = []
     for number, view in enumerate(views):
         apart = np.concatenate(state.residuals(view, number))
@@ -68,7 +68,7 @@ def view_errors(views: Sequence[View], state: RigState) -> Float64:
 
 
 def join_cameras(left: RigState, right: RigState) -> RigState:
-    """Both cameras, the right one where most views say that it stands."""
+    """Both cameras in one rig, with the median pose of the right camera over all views."""
     T_right_left = [
         T_right @ invert(T_left)
         for T_left, T_right in zip(left.T_rig_board, right.T_rig_board, strict=True)
@@ -84,7 +84,7 @@ def locate_board(camera: CameraIntrinsics, seen: Sighting) -> Float64:
     """float64 (4, 4), T_camera_board of one sighting.
 
     Raises:
-        CalibrationError: The corners are on one line, or no pose fits.
+        CalibrationError: The corners are collinear, or no pose fits.
     """
     rays = unproject(camera, seen.pixels)
     known = np.isfinite(rays).all(axis=1)
@@ -105,7 +105,7 @@ def _with_poses(camera: CameraIntrinsics, sightings: Sequence[Sighting]) -> RigS
 
 
 def _guess_pinhole(sightings: Sequence[Sighting], size: Size) -> CameraIntrinsics:
-    """Zhang's closed form and a few rounds with two radial terms, by OpenCV."""
+    """OpenCV's calibration: Zhang's closed form, refined with two radial terms."""
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     try:
         _, matrix, distortion, *_ = cv2.calibrateCamera(
@@ -117,12 +117,12 @@ def _guess_pinhole(sightings: Sequence[Sighting], size: Size) -> CameraIntrinsic
             flags=flags,
         )
     except cv2.error as error:
-        raise CalibrationError("views of the board determine no camera", got=error.err) from error
+        raise CalibrationError("views do not determine a camera", got=error.err) from error
     return CameraIntrinsics(matrix, np.array(distortion, dtype=np.float64).ravel(), *size)
 
 
 def _guess_fisheye(sightings: Sequence[Sighting], size: Size) -> RigState:
-    """The plain fisheye, among some fields of view, that fits the board best."""
+    """The undistorted fisheye lens, of several fields of view, that fits the board best."""
     radius = math.hypot(*size) / 2
     guesses: list[tuple[float, int, RigState]] = []
     for angle in _HALF_ANGLES:
@@ -142,5 +142,5 @@ def _guess_fisheye(sightings: Sequence[Sighting], size: Size) -> RigState:
         error = float(np.median(view_errors(views, state)))
         guesses.append((error if math.isfinite(error) else math.inf, len(guesses), state))
     if not guesses or math.isinf(min(guesses)[0]):
-        raise CalibrationError("views of the board determine no fisheye")
+        raise CalibrationError("views do not determine a fisheye lens")
     return min(guesses)[2]

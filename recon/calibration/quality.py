@@ -1,4 +1,4 @@
-"""What a calibration is worth, apart from how well it fits."""
+"""Quality of the views of a calibration: image coverage and tilt of the board."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from recon.calibration.stereo import StereoFit
 from recon.structures import CameraIntrinsics
 from recon.structures.arrays import Float64
 
-# The picture in 8 by 6 cells: where no corner ever was, a lens is guessed.
+# Image cells, 8 by 6: in a cell without corners, the lens model is extrapolated.
 _CELLS: Final = (8, 6)
 
 
 def shared_pixels(view: View) -> tuple[Float64, Float64]:
-    """float64 (N, 2) twice: the corners that both cameras saw, in the left and right picture."""
+    """float64 (N, 2) twice: the corners that both cameras saw, in the left and right image."""
     left, right = view.seen
     _, of_left, of_right = np.intersect1d(left.numbers, right.numbers, return_indices=True)
     return left.pixels[of_left], right.pixels[of_right]
 
 
 def coverage(pixels: Sequence[Float64], camera: CameraIntrinsics) -> float:
-    """Share of 8 by 6 cells of the picture in which a corner was seen, in [0, 1].
+    """Share of the 8 by 6 image cells in which a corner was seen, in [0, 1].
 
     Args:
         pixels: float64 (N, 2) for each view.
@@ -37,6 +37,6 @@ def coverage(pixels: Sequence[Float64], camera: CameraIntrinsics) -> float:
 
 
 def tilt_deg(fit: StereoFit) -> Float64:
-    """float64 (V,), how far the board leant away from facing the left camera's axis."""
+    """float64 (V,), angle between the board's normal and the left camera's optical axis."""
     normals = np.array([T[2, 2] for T in fit.state.T_rig_board])
     return np.asarray(np.degrees(np.arccos(np.clip(np.abs(normals), 0.0, 1.0))))

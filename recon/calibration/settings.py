@@ -1,4 +1,4 @@
-"""How a rig is calibrated."""
+"""Settings of the stereo calibration."""
 
 from __future__ import annotations
 
@@ -12,36 +12,37 @@ LensKind = Literal["radtan", "rational", "fisheye"]
 
 
 class CalibrationSettings(Settings):
-    """Lens, what counts as an outlier, and how sure one must be."""
+    """Lens model, outliers, acceptance and uncertainty."""
 
     model: LensKind = Field(
         default="radtan",
-        description="Radtan = radial and tangential (most lenses), rational = wide lenses, "
-        "fisheye = by angle (150 degrees and more).",
+        description="Lens model: radtan (radial and tangential, most lenses), rational (wide "
+        "angle) or fisheye (150 degrees or more).",
     )
     radial_terms: Literal[2, 3] = Field(
-        default=3, description="Radial coefficients of radtan: k1 k2, or k1 k2 k3."
+        default=3, description="Number of radial coefficients of radtan: k1 k2, or k1 k2 k3."
     )
     outlier_ratio: float = Field(
         default=3.0,
         gt=1,
-        description="A view whose error is so many times the median of all views is dropped.",
+        description="Drop views whose error exceeds this multiple of the median of all views.",
     )
     outlier_px: float = Field(
-        default=0.3, ge=0, description="… but none whose error is below this, rms pixels."
+        default=0.3, ge=0, description="Never drop views with an rms error below this, in pixels."
     )
-    min_views: int = Field(default=5, ge=3, description="Fewer views with the board are refused.")
+    min_views: int = Field(default=5, ge=3, description="Minimum number of views with the board.")
     max_rms_px: float = Field(
-        default=2.0, gt=0, description="A result that fits worse than this is refused."
+        default=2.0, gt=0, description="Largest rms error of an accepted calibration, in pixels."
     )
-    bootstrap: int = Field(default=500, ge=50, description="Resamplings of the views.")
+    bootstrap: int = Field(default=500, ge=50, description="Number of bootstrap resamples.")
     confidence: float = Field(
-        default=0.95, gt=0.5, lt=1, description="Share of the resamplings that intervals hold."
+        default=0.95, gt=0.5, lt=1, description="Confidence level of the intervals."
     )
     depths_m: tuple[float, ...] = Field(
-        default=(2.0, 5.0, 10.0, 20.0), description="Depths at which errors are told."
+        default=(2.0, 5.0, 10.0, 20.0),
+        description="Depths at which the depth error is predicted, in metres.",
     )
     match_sigma_px: float = Field(
-        default=0.25, gt=0, description="Error of a match, for the depth error that comes with it."
+        default=0.25, gt=0, description="Assumed matching error for that prediction, in pixels."
     )
-    seed: int = Field(default=0, ge=0, description="Of the resampling.")
+    seed: int = Field(default=0, ge=0, description="Seed of the resampling.")

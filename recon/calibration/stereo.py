@@ -1,4 +1,4 @@
-"""Two cameras from their views of a board; views that do not fit are dropped and named."""
+"""Stereo calibration from views of a board; views that do not fit are dropped and named."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from recon.structures import StereoCalibration
 from recon.structures.arrays import Bool, Float64
 
 _DROPPING_ROUNDS: Final = 4
-# Both cameras fit alone, together they do not: the pictures were not taken together.
+# An rms error this many times that of each camera alone: the images were not taken together.
 _MISMATCH: Final = 3.0
 
 
@@ -33,13 +33,13 @@ class StereoFit:
 
     Attributes:
         calibration: The rig.
-        state: The same with the positions of the board.
-        information: What each view says of the shared numbers.
+        state: The rig with the poses of the board.
+        information: Information of each view about the shared parameters.
         views: The views that were used.
-        dropped: Names of the views that were not, with their rms error in pixels.
-        errors_px: float64 (V, 2), rms error of each used view in the left and right picture.
-        alone_px: Rms error of the left and of the right camera calibrated alone.
-        rms_px: Root mean square distance over all corners of both pictures.
+        dropped: Names of the views that were dropped, with their rms errors in pixels.
+        errors_px: float64 (V, 2), rms error of each used view in the left and right image.
+        alone_px: Rms errors of the left and the right camera, each calibrated alone.
+        rms_px: Rms reprojection error over all corners of both cameras.
     """
 
     calibration: StereoCalibration
@@ -55,16 +55,16 @@ class StereoFit:
 def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSettings) -> StereoFit:
     """Calibrate two cameras.
 
-    Each camera is calibrated alone, then both together over all of their numbers. Views whose
-    error is `CalibrationSettings.outlier_ratio` times the median are dropped.
+    Each camera is calibrated alone, then all parameters of both are refined together. Views whose
+    error exceeds `CalibrationSettings.outlier_ratio` times the median are dropped.
 
     Args:
         views: Each with a sighting of the left and of the right camera.
-        size: (width, height) of the pictures.
-        settings: How.
+        size: (width, height) of the images.
+        settings: Lens model and limits.
 
     Raises:
-        CalibrationError: There are too few views, or they fit no rig.
+        CalibrationError: There are too few views, or no rig fits them.
 
     Ref: Zhang 2000; the lens models are OpenCV's.
     """
@@ -97,7 +97,7 @@ def stereo_of(state: RigState) -> StereoCalibration:
     """The rig of a state.
 
     Raises:
-        CalibrationError: Its numbers cannot give depth.
+        CalibrationError: Its parameters are invalid, such as a zero baseline.
     """
     left, right = state.cameras
     return StereoCalibration(left, right, state.T_camera_rig[1])
@@ -142,7 +142,7 @@ def _check_count(
         return
     lost = f", after {', '.join(dropped)} did not fit" if dropped else ""
     raise CalibrationError(
-        "too few views show the board in both pictures",
+        "too few views show the board in both images",
         got=f"{len(views)}{lost}",
         expected=f"at least {settings.min_views}",
         hint="take more, with the board tilted, and near and far",
@@ -154,10 +154,10 @@ def _no_fit(
 ) -> CalibrationError:
     if rms_px > _MISMATCH * max(alone_px):
         what = "each camera fits alone, but not both together"
-        hint = "were left and right taken at the same moment, and do the names pair them rightly?"
+        hint = "were left and right taken at the same time, and do their names pair them correctly?"
     else:
         what = "no lens of this model fits the corners"
-        hint = "is the board flat, and --model (radtan, rational, fisheye) that of the lens?"
+        hint = "is the board flat, and does --model (radtan, rational, fisheye) suit the lens?"
     return CalibrationError(
         what,
         got=f"{rms_px:.1f} px rms (alone: left {alone_px[0]:.1f}, right {alone_px[1]:.1f})",

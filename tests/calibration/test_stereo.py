@@ -130,7 +130,7 @@ def test_pictures_of_different_moments_are_refused_as_such(make_views) -> None:
         replace(view, seen=(view.seen[0], views[(n + 5) % 12].seen[1]))
         for n, view in enumerate(views)
     ]
-    with pytest.raises(CalibrationError, match=r"alone.*together.*same moment"):
+    with pytest.raises(CalibrationError, match=r"alone.*together.*same time"):
         calibrate_stereo(shuffled, SIZE, CalibrationSettings())
 
 
