@@ -1,4 +1,4 @@
-"""Whether pictures can give depth at all: measures of pictures and features, and a verdict."""
+"""Audit of a recording: measures of images and matched features, and a verdict on usability."""
 
 from recon.audit.alignment import RowAlignment, align_rows, count_aligned, mend_rig
 from recon.audit.exposure import measure_gain

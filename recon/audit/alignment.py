@@ -1,7 +1,7 @@
-"""Row errors of a pair that is said to be rectified, and the small rotation that mends them.
+"""Row errors of a rectified pair, and the small rotation that corrects them.
 
-Of the right camera's three rotations two move rows: pitch moves all of them, roll moves them with
-the column. Yaw moves columns, which is a disparity like any other: no feature can tell.
+Two of the right camera's three rotations move rows: pitch moves all rows alike, roll in proportion
+to the column. Yaw moves columns, which cannot be told from disparity.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from recon.structures import CameraIntrinsics, RectifiedCamera, StereoCalibratio
 from recon.structures.arrays import Bool, Float32, Float64
 
 _NEAR_PX: Final = 1.5
-"""Features whose rows fit a rotation to this agree with it."""
+"""Features with a smaller row error after a rotation agree with it."""
 
 _TRIALS: Final = 300
 _REFITS: Final = 8
@@ -24,18 +24,17 @@ _REFITS: Final = 8
 
 @dataclass(frozen=True)
 class RowAlignment:
-    """Row errors, right minus left, and what is left of them after the best rotation.
+    """Row errors (right minus left), and the rotation that minimises them.
 
     Attributes:
-        features: Matched features.
-        agreeing: Those that agree with one rotation.
-        mean_px: Mean row error of those.
-        spread_px: Standard deviation of it.
-        rms_px: Root of the mean square: 0 where rows correspond everywhere, noise of the features
-            taken away.
-        residual_px: Standard deviation after the rotation, robust: the noise of the features.
-        pitch_rad: Rotation of the right camera about x that mends the rows.
-        roll_rad: Rotation about z.
+        features: Number of matched features.
+        agreeing: Number of features that agree with the rotation.
+        mean_px: Mean row error of the agreeing features.
+        spread_px: Standard deviation of their row error.
+        rms_px: Root mean square row error with the feature noise removed; 0 if rows are aligned.
+        residual_px: Robust standard deviation after the rotation: the feature noise.
+        pitch_rad: Correcting rotation of the right camera about x.
+        roll_rad: Correcting rotation of the right camera about z.
     """
 
     features: int
@@ -49,25 +48,25 @@ class RowAlignment:
 
     @property
     def rotation(self) -> Float64:
-        """float64 (3, 3): takes rays of the right camera to where rows correspond."""
+        """float64 (3, 3): rotates rays of the right camera so that rows are aligned."""
         return exp_so3(np.array([self.pitch_rad, 0.0, self.roll_rad]))
 
     def turned_rows(self, right_uv: Float32, camera: RectifiedCamera) -> Float64:
-        """float64 (N,): rows of features of the right picture when it is mended."""
+        """float64 (N,): rows of features of the right image after correction."""
         turn = np.array([self.pitch_rad, self.roll_rad])
         return np.asarray(turn_features(right_uv, camera, turn)[:, 1])
 
 
 def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> RowAlignment | None:
-    """Fit the rotation of the right camera that makes rows correspond.
+    """Fit the rotation of the right camera that aligns rows.
 
     Args:
-        left_uv: float32 (N, 2), features in the left picture, wrong ones among them.
-        right_uv: float32 (N, 2), the same in the right picture.
+        left_uv: float32 (N, 2), features in the left image; some may be wrong matches.
+        right_uv: float32 (N, 2), the same features in the right image.
         camera: The rectified camera.
 
     Returns:
-        None where fewer than a dozen features agree.
+        None if fewer than 12 features agree.
     """
     if len(left_uv) < 12:
         return None
@@ -77,7 +76,7 @@ def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> 
         return None
     turn = _solve(basis[agree], rows[agree])
     for _ in range(_REFITS):
-        # The basis holds for small turns: it is taken anew about the best one so far.
+        # The basis is valid for small rotations: linearise again at the best one so far.
         basis, rows = _linear(left_uv, turn_features(right_uv, camera, turn), camera)
         agree = np.abs(rows) * camera.focal_px < _NEAR_PX
         turn = turn + _solve(basis[agree], rows[agree])
@@ -100,7 +99,7 @@ def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> 
 
 
 def turn_features(right_uv: Float32, camera: RectifiedCamera, turn: Float64) -> Float64:
-    """Where features of the right picture lie when it is turned.
+    """Positions of features of the right image after a rotation of the right camera.
 
     Args:
         right_uv: float32 (N, 2).
@@ -126,18 +125,18 @@ def count_aligned(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) 
 def mend_rig(
     rig: RectifiedCamera | StereoCalibration, alignment: RowAlignment, R_rect_left: Float64
 ) -> StereoCalibration:
-    """The calibration with the right camera turned so that rows correspond; it stays in its place.
+    """The calibration with the right camera rotated in place so that rows are aligned.
 
     Args:
-        rig: The calibration that the pictures were rectified with.
-        alignment: Row errors of the rectified pictures.
-        R_rect_left: float64 (3, 3), rotation from the left camera to the rectified one; the
-            identity for a rig that is rectified.
+        rig: The calibration that the images were rectified with.
+        alignment: Row errors of the rectified images.
+        R_rect_left: float64 (3, 3), rotation from the left camera to the rectified camera; the
+            identity for a rectified rig.
     """
     raw = _as_raw(rig)
     R, t = raw.T_right_left[:3, :3], raw.T_right_left[:3, 3]
     centre = -R.T @ t
-    # Rectified right rays are R_rect_left @ R.T @ ray; the alignment turns them once more.
+    # Rectified right rays are R_rect_left @ R.T @ ray; the alignment rotates them further.
     turned = R @ R_rect_left.T @ alignment.rotation.T @ R_rect_left
     return replace(raw, T_right_left=make_transform(turned, -turned @ centre))
 
@@ -160,7 +159,7 @@ def _linear(
 ) -> tuple[Float64, Float64]:
     """Basis (N, 2) and target (N,) of ``rows = basis @ (pitch, roll)``, in focal lengths.
 
-    A small turn w moves a ray p by w × p; its row then is y - w_x·(1 + y²) + w_z·x.
+    A small rotation w moves a ray p by w × p; its row becomes y - w_x·(1 + y²) + w_z·x.
     """
     x = (right_uv[:, 0].astype(np.float64) - camera.cx_right_px) / camera.focal_px
     y = (right_uv[:, 1].astype(np.float64) - camera.cy_px) / camera.focal_px
@@ -169,17 +168,17 @@ def _linear(
 
 
 def _solve(basis: Float64, rows: Float64) -> Float64:
-    """float64 (2,): pitch and roll of least squares."""
+    """float64 (2,): least-squares pitch and roll."""
     return np.asarray(np.linalg.lstsq(basis, rows, rcond=None)[0], dtype=np.float64)
 
 
 def _consensus(basis: Float64, rows: Float64, focal_px: float) -> Bool:
-    """bool (N,): the largest set of features that agree with one turn, of many tried by two."""
+    """bool (N,): the largest set of features that agree with one rotation (RANSAC, pairs)."""
     rng = np.random.default_rng(0)
     pick = rng.integers(0, len(rows), (_TRIALS, 2))
     a, b = basis[pick[:, 0]], basis[pick[:, 1]]
     det = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    # Two features in one column tell nothing of roll.
+    # Two features in nearly the same column do not determine roll.
     good = np.abs(det) > 0.05
     a, b, det = a[good], b[good], det[good]
     first, second = rows[pick[good, 0]], rows[pick[good, 1]]

@@ -1,4 +1,4 @@
-"""Whether both cameras see the same thing equally bright."""
+"""Brightness ratio of the two cameras."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _BRIGHT: Final = 243.0
 
 
 def measure_gain(left: UInt8, right: UInt8, left_uv: Float32, right_uv: Float32) -> Float64:
-    """Brightness of the right picture by the left one's, around features that both show.
+    """Brightness of the right image relative to the left, around matched features.
 
     Args:
         left: uint8 (H, W).
         right: uint8 (H, W).
-        left_uv: float32 (N, 2), features in the left picture.
-        right_uv: float32 (N, 2), the same in the right picture.
+        left_uv: float32 (N, 2), features in the left image.
+        right_uv: float32 (N, 2), the same features in the right image.
 
     Returns:
         float64 (M,), one ratio for each feature whose surroundings are mostly neither black

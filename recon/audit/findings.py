@@ -1,4 +1,4 @@
-"""What an audit says: findings, each with what to do, and one verdict."""
+"""Results of an audit: findings with advice, and a verdict."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ Verdict = Literal["good", "usable", "not usable"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong.
+    """One problem of a recording.
 
     Attributes:
-        code: What kind of thing, one word, for programs.
-        fatal: Whether depth is wrong or missing because of it.
-        text: What was found and what to do, for people.
+        code: Kind of problem, one word, for programs.
+        fatal: Whether the problem makes depth wrong or impossible.
+        text: Description and advice, for people.
     """
 
     code: str
@@ -25,7 +25,7 @@ class Finding:
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
-    """Good without findings, not usable with a fatal one."""
+    """Good without findings, not usable with a fatal one, else usable."""
     found = list(findings)
     if any(finding.fatal for finding in found):
         return "not usable"

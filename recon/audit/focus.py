@@ -1,4 +1,4 @@
-"""How sharp a picture is, whatever it shows and however bright it is."""
+"""Image sharpness, independent of content and brightness."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from recon.structures.arrays import UInt8
 
 
 def measure_sharpness(image: UInt8) -> float:
-    """Share of the finest detail in the detail of a picture, in [0, 1].
+    """Share of the finest detail in all detail of an image, in [0, 1].
 
-    Laplacians of the picture, and of the picture at a quarter of its size: what is blurred has
-    lost the first, and not the second. The noise of the sensor is taken away from both.
+    Compares Laplacians at full and at quarter size: blur reduces the first, but not the second.
+    Sensor noise is subtracted from both.
 
     Args:
         image: uint8 (H, W).
@@ -25,7 +25,7 @@ def measure_sharpness(image: UInt8) -> float:
 
 
 def _detail(image: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> float:
-    """Mean size of the strongest twentieth of second differences, less the median of all."""
+    """Mean of the strongest 5 % of absolute Laplacians, minus twice the median of all."""
     size = np.abs(cv2.Laplacian(image, cv2.CV_32F))
     noise, strong = np.quantile(size, [0.5, 0.95])
     return float(max(0.0, size[size >= strong].mean() - 2.0 * noise))

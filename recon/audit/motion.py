@@ -1,4 +1,4 @@
-"""What motion tells: how fast the rig seems to go, and whether one camera is late."""
+"""Measures from motion: apparent speed of the rig, and time skew between the cameras."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from recon.structures.arrays import Bool, Float32, Float64, UInt8
 
 _MIN_POINTS: Final = 20
 _MIN_DISPARITY_PX: Final = 2.0
-# Rows must move by so much between frames for the time of a picture to be told from them.
+# Features must move at least this many rows per frame to reveal a time skew.
 _MIN_FLOW_PX: Final = 1.0
 
 
 def track(now: UInt8, then: UInt8, uv: Float32) -> tuple[Float32, Bool]:
-    """Where features of one picture are in the next.
+    """Track features from one image to the next (Lucas-Kanade).
 
     Args:
         now: uint8 (H, W).
@@ -25,7 +25,8 @@ def track(now: UInt8, then: UInt8, uv: Float32) -> tuple[Float32, Bool]:
         uv: float32 (N, 2), features of ``now``.
 
     Returns:
-        float32 (N, 2), and bool (N,), which of them were found there and back.
+        float32 (N, 2), positions in ``then``; and bool (N,), True where tracking back returns to
+        the start.
     """
     if not len(uv):
         return uv, np.zeros(0, np.bool_)
@@ -38,16 +39,16 @@ def track(now: UInt8, then: UInt8, uv: Float32) -> tuple[Float32, Bool]:
 def measure_speed(
     left_uv: Float32, right_uv: Float32, later_uv: Float32, camera: RectifiedCamera
 ) -> float | None:
-    """Metres that the rig has moved between two frames, if the calibration is right.
+    """Distance in metres that the rig moves between two frames, if the calibration is correct.
 
     Args:
-        left_uv: float32 (N, 2), features in the left picture.
-        right_uv: float32 (N, 2), in the right picture.
-        later_uv: float32 (N, 2), in the left picture of the next frame.
+        left_uv: float32 (N, 2), features in the left image.
+        right_uv: float32 (N, 2), the same features in the right image.
+        later_uv: float32 (N, 2), the same features in the left image of the next frame.
         camera: The rectified camera.
 
     Returns:
-        None where too few features agree on one motion.
+        None if too few features agree on one motion.
     """
     disparity = left_uv[:, 0] - right_uv[:, 0] + camera.doffs_px
     near = disparity > _MIN_DISPARITY_PX
@@ -66,17 +67,17 @@ def measure_speed(
 
 
 def measure_time_skew(row_error_px: Float64, row_flow_px: Float64) -> tuple[float, float] | None:
-    """By how many frames the right camera is late, from rows that go on moving meanwhile.
+    """Delay of the right camera in frames, from the vertical motion of features.
 
-    A feature whose row moves by v a frame is seen v·s lower by a camera that is s frames late:
-    the slope of row errors over row flow is the skew.
+    A camera that is s frames late sees a feature whose row moves by v per frame v·s rows lower:
+    the slope of row error over row flow is the skew.
 
     Args:
-        row_error_px: float64 (N,), right minus left row, the rig's own error taken away.
+        row_error_px: float64 (N,), right minus left row, with the rig's own row error removed.
         row_flow_px: float64 (N,), rows that each feature moves from this frame to the next.
 
     Returns:
-        The skew and its standard error, frames; None where nothing moves enough.
+        The skew and its standard error, in frames; None if too few features move enough.
     """
     moving = np.abs(row_flow_px) > _MIN_FLOW_PX
     if moving.sum() < _MIN_POINTS:

@@ -1,4 +1,4 @@
-"""Frames that come twice, and cameras that stand still while the other goes on."""
+"""Repeated frames, and cameras that freeze while the other goes on."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import cv2
 
 from recon.structures.arrays import UInt8
 
-# Mean difference in grey levels: two exposures of one scene differ by the noise of the sensor.
+# Mean difference in grey levels; two exposures of a static scene differ more, by sensor noise.
 _SAME_DN: Final = 0.05
 
 
@@ -18,9 +18,9 @@ class RepeatCounter:
     """Counts repeats in a series of pairs.
 
     Attributes:
-        steps: Pairs compared with the one before.
-        both: Steps on which neither picture changed.
-        frozen: Longest run of steps on which (left, right) alone did not change.
+        steps: Number of pairs compared with the previous pair.
+        both: Number of steps in which neither image changed.
+        frozen: Longest run of steps in which only the (left, right) image did not change.
     """
 
     steps: int = 0
@@ -30,15 +30,15 @@ class RepeatCounter:
     _last: tuple[UInt8, UInt8] | None = None
 
     def restart(self) -> None:
-        """The next pair does not follow the last one."""
+        """Start a new series: the next pair does not follow the last one."""
         self._last, self._run = None, [0, 0]
 
     def add(self, left: UInt8, right: UInt8) -> None:
-        """Compare a pair with the one before.
+        """Compare a pair with the previous one.
 
         Args:
             left: uint8 (H, W) or (H, W, 3).
-            right: The same of the right one.
+            right: uint8, same shape as ``left``.
         """
         if self._last is not None:
             self.steps += 1

@@ -1,4 +1,4 @@
-"""From recorded pictures to rows that correspond, and from colour to grey."""
+"""Rectification, calibrated and uncalibrated, checks of rectified pairs, and grey conversion."""
 
 from recon.rectification.epipolar import epipolar_curves, epipolar_lines
 from recon.rectification.features import match_again, match_exactly

@@ -1,4 +1,4 @@
-"""Where in the other picture the partner of a pixel must lie."""
+"""Epipolar lines, and the curves that lens distortion makes of them."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from recon.geometry.se3 import apply, invert
 from recon.structures import CameraIntrinsics, StereoCalibration
 from recon.structures.arrays import Float64
 
-# Depths along a ray, in baselines: from closer than any rig sees to as good as infinity.
+# Depths along a ray, in baselines: from nearer than any rig measures to practically infinity.
 _DEPTHS: Final = np.geomspace(0.5, 1e4, 400)
 
 
 def epipolar_curves(
     calibration: StereoCalibration, left_px: Float64, right_px: Float64
 ) -> tuple[list[Float64], list[Float64]]:
-    """Epipolar lines in the raw pictures; lenses bend them.
+    """Epipolar curves in the raw images (straight lines bent by the lenses).
 
     Args:
         calibration: The raw rig.
-        left_px: float64 (N, 2), pixels of the left picture.
-        right_px: float64 (N, 2), pixels of the right picture.
+        left_px: float64 (N, 2), pixels of the left image.
+        right_px: float64 (N, 2), pixels of the right image.
 
     Returns:
-        For each right pixel its curve (M, 2) in the left picture, and for each left pixel its
-        curve in the right one; NaN where a curve leaves the picture.
+        For each right pixel its curve (M, 2) in the left image, and for each left pixel its curve
+        in the right image; NaN where a curve leaves the image.
     """
     T, near = calibration.T_right_left, calibration.baseline_m
     left, right = calibration.left, calibration.right
@@ -39,13 +39,13 @@ def epipolar_curves(
 def epipolar_lines(
     fundamental: Float64, left_px: Float64, right_px: Float64, size: tuple[int, int]
 ) -> tuple[list[Float64], list[Float64]]:
-    """The same for plain pinholes by their fundamental matrix, ``right.T @ F @ left = 0``.
+    """Epipolar lines of undistorted pinhole cameras; returned as by `epipolar_curves`.
 
     Args:
-        fundamental: float64 (3, 3).
-        left_px: float64 (N, 2), pixels of the left picture.
-        right_px: float64 (N, 2), pixels of the right picture.
-        size: (width, height) of the pictures.
+        fundamental: float64 (3, 3), the fundamental matrix, ``right.T @ F @ left = 0``.
+        left_px: float64 (N, 2), pixels of the left image.
+        right_px: float64 (N, 2), pixels of the right image.
+        size: (width, height) of the images.
     """
     in_left = [_line(fundamental.T @ [*pixel, 1.0], size) for pixel in right_px]
     in_right = [_line(fundamental @ [*pixel, 1.0], size) for pixel in left_px]
@@ -60,7 +60,7 @@ def _curve(
 
 
 def _line(line: Float64, size: tuple[int, int]) -> Float64:
-    """float64 (M, 2), points of a line a·x + b·y + c = 0 within a picture."""
+    """float64 (M, 2), points on the line a·x + b·y + c = 0; NaN outside the image."""
     a, b, c = line
     if abs(b) >= abs(a):
         x = np.linspace(0, size[0] - 1, 50)

@@ -1,4 +1,4 @@
-"""Features that two pictures share, to a fraction of a pixel, whatever lies between the cameras."""
+"""Subpixel feature matches between two images, for any geometry of the cameras."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from recon.rectification.shaping import map_pixels
 from recon.structures.arrays import Float32, Float64, Int32, UInt8
 
 _RATIO: Final = 0.75
-_BLOCK: Final = 1024  # descriptors that are compared with all others at once
-# Rows that a first guess may be off by.
+_BLOCK: Final = 1024  # descriptors compared with all others at once
+# Row error that the initial homographies may leave.
 _ROWS_APART: Final = 12.0
-_CONTRAST: Final = 0.02  # half of OpenCV's: weak features still tell where they are
+_CONTRAST: Final = 0.02  # half of OpenCV's default: weak features are still located accurately
 
 
 def match_exactly(left: UInt8, right: UInt8, count: int = 8000) -> PairFeatures:
-    """Mutual best matches of SIFT features that stand out.
+    """Mutual best matches of SIFT features that pass the ratio test.
 
-    Slower than `match_features`, but its places are exact and pictures may be turned, scaled and
-    slanted against each other.
+    Slower than `match_features`, but subpixel accurate and robust to rotation, scale and slant
+    between the images.
 
     Args:
         left: uint8 (H, W).
         right: uint8 (H, W).
-        count: Features per picture at most.
+        count: Maximum number of features per image.
 
     Ref:
         Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
@@ -38,7 +38,7 @@ def match_exactly(left: UInt8, right: UInt8, count: int = 8000) -> PairFeatures:
         return PairFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
     at = _mutual_best(left_d, right_d)
     both = np.hstack([left_uv[at[:, 0]], right_uv[at[:, 1]]])
-    # SIFT gives a place with two directions twice.
+    # SIFT returns a keypoint with two orientations twice.
     unique = np.unique(both, axis=0)
     return PairFeatures(np.array(unique[:, :2]), np.array(unique[:, 2:]))
 
@@ -46,17 +46,17 @@ def match_exactly(left: UInt8, right: UInt8, count: int = 8000) -> PairFeatures:
 def match_again(
     left: UInt8, right: UInt8, H_left: Float64, H_right: Float64, count: int = 8000
 ) -> PairFeatures:
-    """Match pictures that homographies have made alike already, for more and better matches.
+    """Match images that homographies roughly align, for more and better matches.
 
     Args:
-        left: uint8 (H, W), as recorded.
-        right: uint8 (H, W), as recorded.
-        H_left: float64 (3, 3), from recorded pixels to ones whose rows about correspond.
-        H_right: The same of the right picture.
-        count: Features per picture at most.
+        left: uint8 (H, W), raw.
+        right: uint8 (H, W), raw.
+        H_left: float64 (3, 3), from raw pixels to pixels with roughly aligned rows.
+        H_right: The same for the right image.
+        count: Maximum number of features per image.
 
     Returns:
-        Matches within some rows of each other, in recorded pixels.
+        Matches with nearly equal rows after alignment, in raw pixels.
     """
     size = (left.shape[1], left.shape[0])
     views = [
@@ -73,8 +73,8 @@ def match_again(
 
 
 def _mutual_best(left: Float32, right: Float32) -> Int32:
-    """int32 (N, 2), pairs that are each other's best and better than the second best by far."""
-    # SIFT's numbers are whole: products of them are exact, whatever the order of a sum.
+    """int32 (N, 2), pairs that are each other's best match and pass the ratio test."""
+    # SIFT descriptors are whole numbers: float32 sums of products are exact in any order.
     right_sizes = (right**2).sum(axis=1)
     best, second_best = np.empty(len(left), np.int32), np.empty(len(left), np.float32)
     least = np.empty(len(left), np.float32)

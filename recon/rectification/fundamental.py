@@ -1,4 +1,4 @@
-"""The fundamental matrix of matches: found robustly, fitted, and turned into homographies."""
+"""Fundamental matrix: robust estimation, refinement, and rectifying homographies."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from recon.geometry.se3 import exp_so3
 from recon.structures.arrays import Bool, Float64
 
 _FEWEST: Final = 8
-# Where parallax is small, a wide limit lets a wrong geometry pass: several are tried.
+# With little parallax, a wide threshold accepts a wrong geometry: several are tried.
 _DRAWS: Final = (
     (cv2.USAC_MAGSAC, 1.0), (cv2.USAC_MAGSAC, 0.5), (cv2.USAC_MAGSAC, 0.25), (cv2.RANSAC, 1.0),
 )  # fmt: skip
 _ROUNDS: Final = 60
 _STEP: Final = 1e-6
 _STILL: Final = 1e-8
-# Errors below this, pixels, are not told apart by their size.
+# Errors below about this size, in pixels, are weighted alike.
 _SMALLEST_PX: Final = 0.1
 
 
 def find_fundamental(
     left_px: Float64, right_px: Float64, inlier_px: float
 ) -> tuple[Float64 | None, Bool]:
-    """The matrix that matches agree with best (RANSAC, MAGSAC++), fitted to these.
+    """Estimate the fundamental matrix robustly (RANSAC, MAGSAC++) and refine it on its inliers.
 
     Args:
         left_px: float64 (N, 2).
-        right_px: float64 (N, 2), their partners.
-        inlier_px: Distance from its epipolar line up to which a match counts.
+        right_px: float64 (N, 2), the matching pixels.
+        inlier_px: Largest distance of an inlier from its epipolar line.
 
     Returns:
-        float64 (3, 3) with ``right.T @ F @ left = 0``, or None; and bool (N,), which agree.
+        float64 (3, 3) with ``right.T @ F @ left = 0``, or None; and bool (N,), the inliers.
     """
     none = np.zeros(len(left_px), bool)
     if len(left_px) < _FEWEST:
@@ -51,7 +51,7 @@ def find_fundamental(
 def _draw(left_px: Float64, right_px: Float64, inlier_px: float, method: int) -> Float64 | None:
     try:
         F, _ = cv2.findFundamentalMat(left_px, right_px, method, inlier_px, 0.9999, 10000)
-    except cv2.error:  # it finds no model at all
+    except cv2.error:  # no model found
         return None
     return None if F is None or F.shape != (3, 3) else np.asarray(F, dtype=np.float64)
 
@@ -59,7 +59,7 @@ def _draw(left_px: Float64, right_px: Float64, inlier_px: float, method: int) ->
 def _fit_agreeing(
     F: Float64, left_px: Float64, right_px: Float64, inlier_px: float
 ) -> Float64 | None:
-    """Fit to the matches that agree, and again to those that agree then."""
+    """Fit to the inliers, and again to the inliers of that fit."""
     for _ in range(2):
         agreeing = np.abs(line_distances(F, left_px, right_px)) <= inlier_px
         if agreeing.sum() < _FEWEST:
@@ -69,9 +69,9 @@ def _fit_agreeing(
 
 
 def line_distances(F: Float64, left_px: Float64, right_px: Float64) -> Float64:
-    """float64 (N,), how far both pixels of a match are from where it would fit, to first order.
+    """float64 (N,), signed Sampson distances: the error of each match to first order.
 
-    Ref: Sampson's distance, Hartley and Zisserman 2004, equation 11.9.
+    Ref: Hartley and Zisserman 2004, equation 11.9.
     """
     ones = np.ones((len(left_px), 1))
     left, right = np.hstack([left_px, ones]), np.hstack([right_px, ones])
@@ -81,12 +81,12 @@ def line_distances(F: Float64, left_px: Float64, right_px: Float64) -> Float64:
 
 
 def fit_fundamental(F: Float64, left_px: Float64, right_px: Float64) -> Float64:
-    """Fit the seven numbers of a fundamental matrix to matches, by least absolute distances.
+    """Refine the seven parameters of a fundamental matrix, minimising absolute distances.
 
     Args:
-        F: float64 (3, 3), a first guess.
-        left_px: float64 (N, 2), matches that agree with it.
-        right_px: float64 (N, 2).
+        F: float64 (3, 3), initial guess.
+        left_px: float64 (N, 2), inliers.
+        right_px: float64 (N, 2), the matching pixels.
 
     Ref: Bartoli and Sturm 2004, "Non-linear estimation of the fundamental matrix with minimal
         parameters".
@@ -115,7 +115,7 @@ def fit_fundamental(F: Float64, left_px: Float64, right_px: Float64) -> Float64:
         trial = step + np.linalg.lstsq(damped, -J.T @ (weights * error), rcond=1e-12)[0]
         trial_error = apart(trial)
         gain = 1 - (weights @ trial_error**2) / max(weights @ error**2, 1e-300)
-        if gain > 0:  # never true of NaN
+        if gain > 0:  # False for NaN
             step, error, damping = trial, trial_error, damping / 5
             if gain < _STILL:
                 break
@@ -125,37 +125,37 @@ def fit_fundamental(F: Float64, left_px: Float64, right_px: Float64) -> Float64:
 
 
 def epipoles(F: Float64) -> tuple[Float64, Float64]:
-    """float64 (3,) twice, homogeneous: the other camera in the left and in the right picture."""
+    """float64 (3,) twice, homogeneous: the epipoles in the left and in the right image."""
     U, _, Vt = np.linalg.svd(F)
     return Vt[2], U[:, 2]
 
 
 def level_homographies(F: Float64, size: tuple[int, int]) -> tuple[Float64, Float64]:
-    """Homographies of both pictures that bring partners onto common rows.
+    """Homographies that bring matching pixels of both images onto the same row.
 
-    Nothing is divided by the last coordinate of an epipole: it is as good as zero where rows
-    correspond already.
+    Never divides by the last coordinate of an epipole, which is almost zero if the rows are nearly
+    aligned already.
 
     Args:
         F: float64 (3, 3), ``right.T @ F @ left = 0``.
-        size: (width, height) of the pictures.
+        size: (width, height) of the images.
 
     Returns:
-        float64 (3, 3) of the left and of the right picture. Columns of the left one are not
-        those of the right one: rows say nothing of them.
+        float64 (3, 3) for the left and for the right image. They align rows only: the columns of
+        the left image are arbitrary.
 
     Ref: Hartley 1999, "Theory and practice of projective rectification".
     """
     to_middle = np.array([[1, 0, -(size[0] - 1) / 2], [0, 1, -(size[1] - 1) / 2], [0, 0, 1.0]])
     e = to_middle @ epipoles(F)[1]
-    e = e * (np.sign(e[0]) or 1.0)  # the shorter turn
+    e = e * (np.sign(e[0]) or 1.0)  # the smaller rotation
     reach = float(np.hypot(e[0], e[1]))
     c, s = e[:2] / reach
     turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
     away = np.array([[1, 0, 0], [0, 1, 0], [-e[2] / reach, 0, 1.0]])
     H_right = away @ turn @ to_middle
-    # H_right @ [e]x @ F has the rows of the left picture; what is added to it with the epipole
-    # changes columns alone, so any first row will do.
+    # H_right @ [e]x @ F gives the rows of the left image; its first row affects columns alone and
+    # may be replaced by any other.
     e = epipoles(F)[1]
     cross = np.array([[0, -e[2], e[1]], [e[2], 0, -e[0]], [-e[1], e[0], 0]])
     _, second, third = H_right @ cross @ F
@@ -165,12 +165,12 @@ def level_homographies(F: Float64, size: tuple[int, int]) -> tuple[Float64, Floa
 
 
 def _facing(H: Float64, size: tuple[int, int]) -> Float64:
-    """The homography with 1 as last coordinate of the middle of the picture."""
+    """The homography scaled so that the image centre maps to a last coordinate of 1."""
     return np.asarray(H / (H[2] @ [(size[0] - 1) / 2, (size[1] - 1) / 2, 1.0]))
 
 
 def _normalising(pixels: Float64) -> Float64:
-    """float64 (3, 3), moves pixels to the origin and scales them to a mean distance of √2."""
+    """float64 (3, 3), centres pixels on the origin and scales them to a mean distance of √2."""
     middle = pixels.mean(axis=0)
     scale = np.sqrt(2) / max(float(np.linalg.norm(pixels - middle, axis=1).mean()), 1e-12)
     return np.array([[scale, 0, -scale * middle[0]], [0, scale, -scale * middle[1]], [0, 0, 1.0]])

@@ -1,4 +1,4 @@
-"""From colour to grey, in three ways."""
+"""Conversion of colour images to grey."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ _PAPER_WEIGHTS: Final = np.array([0.299, 0.587, 0.144])
 
 
 def to_grey(image: UInt8, mode: GreyMode = "bt601") -> UInt8:
-    """Turn a picture grey; one that is grey already is returned as it is.
+    """Convert an image to grey; a grey image is returned unchanged.
 
-    ``bt601`` weighs red, green and blue with 0.299, 0.587 and 0.114, ``mean`` alike. ``paper``
-    is Eq. 6 of the paper that this project began with, as printed there: its weight of blue, 0.144,
-    is a misprint of 0.114, so the weights sum to 1.03 and bright pixels are clipped at 255.
+    ``bt601`` weights red, green and blue by 0.299, 0.587 and 0.114, ``mean`` equally. ``paper`` is
+    Eq. 6 of the seed paper as printed: its weight of blue, 0.144, is a misprint of 0.114, so the
+    weights sum to 1.03 and bright pixels are clipped at 255.
 
     Args:
         image: uint8 (H, W), or (H, W, 3) RGB.
-        mode: How to weigh the channels.
+        mode: Weights of the channels.
 
     Returns:
         uint8 (H, W), rounded to nearest.
 
     Raises:
-        ShapeError: The array is no picture.
+        ShapeError: The array is not an image.
 
     Ref: ITU-R BT.601, section 2.5.1.
     """
@@ -39,6 +39,6 @@ def to_grey(image: UInt8, mode: GreyMode = "bt601") -> UInt8:
     if mode == "bt601":
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
     if mode == "mean":
-        # A sum of integers is never halfway between two multiples of 3: + 1 rounds to nearest.
+        # An integer is never halfway between two multiples of 3, so + 1 rounds to nearest.
         return np.asarray((image.sum(axis=2, dtype=np.uint16) + 1) // 3, dtype=np.uint8)
     return np.asarray(np.clip(np.rint(image @ _PAPER_WEIGHTS), 0, 255), dtype=np.uint8)

@@ -1,7 +1,7 @@
-"""Whether two pictures are a rectified pair at all: swapped eyes, rows that do not correspond.
+"""Check that two images are a rectified pair: swapped cameras, misaligned rows.
 
-A matcher looks along one row and to one side. Fed with swapped or misaligned pictures it fails
-without a word, or worse, finds something. Features that are matched over the whole picture tell.
+A stereo matcher searches along one row, in one direction. Given swapped or misaligned images it
+fails silently or, worse, finds wrong matches. Features matched over the whole image reveal both.
 """
 
 from __future__ import annotations
@@ -19,43 +19,41 @@ from recon.structures import RectifiedPair
 from recon.structures.arrays import Bool, Float32, UInt8, freeze
 
 _NEAR_PX: Final = 1.0
-"""Features that shift by less between the eyes are too far away to tell the eyes apart."""
+"""Features with a smaller disparity are too far away to show whether the cameras are swapped."""
 
 _OUTLIER_PX: Final = 3.0
-"""Rows of a feature that are off by more than this from the others' tell of a wrong match."""
+"""A feature whose row error differs from that of the others by more than this is a wrong match."""
 
 
 class InspectionSettings(Settings):
-    """When a pair is said not to be rectified."""
+    """When a pair counts as not rectified."""
 
-    every: int | None = Field(
-        default=50, ge=1, description="Every n-th frame is inspected; null = none."
-    )
+    every: int | None = Field(default=50, ge=1, description="Check every n-th frame; null = none.")
     features: int = Field(
-        default=1000, ge=50, le=20000, description="Features per picture at most."
+        default=1000, ge=50, le=20000, description="Maximum number of features per image."
     )
     min_features: int = Field(
-        default=40, ge=8, description="Fewer matched features tell nothing about a pair."
+        default=40, ge=8, description="Minimum number of matched features for a verdict."
     )
     warn_row_px: float = Field(
-        default=1.0, gt=0.0, description="Median row error that is warned of."
+        default=1.0, gt=0.0, description="Median row error that gives a warning, in pixels."
     )
     swapped_share: float = Field(
         default=0.8,
         gt=0.5,
         le=1.0,
-        description="Share of near features with negative disparity from which eyes count as "
-        "swapped.",
+        description="Share of near features with negative disparity from which the cameras count "
+        "as swapped.",
     )
 
 
 @dataclass(frozen=True, eq=False)
 class PairFeatures:
-    """The same features in both pictures, matched without knowing the geometry.
+    """Features matched between both images without use of the camera geometry.
 
     Attributes:
-        left_uv: float32 (N, 2), columns and rows in the left picture, pixels.
-        right_uv: float32 (N, 2), the same features in the right picture.
+        left_uv: float32 (N, 2), columns and rows in the left image, pixels.
+        right_uv: float32 (N, 2), the same features in the right image.
     """
 
     left_uv: Float32
@@ -71,15 +69,15 @@ class PairFeatures:
 
 @dataclass(frozen=True)
 class PairInspection:
-    """How well a pair is rectified, by features matched over the whole picture. NaN = not known.
+    """How well a pair is rectified, from features matched over the whole image. NaN = unknown.
 
     Attributes:
-        features: Matched features that agree on one row error.
-        row_error_px: Median of right minus left row; 0 where rows correspond.
-        row_spread_px: Standard deviation of that, robust (from the median absolute deviation).
-        near: Features near enough to tell the eyes apart.
-        negative_share: Share of those with a negative disparity: about 0, or 1 where the eyes
-            are swapped.
+        features: Number of matched features that agree on one row error.
+        row_error_px: Median of right minus left row; 0 if the rows are aligned.
+        row_spread_px: Robust standard deviation of that (from the median absolute deviation).
+        near: Number of features near enough to show whether the cameras are swapped.
+        negative_share: Share of those with a negative disparity: about 0, or about 1 if the
+            cameras are swapped.
     """
 
     features: int
@@ -90,10 +88,10 @@ class PairInspection:
 
 
 def inspect_pair(pair: RectifiedPair, settings: InspectionSettings | None = None) -> PairInspection:
-    """How well a pair is rectified.
+    """Measure how well a pair is rectified.
 
     Args:
-        pair: A pair that is said to be rectified.
+        pair: A pair that should be rectified.
         settings: Number of features.
     """
     settings = settings or InspectionSettings()
@@ -102,12 +100,12 @@ def inspect_pair(pair: RectifiedPair, settings: InspectionSettings | None = None
 
 
 def match_features(left: UInt8, right: UInt8, count: int) -> PairFeatures:
-    """Features that both pictures show, wherever they are.
+    """Match features between two images, at any position.
 
     Args:
         left: uint8 (H, W).
         right: uint8 (H, W).
-        count: Features per picture at most.
+        count: Maximum number of features per image.
     """
     return PairFeatures(*opencv_features.match_features(left, right, count))
 
@@ -115,12 +113,12 @@ def match_features(left: UInt8, right: UInt8, count: int) -> PairFeatures:
 def inspect_features(
     features: PairFeatures, doffs_px: float = 0.0, min_features: int = 40
 ) -> PairInspection:
-    """Sum matched features up.
+    """Measure how well matched features fit a rectified pair.
 
     Args:
-        features: Of one pair, or of several pairs of one rig.
-        doffs_px: ``cx_right - cx_left``, added to disparities so that 0 is infinitely far.
-        min_features: Fewer tell nothing: the figures are NaN.
+        features: Matches of one pair, or of several pairs of one rig.
+        doffs_px: ``cx_right - cx_left``, added to disparities so that 0 is at infinity.
+        min_features: With fewer features, the measures are NaN.
     """
     shift = features.right_uv - features.left_uv
     agree = _agreeing(shift[:, 1])
@@ -137,31 +135,31 @@ def inspect_features(
 def check_inspection(
     inspection: PairInspection, settings: InspectionSettings, where: str | None = None
 ) -> tuple[str, ...]:
-    """Warnings about a pair; none where it is good, or where nothing can be told.
+    """Warnings about a pair; none if it is good or has too few features.
 
     Args:
-        inspection: What `inspect_pair` found.
+        inspection: Result of `inspect_pair`.
         settings: Limits.
         where: Name of the frame or drive, for the message.
 
     Raises:
-        CalibrationError: Left and right are swapped: no depth can come of it.
+        CalibrationError: Left and right are swapped, so no depth is possible.
     """
     if inspection.negative_share >= settings.swapped_share:
         raise CalibrationError(
-            "left and right pictures are swapped",
+            "left and right images are swapped",
             where=where,
             got=f"{100 * inspection.negative_share:.0f} % of {inspection.near} features farther "
-            "right in the right picture",
+            "right in the right image",
             expected="farther left",
-            hint="give the left camera's pictures first (or un-mirror the pictures)",
+            hint="give the left camera's images first (or un-mirror the images)",
         )
     if abs(inspection.row_error_px) >= settings.warn_row_px:
         line = (
-            "rows of left and right do not correspond: the right picture lies "
+            "rows of left and right are not aligned: the right image is "
             f"{abs(inspection.row_error_px):.0f} px too {_side(inspection.row_error_px)} (expected "
             f"under {settings.warn_row_px:g} px); depth will be poor or wrong: rectify the "
-            "pictures, or calibrate the cameras anew"
+            "images, or recalibrate the cameras"
         )
         return (line,)
     return ()
@@ -172,7 +170,7 @@ def _side(row_error_px: float) -> str:
 
 
 def _agreeing(row_shift: Float32) -> Bool:
-    """bool (N,), features whose row error is near the most common one."""
+    """bool (N,), features whose row error is close to the most common one."""
     if not len(row_shift):
         return np.zeros(0, np.bool_)
     ordered = np.sort(row_shift)

@@ -1,4 +1,4 @@
-"""Turn the pictures of two cameras so that a point lies on the same row in both."""
+"""Calibrated rectification: warp both images so that matching pixels lie on the same row."""
 
 from __future__ import annotations
 
@@ -29,40 +29,42 @@ _INTERPOLATIONS: Final = {
     "cubic": cv2.INTER_CUBIC,
     "lanczos": cv2.INTER_LANCZOS4,
 }
-# Maps of an identity are off by rounding errors, far below what interpolation resolves (1/32 px).
+# Allows for rounding in identity maps; far below the resolution of the interpolation (1/32 px).
 _BORDER_TOLERANCE_PX: Final = 1e-3
-# Beyond it the two views of a pinhole camera hardly overlap.
+# At larger angles the views of two pinhole cameras hardly overlap.
 _LARGEST_ANGLE_RAD: Final = math.radians(60)
 
 
 class RectificationSettings(Settings):
-    """How raw pictures are rectified and turned grey."""
+    """Rectification and grey conversion of raw images."""
 
     alpha: float | None = Field(
         default=0.0,
         ge=0,
         le=1,
-        description="0 = zoomed so that only pixels with a source remain, 1 = every source pixel "
-        "is kept, none = OpenCV's own choice. Without effect on rectified input.",
+        description="Zoom of the rectified views: 0 = only valid pixels, 1 = all source pixels, "
+        "none = OpenCV's default. No effect on rectified input.",
     )
     same_principal_point: bool = Field(
         default=True,
-        description="Give both views one principal point, so that disparity 0 is infinitely far. "
-        "Without effect on rectified input.",
+        description="Use one principal point for both views, so that disparity 0 is at infinity. "
+        "No effect on rectified input.",
     )
     interpolation: Literal["linear", "cubic", "lanczos"] = Field(
-        default="linear", description="How source pixels are interpolated."
+        default="linear", description="Interpolation of source pixels."
     )
-    grey: GreyMode = Field(default="bt601", description="How colours are weighed, see `to_grey`.")
+    grey: GreyMode = Field(
+        default="bt601", description="Weights of the colours in grey images, see `to_grey`."
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Where the pixels of one rectified view come from.
+    """Remap tables of one rectified view.
 
     Attributes:
-        map_x: float32 (H, W), columns in the raw picture.
-        map_y: float32 (H, W), rows in the raw picture.
+        map_x: float32 (H, W), source columns in the raw image.
+        map_y: float32 (H, W), source rows in the raw image.
     """
 
     map_x: Float32
@@ -70,7 +72,7 @@ class View:
 
     @property
     def inside(self) -> Bool:
-        """bool (H, W), True where the source lies inside the raw picture."""
+        """bool (H, W), True where the source is inside the raw image."""
         height, width = self.map_x.shape
         low, e = -_BORDER_TOLERANCE_PX, _BORDER_TOLERANCE_PX
         return np.asarray(
@@ -81,7 +83,7 @@ class View:
         )
 
     def warp(self, image: UInt8, interpolation: int) -> UInt8:
-        """Rectify one raw picture; pixels without a source are black."""
+        """Rectify one raw image; pixels without a source are black."""
         return np.asarray(cv2.remap(image, self.map_x, self.map_y, interpolation))
 
 
@@ -89,17 +91,17 @@ class Rectifier:
     """Rectifies the pairs of one rig.
 
     Args:
-        calibration: The raw cameras, or the camera of pictures that are rectified already; those
-            are only checked for their size and turned grey.
-        settings: How.
+        calibration: The raw cameras, or the camera of already rectified images, which are only
+            checked for size and converted to grey.
+        settings: Zoom, interpolation and grey conversion.
 
     Attributes:
         camera: Geometry of the rectified views.
         valid: bool (H, W), where the rectified left view has a source; None = everywhere.
 
     Raises:
-        CalibrationError: The rig is vertical, or left and right are swapped, or nothing of the
-            scene remains in view.
+        CalibrationError: The rig is vertical, left and right are swapped, the cameras diverge by
+            more than 60 degrees or differ in image size, or a rectified view would be empty.
     """
 
     def __init__(
@@ -126,7 +128,7 @@ class Rectifier:
         """Rectify one pair.
 
         Raises:
-            CalibrationError: The pictures have another size than the calibration.
+            CalibrationError: The image size differs from that of the calibration.
         """
         left, right = self.warp(pair)
         return RectifiedPair(
@@ -140,10 +142,10 @@ class Rectifier:
         )
 
     def warp(self, pair: StereoPair) -> tuple[UInt8, UInt8]:
-        """Both pictures of a pair rectified, in the colours that they have.
+        """Rectify both images of a pair, without grey conversion.
 
         Raises:
-            CalibrationError: The pictures have another size than the calibration.
+            CalibrationError: The image size differs from that of the calibration.
         """
         self._check_size(pair)
         if self._views is None:
@@ -156,7 +158,7 @@ class Rectifier:
         height_px, width_px = pair.left.shape[:2]
         if (width_px, height_px) != (self.camera.width_px, self.camera.height_px):
             raise CalibrationError(
-                "pictures have another size than the calibration",
+                "images have another size than the calibration",
                 where=pair.name or f"frame {pair.index}",
                 got=f"{width_px}x{height_px}",
                 expected=f"{self.camera.width_px}x{self.camera.height_px}",
@@ -167,10 +169,10 @@ class Rectifier:
 
 @dataclass(frozen=True, eq=False)
 class RectifyingTurns:
-    """How the two cameras are turned, and what the turned views look like.
+    """Rectifying rotations of the two cameras, and the rectified camera.
 
     Attributes:
-        R_left: float64 (3, 3), from the raw left camera's axes to the rectified ones.
+        R_left: float64 (3, 3), from the axes of the raw left camera to the rectified axes.
         R_right: The same for the right camera.
         camera: Geometry of the rectified views.
     """
@@ -189,7 +191,7 @@ class RectifyingTurns:
     def place(
         self, calibration: StereoCalibration, pixels: Float64, *, right: bool = False
     ) -> Float64:
-        """float64 (N, 2), where raw pixels (N, 2) of a side come to lie; NaN = nowhere."""
+        """float64 (N, 2), rectified positions of raw pixels (N, 2) of one camera; NaN = none."""
         camera = calibration.right if right else calibration.left
         rays = unproject(camera, pixels) @ (self.R_right if right else self.R_left).T
         flat = (rays / rays[:, 2:]) @ self.matrices[int(right)].T
@@ -197,7 +199,7 @@ class RectifyingTurns:
 
 
 def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) -> RectifyingTurns:
-    """Find how to turn the cameras of a rig, and the rectified camera.
+    """Compute the rectifying rotations of a rig, and the rectified camera.
 
     Raises:
         CalibrationError: See `Rectifier`.
@@ -222,7 +224,7 @@ def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) 
 def plan_rectification(
     calibration: StereoCalibration, settings: RectificationSettings
 ) -> tuple[RectifiedCamera, tuple[View, View]]:
-    """Find the rectified camera and where its left and right pixels come from.
+    """Compute the rectified camera and the remap tables of its left and right view.
 
     Raises:
         CalibrationError: See `Rectifier`.
@@ -274,27 +276,27 @@ def _check_rig(calibration: StereoCalibration) -> None:
     left, right = calibration.left, calibration.right
     if (left.width_px, left.height_px) != (right.width_px, right.height_px):
         raise CalibrationError(
-            "left and right camera differ in size",
+            "left and right camera differ in image size",
             got=f"left {left.width_px}x{left.height_px}, right {right.width_px}x{right.height_px}",
         )
     x, y, z = calibration.T_right_left[:3, 3]
     if abs(y) >= abs(x) or abs(z) >= abs(x):
         raise CalibrationError(
-            "cameras do not stand side by side",
+            "cameras are not side by side",
             got=f"right camera at ({-x:g}, {-y:g}, {-z:g}) m",
             expected="mostly along x",
-            hint="turn the pictures of a vertical rig by 90 degrees and calibrate again",
+            hint="rotate the images of a vertical rig by 90 degrees and calibrate again",
         )
     apart_rad = float(angle_rad(calibration.T_right_left))
     if apart_rad > _LARGEST_ANGLE_RAD:
         raise CalibrationError(
-            "cameras look apart",
+            "cameras look in different directions",
             got=f"{math.degrees(apart_rad):.0f} deg",
             expected=f"at most {math.degrees(_LARGEST_ANGLE_RAD):.0f} deg",
         )
     if x > 0:
         raise CalibrationError(
-            "right camera stands to the left of the left one",
+            "right camera is to the left of the left camera",
             got=f"T[0] = {x:g} m",
             expected="< 0 m",
             hint="swap left and right",

@@ -1,4 +1,4 @@
-"""What rows leave open in a pair of homographies: size, slant, place, least disparity."""
+"""Degrees of freedom left by row alignment: scale, shear, translation and smallest disparity."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from recon.structures.arrays import Float64
 
 Size = tuple[int, int]
 
-# Disparity of the smallest of the matches: a matcher searches from 0.
+# Disparity given to the farthest matches; a matcher searches from 0.
 _SMALLEST_DISPARITY_PX: Final = 4.0
 
 
 def map_pixels(H: Float64, pixels: NDArray[Any]) -> Float64:
-    """float64 (N, 2), where a homography (3, 3) takes pixels (N, 2)."""
+    """float64 (N, 2), pixels (N, 2) mapped by a homography (3, 3)."""
     mapped = pixels.astype(np.float64) @ H[:, :2].T + H[:, 2]
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
@@ -25,16 +25,16 @@ def map_pixels(H: Float64, pixels: NDArray[Any]) -> Float64:
 def shape_views(
     H_left: Float64, H_right: Float64, features: PairFeatures, size: Size
 ) -> tuple[Float64, Float64]:
-    """Choose what rows leave open; rows stay as they correspond.
+    """Choose the degrees of freedom of two row-aligning homographies; rows stay aligned.
 
-    Both pictures stand upright, are slanted as little as may be, have about the size that they
-    had, lie in the middle, and the right one is moved so that disparities are positive.
+    Both images become upright, centred, sheared as little as possible and of about their original
+    size, and the right image is shifted so that disparities are positive.
 
     Args:
         H_left: float64 (3, 3).
         H_right: float64 (3, 3).
-        features: Matches that correspond, raw pixels.
-        size: (width, height) of the pictures.
+        features: Correct matches, raw pixels.
+        size: (width, height) of the images.
 
     Ref: Loop and Zhang 1999, "Computing rectifying homographies for stereo vision", section 6.
     """
@@ -54,10 +54,10 @@ def shape_views(
 
 
 def _levelled(H_left: Float64, H_right: Float64, size: Size) -> list[Float64]:
-    """Tip both pictures forward or back together, until they are alike large above and below.
+    """Tilt both images together about a horizontal axis, until top and bottom have equal scale.
 
-    Rows stay together under (x, y) -> (x, y) / (1 + g·y). The size at a pixel goes with the third
-    coordinate there: g makes that as even as can be over the border of both.
+    Rows stay aligned under (x, y) -> (x, y) / (1 + g·y). The scale at a pixel depends on its third
+    coordinate: g makes this as even as possible along the borders of both images.
     """
     points = np.hstack([np.concatenate([_middles(size), _corners(size)]), np.ones((8, 1))])
     views = [H / (points @ H[2]).mean() for H in (H_left, H_right)]
@@ -76,19 +76,19 @@ def _corners(size: Size) -> Float64:
 
 
 def _middles(size: Size) -> Float64:
-    """float64 (4, 2), the middles of the left, right, upper and lower border."""
+    """float64 (4, 2), the midpoints of the left, right, top and bottom border."""
     w, h = size[0] - 1.0, size[1] - 1.0
     return np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]])
 
 
 def _upright(H: Float64, size: Size) -> float:
-    """Above 0 where the lower border stays below the upper one."""
+    """Positive if the bottom border stays below the top border."""
     _, _, top, bottom = map_pixels(H, _middles(size))
     return float(bottom[1] - top[1])
 
 
 def _straight(H: Float64, size: Size) -> Float64:
-    """Shear and stretch along x so that the middle lines stay at right angles, in proportion."""
+    """Shear and stretch along x so that the centre lines keep their right angle and proportion."""
     left, right, top, bottom = map_pixels(H, _middles(size))
     across, down = right - left, bottom - top
     w, h = size
@@ -103,13 +103,13 @@ def _straight(H: Float64, size: Size) -> Float64:
 
 
 def _extent(H: Float64, size: Size) -> Float64:
-    """Width and height of the mapped middle lines."""
+    """Width and height of the mapped centre lines."""
     left, right, top, bottom = map_pixels(H, _middles(size))
     return np.array([np.linalg.norm(right - left), abs(bottom[1] - top[1])])
 
 
 def _scaled(H: Float64, scale: float, size: Size) -> Float64:
-    """Scale rows alike, and columns so that the picture keeps its proportion."""
+    """Scale the rows of both images alike, and columns so that the aspect ratio is kept."""
     width = _extent(H, size)[0] * scale
     return np.diag([scale * size[0] / width, scale, 1.0]) @ H
 

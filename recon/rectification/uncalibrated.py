@@ -1,4 +1,4 @@
-"""Rectify pairs of unknown cameras by two homographies: rows correspond, scale is unknown."""
+"""Uncalibrated rectification by two homographies: rows are aligned, metric scale is unknown."""
 
 from __future__ import annotations
 
@@ -20,21 +20,23 @@ from recon.structures.arrays import Bool, Float64, UInt8
 
 Size = tuple[int, int]
 
-# Sizes at one corner of a rectified picture, in those at another.
+# Largest ratio of the homogeneous scales at two corners of an image.
 _MOST_STRETCHED: Final = 20.0
 _FEWEST_AT_FIRST: Final = 12
-_HELD_OUT: Final = 4  # every fourth feature measures, the others fit
+_HELD_OUT: Final = 4  # every fourth feature is held out of the fit and measures its error
 
 
 class UncalibratedSettings(Settings):
-    """How pairs without calibration are rectified."""
+    """Rectification of pairs without calibration."""
 
-    features: int = Field(default=8000, ge=100, description="Features per picture at most.")
+    features: int = Field(default=8000, ge=100, description="Maximum number of features per image.")
     min_features: int = Field(
-        default=40, ge=16, description="Fewer matches that agree on one geometry are refused."
+        default=40, ge=16, description="Minimum number of matches that agree on one geometry."
     )
     inlier_px: float = Field(
-        default=1.0, gt=0, description="Distance from its epipolar line up to which a match counts."
+        default=1.0,
+        gt=0,
+        description="Largest distance of an inlier from its epipolar line, in pixels.",
     )
     flat_share: float = Field(
         default=0.9,
@@ -43,23 +45,23 @@ class UncalibratedSettings(Settings):
         description="Share of matches on one plane from which the scene counts as flat.",
     )
     max_row_px: float = Field(
-        default=2.0, gt=0, description="A mean row error above this is refused, pixels."
+        default=2.0, gt=0, description="Largest mean row error of an accepted result, in pixels."
     )
-    pairs: int = Field(default=8, ge=1, description="Pairs of a folder that are looked at.")
+    pairs: int = Field(default=8, ge=1, description="Number of pairs used of a folder.")
 
 
 @dataclass(frozen=True, eq=False)
 class UncalibratedRectification:
-    """Two homographies, and how good they are.
+    """Rectifying homographies, and how good they are.
 
     Attributes:
-        H_left: float64 (3, 3), from raw pixels to rectified ones.
-        H_right: The same of the right picture.
-        fundamental: float64 (3, 3), ``right.T @ F @ left = 0`` of raw pixels.
-        features: The matches that agree, raw pixels.
+        H_left: float64 (3, 3), from raw to rectified pixels.
+        H_right: The same for the right image.
+        fundamental: float64 (3, 3), ``right.T @ F @ left = 0`` for raw pixels.
+        features: The inlier matches, raw pixels.
         matches: Number of all matches.
-        rows_px: float64 (N,), left less right row of each of `features`, rectified.
-        held_out_px: Mean absolute row error of matches that took no part in the fit; NaN = none.
+        rows_px: float64 (N,), left minus right row of each of ``features``, rectified.
+        held_out_px: Mean absolute row error of matches held out of the fit; NaN = too few.
         disparity_px: 1st and 99th percentile of the rectified disparity.
     """
 
@@ -76,13 +78,13 @@ class UncalibratedRectification:
 def rectify_pictures(
     pairs: Sequence[tuple[UInt8, UInt8]], settings: UncalibratedSettings | None = None
 ) -> UncalibratedRectification:
-    """Find homographies that bring the rows of pictures of unknown cameras together.
+    """Find homographies that align the rows of images of uncalibrated cameras.
 
-    Features are matched twice: as recorded, and once these have made the pictures alike.
+    Features are matched twice: in the raw images, and in the images aligned by the first result.
 
     Args:
         pairs: uint8 (H, W) left and right, of one pair or of several pairs of one rig.
-        settings: How.
+        settings: Features and limits.
 
     Raises:
         CalibrationError: See `rectify_uncalibrated`.
@@ -90,7 +92,7 @@ def rectify_pictures(
     settings = settings or UncalibratedSettings()
     height, width = pairs[0][0].shape
     matched = _joined([match_exactly(left, right, settings.features) for left, right in pairs])
-    # A first guess need not be sure: few matches will do, and it is judged by what it leads to.
+    # The initial guess may rest on few matches: the second round checks it.
     few = settings.model_copy(update={"min_features": _FEWEST_AT_FIRST})
     H = _fit(matched, (width, height), few)[:2]
     again = _joined([match_again(left, right, *H, settings.features) for left, right in pairs])
@@ -100,20 +102,20 @@ def rectify_pictures(
 def rectify_uncalibrated(
     features: PairFeatures, size: Size, settings: UncalibratedSettings | None = None
 ) -> UncalibratedRectification:
-    """Find homographies that bring matches of unknown cameras onto common rows.
+    """Find homographies that align the rows of matches of uncalibrated cameras.
 
-    The fundamental matrix is found robustly (MAGSAC++), its seven numbers are fitted to the
-    matches, and it is turned into homographies (Hartley). What rows leave open is chosen so that
-    the pictures are slanted little and disparities are positive.
+    The fundamental matrix is estimated robustly (MAGSAC++), refined on its inliers, and converted
+    to homographies (Hartley). Their remaining degrees of freedom are chosen for little distortion
+    and positive disparities.
 
     Args:
         features: Matches of one pair, or of several pairs of one rig.
-        size: (width, height) of the pictures.
-        settings: How.
+        size: (width, height) of the images.
+        settings: Limits.
 
     Raises:
-        CalibrationError: Too few matches agree, or the scene is flat, or one camera stands in the
-            view of the other.
+        CalibrationError: Too few matches agree, the scene is flat, one camera is in the view of
+            the other, or a row error remains.
 
     Ref: Hartley 1999, "Theory and practice of projective rectification".
     """
@@ -130,10 +132,10 @@ def rectify_uncalibrated(
     rows = left[:, 1] - right[:, 1]
     if float(np.abs(rows).mean()) > settings.max_row_px:
         raise CalibrationError(
-            "rows cannot be brought to correspond",
+            "rows cannot be aligned",
             got=f"{np.abs(rows).mean():.1f} px mean row error",
             expected=f"at most {settings.max_row_px:g} px",
-            hint="lenses that bend straight lines need a calibration: recon calibrate",
+            hint="lenses with distortion need a calibration: recon calibrate",
         )
     low, high = np.percentile(left[:, 0] - right[:, 0], (1, 99))
     return UncalibratedRectification(
@@ -178,16 +180,16 @@ def _fundamental(
     F, agreeing = find_fundamental(left, right, settings.inlier_px)
     if F is None or agreeing.sum() < settings.min_features:
         raise CalibrationError(
-            "too few features of both pictures agree on one geometry",
+            "too few matched features agree on one camera geometry",
             got=f"{int(agreeing.sum())} of {len(features)} matches",
             expected=f"at least {settings.min_features}",
-            hint="are these two views of one scene, with texture?",
+            hint="are these two views of the same scene, with texture?",
         )
     return F, _some(features, agreeing)
 
 
 def _check_epipoles(F: Float64, size: Size) -> None:
-    """A homography tears a picture apart that sees the other camera."""
+    """Raise if an epipole is inside an image, which no homography can rectify."""
     for side, epipole in zip(("left", "right"), epipoles(F), strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
             x, y = epipole[:2] / epipole[2]
@@ -196,20 +198,20 @@ def _check_epipoles(F: Float64, size: Size) -> None:
 
 
 def _check_torn(H_left: Float64, H_right: Float64, size: Size) -> None:
-    """Close to the other camera pixels would be stretched without end."""
+    """Raise if an epipole is so close to an image that pixels would be stretched extremely."""
     w, h = size[0] - 1.0, size[1] - 1.0
     corners = np.array([[0, 0, 1], [w, 0, 1], [w, h, 1], [0, h, 1]])
     for side, H in (("left", H_left), ("right", H_right)):
         last = corners @ H[2]
         if last.min() < last.max() / _MOST_STRETCHED:
-            raise _seen(side, "epipole next to it")
+            raise _seen(side, "epipole close to its border")
 
 
 def _seen(side: str, got: str) -> CalibrationError:
     return CalibrationError(
-        f"the {side} picture sees the other camera: one stands before the other",
+        f"the {side} image sees the other camera: one is in front of the other",
         got=got,
-        expected="outside the picture",
+        expected="outside the image",
         hint="put the cameras side by side",
     )
 
@@ -217,7 +219,7 @@ def _seen(side: str, got: str) -> CalibrationError:
 def _held_out(
     homographies: tuple[Float64, Float64], features: PairFeatures, settings: UncalibratedSettings
 ) -> float:
-    """Mean absolute row error of matches of which the wrong ones are left out."""
+    """Mean absolute row error of held-out matches, without outliers; NaN = none."""
     H_left, H_right = homographies
     left, right = map_pixels(H_left, features.left_uv), map_pixels(H_right, features.right_uv)
     rows = np.abs(left[:, 1] - right[:, 1])
@@ -226,15 +228,15 @@ def _held_out(
 
 
 def _check_depth(features: PairFeatures, settings: UncalibratedSettings) -> None:
-    """Two views of a plane go with any pair of cameras: rows of another scene would not fit."""
+    """Raise if the scene is planar: this does not determine the geometry of the cameras."""
     _, mask = cv2.findHomography(
         features.left_uv, features.right_uv, cv2.USAC_MAGSAC, settings.inlier_px
     )
     share = 0.0 if mask is None else float(np.mean(mask))
     if share > settings.flat_share:
         raise CalibrationError(
-            "the scene is flat: it does not tell how the cameras stand",
+            "the scene is flat and does not determine the camera geometry",
             got=f"{100 * share:.0f} % of the matches on one plane",
             expected=f"at most {100 * settings.flat_share:g} %",
-            hint="show near and far things together, or calibrate: recon calibrate",
+            hint="use a scene with both near and far objects, or calibrate: recon calibrate",
         )

@@ -1,4 +1,4 @@
-"""The common view of two cameras, one of which at least cannot show all it sees on a plane."""
+"""Rectified views of wide-angle cameras, whose field of view does not fit on an image plane."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from recon.adapters.opencv_lens import unproject
 from recon.structures import CameraIntrinsics, StereoCalibration
 from recon.structures.arrays import Float64
 
-# A flat picture stretches with 1 / cos²: at 60 degrees from the axis a pixel is four times as wide.
+# A planar image stretches by 1 / cos²: fourfold at 60 degrees from the optical axis.
 _WIDEST: Final = math.tan(math.radians(60))
 _BORDER_POINTS: Final = 65
 
@@ -22,10 +22,10 @@ Box = tuple[Float64, Float64]
 def plan_wide_view(
     calibration: StereoCalibration, alpha: float | None, *, same_principal_point: bool
 ) -> tuple[Float64, Float64, Float64, Float64]:
-    """Rotations and projections of the rectified views, as ``stereoRectify`` gives for pinholes.
+    """Rotations and projections of the rectified views, like ``stereoRectify`` for pinholes.
 
-    Along their shorter side the views reach at most 60 degrees from their axes, whatever the lenses
-    see.
+    Along their shorter side the views reach at most 60 degrees from the optical axis, however wide
+    the lenses are.
 
     Returns:
         ``R_left, R_right`` (3, 3) and ``P_left, P_right`` (3, 4).
@@ -60,7 +60,7 @@ def plan_wide_view(
 
 
 def _boxes(camera: CameraIntrinsics, rotation: Float64) -> tuple[Box, Box]:
-    """The largest box within the turned border of the picture, and the smallest around it."""
+    """The largest box inside the rotated image border, and the smallest box around it."""
     w, h = camera.width_px - 1.0, camera.height_px - 1.0
     t, zero = np.linspace(0, 1, _BORDER_POINTS), np.zeros(_BORDER_POINTS)
     sides = {
@@ -77,9 +77,9 @@ def _boxes(camera: CameraIntrinsics, rotation: Float64) -> tuple[Box, Box]:
 
 
 def _flat(camera: CameraIntrinsics, rotation: Float64, pixels: Float64) -> Float64:
-    """Border pixels on the plane z = 1 of the view, no farther out than the widest angle."""
+    """Border pixels projected onto the plane z = 1 of the view, clipped to the widest angle."""
     plane = unproject(camera, pixels)
-    # Rays at 90 degrees and more have no z = 1: they lie as far out as is allowed, on their side.
+    # Rays at 90 degrees or more do not meet z = 1: they are placed at the clipping limit.
     centre = np.array([camera.matrix[0, 2], camera.matrix[1, 2]])
     outward = np.concatenate([(pixels - centre) * 1e3, np.ones((len(pixels), 1))], axis=1)
     turned = np.where(np.isfinite(plane), plane, outward) @ rotation.T

@@ -235,7 +235,7 @@ def test_a_jump_of_the_exposure_is_no_failure(seen: list[RectifiedPair], tmp_pat
 
 def test_swapped_eyes_end_in_one_clear_line(seen: list[RectifiedPair], tmp_path: Path) -> None:
     swapped = [replace(pair, left=pair.right, right=pair.left) for pair in seen[:3]]
-    with pytest.raises(CalibrationError, match="left and right pictures are swapped"):
+    with pytest.raises(CalibrationError, match="left and right images are swapped"):
         map_drive(swapped, tmp_path)
     assert not (tmp_path / "out").exists()
 
@@ -247,7 +247,7 @@ def test_rows_that_are_off_by_five_pixels_are_told(tmp_path: Path) -> None:
         cv2.imwrite(str(path), np.roll(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), 5, axis=0))
     options = MapOptions(out=tmp_path / "out", mesh=False)
     run = run_map(open_source(tmp_path / "drive"), load_config(), options)
-    assert any("the right picture lies 5 px too low" in line for line in run.warnings)
+    assert any("the right image is 5 px too low" in line for line in run.warnings)
 
 
 def test_one_frame_makes_a_map(seen: list[RectifiedPair], tmp_path: Path) -> None:

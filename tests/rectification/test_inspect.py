@@ -63,14 +63,14 @@ def test_rows_that_are_off_are_measured_and_said(row_px: float) -> None:
     found = inspect_pair(make_pair(row_px=row_px), SETTINGS)
     assert found.row_error_px == pytest.approx(row_px, abs=0.2)
     (line,) = check_inspection(found, SETTINGS)
-    assert "rows of left and right do not correspond" in line
+    assert "rows of left and right are not aligned" in line
     assert f"{abs(row_px):.0f} px too {'low' if row_px > 0 else 'high'}" in line
 
 
 def test_swapped_eyes_are_an_error_that_says_so() -> None:
     found = inspect_pair(swapped(make_pair()), SETTINGS)
     assert found.negative_share > 0.98
-    with pytest.raises(CalibrationError, match="frame 7: left and right pictures are swapped"):
+    with pytest.raises(CalibrationError, match="frame 7: left and right images are swapped"):
         check_inspection(found, SETTINGS, where="frame 7")
 
 

@@ -135,7 +135,7 @@ def test_a_camera_in_view_of_the_other_is_refused() -> None:
 
 
 def test_too_few_matches_are_refused() -> None:
-    with pytest.raises(CalibrationError, match=r"too few features.*at least 40"):
+    with pytest.raises(CalibrationError, match=r"too few matched features.*at least 40"):
         rectify_uncalibrated(scene(count=30), SIZE)
 
 
