@@ -1,4 +1,4 @@
-"""From estimates and truth to figures."""
+"""Evaluation of disparity maps, trajectories, clouds and occupancy against ground truth."""
 
 from recon.evaluation.association import associate
 from recon.evaluation.confidence import (

@@ -1,4 +1,4 @@
-"""Which poses of two paths belong together, told by their times."""
+"""Association of the poses of two trajectories by timestamp."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from recon.structures.arrays import Float64, Int32
 def associate(
     estimate: Trajectory, truth: Trajectory, tolerance_s: float
 ) -> tuple[Trajectory, Trajectory]:
-    """The poses of both that have a partner: each is the nearest in time to the other.
+    """Match poses that are mutually nearest in time; poses without a match are left out.
 
     Args:
-        estimate: Any path.
-        truth: Another, on the same clock; its rate may differ.
-        tolerance_s: How far the times of partners may differ.
+        estimate: Estimated trajectory.
+        truth: True trajectory, on the same clock; its rate may differ.
+        tolerance_s: Largest time difference of a match.
 
     Returns:
-        Two paths of equal length, partner by partner, each with its own times.
+        Two trajectories of equal length, pose by pose, each with its own timestamps.
 
     Raises:
-        EvaluationError: No pose has a partner.
+        EvaluationError: No poses match.
     """
     there = nearest_times(estimate.timestamps_s, truth.timestamps_s)
     back = nearest_times(truth.timestamps_s, estimate.timestamps_s)
@@ -31,16 +31,16 @@ def associate(
     mutual = (back[there] == np.arange(len(estimate))) & (apart_s <= tolerance_s)
     if not mutual.any():
         raise EvaluationError(
-            "no pose of the one path is as old as one of the other",
+            "no poses of the two trajectories match in time",
             got=f"times {_span(estimate)} and {_span(truth)}",
             expected=f"times within {tolerance_s:g} s of each other",
-            hint="raise --tolerance, or see that both use the same clock",
+            hint="raise --tolerance, or make sure that both use the same clock",
         )
     return _part(estimate, np.flatnonzero(mutual)), _part(truth, there[mutual])
 
 
 def nearest_times(times_s: Float64, others_s: Float64) -> Int32:
-    """int32 (N,): for each time the index of the nearest of the others (M ≥ 1, not falling)."""
+    """int32 (N,): for each time, the index of the nearest of the others (M ≥ 1, sorted)."""
     after = np.clip(np.searchsorted(others_s, times_s), 0, len(others_s) - 1)
     before = np.maximum(after - 1, 0)
     earlier = np.abs(times_s - others_s[before]) <= np.abs(others_s[after] - times_s)

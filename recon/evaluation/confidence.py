@@ -1,4 +1,4 @@
-"""Whether a confidence, and a standard deviation, mean what they say."""
+"""Calibration of confidences and standard deviations, measured against ground truth."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from recon.structures.arrays import Bool, Float32, Float64, freeze
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """How often pixels of each level of confidence are right.
+    """Reliability diagram: share of correct pixels for each level of confidence.
 
     Attributes:
         edges: float64 (B + 1,), limits of the bins, from 0 to 1.
-        confidence: float64 (B,), mean confidence in the bin; NaN = no pixel there.
-        right: float64 (B,), share of right pixels in the bin; NaN = no pixel there.
+        confidence: float64 (B,), mean confidence in the bin; NaN = empty bin.
+        right: float64 (B,), share of correct pixels in the bin; NaN = empty bin.
         pixels: float64 (B,), number of pixels in the bin.
     """
 
@@ -34,19 +34,19 @@ class Reliability:
 
     @property
     def calibration_error(self) -> float:
-        """Expected calibration error, in [0, 1]: ``|confidence - right|`` of a pixel's bin."""
+        """Expected calibration error in [0, 1]: mean ``|confidence - right|`` over all pixels."""
         gaps = np.nan_to_num(np.abs(self.confidence - self.right))
         return float(np.average(gaps, weights=self.pixels))
 
 
 @dataclass(frozen=True, eq=False)
 class Sparsification:
-    """The share of wrong pixels among those left, as the least certain ones are removed.
+    """Sparsification curve: share of wrong pixels left as the least confident ones are removed.
 
     Attributes:
-        removed: float64 (N,), share of the pixels that are removed, from 0 to below 1.
-        wrong: float64 (N,), share of wrong ones among the rest, removed by confidence.
-        best: float64 (N,), the same if the wrong ones were removed first: the least possible.
+        removed: float64 (N,), share of removed pixels, from 0 to below 1.
+        wrong: float64 (N,), share of wrong pixels among the rest, if removed by confidence.
+        best: float64 (N,), the same if the wrong pixels are removed first: the optimum.
     """
 
     removed: Float64
@@ -60,19 +60,19 @@ class Sparsification:
 
     @property
     def ause(self) -> float:
-        """Area between the two curves, in [0, 1]; 0 = the confidence sorts perfectly."""
+        """Area between the two curves in [0, 1]; 0 = the confidence ranks pixels perfectly."""
         return float(np.mean(self.wrong - self.best))
 
 
 def measure_reliability(
     estimate: Disparity, truth: DisparityTruth, limit_px: float = 1.0, bins: int = 10
 ) -> Reliability:
-    """Compare the confidence of pixels with how often they are right.
+    """Compare the confidence of pixels with the share of them that is correct.
 
     Args:
         estimate: The disparity, with its confidence.
-        truth: The truth at the same size; pixels that only the left camera sees count too.
-        limit_px: Pixels are right when they are off by no more than this.
+        truth: Ground truth at the same size; occluded pixels count too.
+        limit_px: Largest error of a correct pixel.
         bins: Number of equal bins between 0 and 1.
 
     Raises:
@@ -96,14 +96,14 @@ def measure_reliability(
 def measure_sparsification(
     estimate: Disparity, truth: DisparityTruth, limit_px: float = 1.0, steps: int = 100
 ) -> Sparsification:
-    """Remove the least certain pixels step by step and count the wrong ones that stay.
+    """Remove the least confident pixels step by step, and measure the share of wrong ones left.
 
-    Pixels of equal confidence are removed in an order that does not favour either kind.
+    Among pixels of equal confidence, correct and wrong ones are removed in proportion.
 
     Args:
         estimate: The disparity, with its confidence.
-        truth: The truth at the same size.
-        limit_px: Pixels are wrong when they are off by more than this.
+        truth: Ground truth at the same size.
+        limit_px: Pixels with a larger error are wrong.
         steps: Number of points of the curves.
 
     Raises:
@@ -124,14 +124,14 @@ def measure_sparsification(
 
 
 def share_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float = 1.0) -> float:
-    """Share of the pixels, in [0, 1], whose error is less than so many standard deviations.
+    """Share of the pixels, in [0, 1], whose error is within some standard deviations.
 
-    Of a normal distribution 0.683 lie within one and 0.954 within two.
+    For a normal distribution, it is 0.683 within one and 0.954 within two.
 
     Args:
         estimate: The disparity, with its standard deviation.
-        truth: The truth at the same size.
-        sigmas: How many.
+        truth: Ground truth at the same size.
+        sigmas: Number of standard deviations.
 
     Raises:
         EvaluationError: The sizes differ, or no pixel has both a value and a known truth.
@@ -142,7 +142,7 @@ def share_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float
 
 
 def _shared_by_equals(confidence: Float32, wrong: Float64) -> Float64:
-    """Wrong pixels from the most certain to the least, spread evenly over equal confidences."""
+    """Wrong pixels in order of decreasing confidence, averaged over equal confidences."""
     _, group, size = np.unique(-confidence, return_inverse=True, return_counts=True)
     share = np.bincount(group, weights=wrong) / size
     return np.asarray(np.repeat(share, size), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""How far a disparity map is from the truth, counted as Middlebury and KITTI count."""
+"""Errors of disparity maps, with the measures of Middlebury and KITTI."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ def evaluate_disparity(
 ) -> DisparityMetrics:
     """Compare a disparity map with the truth, over the pixels whose truth is known.
 
-    ``bad[t]`` is the share of all those pixels that have a value off by more than ``t``; pixels
-    without a value count as invalid and not as bad, so ``bad + invalid`` is the whole loss.
+    ``bad[t]`` is the share of all compared pixels with an error above ``t``; pixels without a
+    value count as invalid and not as bad, so ``bad + invalid`` is the share of all failures.
 
     Args:
         estimate: A disparity, or its values: float32 (H, W), pixels, NaN = none.
-        truth: The truth at the same size.
-        thresholds_px: The limits of ``bad``, in pixels of the size that figures are given in.
-        occluded: Count the pixels too that only the left camera sees.
-        scale: Pixels of the size that figures are given in per pixel here: 4 to give a
-            quarter-size map the figures of the full size.
+        truth: Ground truth at the same size.
+        thresholds_px: Thresholds of ``bad``, in pixels at the scale of the results.
+        occluded: Whether to include pixels that only the left camera sees.
+        scale: Factor from pixels of the map to pixels of the results: 4 reports a quarter-size
+            map in full-size pixels.
 
     Raises:
         EvaluationError: The sizes differ, or no pixel has a known truth.
@@ -74,13 +74,13 @@ def evaluate_depth(
     *,
     occluded: bool = False,
 ) -> DepthMetrics:
-    """Compare the depths that a disparity map and the truth give.
+    """Compare the depth of a disparity map with the true depth.
 
     Args:
         estimate: A disparity, or its values: float32 (H, W), pixels, NaN = none.
-        truth: The truth at the same size.
+        truth: Ground truth at the same size.
         camera: The camera at that size.
-        occluded: Count the pixels too that only the left camera sees.
+        occluded: Whether to include pixels that only the left camera sees.
 
     Raises:
         EvaluationError: The sizes differ, or no pixel has a known truth.
@@ -104,14 +104,14 @@ def evaluate_depth(
 def _compared(
     estimate: Disparity | Float32, truth: DisparityTruth, *, occluded: bool
 ) -> tuple[Float64, Float64]:
-    """float64 (N,), values and truth of the pixels that are compared."""
+    """float64 (N,) twice, values and truth of the compared pixels."""
     values = estimate.values if isinstance(estimate, Disparity) else estimate
     counted = _counted(values, truth, occluded=occluded)
     return values[counted].astype(np.float64), truth.values[counted].astype(np.float64)
 
 
 def _counted(values: Float32, truth: DisparityTruth, *, occluded: bool) -> Bool:
-    """bool (H, W), the pixels that are compared."""
+    """bool (H, W), the compared pixels."""
     if values.shape != truth.values.shape:
         raise EvaluationError(
             "disparity and truth differ in size",
@@ -129,7 +129,7 @@ def _mean(numbers: Float64) -> float:
 
 
 def _quantile(numbers: Float64, percent: int) -> float:
-    """The smallest of the numbers that at least so many per cent do not exceed; NaN = none."""
+    """The smallest number that at least ``percent`` % of them do not exceed; NaN if empty."""
     if not len(numbers):
         return float("nan")
     rank = max(1, -(-len(numbers) * percent // 100))

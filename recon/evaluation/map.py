@@ -1,4 +1,4 @@
-"""How right and how complete a cloud is, against a reference cloud."""
+"""Accuracy and completeness of a cloud with respect to a reference cloud."""
 
 from __future__ import annotations
 
@@ -21,15 +21,14 @@ def evaluate_map(
 ) -> MapMetrics:
     """Compare a cloud with a reference in the same frame.
 
-    Both clouds are first reduced to one point per voxel. Without that a map is judged by where
-    it happens to be dense: a stereo cloud has a hundred times more points on a wall at 3 m than
-    on one at 30 m.
+    Both clouds are first reduced to one point per voxel, so that dense regions do not dominate: a
+    stereo cloud has a hundred times more points on a wall at 3 m than on one at 30 m.
 
     Args:
         cloud: The estimate.
-        reference: What is taken as true; what it did not see counts against the precision.
-        threshold_m: Distance below which a point counts as right.
-        voxel_m: Edge of the voxels; None = half of the threshold.
+        reference: The cloud taken as true; surfaces that it lacks count against the precision.
+        threshold_m: Distance below which a point counts as correct.
+        voxel_m: Voxel size; None = half of the threshold.
 
     Returns:
         Precision, recall, their harmonic mean, and the distances from the estimate to the
@@ -60,16 +59,16 @@ def evaluate_map(
 
 
 def within_reach(cloud: PointCloud, reference: PointCloud, path: Trajectory) -> Bool:
-    """Which points lie no higher over the path, and no lower, than what the reference saw.
+    """Which points are within the height range, relative to the path, that the reference covers.
 
-    A LiDAR looks little above its own height, a camera sees the crowns of the trees: what stands
-    there is neither right nor wrong. The band of heights is that of the whole reference, so that
-    what floats above a road still counts.
+    A LiDAR sees little above its own height, a camera sees tree tops: points there can be neither
+    confirmed nor refuted. The range is that of the whole reference, so that points floating above
+    a road still count.
 
     Args:
         cloud: The estimate.
-        reference: What is taken as true.
-        path: The cameras, in the frame of both (y of a camera points down).
+        reference: The cloud taken as true.
+        path: Camera poses, in the frame of both clouds (y of a camera points down).
 
     Returns:
         bool (N,), one for each point of the cloud.
@@ -80,7 +79,7 @@ def within_reach(cloud: PointCloud, reference: PointCloud, path: Trajectory) -> 
 
 
 def _heights_m(xyz: Float32, path: Trajectory) -> Float64:
-    """float64 (N,): height over the nearest camera, along its y axis."""
+    """float64 (N,): height above the nearest camera, along its y axis."""
     nearest = open3d_clouds.nearest(xyz, path.positions_m)[0][:, 0]
     down = path.T_world_camera[nearest, :3, 1]
     return np.asarray(-np.einsum("ni,ni->n", down, xyz - path.positions_m[nearest]))
@@ -89,17 +88,17 @@ def _heights_m(xyz: Float32, path: Trajectory) -> Float64:
 def register_cloud(
     cloud: PointCloud, reference: PointCloud, reach_m: float
 ) -> tuple[Float64, float]:
-    """The rigid motion that lays a cloud onto a reference by ICP, from where it lies.
+    """Align a cloud to a reference by ICP, starting from its present pose.
 
-    It hides a wrong pose of the whole map: what is left are the errors of its shape.
+    This removes errors in the pose of the whole map and leaves the errors of its shape.
 
     Args:
-        cloud: The estimate, off by less than ten times ``reach_m``.
-        reference: What is taken as true, in the same frame.
-        reach_m: How far points may be off in the end.
+        cloud: The estimate, misaligned by less than ten times ``reach_m``.
+        reference: The cloud taken as true, in the same frame.
+        reach_m: Largest distance of correspondences in the last stage.
 
     Returns:
-        float64 (4, 4), ``T_reference_cloud``, and the share of the points with a partner.
+        float64 (4, 4), ``T_reference_cloud``, and the share of the points with a correspondence.
 
     Raises:
         EvaluationError: A cloud is empty or the frames differ.
@@ -129,7 +128,7 @@ def nearest_distances(xyz: Float32, reference_xyz: Float32) -> Float32:
 
 
 def _check(cloud: PointCloud, reference: PointCloud, threshold_m: float) -> None:
-    """Raise where a comparison would mean nothing."""
+    """Raise if the clouds cannot be compared."""
     for name, points in (("estimated", cloud), ("reference", reference)):
         if len(points) == 0:
             raise EvaluationError(f"the {name} cloud is empty")

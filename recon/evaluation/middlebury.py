@@ -1,7 +1,7 @@
-"""The figures of the Middlebury stereo benchmark, version 3.
+"""Measures of the Middlebury stereo benchmark, version 3; errors are in full-size pixels.
 
 Ref: D. Scharstein, H. Hirschmüller et al., Middlebury Stereo Evaluation SDK 1.6, and the table of
-https://vision.middlebury.edu/stereo/eval3/: errors are in pixels of the full size.
+https://vision.middlebury.edu/stereo/eval3/.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from recon.structures import Disparity, DisparityMetrics, DisparityTruth
 from recon.structures.arrays import Float32
 
 HALF_WEIGHT: Final = frozenset({"PianoL", "Playroom", "Playtable", "Shelves", "Vintage"})
-"""Scenes that count half in the table's mean: variants, or hard for a single reason."""
+"""Scenes with half weight in the table's mean: variants, or hard for a single reason."""
 
 
 @dataclass(frozen=True)
 class MiddleburyRules:
-    """What a scene says about how results for it are counted.
+    """Rules of a scene for the evaluation of results.
 
     Attributes:
         full_size_factor: Full-size pixels per pixel of the truth.
-        largest_px: Results are clipped to [0, this], pixels of the truth; None = known to nobody.
-        isint: Results are rounded to whole pixels of the truth.
+        largest_px: Results are clipped to [0, this], pixels of the truth; None = unknown.
+        isint: Whether results are rounded to whole pixels of the truth.
     """
 
     full_size_factor: float = 1.0
@@ -38,20 +38,19 @@ class MiddleburyRules:
 
 
 def scene_weight(name: str) -> float:
-    """How much a scene counts in the table's mean: 8, or 4 for those of `HALF_WEIGHT`.
+    """Weight of a scene in the table's mean: 8, or 4 for the scenes of `HALF_WEIGHT`.
 
     Args:
-        name: Name of its folder, or a path that ends in it.
+        name: Name of the scene's folder, or a path that ends in it.
     """
     scene = name.rpartition("/")[2].removesuffix("-perfect").removesuffix("-imperfect")
     return 4.0 if scene in HALF_WEIGHT else 8.0
 
 
 def at_truth_size(values: Float32, shape: tuple[int, ...]) -> Float32:
-    """A result at the size of the truth, its values in pixels of that size.
+    """Resample a result to the size of the truth, with values in pixels of that size.
 
-    A smaller one is enlarged, and of a larger one every second or fourth pixel is taken; nothing
-    is interpolated.
+    Pixels are repeated or skipped, never interpolated.
 
     Args:
         values: float32 (h, w), pixels of its own size; NaN = none.
@@ -61,21 +60,21 @@ def at_truth_size(values: Float32, shape: tuple[int, ...]) -> Float32:
         float32 (H, W).
 
     Raises:
-        EvaluationError: Neither size is 1, 2 or 4 times the other, a row and column less or more.
+        EvaluationError: Neither size is 1, 2 or 4 times the other, up to rounding.
     """
     step = _step(values.shape, shape)
     return np.asarray(_taken(values, shape, step) / np.float32(step), dtype=np.float32)
 
 
 def estimate_at_truth_size(estimate: Disparity, shape: tuple[int, ...]) -> tuple[Disparity, float]:
-    """`at_truth_size` of all that is known of a result.
+    """Resample all arrays of a result as `at_truth_size` does.
 
     Args:
         estimate: The result.
         shape: (H, W) of the truth.
 
     Returns:
-        The result at that size, and how many pixels of its own size a pixel there is.
+        The result at that size, and the number of its original pixels per pixel of the truth.
 
     Raises:
         EvaluationError: The sizes do not fit.
@@ -91,12 +90,12 @@ def estimate_at_truth_size(estimate: Disparity, shape: tuple[int, ...]) -> tuple
 
 
 def by_the_rules(values: Float32, shape: tuple[int, ...], rules: MiddleburyRules) -> Float32:
-    """What of a result is compared: float32 (H, W) at the size of the truth, clipped, rounded.
+    """A result as it is compared: float32 (H, W), at the size of the truth, clipped, rounded.
 
     Args:
         values: float32 (h, w), pixels; NaN = none.
         shape: (H, W) of the truth.
-        rules: Of the scene.
+        rules: Rules of the scene.
 
     Raises:
         EvaluationError: The sizes do not fit.
@@ -109,13 +108,13 @@ def by_the_rules(values: Float32, shape: tuple[int, ...], rules: MiddleburyRules
 def evaluate_middlebury(
     values: Float32, truth: DisparityTruth, rules: MiddleburyRules, *, occluded: bool = False
 ) -> DisparityMetrics:
-    """Compare a result with the truth as the benchmark does; figures in full-size pixels.
+    """Compare a result with the truth as the benchmark does; errors are in full-size pixels.
 
     Args:
-        values: float32 (h, w), pixels; NaN = none. Sparse as found, or dense (holes filled).
-        truth: The truth, at this size, or a half, a quarter, twice or four times of it.
-        rules: Of the scene.
-        occluded: Count the pixels too that only the left camera sees ("all").
+        values: float32 (h, w), pixels; NaN = none. Sparse as matched, or dense (holes filled).
+        truth: Ground truth, at the size of the result or 2 or 4 times larger or smaller.
+        rules: Rules of the scene.
+        occluded: Whether to include pixels that only the left camera sees ("all").
 
     Raises:
         EvaluationError: The sizes do not fit, or no pixel has a known truth.
@@ -125,10 +124,10 @@ def evaluate_middlebury(
 
 
 def weighted_mean(figures: Mapping[str, float]) -> float:
-    """The mean over scenes as the table has it; NaN where one is.
+    """The mean over scenes, weighted as in the table; NaN if any value is NaN.
 
     Args:
-        figures: A figure of each scene, by the scene's name.
+        figures: One value for each scene, by the scene's name.
 
     Raises:
         EvaluationError: There is no scene.
@@ -158,7 +157,7 @@ def _fits(large: tuple[int, ...], small: tuple[int, ...], factor: int) -> bool:
 
 
 def _taken(values: NDArray[Any], shape: tuple[int, ...], step: float) -> NDArray[Any]:
-    """The pixel at ``step`` times row and column, whole parts."""
+    """The pixels at ``step`` times row and column, rounded down."""
     rows, columns = (
         np.minimum((np.arange(n) * step).astype(np.intp), limit - 1)
         for n, limit in zip(shape, values.shape, strict=True)

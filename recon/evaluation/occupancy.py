@@ -1,9 +1,9 @@
-"""How right and how complete an occupancy map is, against the exact truth.
+"""Accuracy and completeness of an occupancy map with respect to exact ground truth.
 
-Only what the drive could know counts. A true voxel holds a surface that enough frames saw within
-the map's range. An occupied voxel counts where enough frames had its place in the picture and in
-range, hidden or not: what is invented inside a wall is wrong too. A cell of the grid counts where
-enough frames saw a surface in it, not higher than the band.
+Only what the drive could observe counts. A true voxel counts if enough frames saw its surface
+within the map's range. An occupied voxel counts if it was in the field of view and in range in
+enough frames, occluded or not: a voxel invented inside a wall is wrong too. A cell of the grid
+counts if enough frames saw a surface in it, not above the height band.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ _BITS: Final = 21
 def evaluate_occupancy(
     voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth
 ) -> OccupancyMetrics:
-    """Compare voxels and flat grid of a map with the truth.
+    """Compare the voxels and the 2-D grid of a map with the truth.
 
     Args:
         voxels: The map; log-odds above 0 are occupied.
-        grid: The flat grid of the same map.
-        truth: In the axes and cells of the map.
+        grid: The 2-D grid of the same map.
+        truth: Ground truth, in the axes and cells of the map.
 
     Returns:
-        Figures for a tolerance of one cell (26 neighbours in space, 8 on the ground), and for
-        none. With the tolerance, a true cell is found when an estimated one of its kind lies
-        within it, and an estimated cell is wrong when no true one does: found / (true + wrong).
+        Results with a tolerance of one cell (26 neighbours in 3-D, 8 in the grid), and without.
+        With the tolerance, a true cell is found if an estimated cell of its state is that near,
+        and an estimated cell is wrong if no true one is: IoU = found / (true + wrong).
 
     Raises:
         EvaluationError: The resolutions differ, or there is nothing to compare.
@@ -55,19 +55,19 @@ def evaluate_occupancy(
     _check(voxels, grid, truth)
     occupied = voxels.keys[voxels.log_odds > 0]
     counted = occupied[_looked_at(occupied, truth)]
-    pictures = grid_on_truth(grid, truth), truth.grid.cells
+    grids = grid_on_truth(grid, truth), truth.grid.cells
     return OccupancyMetrics(
         resolution_m=voxels.resolution_m,
         least_frames=truth.least_frames,
         voxels=_compare_voxels(occupied, counted, truth, _TOLERANCE),
         voxels_exact=_compare_voxels(occupied, counted, truth, 0),
-        grid=_compare_grids(*pictures, truth.seen, _TOLERANCE),
-        grid_exact=_compare_grids(*pictures, truth.seen, 0),
+        grid=_compare_grids(*grids, truth.seen, _TOLERANCE),
+        grid_exact=_compare_grids(*grids, truth.seen, 0),
     )
 
 
 def _check(voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth) -> None:
-    """Raise where a comparison would mean nothing."""
+    """Raise if map and truth cannot be compared."""
     sizes = {voxels.resolution_m, grid.resolution_m, truth.grid.resolution_m}
     if max(sizes) - min(sizes) > 1e-9:
         raise EvaluationError(
@@ -76,14 +76,14 @@ def _check(voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth) 
         )
     if not (truth.frames >= truth.least_frames).any() or not truth.seen.any():
         raise EvaluationError(
-            "the drive saw nothing often enough to compare",
-            expected=f"surfaces in {truth.least_frames} frames",
-            hint="a drive of more frames",
+            "no surface was seen in enough frames to compare",
+            expected=f"surfaces seen in {truth.least_frames} frames",
+            hint="use a drive with more frames",
         )
 
 
 def _looked_at(keys: Int32, truth: OccupancyTruth) -> Bool:
-    """Which cells lay in the picture and in range in enough frames, whatever hid them."""
+    """Which voxels were in the field of view and in range in enough frames, occluded or not."""
     centres = (keys.astype(np.float64) + 0.5) * truth.grid.resolution_m
     frames = np.zeros(len(keys), np.int64)
     width, height = truth.camera.width_px, truth.camera.height_px
@@ -109,7 +109,7 @@ def _compare_voxels(
 
 
 def _near(keys: Int32, others: Int32, tolerance: int) -> Bool:
-    """Which cells have one of the others at most so many cells away on every axis."""
+    """Which voxels have one of the others within ``tolerance`` cells on every axis."""
     steps = np.arange(-tolerance, tolerance + 1)
     known = np.unique(_pack(others))
     found = np.zeros(len(keys), dtype=np.bool_)
@@ -119,13 +119,13 @@ def _near(keys: Int32, others: Int32, tolerance: int) -> Bool:
 
 
 def _pack(keys: NDArray[Any]) -> NDArray[np.int64]:
-    """One number for each cell (N, 3)."""
+    """One number for each voxel key (N, 3)."""
     wide = keys.astype(np.int64) + (1 << (_BITS - 1))
     return np.asarray((wide[:, 0] << (2 * _BITS)) | (wide[:, 1] << _BITS) | wide[:, 2])
 
 
 def grid_on_truth(grid: OccupancyGrid, truth: OccupancyTruth) -> NDArray[np.int8]:
-    """The cells of a grid in the raster of the true one; UNKNOWN where it does not reach."""
+    """The cells of a grid, cropped or padded with UNKNOWN to the extent of the true grid."""
     offset_m = np.array(truth.grid.origin_m) - np.array(grid.origin_m)
     right, down = np.rint(offset_m / grid.resolution_m).astype(int).tolist()
     rows, columns = (np.arange(n) for n in truth.seen.shape)
@@ -151,7 +151,7 @@ def _compare_grids(
 
 
 def _iou(estimate: Bool, true: Bool, seen: Bool, tolerance: int) -> float:
-    """Found / (true + wrong) over the seen cells; at no tolerance, intersection over union."""
+    """Found / (true + wrong) over the seen cells; without tolerance, intersection over union."""
     found = seen & true & _grown(estimate, tolerance)
     wrong = seen & estimate & ~_grown(true, tolerance)
     union = int((seen & true).sum() + wrong.sum())
@@ -159,11 +159,11 @@ def _iou(estimate: Bool, true: Bool, seen: Bool, tolerance: int) -> float:
 
 
 def _grown(cells: Bool, tolerance: int) -> Bool:
-    """The cells and their neighbours up to so many cells away."""
+    """The cells dilated by ``tolerance`` cells."""
     kernel = np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
     return np.asarray(cv2.dilate(cells.astype(np.uint8), kernel) > 0)
 
 
 def _share(which: Bool) -> float:
-    """Share of True; NaN of nothing."""
+    """Share of True values; NaN if empty."""
     return float(which.mean()) if which.size else float("nan")

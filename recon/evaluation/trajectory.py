@@ -1,4 +1,4 @@
-"""How far an estimated trajectory is from the true one, to the KITTI benchmark's rules."""
+"""Trajectory errors: KITTI's relative errors over segments, ATE and RPE."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from recon.structures import LengthErrors, Trajectory, TrajectoryMetrics
 from recon.structures.arrays import Float64, Int32
 
 KITTI_LENGTHS_M: Final = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-"""The benchmark's segments."""
+"""Segment lengths of the KITTI benchmark."""
 
 SHORT_LENGTHS_M: Final = (50.0, 100.0)
-"""Segments of a drive that has no room for two of the benchmark's."""
+"""Segment lengths for a drive that is too short for two lengths of the benchmark."""
 
 KITTI_STEP_FRAMES: Final = 10
 """The benchmark starts a segment at every tenth frame (one second)."""
 
 MIN_PATH_M: Final = 1.0
-"""Errors relative to a shorter path would be the truth's own noise."""
+"""On a shorter path, relative errors would be dominated by the noise of the ground truth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Stretches of the true path.
+    """Segments of the true path.
 
     Attributes:
-        first: int32 (N,), frame at which each begins.
-        last: int32 (N,), frame at which each ends.
-        length_m: float64 (N,), nominal length of each.
+        first: int32 (N,), first frame of each segment.
+        last: int32 (N,), last frame of each segment.
+        length_m: float64 (N,), nominal length of each segment.
     """
 
     first: Int32
@@ -44,35 +44,38 @@ class Segments:
 
 
 class TrajectoryRules(Settings):
-    """How two paths are compared."""
+    """Alignment and segments of a trajectory comparison."""
 
     alignment: Literal["none", "origin", "se3", "sim3"] = Field(
         default="se3",
-        description="What is done to the estimate first: nothing, moved to the true first pose, "
-        "moved as a whole to lie closest, or also scaled.",
+        description="Alignment of the estimate: none, at the first pose (origin), rigid (se3), or "
+        "rigid with scale (sim3).",
     )
     lengths_m: tuple[Annotated[float, Field(gt=0)], ...] | None = Field(
         default=None,
         min_length=1,
-        description="Lengths of the segments; null = chosen by the path.",
+        description="Lengths of the segments in metres; null = chosen by the length of the path.",
     )
     step_frames: int | None = Field(
-        default=None, ge=1, description="A segment starts at every such frame; null = by the path."
+        default=None,
+        ge=1,
+        description="Frames between the starts of segments; null = chosen by the length of the "
+        "path.",
     )
-    rpe_frames: int = Field(default=1, ge=1, description="Frames apart for the RPE.")
+    rpe_frames: int = Field(default=1, ge=1, description="Frame distance of the RPE.")
 
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryComparison:
-    """Two paths and how they differ, for figures.
+    """Two trajectories and their differences, as needed for plots.
 
     Attributes:
-        estimate: The estimate, aligned.
-        truth: The truth, pose by pose.
-        segments: The stretches of the relative errors.
+        estimate: The aligned estimate.
+        truth: The true trajectory, pose by pose.
+        segments: The segments of the relative errors.
         segment_percent: float64 (N,), translation error of each segment, per cent of its length.
-        segment_deg_per_100m: float64 (N,), rotation error of each.
-        metrics: The figures.
+        segment_deg_per_100m: float64 (N,), rotation error of each segment.
+        metrics: The summary.
     """
 
     estimate: Trajectory
@@ -92,7 +95,7 @@ class TrajectoryComparison:
 def evaluate_trajectory(
     estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules | None = None
 ) -> TrajectoryMetrics:
-    """Figures of an estimated trajectory against the true one: see `compare_paths`."""
+    """The errors of an estimated trajectory, see `compare_paths`."""
     return compare_paths(estimate, truth, rules).metrics
 
 
@@ -101,22 +104,22 @@ def compare_paths(
 ) -> TrajectoryComparison:
     """Compare an estimated trajectory with the true one, pose by pose.
 
-    Relative errors follow the KITTI development kit: segments of those lengths from 100 to 800 m
-    that the true path has room for, one at every tenth frame; the error of a segment is the error
-    of the motion over it, divided by its length; the mean is over all segments. A drive with room
-    for fewer than two of these lengths has segments of 50 and 100 m instead, starting at every
-    frame, and one of 50 m or less has segments of half its path:
-    `TrajectoryMetrics.segment_lengths_m` tells which were used.
+    Relative errors follow the KITTI development kit: segments of 100 to 800 m, as far as the true
+    path has room for them, starting at every tenth frame; the error of a segment is the error of
+    the motion over it, divided by its length; the mean is over all segments. A drive with room for
+    fewer than two of these lengths uses segments of 50 and 100 m instead, starting at every frame,
+    and a drive of 50 m or less uses segments of half its length. The lengths used are in
+    `TrajectoryMetrics.segment_lengths_m`.
 
     Args:
         estimate: One pose for each true pose.
         truth: The true poses.
-        rules: How to align and what to cut; None = the defaults. A change of scale counts for
-            every figure, a rigid motion for ``ate_m`` alone.
+        rules: Alignment and segments; None = the defaults. The scale of the alignment affects all
+            errors, its rigid part only the ATE.
 
     Raises:
         EvaluationError: The lengths differ, there are too few poses, the true path is shorter
-            than `MIN_PATH_M`, or it has no room for a segment asked for.
+            than `MIN_PATH_M`, or it has no room for a requested segment.
 
     Ref:
         Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012;
@@ -154,7 +157,7 @@ def compare_paths(
 
 
 def align(estimate: Trajectory, truth: Trajectory, alignment: str) -> Similarity:
-    """The motion of the estimate that `TrajectoryRules.alignment` asks for."""
+    """The transform of the estimate for `TrajectoryRules.alignment`."""
     if alignment == "none":
         return Similarity(np.eye(4))
     if alignment == "origin":
@@ -168,21 +171,21 @@ def choose_segments(
     lengths_m: tuple[float, ...] | None = None,
     step_frames: int | None = None,
 ) -> Segments:
-    """The segments over which a drive is judged.
+    """Choose the segments over which a drive is evaluated.
 
     Args:
-        distances_m: float64 (N,), true path length from the first pose to each.
-        lengths_m: Their lengths; None = those of the benchmark that fit, or shorter ones.
-        step_frames: Frames from start to start; None = 10, or 1 for shorter lengths.
+        distances_m: float64 (N,), true path length from the first pose to each pose.
+        lengths_m: Segment lengths; None = those of the benchmark that fit, or shorter ones.
+        step_frames: Frames between starts; None = 10, or 1 for shorter lengths.
 
     Raises:
-        EvaluationError: Lengths are given, and the path has room for none.
+        EvaluationError: Lengths are given, and the path has room for none of them.
     """
     if lengths_m is not None:
         segments = segments_of(distances_m, lengths_m, step_frames or KITTI_STEP_FRAMES)
         if not len(segments.first):
             raise EvaluationError(
-                "true path has no room for a segment asked for",
+                "true path has no room for a segment of the requested lengths",
                 got=f"a path of {distances_m[-1]:.1f} m",
                 expected=f"more than {min(lengths_m):g} m",
             )
@@ -199,8 +202,8 @@ def choose_segments(
 def segments_of(distances_m: Float64, lengths_m: tuple[float, ...], step: int) -> Segments:
     """Segments of given lengths from every ``step``-th frame, where the path has room for them.
 
-    As in the development kit, a segment ends at the first frame that lies farther along the
-    path than its length.
+    As in the development kit, a segment ends at the first frame whose distance along the path
+    exceeds its length.
     """
     starts = np.arange(0, len(distances_m), step)
     first = np.repeat(starts, len(lengths_m))
@@ -223,7 +226,7 @@ def motion_errors(
 
 
 def _motion(trajectory: Trajectory, first: Int32, last: Int32) -> Float64:
-    """Float64 (N, 4, 4), poses of the last frames in axes of the first ones."""
+    """float64 (N, 4, 4), poses of the last frames relative to the first ones."""
     poses = trajectory.T_world_camera
     motion: Float64 = invert(poses[first]) @ poses[last]
     return motion
@@ -257,7 +260,7 @@ def _check(estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules) -> N
             "estimated and true trajectory differ in length",
             got=f"{len(estimate)} poses",
             expected=f"{len(truth)} poses",
-            hint="without times (TUM, or --times) both must have a pose for each frame",
+            hint="without timestamps (TUM, or --times) both must have one pose per frame",
         )
     least = rules.rpe_frames + 1
     if len(truth) < least:
