@@ -1,1 +1,1 @@
-"""One file per heavy library: arrays in, arrays out, foreign exceptions turned into ours."""
+"""One file per heavy library: arrays in, arrays out, its exceptions converted to ours."""

@@ -1,4 +1,4 @@
-"""The one file that knows kiss-icp: arrays in, arrays out, its exceptions turned into ours."""
+"""Adapter of kiss-icp: arrays in, arrays out, its exceptions converted to ours."""
 
 from __future__ import annotations
 
@@ -26,17 +26,18 @@ from recon.structures.arrays import Float64
 
 @dataclass(frozen=True)
 class KissIcpOptions:
-    """Every choice that kiss-icp leaves open.
+    """All parameters of kiss-icp.
 
     Attributes:
-        max_range_m: Points farther from the sensor are left, and the map is clipped there.
-        source_range_m: Points farther away are added to the map, but not aligned to it.
-        voxel_m: Edge of a voxel of the map.
-        points_per_voxel: Points that a voxel of the map keeps.
-        iterations: ICP steps at most.
-        convergence: Length of a step that ends the iterations.
-        initial_threshold_m: First value of the adaptive threshold.
-        min_motion_m: Deviation from the motion model that the adaptive threshold ignores.
+        max_range_m: Points farther from the sensor are dropped, and the map is clipped there.
+        source_range_m: Points farther away are added to the map, but not used for alignment.
+        voxel_m: Voxel size of the map.
+        points_per_voxel: Maximum number of points per voxel of the map.
+        iterations: Maximum number of ICP iterations.
+        convergence: Step length below which ICP has converged.
+        initial_threshold_m: Initial value of the adaptive threshold.
+        min_motion_m: Deviations from the motion model below this do not change the adaptive
+            threshold.
     """
 
     max_range_m: float
@@ -51,11 +52,11 @@ class KissIcpOptions:
 
 @dataclass(frozen=True, eq=False)
 class IcpAlignment:
-    """What ICP says about one frame.
+    """Result of ICP for one frame.
 
     Attributes:
         T_world_camera: float64 (4, 4), the aligned pose.
-        source: float64 (N, 3), the points that were aligned, camera axes.
+        source: float64 (N, 3), the points used for alignment, camera axes.
     """
 
     T_world_camera: Float64
@@ -65,14 +66,14 @@ class IcpAlignment:
 class KissIcp:
     """kiss-icp and its local map.
 
-    Points in OpenCV's camera axes give poses of the camera. One thread keeps sums in one order,
-    so that equal input gives equal output.
+    Points are in OpenCV's camera axes, poses are those of the camera. It runs in one thread, so
+    that sums have a fixed order and equal input gives equal output.
 
     Args:
-        options: Every choice that kiss-icp leaves open.
+        options: All parameters of kiss-icp.
 
     Raises:
-        RegistrationError: kiss-icp refuses the options.
+        RegistrationError: kiss-icp rejects the options.
     """
 
     def __init__(self, options: KissIcpOptions) -> None:
@@ -81,7 +82,7 @@ class KissIcp:
             self._icp = _RangedKissIcp(_config(options), options)
 
     def register(self, xyz_camera: NDArray[np.floating]) -> IcpAlignment:
-        """Register a frame as kiss-icp does by itself: its motion model, its threshold, its map.
+        """Register a frame with kiss-icp's own motion model, threshold and map update.
 
         Args:
             xyz_camera: (N, 3), metres, finite; not empty.
@@ -100,12 +101,12 @@ class KissIcp:
         T_world_guess: NDArray[np.floating],
         threshold_m: float,
     ) -> IcpAlignment:
-        """Align a frame to the map, which stays as it is: the caller decides what to believe.
+        """Align a frame to the map without changing it; the caller may reject the result.
 
         Args:
             xyz_camera: (N, 3), metres, finite; not empty.
-            T_world_guess: (4, 4), where the camera may be.
-            threshold_m: Scale of the robust kernel; points pair up to thrice as far.
+            T_world_guess: (4, 4), initial guess of the camera's pose.
+            threshold_m: Scale of the robust kernel; correspondences are at most three times as far.
 
         Raises:
             RegistrationError: There are no points, or kiss-icp fails.
@@ -120,7 +121,7 @@ class KissIcp:
     def update(
         self, xyz_camera: NDArray[np.floating], T_world_camera: NDArray[np.floating]
     ) -> None:
-        """Add a frame to the map, at the pose that was decided.
+        """Add a frame to the map at its final pose.
 
         Raises:
             RegistrationError: There are no points, or kiss-icp fails.
@@ -135,11 +136,11 @@ class KissIcp:
         """float64 (M, 3), the points of the local map, world axes, in ascending order."""
         with _our_errors():
             points = np.array(self._icp.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3)
-        # The order of kiss-icp's hash depends on its history, that of the numbers does not.
+        # The order of kiss-icp's hash map depends on its history; sorted order does not.
         return points[np.lexsort(points.T[::-1])]
 
     def __getstate__(self) -> dict[str, Any]:
-        """All that decides what comes next, as plain values: a drive can be resumed from it."""
+        """The full state as plain values, from which a drive can be resumed."""
         icp = self._icp
         return {
             "options": self._options,
@@ -159,7 +160,7 @@ class KissIcp:
 
 
 class _AdaptiveThreshold:
-    """kiss-icp's threshold, whose own class cannot be saved: how far the motion model is off.
+    """kiss-icp's adaptive threshold: rms error of the motion model. Its own class cannot be saved.
 
     Ref:
         Vizzo et al., "KISS-ICP: in defense of point-to-point ICP", RA-L 2023, section III-C.
@@ -185,7 +186,7 @@ class _AdaptiveThreshold:
 
 
 class _RangedKissIcp(KissICP):  # type: ignore[misc]
-    """kiss-icp whose source is cut shorter than its map, and whose steps can be taken apart."""
+    """kiss-icp with a shorter range for alignment than for the map, and with separate steps."""
 
     def __init__(self, config: KISSConfig, options: KissIcpOptions) -> None:
         super().__init__(config)
@@ -194,7 +195,7 @@ class _RangedKissIcp(KissICP):  # type: ignore[misc]
         self._source_range_m = options.source_range_m
 
     def voxelize(self, iframe: Float64) -> tuple[Float64, Float64]:
-        """Source and map points; points at the rim of the map would be pulled inwards."""
+        """Source and map points; source points near the map's edge would bias the alignment."""
         source, frame = super().voxelize(iframe)
         near = np.linalg.norm(source, axis=1) <= self._source_range_m
         return source[near], frame
@@ -205,8 +206,8 @@ class _RangedKissIcp(KissICP):  # type: ignore[misc]
         return clipped
 
     def align(self, source: Float64, guess: Float64, threshold_m: float) -> Float64:
-        """Pose of a source by the map alone; the guess where there is nothing to align."""
-        # The prior goes the way that kiss-icp's own motion model goes: last pose times last delta.
+        """Pose of a source in the map; the guess if there is nothing to align."""
+        # The guess enters where kiss-icp's motion model does: as last pose times last delta.
         self.last_delta = orthonormalise(np.linalg.inv(self.last_pose) @ guess)
         if not len(source) or self.local_map.empty():
             return guess
@@ -220,14 +221,14 @@ class _RangedKissIcp(KissICP):  # type: ignore[misc]
         return pose
 
     def settle(self, frame: Float64, pose: Float64) -> None:
-        """Take a pose as decided and its frame into the map."""
+        """Accept a pose and add its frame to the map."""
         self.last_delta = orthonormalise(np.linalg.inv(self.last_pose) @ pose)
         self.last_pose = pose
         self.local_map.update(frame, pose)
 
 
 def _config(options: KissIcpOptions) -> KISSConfig:
-    """The whole configuration; ``model_construct`` keeps environment variables out of it."""
+    """kiss-icp's configuration; ``model_construct`` ignores environment variables."""
     return KISSConfig.model_construct(
         out_dir="",
         data=DataConfig(max_range=options.max_range_m, min_range=0.0, deskew=False),
@@ -248,10 +249,10 @@ def _config(options: KissIcpOptions) -> KISSConfig:
 
 
 def _points(xyz: NDArray[np.floating]) -> Float64:
-    """A writable float64 copy (kiss-icp refuses read-only arrays), checked."""
+    """Check points and make a writable float64 copy (kiss-icp rejects read-only arrays)."""
     points = np.array(xyz, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        # An empty frame raises nothing in kiss-icp, but moves its pose.
+        # kiss-icp accepts an empty frame silently, but changes its pose.
         raise RegistrationError("no points to register", got=points.shape, expected="(N, 3)")
     if not np.isfinite(points).all():
         raise RegistrationError("points to register are not finite")
@@ -259,7 +260,7 @@ def _points(xyz: NDArray[np.floating]) -> Float64:
 
 
 def _pose(T: NDArray[np.floating]) -> Float64:
-    """A writable rigid copy: a rotation that is not orthonormal would abort the process."""
+    """A writable orthonormal copy: kiss-icp aborts the process if the rotation is not."""
     pose = np.array(T, dtype=np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise RegistrationError("pose for ICP is not a finite 4x4 matrix", got=pose.shape)

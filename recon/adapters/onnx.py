@@ -1,4 +1,4 @@
-"""Networks in ONNX files through onnxruntime (extra ``onnx``): arrays in, arrays out."""
+"""Adapter of onnxruntime (extra ``onnx``) for ONNX networks: arrays in, arrays out."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from recon.structures.arrays import Float32
 
 
 class OnnxNetwork:
-    """A network that is loaded and ready to run on the processor.
+    """A loaded network, run on the CPU.
 
     Args:
         path: An ``.onnx`` file.
-        threads: Threads within one operator; None = onnxruntime decides.
+        threads: Threads per operator; None = onnxruntime's default.
 
     Raises:
         MissingDependencyError: onnxruntime is not installed.
-        FormatError: The file is missing, or no network that onnxruntime can load.
+        FormatError: The file is missing, or onnxruntime cannot load it.
     """
 
     def __init__(self, path: Path, threads: int | None = None) -> None:
@@ -33,7 +33,7 @@ class OnnxNetwork:
         self._errors = _errors_of(runtime)
         options = runtime.SessionOptions()
         options.intra_op_num_threads = threads or 0
-        options.log_severity_level = 4  # fatal: what is less arrives as an exception, if at all
+        options.log_severity_level = 4  # fatal only: lesser errors arrive as exceptions
         try:
             self._session = runtime.InferenceSession(
                 str(path), options, providers=["CPUExecutionProvider"]
@@ -47,18 +47,18 @@ class OnnxNetwork:
         """Run the network once.
 
         Args:
-            inputs: float32 arrays, in the order in which the network lists its inputs.
+            inputs: float32 arrays, in the order of the network's inputs.
 
         Returns:
-            Its outputs, in its order.
+            The outputs, in the order of the network.
 
         Raises:
-            MatchingError: The network has other inputs than these.
+            MatchingError: The network has a different number or shape of inputs.
         """
         wanted = self._session.get_inputs()
         if len(wanted) != len(inputs):
             raise MatchingError(
-                "the network has another number of inputs",
+                "the network has a different number of inputs",
                 where=self._path,
                 got=f"{len(wanted)}: {', '.join(one.name for one in wanted)}",
                 expected=str(len(inputs)),
@@ -68,16 +68,16 @@ class OnnxNetwork:
             outputs = self._session.run(None, feed)
         except self._errors as error:
             raise MatchingError(
-                "the network cannot be run on these pictures",
+                "the network cannot process these images",
                 where=self._path,
                 got=_first_line(error),
-                hint="check the size and the channels that it was made for",
+                hint="check the image size and the channels that it expects",
             ) from error
         return [np.asarray(output, dtype=np.float32) for output in outputs]
 
 
 def _errors_of(runtime: Any) -> tuple[type[Exception], ...]:
-    """What onnxruntime raises: its own errors have no common root."""
+    """Exceptions that onnxruntime raises: its own have no common base class."""
     state = vars(runtime.capi.onnxruntime_pybind11_state).values()
     own = [kind for kind in state if isinstance(kind, type) and issubclass(kind, Exception)]
     return (*own, RuntimeError, ValueError, TypeError)

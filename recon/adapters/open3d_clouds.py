@@ -1,4 +1,4 @@
-"""Open3D's point cloud filters: arrays in, arrays out, its complaints turned into ours."""
+"""Open3D's point cloud filters: arrays in, arrays out, its errors converted to ours."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ def voxel_downsample(
 
     Args:
         xyz: (N, 3), metres, finite.
-        attributes: (N, K) numbers that travel with the points; K may be 0.
-        voxel_m: Edge of a voxel.
+        attributes: (N, K) attributes of the points; K may be 0.
+        voxel_m: Voxel size.
 
     Returns:
         float32 (M, 3) and float32 (M, K).
 
     Raises:
-        SettingsError: The voxel is so small that Open3D cannot number it.
+        SettingsError: The voxel is too small for Open3D's voxel index.
         ShapeError: A point is not finite.
     """
-    # Open3D averages three more numbers per point ("colours"), so attributes go by threes; the
-    # order of its voxels depends on the positions alone, so it is the same each time.
+    # Open3D averages three attributes per point (as colours), so they are passed in groups of
+    # three; the order of its voxels depends only on positions and is the same for each group.
     groups = [attributes[:, k : k + 3] for k in range(0, attributes.shape[1], 3)]
     cloud = _legacy(xyz)
     if not groups:
@@ -52,8 +52,8 @@ def statistical_inliers(xyz: NDArray[Any], neighbours: int, sigmas: float) -> Bo
 
     Args:
         xyz: (N, 3), metres, finite.
-        neighbours: Number of nearest neighbours looked at.
-        sigmas: Standard deviations above the cloud's mean that are still usual.
+        neighbours: Number of nearest neighbours.
+        sigmas: Limit, in standard deviations above the mean over the cloud.
 
     Returns:
         bool (N,), True = keep.
@@ -70,8 +70,8 @@ def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float) -> Bool:
 
     Args:
         xyz: (N, 3), metres, finite.
-        neighbours: Number of other points that must be near.
-        radius_m: How near.
+        neighbours: Minimum number of other points within the radius.
+        radius_m: The radius.
 
     Returns:
         bool (N,), True = keep.
@@ -79,17 +79,17 @@ def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float) -> Bool:
     if len(xyz) == 0:
         return np.ones(0, dtype=bool)
     with _quiet():
-        # Open3D counts the point itself as a neighbour and asks for more than its number.
+        # Open3D counts the point itself, but requires more neighbours than the given number.
         _, index = _legacy(xyz).remove_radius_outlier(neighbours, radius_m)
     return _mask(index, len(xyz))
 
 
 def estimate_normals(xyz: NDArray[Any], neighbours: int) -> Float32:
-    """Unit normals of the planes through each point's nearest neighbours; the sign is free.
+    """Unit normals of the planes fitted to each point's nearest neighbours, of arbitrary sign.
 
     Args:
         xyz: (N, 3), metres, finite.
-        neighbours: Number of nearest neighbours, the point included.
+        neighbours: Number of nearest neighbours, including the point itself.
 
     Returns:
         float32 (N, 3).
@@ -101,12 +101,12 @@ def estimate_normals(xyz: NDArray[Any], neighbours: int) -> Float32:
 
 
 def agree_normals(xyz: NDArray[Any], normals: NDArray[Any], neighbours: int) -> Float32:
-    """Normals flipped so that neighbours agree, along a minimum spanning tree.
+    """Orient normals consistently between neighbours, along a minimum spanning tree.
 
     Args:
         xyz: (N, 3), metres, finite.
         normals: (N, 3), unit.
-        neighbours: Number of nearest neighbours that the tree may use.
+        neighbours: Number of nearest neighbours that the tree may connect.
 
     Returns:
         float32 (N, 3).
@@ -128,15 +128,14 @@ def nearest(
     Args:
         query: (N, 3), metres, finite.
         reference: (M, 3), metres, finite, ``M >= neighbours``.
-        neighbours: How many.
+        neighbours: Number of neighbours.
 
     Returns:
         int32 (N, neighbours), rows of ``reference``, and float32 (N, neighbours), distances in
         metres, nearest first.
 
     Raises:
-        ShapeError: There are fewer reference points than neighbours asked for, or a point is
-            not finite.
+        ShapeError: There are fewer reference points than neighbours, or a point is not finite.
     """
     if len(reference) < neighbours:
         raise ShapeError(
@@ -145,7 +144,7 @@ def nearest(
     if len(query) == 0:
         empty = np.zeros((0, neighbours))
         return empty.astype(np.int32), empty.astype(np.float32)
-    # Far from the origin float32 squares lose centimetres: both clouds move to the reference.
+    # Far from the origin, squared float32 distances lose centimetres: centre both clouds.
     centre = np.mean(reference, axis=0, dtype=np.float64)
     near_origin, points = _tensor(_finite(reference) - centre), _tensor(_finite(query) - centre)
     with _quiet():
@@ -156,7 +155,7 @@ def nearest(
 
 
 def _voxelised(cloud: Any, voxel_m: float) -> Any:
-    """Open3D's own reduction."""
+    """Open3D's voxel downsampling."""
     try:
         with _quiet():
             return cloud.voxel_down_sample(voxel_m)
@@ -167,12 +166,12 @@ def _voxelised(cloud: Any, voxel_m: float) -> Any:
 
 
 def _legacy(xyz: NDArray[Any]) -> Any:
-    """Open3D's cloud of a copy of the points; it takes neither read-only nor float32 arrays."""
+    """Open3D cloud of a copy of the points; it accepts neither read-only nor float32 arrays."""
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(_finite(xyz).copy()))
 
 
 def _finite(xyz: NDArray[Any]) -> Float64:
-    """The points as float64, if they are all finite."""
+    """The points as float64, checked to be finite."""
     points = np.asarray(xyz, dtype=np.float64)
     if not np.isfinite(points).all():
         raise ShapeError("a point of the cloud is not finite")
@@ -195,6 +194,6 @@ def _mask(index: Any, length: int) -> Bool:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep Open3D's warnings off standard output; what matters is checked and raised."""
+    """Keep Open3D's warnings off standard output; errors that matter are checked and raised."""
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         yield

@@ -1,4 +1,4 @@
-"""Open3D's mesh files and mesh surgery: arrays in, arrays out, its complaints turned into ours."""
+"""Open3D's mesh files and mesh processing: arrays in, arrays out, its errors converted to ours."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from recon.structures.arrays import Float32, Int32
 
 
 def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
-    """Write OBJ or STL, as the suffix says.
+    """Write OBJ or STL, chosen by the suffix.
 
     Raises:
         OutputError: Open3D could not write the file.
@@ -30,15 +30,15 @@ def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
 
 
 def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
-    """Read OBJ, STL, GLB and what else Open3D knows by its suffix.
+    """Read OBJ, STL, GLB or another format that Open3D knows, chosen by the suffix.
 
     Raises:
-        FormatError: Open3D found no triangle in the file.
+        FormatError: Open3D found no triangles in the file.
     """
     with _quiet():
         mesh = o3d.io.read_triangle_mesh(Path(path))
     if not mesh.has_triangles():
-        raise FormatError("the file holds no triangle that Open3D can read", where=path)
+        raise FormatError("the file has no triangles that Open3D can read", where=path)
     return TriangleMesh(
         vertices=np.asarray(mesh.vertices).astype(np.float32),
         faces=np.asarray(mesh.triangles).astype(np.int32),
@@ -48,14 +48,14 @@ def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
 
 
 def component_labels(vertices: NDArray[Any], faces: NDArray[Any]) -> tuple[Int32, Int32]:
-    """Which connected component each face belongs to.
+    """Label the connected components of a mesh.
 
     Args:
         vertices: (V, 3).
         faces: int (F, 3).
 
     Returns:
-        int32 (F,) number of the component of each face, and int32 (C,) faces of each component.
+        int32 (F,), component of each face, and int32 (C,), number of faces of each component.
     """
     with _quiet():
         labels, sizes, _ = _surface(vertices, faces).cluster_connected_triangles()
@@ -65,10 +65,10 @@ def component_labels(vertices: NDArray[Any], faces: NDArray[Any]) -> tuple[Int32
 def decimate(
     vertices: NDArray[Any], faces: NDArray[Any], target_faces: int
 ) -> tuple[Float32, Int32]:
-    """Collapse edges until about ``target_faces`` are left, keeping shape and border.
+    """Collapse edges until about ``target_faces`` are left, preserving shape and border.
 
     Raises:
-        MeshingError: Nothing is left.
+        MeshingError: No face is left.
 
     Ref: Garland & Heckbert, "Surface simplification using quadric error metrics", 1997.
     """
@@ -85,7 +85,7 @@ def decimate(
 
 
 def _surface(vertices: NDArray[Any], faces: NDArray[Any]) -> Any:
-    """Open3D's mesh of copies; it takes neither read-only nor single-precision arrays."""
+    """Open3D mesh of copies; it accepts neither read-only nor float32 arrays."""
     return o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(np.array(vertices, dtype=np.float64)),
         o3d.utility.Vector3iVector(np.array(faces, dtype=np.int32)),
@@ -117,6 +117,6 @@ def _colours(mesh: Any) -> NDArray[np.uint8] | None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep Open3D's warnings off standard output; what matters is checked and raised."""
+    """Keep Open3D's warnings off standard output; errors that matter are checked and raised."""
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         yield

@@ -1,4 +1,4 @@
-"""Open3D's pose graph: arrays in, arrays out, its complaints turned into ours."""
+"""Open3D's pose graph optimisation: arrays in, arrays out, its errors converted to ours."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from recon.structures.arrays import Float64, freeze
 
 @dataclass(frozen=True, eq=False)
 class PoseEdge:
-    """What is known about two nodes.
+    """Relative pose constraint between two nodes.
 
     Attributes:
-        first: Number of the one node.
-        last: Number of the other.
+        first: Index of one node.
+        last: Index of the other node.
         T_first_last: float64 (4, 4).
-        information: float64 (6, 6) of a step (translation in metres, rotation vector in radians).
-        doubtful: Whether the edge may be wrong altogether, and so may be switched off.
+        information: float64 (6, 6), information matrix of a step (translation in metres, rotation
+            vector in radians).
+        doubtful: Whether the edge may be an outlier, which the optimiser may switch off.
     """
 
     first: int
@@ -39,18 +40,18 @@ class PoseEdge:
 def optimise_poses(
     T_world_node: Float64, edges: Sequence[PoseEdge], half_chi2: float
 ) -> tuple[Float64, Float64]:
-    """Move nodes to where all edges agree best; the first one stays.
+    """Optimise a pose graph; the first node is fixed.
 
     Args:
-        T_world_node: float64 (N, 4, 4), where to begin.
-        edges: What is known; a doubtful edge of misfit ``half_chi2`` counts a quarter.
-        half_chi2: See there.
+        T_world_node: float64 (N, 4, 4), initial poses.
+        edges: The constraints.
+        half_chi2: Misfit at which the weight of a doubtful edge has dropped to a quarter.
 
     Returns:
         The poses, float64 (N, 4, 4), and the weight of each edge, float64, in [0, 1].
 
     Raises:
-        RegistrationError: Open3D gives a pose that is not finite.
+        RegistrationError: Open3D returns a pose that is not finite.
 
     Ref:
         Choi, Zhou, Koltun, "Robust reconstruction of indoor scenes", CVPR 2015.
@@ -61,7 +62,7 @@ def optimise_poses(
         graph.nodes.append(registration.PoseGraphNode(np.array(T)))
     for edge in edges:
         graph.edges.append(_edge(edge))
-    # Open3D scales its switches by the mean of what it takes for a number of points.
+    # Open3D scales its line process by the mean of what it assumes to be a number of points.
     scale = float(np.mean([edge.information[2, 2] for edge in edges]))
     option = registration.GlobalOptimizationOption(
         max_correspondence_distance=1.0,
@@ -80,7 +81,7 @@ def optimise_poses(
 
 
 def _edge(edge: PoseEdge) -> Any:
-    # Open3D's steps begin with the rotation; ours with the translation.
+    # Open3D's steps begin with the rotation, ours with the translation.
     order = [3, 4, 5, 0, 1, 2]
     information = np.array(edge.information)[np.ix_(order, order)]
     return o3d.pipelines.registration.PoseGraphEdge(

@@ -1,4 +1,4 @@
-"""Open3D ray casting (Embree): which triangle does a ray meet first, and is a point in sight?"""
+"""Open3D's ray casting (Embree): first triangle hit by a ray, and visibility tests."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _NO_HIT = np.uint32(0xFFFFFFFF)
 
 
 class RayScene:
-    """A set of triangles that rays are cast at.
+    """A set of triangles for ray casting.
 
-    Open3D works in single precision. It is asked for the triangle alone; whoever needs an exact
-    distance intersects the ray with that triangle's plane in double precision.
+    Open3D computes in single precision and returns only the triangle; for an exact distance,
+    intersect the ray with the plane of that triangle in double precision.
 
     Args:
         triangles: (F, 3, 3) corners, metres.
-        threads: Threads of a cast; 0 = one per core. The answer does not depend on it.
+        threads: Number of threads; 0 = one per core. The result does not depend on it.
 
     Raises:
         ShapeError: There is no triangle, or a corner is not finite.
@@ -46,11 +46,11 @@ class RayScene:
         """The first triangle on each ray.
 
         Args:
-            origin: (3,), where all rays start.
-            directions: (N, 3), any length but zero.
+            origin: (3,), common origin of the rays.
+            directions: (N, 3), of any nonzero length.
 
         Returns:
-            int32 (N,), index of the triangle; -1 = the ray meets nothing.
+            int32 (N,), index of the triangle; -1 = the ray hits nothing.
         """
         hits = self._scene.cast_rays(_rays(origin, directions), nthreads=self._threads)
         faces = hits["primitive_ids"].numpy()
@@ -59,13 +59,13 @@ class RayScene:
     def blocked(
         self, origins: NDArray[Any], reaches: NDArray[Any], near: float = 0.0, far: float = 1.0
     ) -> Bool:
-        """Whether anything stands on the segment from ``origin`` to ``origin + reach``.
+        """Whether a triangle intersects the segment from ``origin`` to ``origin + reach``.
 
         Args:
             origins: (3,) or (N, 3), metres.
             reaches: (N, 3), metres.
-            near: Share of the reach at which the segment begins.
-            far: Share of the reach at which it ends; below 1 spares the surface it ends on.
+            near: Fraction of the reach at which the segment begins.
+            far: Fraction of the reach at which it ends; below 1 ignores the surface it ends on.
 
         Returns:
             bool (N,).

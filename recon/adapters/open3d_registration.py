@@ -1,4 +1,4 @@
-"""Open3D's ICP: arrays in, a transform out, its complaints turned into ours."""
+"""Open3D's ICP: arrays in, a transform out, its errors converted to ours."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ _CONVERGED = 1e-7
 def icp(
     xyz: NDArray[Any], reference_xyz: NDArray[Any], reaches_m: tuple[float, ...]
 ) -> tuple[Float64, float]:
-    """Move points rigidly onto the surfaces that reference points were sampled from.
+    """Align points to a reference cloud by robust point-to-plane ICP.
 
     Args:
-        xyz: (N, 3), metres, finite, roughly in place.
+        xyz: (N, 3), metres, finite, roughly aligned.
         reference_xyz: (M, 3), metres, finite.
-        reaches_m: How far a point may be from its partner, one pass for each, falling.
+        reaches_m: Maximum correspondence distance of each pass, decreasing.
 
     Returns:
-        float64 (4, 4), ``T_reference_points``, and the share of the points that have a partner
-        within the last reach.
+        float64 (4, 4), ``T_reference_points``, and the share of the points that have a
+        correspondence in the last pass.
 
     Raises:
-        RegistrationError: No point has a partner, or Open3D finds no motion.
+        RegistrationError: No point has a correspondence, or Open3D finds no transform.
 
     Ref: Chen & Medioni, "Object modelling by registration of multiple range images", 1992;
     robust weights: Babin et al., "Analysis of robust functions for registration algorithms", 2019.
     """
     registration = o3d.pipelines.registration
-    # Far from the origin a rotation about it moves everything: both clouds come to the middle.
+    # Far from the origin, a small rotation about it is a large motion: centre both clouds.
     centre = np.mean(reference_xyz, axis=0, dtype=np.float64)
     source, target = _cloud(xyz - centre), _cloud(reference_xyz - centre)
     criteria = registration.ICPConvergenceCriteria(_CONVERGED, _CONVERGED, _ITERATIONS)
@@ -51,7 +51,7 @@ def icp(
             T, fitness = np.asarray(found.transformation).copy(), float(found.fitness)
             if fitness == 0 or not np.isfinite(T).all():
                 raise RegistrationError(
-                    "ICP found no partners for the points",
+                    "ICP found no corresponding points",
                     expected=f"clouds within {reach_m:g} m of each other",
                 )
     there, back = np.eye(4), np.eye(4)

@@ -1,4 +1,4 @@
-"""ChArUco boards: OpenCV's dictionaries, its board and its detector."""
+"""OpenCV's ChArUco boards: marker dictionaries, board layout and detector."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from recon.errors import SettingsError
 from recon.structures.arrays import Float64, Int32, UInt8
 from recon.structures.board import CalibrationBoard
 
-# Sub-pixel corners of a quarter of a square are refined later, with a window that fits the view.
 _PREFIX: Final = "DICT_"
 
 
 def dictionary_names() -> list[str]:
-    """Names of OpenCV's marker dictionaries, in capitals, without ``DICT_``."""
+    """Names of OpenCV's marker dictionaries, in upper case, without ``DICT_``."""
     return sorted({n[len(_PREFIX) :].upper() for n in dir(cv2.aruco) if n.startswith(_PREFIX)})
 
 
 def dark_rectangles(board: CalibrationBoard) -> Float64:
-    """float64 (M, 4), all that is dark on a board: x0, y0, x1, y1 in metres.
+    """float64 (M, 4), the dark rectangles of a board: x0, y0, x1, y1 in metres.
 
     The origin is the first inner corner, as in `CalibrationBoard.corners_m`.
 
@@ -38,7 +37,7 @@ def dark_rectangles(board: CalibrationBoard) -> Float64:
     for number, corners in zip(charuco.getIds().ravel(), charuco.getObjPoints(), strict=True):
         markers.append(_marker_cells(board, int(number), np.asarray(corners)[:, :2]))
     columns, rows = board.squares
-    # OpenCV's boards begin with a dark square at the upper left corner, older ones ended so.
+    # OpenCV's boards have a dark square at the upper left corner, legacy ones at the lower left.
     light = 1 if board.legacy and rows % 2 == 0 else 0
     dark = [(x, y) for y in range(rows) for x in range(columns) if (x + y) % 2 == light]
     low = np.array(dark, dtype=np.float64) * board.square_m
@@ -47,10 +46,11 @@ def dark_rectangles(board: CalibrationBoard) -> Float64:
 
 
 def find_charuco(grey: UInt8, board: CalibrationBoard) -> tuple[Int32, Float64]:
-    """Find the inner corners of a ChArUco board, which may be seen in part.
+    """Find the inner corners of a ChArUco board, which may be partly visible.
 
     Returns:
-        Numbers int32 (N,) into `CalibrationBoard.corners_m`, and pixels float64 (N, 2).
+        int32 (N,), indices into `CalibrationBoard.corners_m`, and float64 (N, 2), pixels before
+        refinement.
 
     Raises:
         SettingsError: The dictionary is unknown, or too small for the board.
@@ -65,7 +65,7 @@ def find_charuco(grey: UInt8, board: CalibrationBoard) -> tuple[Int32, Float64]:
 
 
 def find_markers(grey: UInt8, dictionary: str) -> Int32:
-    """int32 (N,), numbers of the markers of a dictionary that a picture shows."""
+    """int32 (N,), ids of the markers of a dictionary found in an image."""
     detector = cv2.aruco.ArucoDetector(_dictionary(dictionary))
     numbers = detector.detectMarkers(grey)[1]
     return np.zeros(0, np.int32) if numbers is None else np.asarray(numbers, np.int32).ravel()
@@ -81,7 +81,7 @@ def _dictionary(name: str) -> Any:
     number = getattr(cv2.aruco, f"{_PREFIX}{name}", None)
     if number is None:
         raise SettingsError(
-            "unknown dictionary of markers", got=name, expected=", ".join(dictionary_names())
+            "unknown marker dictionary", got=name, expected=", ".join(dictionary_names())
         )
     return cv2.aruco.getPredefinedDictionary(number)
 
@@ -102,7 +102,7 @@ def _charuco(board: CalibrationBoard) -> Any:
 
 
 def _marker_cells(board: CalibrationBoard, number: int, corners: Float64) -> Float64:
-    """Dark cells (M, 4) of one marker whose corners (4, 2) are known, metres."""
+    """float64 (M, 4), dark cells of the marker with the given corners (4, 2), metres."""
     dictionary = _dictionary(board.dictionary)
     cells = dictionary.markerSize + 2
     bits = cv2.aruco.generateImageMarker(dictionary, number, cells)

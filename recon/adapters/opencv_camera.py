@@ -1,4 +1,4 @@
-"""Live cameras through OpenCV. A video file stands in for one."""
+"""Live cameras through OpenCV; a video file can take the place of a camera."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ import numpy as np
 from recon.errors import SourceError
 from recon.structures.arrays import UInt8
 
-# V4L2's menu of exposure modes: 1 = manual, 3 = automatic.
+# V4L2's exposure modes: 1 = manual, 3 = automatic.
 _MANUAL: Final = 1
 
 
 class Camera(Protocol):
-    """What a capture needs of a camera."""
+    """Interface of a camera for capture."""
 
     name: str
     live: bool
 
     @property
     def rate_hz(self) -> float:
-        """Frames per second; NaN where the driver does not tell."""
+        """Frames per second; NaN if the driver does not report it."""
         ...
 
     def grab(self) -> float | None:
-        """Take the next frame without decoding it; its time in seconds, None = no more."""
+        """Grab the next frame without decoding it; its time in seconds, None = end."""
         ...
 
     def retrieve(self) -> UInt8:
-        """Decode the frame that was grabbed: uint8 (H, W, 3) RGB."""
+        """Decode the grabbed frame: uint8 (H, W, 3) RGB."""
         ...
 
     def lock(self, exposure: float | None) -> float | None:
-        """Hold exposure and white balance; the exposure, None = the driver cannot."""
+        """Fix exposure and white balance; the exposure, None = not supported by the driver."""
         ...
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
         ...
 
 
@@ -49,15 +49,15 @@ class OpenCvCamera:
 
     Args:
         device: ``0``, ``/dev/video0`` or a file.
-        size: Width and height to ask for; None = as it is.
-        rate_hz: Frames per second to ask for; None = as it is.
+        size: Width and height to request; None = unchanged.
+        rate_hz: Frames per second to request; None = unchanged.
 
     Attributes:
         name: The device as given.
         live: False for a file.
 
     Raises:
-        SourceError: The device cannot be opened, or cannot give that size.
+        SourceError: The device cannot be opened, or does not support that size.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class OpenCvCamera:
         number = int(device) if device.isdigit() else None
         log = cv2.utils.logging
         before = log.getLogLevel()
-        log.setLogLevel(log.LOG_LEVEL_SILENT)  # what it writes is raised as an error below
+        log.setLogLevel(log.LOG_LEVEL_SILENT)  # a failure is raised as an error below
         try:
             self._capture = cv2.VideoCapture(device if number is None else number)
         finally:
@@ -78,37 +78,37 @@ class OpenCvCamera:
                 "camera cannot be opened",
                 where=device,
                 expected=f"one of {found}" if found else "a camera: there is no /dev/video*",
-                hint="another program may use it",
+                hint="another program may be using it",
             )
         if self.live:
             self._ask(size, rate_hz)
 
     @property
     def rate_hz(self) -> float:
-        """Frames per second; NaN where the driver does not tell."""
+        """Frames per second; NaN if the driver does not report it."""
         rate = self._capture.get(cv2.CAP_PROP_FPS)
         return float(rate) if rate > 0 else float("nan")
 
     def grab(self) -> float | None:
-        """Take the next frame without decoding it.
+        """Grab the next frame without decoding it.
 
         Returns:
-            When it was taken, as the driver says, in seconds of the machine's monotonic clock; of
-            a file its position. None = there is no more.
+            Time of the frame according to the driver, in seconds of the machine's monotonic clock;
+            for a file, its position. None = end of the stream.
         """
         if not self._capture.grab():
             return None
         now_s = time.monotonic()
         stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-        # A driver without stamps says 0, or counts from somewhere else.
+        # A driver without timestamps returns 0, or uses another clock.
         believed = not self.live or 0 <= now_s - stamp_s < 1
         return float(stamp_s) if believed else now_s
 
     def retrieve(self) -> UInt8:
-        """Decode the frame that was grabbed: uint8 (H, W, 3) RGB.
+        """Decode the grabbed frame: uint8 (H, W, 3) RGB.
 
         Raises:
-            SourceError: It cannot be decoded.
+            SourceError: The frame cannot be decoded.
         """
         done, image = self._capture.retrieve()
         if not done:
@@ -116,13 +116,13 @@ class OpenCvCamera:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
     def lock(self, exposure: float | None) -> float | None:
-        """Hold exposure and white balance.
+        """Fix exposure and white balance.
 
         Args:
-            exposure: Of the other camera, in the driver's unit; None = as it is now.
+            exposure: Exposure of the other camera, in the driver's unit; None = keep the current.
 
         Returns:
-            The exposure that is held; None = the driver cannot.
+            The fixed exposure; None = not supported by the driver.
         """
         if not self.live:
             return None
@@ -134,7 +134,7 @@ class OpenCvCamera:
         return float(value) if held else None
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
         self._capture.release()
 
     def _ask(self, size: tuple[int, int] | None, rate_hz: float | None) -> None:
@@ -148,7 +148,7 @@ class OpenCvCamera:
         given = tuple(int(self._capture.get(key)) for key in keys)
         if given != size:
             raise SourceError(
-                "camera cannot give this size",
+                "camera does not support this image size",
                 where=self.name,
                 got=f"{given[0]}x{given[1]}",
                 expected=f"{size[0]}x{size[1]}",

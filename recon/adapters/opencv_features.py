@@ -1,7 +1,6 @@
-"""Features that two pictures share, wherever they lie: mutual, distinct matches of ORB or SIFT.
+"""Feature matching between two images: mutual, distinctive matches of ORB or SIFT.
 
-It stands here because two stages use it: rectification inspects pairs with it, and odometry finds
-its place again.
+An adapter because two stages need it: rectification to inspect pairs, odometry to relocalise.
 """
 
 from __future__ import annotations
@@ -16,27 +15,27 @@ from numpy.typing import NDArray
 from recon.structures.arrays import Float32, UInt8
 
 _RATIO: Final = 0.8
-"""Lowe's ratio: the best match must be so much nearer than the second best."""
+"""Lowe's ratio test: the best distance must be below this share of the second best."""
 
 _ROUGH_PX: Final = 3.0
-"""Features of coarse pyramid levels are a few pixels off; farther is another thing."""
+"""Features of coarse pyramid levels are a few pixels off; larger shifts are wrong matches."""
 
 
 def match_features(
     first: UInt8, second: UInt8, count: int, *, any_scale: bool = False
 ) -> tuple[Float32, Float32]:
-    """Features that both pictures show: mutual best matches that stand out.
+    """Match features between two images: mutual best matches that pass the ratio test.
 
     Args:
         first: uint8 (H, W).
         second: uint8 (H, W).
-        count: Features per picture at most.
-        any_scale: Whether things may be much larger in one of them: SIFT then, which takes ten
-            times as long as ORB.
+        count: Maximum number of features per image.
+        any_scale: Whether the scale may differ much between the images: uses SIFT, which takes
+            ten times as long as ORB.
 
     Returns:
-        float32 (N, 2) and (N, 2), columns and rows in the first and in the second picture, the
-        second to a fraction of a pixel.
+        float32 (N, 2) and (N, 2), columns and rows in the first and in the second image, the
+        second with subpixel accuracy.
 
     Ref:
         Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011;
@@ -56,15 +55,15 @@ def match_features(
     mutual = [(i, j) for i, j in there.items() if back.get(j) == i]
     at = np.array(mutual, dtype=np.int64).reshape(-1, 2)
     matched = uv[at[:, 0]], other_uv[at[:, 1]]
-    # A patch that changed its size cannot be refined by shifting it; SIFT is exact enough.
+    # Tracking cannot refine a patch that changed its scale; SIFT is accurate enough.
     return matched if any_scale else _refined(first, second, *matched)
 
 
 def exposed_as(model: UInt8, image: UInt8) -> UInt8:
-    """A picture at the brightness and contrast of another: tracking takes both for motion.
+    """An image with the brightness and contrast of another, since tracking needs them equal.
 
     Args:
-        model: uint8 (H, W), whose mean and spread are taken over.
+        model: uint8 (H, W), reference for mean and standard deviation.
         image: uint8 (H, W).
     """
     gain = float(model.std()) / max(float(image.std()), 1.0)
@@ -73,14 +72,14 @@ def exposed_as(model: UInt8, image: UInt8) -> UInt8:
 
 
 def _describe(detector: cv2.Feature2D, image: UInt8) -> tuple[Float32, NDArray[Any]]:
-    """Places (N, 2) and descriptors (N, C) of the features of a picture."""
+    """Positions (N, 2) and descriptors (N, C) of the features of an image."""
     keypoints, bits = detector.detectAndCompute(image, None)
     uv = np.array([point.pt for point in keypoints], dtype=np.float32).reshape(-1, 2)
     return uv, np.zeros((0, 1), np.uint8) if bits is None else np.asarray(bits)
 
 
 def _distinct(candidates: Sequence[Sequence[cv2.DMatch]]) -> dict[int, int]:
-    """Best matches that are much better than the second best."""
+    """Best matches that pass the ratio test."""
     return {
         best.queryIdx: best.trainIdx
         for best, second in candidates
@@ -91,7 +90,7 @@ def _distinct(candidates: Sequence[Sequence[cv2.DMatch]]) -> dict[int, int]:
 def _refined(
     first: UInt8, second: UInt8, uv: Float32, other_uv: Float32
 ) -> tuple[Float32, Float32]:
-    """Matches whose place in the second picture is known to a fraction of a pixel."""
+    """Matches with subpixel positions in the second image; those that move too far are dropped."""
     if not len(uv):
         return uv, other_uv
     there, status, _ = cv2.calcOpticalFlowPyrLK(

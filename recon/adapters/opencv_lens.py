@@ -1,4 +1,4 @@
-"""What a lens does to a ray, and its inverse: OpenCV's two models behind one pair of functions."""
+"""Projection and its inverse for raw cameras: one interface to OpenCV's two lens models."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from recon.structures.arrays import Float32, Float64
 
 _ORIGIN: Final = np.zeros(3)
 _LARGEST_MISS_PX: Final = 0.01
-"""A ray whose pixel is farther off than this is not the inverse of the lens."""
+"""Largest reprojection error of a correctly inverted ray."""
 
-# OpenCV inverts a lens by iteration and by default stops early (five rounds, 0.01).
+# OpenCV inverts a lens model iteratively, and stops early by default (five iterations, 0.01).
 _EXACT: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
 
 
 def project(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
-    """float64 (N, 2), pixels of points (N, 3) in the camera's axes; NaN at or behind its plane."""
+    """float64 (N, 2), pixels of points (N, 3) in camera axes; NaN at or behind its plane."""
     return project_with_jacobian(camera, xyz)[0]
 
 
 def project_with_jacobian(
     camera: CameraIntrinsics, xyz: NDArray[Any]
 ) -> tuple[Float64, Float64, Float64]:
-    """Project points, and tell how their pixels move.
+    """Project points, with Jacobians.
 
     Args:
         camera: The raw camera.
-        xyz: (N, 3), in its axes.
+        xyz: (N, 3), in camera axes.
 
     Returns:
-        Pixels float64 (N, 2), NaN for points at or behind the camera's plane; their derivatives
-        by the point, (N, 2, 3); and by (fx, fy, cx, cy, distortion …), (N, 2, 4 + D).
+        Pixels float64 (N, 2), NaN for points at or behind the camera's plane; their Jacobians by
+        the point, (N, 2, 3), and by (fx, fy, cx, cy, distortion …), (N, 2, 4 + D).
     """
     points = np.ascontiguousarray(xyz, dtype=np.float64).reshape(-1, 1, 3)
     matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
@@ -44,7 +44,7 @@ def project_with_jacobian(
         pixels, J = cv2.fisheye.projectPoints(points, _ORIGIN, _ORIGIN, matrix, distortion)
         by_point, by_lens = J[:, 11:14], J[:, :8]
     else:
-        # OpenCV has no lens with fewer than four coefficients.
+        # OpenCV needs at least four distortion coefficients.
         padded = distortion if count else np.zeros(4)
         pixels, J = cv2.projectPoints(points, _ORIGIN, _ORIGIN, matrix, padded)
         by_point, by_lens = J[:, 3:6], J[:, 6 : 10 + count]
@@ -54,10 +54,10 @@ def project_with_jacobian(
 
 
 def project_into_picture(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
-    """float64 (N, 2), pixels of points (N, 3) that lie in the picture; NaN for all others.
+    """float64 (N, 2), pixels of points (N, 3) inside the image; NaN for all others.
 
-    Far outside the picture the polynomials of a lens fold back into it: such a pixel's ray does
-    not lead to the point, and it is NaN too.
+    Far outside the field of view, the distortion polynomial may fold points back into the image;
+    the ray of such a pixel does not lead to the point, and it is NaN too.
     """
     pixels = project(camera, xyz)
     limit = np.array([camera.width_px - 1, camera.height_px - 1])
@@ -69,9 +69,9 @@ def project_into_picture(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64
 
 
 def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
-    """float64 (N, 3), the rays of pixels (N, 2) in the camera's axes, with z = 1.
+    """float64 (N, 3), the rays of pixels (N, 2) in camera axes, with z = 1.
 
-    Where the lens model cannot be inverted (outside the picture) the ray is NaN.
+    A ray is NaN where the lens model cannot be inverted (outside the image).
     """
     points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
     matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
@@ -82,7 +82,7 @@ def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
     else:
         plane = cv2.undistortPoints(points, matrix, distortion, criteria=_EXACT)
     rays = np.concatenate([plane.reshape(-1, 2), np.ones((len(points), 1))], axis=1)
-    # OpenCV marks a fisheye's failures with -1e6, and those of other lenses not at all.
+    # OpenCV marks failures of the fisheye model with -1e6, those of other models not at all.
     rays[~(np.abs(rays).max(axis=1) < 1e5)] = np.nan
     if camera.model != "fisheye":
         with np.errstate(invalid="ignore"):
@@ -92,9 +92,9 @@ def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
 
 
 def sees_all(camera: CameraIntrinsics) -> bool:
-    """Whether each pixel on the border of the picture has a ray of its own.
+    """Whether the lens model can be inverted along the whole border of the image.
 
-    The polynomials of a lens were fitted where points were seen; farther out they may turn back.
+    Distortion polynomials are fitted where points were seen; farther out they may fold back.
     """
     w, h = camera.width_px - 1.0, camera.height_px - 1.0
     t = np.linspace(0, 1, 65)
@@ -106,12 +106,12 @@ def sees_all(camera: CameraIntrinsics) -> bool:
 def rectifying_maps(
     camera: CameraIntrinsics, rotation: Float64, matrix: Float64, size: tuple[int, int]
 ) -> tuple[Float32, Float32]:
-    """Columns and rows in the raw picture of each pixel of a turned pinhole view.
+    """Remap tables of a rotated pinhole view: columns and rows in the raw image, float32 (H, W).
 
     Args:
         camera: The raw camera.
-        rotation: float64 (3, 3), from the camera's axes to those of the view.
-        matrix: float64 (3, 3) or (3, 4), the view's pinhole matrix.
+        rotation: float64 (3, 3), from camera axes to those of the view.
+        matrix: float64 (3, 3) or (3, 4), the pinhole matrix of the view.
         size: (width, height) of the view, pixels.
     """
     if camera.model != "fisheye" and not sees_all(camera):
@@ -135,7 +135,7 @@ def rectifying_maps(
 def _without_folds(
     camera: CameraIntrinsics, rotation: Float64, matrix: Float64, size: tuple[int, int]
 ) -> tuple[Float32, Float32]:
-    """Maps that lead nowhere, (-1, -1), where a lens folds back into its picture."""
+    """Remap tables that are (-1, -1) where the lens model folds back into the image."""
     x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
     rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]).astype(np.float64)
     xyz = (np.linalg.inv(rotation) @ np.linalg.inv(matrix[:, :3]) @ rays).T

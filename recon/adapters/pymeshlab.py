@@ -1,8 +1,8 @@
-"""Screened Poisson by pymeshlab, in a process of its own.
+"""Screened Poisson reconstruction by pymeshlab, in a child process.
 
-MeshLab's Poisson may abort the process, exhaust its memory, print, and leave it in a deleted
-working directory. In a child that ends after one surface none of this reaches the caller; it
-costs about half a second. The arrays go there and back as files in a temporary folder.
+MeshLab's Poisson may abort the process, exhaust its memory, print, or leave it in a deleted
+working directory. A child process for each surface shields the caller from this; it costs about
+half a second. Arrays are exchanged as files in a temporary folder.
 """
 
 from __future__ import annotations
@@ -32,32 +32,32 @@ def screened_poisson(
     samples_per_node: float,
     point_weight: float,
 ) -> tuple[Float32, Int32, Float32]:
-    """The closed surface whose normals fit the points best.
+    """Closed surface through oriented points.
 
     Args:
         xyz: (N, 3), metres, finite.
         normals: (N, 3), unit, finite, outwards.
         depth: Depth of the octree: the surface has at most 2^depth cells along its longest side.
-        samples_per_node: Points that a cell of the octree should hold; more for noisy points.
-        point_weight: Weight of passing through the points against following the normals.
+        samples_per_node: Minimum number of points per octree cell; larger for noisy points.
+        point_weight: Weight of interpolating the points relative to fitting the normals.
 
     Returns:
-        float32 (V, 3) vertices, int32 (F, 3) faces, and float32 (V,) density of the points
-        around each vertex, in octree levels (one more = four times as dense).
+        float32 (V, 3) vertices, int32 (F, 3) faces, and float32 (V,) point density around each
+        vertex, in octree levels (one level more = four times as dense).
 
     Raises:
-        MeshingError: A point or normal is not finite, MeshLab failed or ran out of memory, or
+        MeshingError: A point or normal is not finite, or MeshLab failed, ran out of memory or
             found no surface.
     """
-    # One NaN can make MeshLab return nothing, or a surface that is wrong everywhere.
+    # A single NaN can make MeshLab return nothing, or a surface that is wrong everywhere.
     if not (np.isfinite(xyz).all() and np.isfinite(normals).all()):
         raise MeshingError("a point or normal of the cloud is not finite")
     options = {
         "depth": depth,
         "samplespernode": samples_per_node,
         "pointweight": point_weight,
-        # More threads give another result each time, and wait by spinning: on a busy machine two
-        # of them took twenty times as long as one.
+        # More threads make the result non-deterministic, and busy-wait: on a loaded machine, two
+        # took twenty times as long as one.
         "threads": 1,
         "preclean": True,
     }
@@ -77,8 +77,8 @@ def screened_poisson(
 
 
 def _run_child(folder: str, options: dict[str, Any]) -> None:
-    """Run this module as a program on the files of a folder."""
-    # The child must find this package however the parent found it.
+    """Run this module as a program on the files in a folder."""
+    # The child must be able to import this package however the parent found it.
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     child = subprocess.run(
         [sys.executable, "-m", __name__, folder, json.dumps(options)],
@@ -99,8 +99,8 @@ def _run_child(folder: str, options: dict[str, Any]) -> None:
 
 
 def _reconstruct(folder: Path, options: dict[str, Any]) -> None:
-    """What the child does: points.npz in, surface.npz out."""
-    import pymeshlab  # noqa: PLC0415 - only the child pays for it
+    """Work of the child process: points.npz in, surface.npz out."""
+    import pymeshlab  # noqa: PLC0415 - only the child needs this slow import
 
     with np.load(folder / _POINTS) as points:
         cloud = pymeshlab.Mesh(

@@ -1,7 +1,7 @@
-"""OctoMap trees through pyoctomap: a file in, arrays out.
+"""OctoMap files through pyoctomap: a file in, arrays out.
 
-OctoMap counts cells as we do: cell ``k`` spans ``[k, k + 1) · resolution`` (its own keys are
-shifted by 2^15), so nothing is resampled.
+OctoMap's voxel grid is the same as ours: voxel ``k`` spans ``[k, k + 1) · resolution`` (its own
+keys are offset by 2^15), so nothing is resampled.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from recon.structures.arrays import Float32, Int32
 
 
 def decode_octomap(path: Path) -> tuple[Int32, Float32, float]:
-    """Cells, log-odds and resolution of a ``.bt`` file.
+    """Voxels, log-odds and resolution of a ``.bt`` file.
 
-    Pruned leaves are expanded into the cells that they stand for.
+    Pruned leaves are expanded into the voxels that they cover.
 
     Raises:
-        FormatError: The file is missing or is no OctoMap.
+        FormatError: The file is missing, damaged or not an OctoMap.
     """
     tree = _read_tree(path)
     leaves = [
@@ -37,7 +37,7 @@ def decode_octomap(path: Path) -> tuple[Int32, Float32, float]:
 
 
 def _read_tree(path: Path) -> Any:
-    """The tree of a file, whole."""
+    """Read the tree of a file and check that it is complete."""
     first = _first_line(path)
     if first != b"# Octomap OcTree binary file":
         raise FormatError(
@@ -60,7 +60,7 @@ def _first_line(path: Path) -> bytes:
 def _expand(
     centres: NDArray[np.float64], sizes: NDArray[np.float64], resolution_m: float
 ) -> tuple[Int32, NDArray[np.intp]]:
-    """Cells of leaves of any size, and the leaf that each belongs to."""
+    """Voxels of leaves of any size, and the index of the leaf of each."""
     edges = np.rint(sizes / resolution_m).astype(np.int64)
     corners = np.rint(centres / resolution_m - edges[:, None] / 2).astype(np.int64)
     keys, source = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.intp)]

@@ -1,7 +1,7 @@
-"""Bags of ROS 1 (.bag), ROS 2 (a folder, .db3) and MCAP, read with rosbags: no ROS is needed.
+"""Bags of ROS 1 (.bag), ROS 2 (a folder, .db3) and MCAP, read with rosbags, without ROS.
 
-Only the three kinds of message that a stereo source needs are looked at, so a bag may hold any
-other kinds, known or not. What rosbags and the libraries below it raise becomes a `FormatError`.
+Only the three message types that a stereo source needs are read; a bag may contain any others,
+known or not. Exceptions of rosbags and its dependencies become a `FormatError`.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ _NS_PER_S: Final = 1_000_000_000
 
 @dataclass(frozen=True)
 class BagTopic:
-    """One topic of a kind that is understood.
+    """One topic of a supported message type.
 
     Attributes:
-        name: Its name.
+        name: Name of the topic.
         kind: `IMAGE`, `COMPRESSED` or `CAMERA_INFO`.
-        messages: How many messages it has.
+        messages: Number of messages.
     """
 
     name: str
@@ -45,15 +45,15 @@ class BagTopic:
 
 @dataclass(frozen=True, eq=False)
 class BagImage:
-    """A picture as it was recorded; a compressed one has an encoding alone.
+    """An image as recorded; a compressed image has only ``encoding`` and ``data``.
 
     Attributes:
-        encoding: ROS's name: ``mono8``, ``bgr8`` …; of a compressed one its ``format``.
+        encoding: ROS's encoding, such as ``mono8`` or ``bgr8``; ``format`` of a compressed image.
         data: The bytes.
-        width_px: Width; 0 where compressed.
-        height_px: Height; 0 where compressed.
-        step: Bytes per row; 0 where compressed.
-        big_endian: Order of bytes of 16-bit pixels.
+        width_px: Width; 0 if compressed.
+        height_px: Height; 0 if compressed.
+        step: Bytes per row; 0 if compressed.
+        big_endian: Whether 16-bit pixels are big-endian.
     """
 
     encoding: str
@@ -69,8 +69,8 @@ class BagCameraInfo:
     """``sensor_msgs/CameraInfo``.
 
     Attributes:
-        width_px: Width of the pictures.
-        height_px: Height of the pictures.
+        width_px: Width of the images.
+        height_px: Height of the images.
         model: Name of the lens model.
         D: float64 (N,), distortion.
         K: float64 (3, 3), the raw camera.
@@ -94,11 +94,11 @@ class Bag:
         paths: ROS 1 files that belong together, or one folder or file of ROS 2.
 
     Attributes:
-        topics: The topics that are understood, by name.
+        topics: The topics of supported types, by name.
 
     Raises:
         MissingDependencyError: rosbags is not installed.
-        FormatError: The recording is missing, cut off or damaged.
+        FormatError: The recording is missing, truncated or damaged.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -112,14 +112,14 @@ class Bag:
         self.topics = self._list_topics()
 
     def scan(self, topics: Sequence[str]) -> dict[str, NDArray[np.int64]]:
-        """Read the times of all messages of some topics, and nothing else of them.
+        """Read only the times of all messages of some topics.
 
         Returns:
-            For each topic int64 (N, 2), nanoseconds: when recorded, and the header's stamp;
-            in the order of recording.
+            For each topic int64 (N, 2), nanoseconds: time of recording and header stamp, in the
+            order of recording.
 
         Raises:
-            FormatError: The recording is cut off or damaged.
+            FormatError: The recording is truncated or damaged.
         """
         times: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
         for topic, recorded_ns, content in self._messages(topics):
@@ -129,14 +129,14 @@ class Bag:
         }
 
     def images(self, topic: str, start_ns: int | None = None) -> Iterator[BagImage]:
-        """Yield the pictures of a topic in the order of recording.
+        """Yield the images of a topic in the order of recording.
 
         Args:
             topic: An image topic.
-            start_ns: Skip what was recorded before.
+            start_ns: Skip messages recorded before this time.
 
         Raises:
-            FormatError: The recording is cut off or damaged.
+            FormatError: The recording is truncated or damaged.
         """
         compressed = self.topics[topic].kind == COMPRESSED
         for _, _, content in self._messages([topic], start_ns):
@@ -154,14 +154,14 @@ class Bag:
                 )
 
     def camera_info(self, topic: str) -> BagCameraInfo:
-        """Read the first message of a camera's calibration.
+        """Read the first message of a ``CameraInfo`` topic.
 
         Raises:
-            FormatError: There is none, or the recording is damaged.
+            FormatError: There is no message, or the recording is damaged.
         """
         for _, _, content in self._messages([topic]):
             message = self._parse(content, topic)
-            # ROS 1 writes the matrices' names in capitals.
+            # ROS 1 has upper-case field names.
             matrix = {
                 name: np.array(getattr(message, name if self._ros1 else name.lower()))
                 for name in "DKRP"
@@ -179,7 +179,7 @@ class Bag:
 
     def _list_topics(self) -> dict[str, BagTopic]:
         found: dict[str, BagTopic] = {}
-        with self._telling(), self._opened() as readers:
+        with self._our_errors(), self._opened() as readers:
             for connection in (c for reader in readers for c in reader.connections):
                 name, kind = connection.topic, connection.msgtype
                 if kind in {IMAGE, COMPRESSED, CAMERA_INFO}:
@@ -191,7 +191,7 @@ class Bag:
         self, topics: Sequence[str], start_ns: int | None = None
     ) -> Iterator[tuple[str, int, bytes]]:
         """Topic, time of recording and content of each message, in that order."""
-        with self._telling(), self._opened() as readers:
+        with self._our_errors(), self._opened() as readers:
             streams = []
             for reader in readers:
                 wanted = [c for c in reader.connections if c.topic in topics]
@@ -202,18 +202,18 @@ class Bag:
 
     def _parse(self, content: bytes, topic: str) -> Any:
         kind = self.topics[topic].kind
-        with self._telling():
+        with self._our_errors():
             if self._ros1:
                 return self._store.deserialize_ros1(content, kind)
             return self._store.deserialize_cdr(content, kind)
 
     def _stamp_ns(self, content: bytes, topic: str) -> int:
-        """The header's stamp: every kind here begins with a header."""
+        """The header stamp: all supported types begin with a header."""
         try:
             if self._ros1:
                 _, seconds, nanoseconds = struct.unpack_from("<III", content)
             else:
-                # CDR's second byte tells the order of bytes.
+                # The second byte of CDR gives the byte order.
                 order = "<" if content[1] & 1 else ">"
                 seconds, nanoseconds = struct.unpack_from(order + "iI", content, 4)
         except (struct.error, IndexError) as error:
@@ -228,8 +228,8 @@ class Bag:
             yield [stack.enter_context(self._reader(path)) for path in self.paths]
 
     @contextmanager
-    def _telling(self) -> Iterator[None]:
-        """Turn whatever a damaged file makes the libraries raise into one line."""
+    def _our_errors(self) -> Iterator[None]:
+        """Convert any exception that a damaged file causes to a `FormatError`."""
         try:
             yield
         except (ReconError, MemoryError):
@@ -239,6 +239,6 @@ class Bag:
                 "recording cannot be read",
                 where=self.paths[0],
                 got=str(error) or type(error).__name__,
-                hint="it may be cut off; copy it again, or mend it with rosbag reindex, "
+                hint="it may be truncated; copy it again, or repair it with rosbag reindex, "
                 "ros2 bag reindex or mcap recover",
             ) from error

@@ -33,7 +33,7 @@ def test_the_motion_between_two_samples_of_a_corner_is_found(away_m: float) -> N
 
 
 def test_clouds_that_are_too_far_apart_are_told() -> None:
-    with pytest.raises(RegistrationError, match="no partners"):
+    with pytest.raises(RegistrationError, match="no corresponding points"):
         icp(corner(0), corner(1) + 100, (2.0, 0.5))
 
 

@@ -151,7 +151,7 @@ def test_no_board_is_seen_in_noise() -> None:
 
 def test_an_unknown_or_small_dictionary_is_refused() -> None:
     blank = np.full((100, 100), 255, np.uint8)
-    with pytest.raises(SettingsError, match=r"unknown dictionary of markers.*4X4_50"):
+    with pytest.raises(SettingsError, match=r"unknown marker dictionary.*4X4_50"):
         find_board(blank, parse_board("charuco:8x6:30mm:22mm:9x9_10"))
     with pytest.raises(SettingsError, match=r"too few markers.*4x4_50 with 50.*at least 96"):
         find_board(blank, parse_board("charuco:16x12:30mm:22mm:4x4_50"))
