@@ -113,9 +113,7 @@ def test_markers_of_another_dictionary_are_told() -> None:
 
 def test_a_charuco_board_of_another_size_is_told() -> None:
     board = parse_board("charuco:5x4:30mm:22mm:5x5_100")
-    with pytest.raises(
-        CalibrationError, match=r"marker ids up to 2\d, expected 0 to 9 for 5x4"
-    ):
+    with pytest.raises(CalibrationError, match=r"marker ids up to 2\d, expected 0 to 9 for 5x4"):
         check_charuco(4, pictures(CHARUCO).__getitem__, board)
 
 

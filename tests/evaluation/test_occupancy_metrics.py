@@ -137,5 +137,5 @@ def test_wrong_comparisons_are_refused() -> None:
     coarse = OccupancyGrid(np.zeros((2, 2), np.int8), 0.4, (0.0, 0.0))
     with pytest.raises(EvaluationError, match="different resolutions"):
         evaluate_occupancy(_voxels(WALL), coarse, _truth())
-    with pytest.raises(EvaluationError, match="nothing often enough"):
+    with pytest.raises(EvaluationError, match="no surface was seen in enough frames"):
         evaluate_occupancy(_voxels(WALL), _truth().grid, _truth(frames=2))
