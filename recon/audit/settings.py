@@ -42,7 +42,7 @@ class AuditSettings(Settings):
         description="Share of negative disparities from which the cameras count as swapped.",
     )
     row_px: float = Field(
-        default=0.75, gt=0, description="Rms row error above which a finding is reported, in pixels."
+        default=0.75, gt=0, description="Rms row error above which it is reported, in pixels."
     )
     bad_row_px: float = Field(
         default=1.5, gt=0, description="Rms row error above which that finding is fatal, in pixels."
@@ -65,7 +65,7 @@ class AuditSettings(Settings):
         description="An image counts as blank below this standard deviation, in grey levels.",
     )
     repeated_share: float = Field(
-        default=0.02, ge=0, lt=1, description="Share of repeated frames above which they are reported."
+        default=0.02, ge=0, lt=1, description="Share of repeated frames that is still accepted."
     )
     frozen_frames: int = Field(
         default=3, ge=2, description="Repeats in a row from which one camera counts as frozen."

@@ -22,7 +22,7 @@ def depth_from_disparity(disparity_px: NDArray[Any], camera: RectifiedCamera) ->
         float32, metres; NaN where the disparity is unknown or not in front of the camera.
     """
     shifted = np.asarray(disparity_px, dtype=np.float64) + camera.doffs_px
-    # Beyond what float32 holds a point is as good as infinitely far.
+    # A depth that overflows float32 is infinite.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         depth = camera.focal_px * camera.baseline_m / shifted
         return np.where(shifted > 0, depth, np.nan).astype(np.float32)

@@ -162,8 +162,8 @@ class Rectifier:
                 where=pair.name or f"frame {pair.index}",
                 got=f"{width_px}x{height_px}",
                 expected=f"{self.camera.width_px}x{self.camera.height_px}",
-                hint="give pictures as they were calibrated, not resized, cropped or turned, or "
-                "the calibration of these",
+                hint="use images as they were calibrated (not resized, cropped or rotated), or a "
+                "calibration of these images",
             )
 
 
