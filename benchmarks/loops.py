@@ -26,7 +26,13 @@ from recon.evaluation import evaluate_map
 from recon.geometry import se3
 from recon.geometry.alignment import fit_points
 from recon.geometry.transform import transform_cloud
-from recon.mapping import add_floor, estimate_ground_surface, flatten, fusion_range_m
+from recon.mapping import (
+    add_floors,
+    estimate_ground_surface,
+    find_floors,
+    flatten,
+    fusion_range_m,
+)
 from recon.odometry import Odometry, OdometryFrame, OdometryResult, make_odometry
 from recon.pipeline.config import ReconConfig, load_config
 from recon.pipeline.sequence import MappedSequence, map_sequence
@@ -240,7 +246,7 @@ def flat_grid(mapped: MappedSequence) -> OccupancyGrid:
     config, T = mapped.config, mapped.T_map_world
     cloud = transform_cloud(mapped.cloud, T, frame="map")
     path_m = se3.apply(T, mapped.trajectory.positions_m)
-    floor = add_floor(cloud, mapped.voxels, config.ground)
+    floor = add_floors(cloud, find_floors(mapped.voxels), config.ground)
     ground = estimate_ground_surface(floor, path_m, config.ground)
     return flatten(mapped.voxels, ground, config.grid)
 
