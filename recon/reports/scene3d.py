@@ -31,6 +31,7 @@ _BACKGROUND = "#14181d"
 _PATH_COLOURS = ("#ff5252", "#ffb74d", "#81c784")
 _OUTLIER_SHARE = 0.002
 _BEHIND_AND_ABOVE = (-0.95, -1.15, 0.75)
+_FARTHEST_EYE = 2.2  # in units of plotly: a cube of edge 2 then fills most of the view
 _LOOK_AT = (-0.1, -0.1, -0.1)  # nearer than the centre, as near objects fill more of the view
 Json = dict[str, Any]
 
@@ -198,7 +199,9 @@ def _eye(scene: Scene, box: Float64) -> Float64:
     """float64 (3,): viewpoint, in units of plotly relative to the centre of the box."""
     if scene.eye_m is None:
         return np.array(_BEHIND_AND_ABOVE)
-    return np.asarray((np.asarray(scene.eye_m) - box.mean(axis=0)) * _scale(box))
+    eye = (np.asarray(scene.eye_m) - box.mean(axis=0)) * _scale(box)
+    # Seen from the position of a long lens, everything would be small in this wider view.
+    return np.asarray(eye * min(1.0, _FARTHEST_EYE / max(float(np.linalg.norm(eye)), 1e-9)))
 
 
 def _layout(eye: Float64, box: Float64) -> Json:

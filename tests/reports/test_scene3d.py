@@ -84,6 +84,14 @@ def test_eye_in_metres_is_where_the_layout_looks_from() -> None:
     assert eye["y"] == pytest.approx(0.0)
 
 
+def test_what_is_far_off_is_looked_at_from_nearer_in_the_same_direction() -> None:
+    corners = np.array([[0, 0, 0], [1, 1, 1]], dtype=np.float32)
+    scene = Scene(np.eye(4), PointCloud(corners), eye_m=(-9.5, 0.5, 10.5))
+    eye = plot_scene(scene)["layout"]["scene"]["camera"]["eye"]
+    assert eye["x"] == pytest.approx(-eye["z"])
+    assert np.hypot(eye["x"], eye["z"]) == pytest.approx(2.2)
+
+
 def test_a_point_far_from_all_others_does_not_make_the_rest_small(cloud: PointCloud) -> None:
     far = np.concatenate([cloud.xyz, [[1e4, 0, 0]]]).astype(np.float32)
     layout = plot_scene(Scene(np.eye(4), PointCloud(far)))["layout"]["scene"]
