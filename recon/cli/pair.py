@@ -54,18 +54,20 @@ def pair(
       recon pair im0.png im1.png --calib calib.txt --out outputs/motorcycle
       recon pair im0.png im1.png --calib calib.txt --truth disp0GT.pfm
     """
-    del quiet  # there is no progress to hide; every command takes the option
     with session():
         from recon.pipeline.config import PAIR_DEFAULTS, load_config, matching_overrides
         from recon.pipeline.pair_input import read_pair_input
         from recon.pipeline.pair_run import PairOptions, run_pair
         from recon.reports import present_pair
+        from recon.viewers import choose_viewer
 
         overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
         settings = load_config(config, overrides, PAIR_DEFAULTS)
         unit = settings.source.metres_per_unit if unit_m is None else unit_m
         given = read_pair_input(left, right, calib, truth, metres_per_unit=unit)
-        options = PairOptions("pair", out, threads, present_pair)
+        options = PairOptions(
+            "pair", out, threads, present_pair, choose_viewer(quiet=quiet).on_stage
+        )
         run = run_pair(given, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)
 
@@ -95,17 +97,19 @@ def disparity(
       recon disparity left.png right.png --ndisp 128
       recon disparity raw_left.png raw_right.png --calib rig.yaml --matcher sgm
     """
-    del quiet  # there is no progress to hide; every command takes the option
     with session():
         from recon.pipeline.config import PAIR_DEFAULTS, load_config, matching_overrides
         from recon.pipeline.pair_input import read_pair_input
         from recon.pipeline.pair_run import PairOptions, run_pair
         from recon.reports import present_disparity
+        from recon.viewers import choose_viewer
 
         overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
         settings = load_config(config, overrides, PAIR_DEFAULTS)
         unit = settings.source.metres_per_unit
         given = read_pair_input(left, right, calib, metres_per_unit=unit)
-        options = PairOptions("disparity", out, threads, present_disparity)
+        options = PairOptions(
+            "disparity", out, threads, present_disparity, choose_viewer(quiet=quiet).on_stage
+        )
         run = run_pair(given, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

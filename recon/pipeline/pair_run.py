@@ -99,12 +99,19 @@ class PairOptions:
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores. Changes no result.
         present: Writes pictures and the report of the run into its folder.
+        on_stage: Told the name of each stage that may take long when it begins.
     """
 
     command: str = "pair"
     out: Path | None = None
     threads: int | None = None
     present: Callable[[PairRun, RunDirectory], None] | None = None
+    on_stage: Callable[[str], None] | None = None
+
+    def tell(self, stage: str) -> None:
+        """Tell whoever wants to know that a stage begins."""
+        if self.on_stage is not None:
+            self.on_stage(stage)
 
 
 def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> PairRun:
@@ -124,16 +131,18 @@ def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> Pai
             given.calibration, config, threads=threads, stopwatch=watch
         )
         faults = _look(given, config, options, watch)
+        options.tell("match")
         if options.command == "disparity":
             run = _match(given, config, reconstructor)
         else:
-            run = _reconstruct(given, config, reconstructor, watch)
+            run = _reconstruct(given, config, reconstructor, options, watch)
         few = check_found(run.disparity, given.pair, faults)
         run = replace(run, warnings=(*(fault.text for fault in faults), *few, *run.warnings))
         with watch.stage("write"):
             _write(run, directory)
         run.summary.update(cost(watch, time.perf_counter() - start))
         if options.present is not None:
+            options.tell("report")
             with watch.stage("report"):
                 options.present(run, directory)
         run.summary["warnings"] = list(run.warnings)
@@ -167,10 +176,15 @@ def _match(given: PairInput, config: ReconConfig, reconstructor: FrameReconstruc
 
 
 def _reconstruct(
-    given: PairInput, config: ReconConfig, reconstructor: FrameReconstructor, watch: Stopwatch
+    given: PairInput,
+    config: ReconConfig,
+    reconstructor: FrameReconstructor,
+    options: PairOptions,
+    watch: Stopwatch,
 ) -> PairRun:
     """The run of a pair with cloud and mesh; without a mesh it is still a run."""
     frame = reconstructor.reconstruct(given.pair)
+    options.tell("mesh")
     mesh: TriangleMesh | None = None
     warnings = frame.warnings
     try:

@@ -33,6 +33,13 @@ def run(
     return run_pair(PairInput(pair, camera), settings, PairOptions(command, out))
 
 
+def test_stages_that_take_long_are_told_when_they_begin(pair: StereoPair, tmp_path: Path) -> None:
+    told: list[str] = []
+    options = PairOptions("pair", tmp_path / "out", on_stage=told.append)
+    run_pair(PairInput(pair, CAMERA), load_config(None, ["mesh.max_depth=5"]), options)
+    assert told == ["match", "mesh"]  # there is no report to write
+
+
 def test_a_good_pair_is_not_warned_of(pair: StereoPair, tmp_path: Path) -> None:
     assert run(pair, tmp_path / "out").warnings == ()
 
