@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import open3d as o3d
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from recon.errors import SettingsError, ShapeError
 from recon.structures.arrays import Bool, Float32, Float64, Int32
+
+# Open3D searches by squared distances, and float32 ends at 3e38.
+_SEARCHABLE_M: Final = 1e18
 
 
 def voxel_downsample(
@@ -113,11 +116,26 @@ def agree_normals(xyz: NDArray[Any], normals: NDArray[Any], neighbours: int) -> 
 
     Ref: Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992.
     """
-    cloud = _legacy(xyz)
+    try:
+        return _orient(_legacy(xyz), normals, neighbours)
+    except RuntimeError:
+        # Qhull finds no simplex among points of one plane or one sphere; moved a little, it does.
+        return _orient(_legacy(_joggled(xyz)), normals, neighbours)
+
+
+def _orient(cloud: Any, normals: NDArray[Any], neighbours: int) -> Float32:
+    """Open3D's own flipping."""
     cloud.normals = o3d.utility.Vector3dVector(np.array(normals, dtype=np.float64))
     with _quiet():
-        cloud.orient_normals_consistent_tangent_plane(min(neighbours, len(xyz) - 1))
+        cloud.orient_normals_consistent_tangent_plane(min(neighbours, len(cloud.points) - 1))
     return _array(cloud.normals)
+
+
+def _joggled(xyz: NDArray[Any]) -> Float64:
+    """The points, moved by up to a millionth of their extent, the same way each time."""
+    points = _finite(xyz)
+    reach = 1e-6 * float(np.ptp(points, axis=0).max())
+    return points + np.random.default_rng(0).uniform(-reach, reach, points.shape)
 
 
 def nearest(
@@ -135,7 +153,8 @@ def nearest(
         metres, nearest first.
 
     Raises:
-        ShapeError: There are fewer reference points than neighbours, or a point is not finite.
+        ShapeError: There are fewer reference points than neighbours, a point is not finite, or
+            points lie so far apart that float32 cannot hold squared distances.
     """
     if len(reference) < neighbours:
         raise ShapeError(
@@ -146,7 +165,15 @@ def nearest(
         return empty.astype(np.int32), empty.astype(np.float32)
     # Far from the origin, squared float32 distances lose centimetres: centre both clouds.
     centre = np.mean(reference, axis=0, dtype=np.float64)
-    near_origin, points = _tensor(_finite(reference) - centre), _tensor(_finite(query) - centre)
+    moved = [_finite(xyz) - centre for xyz in (reference, query)]
+    farthest_m = max(float(np.abs(xyz).max()) for xyz in moved)
+    if farthest_m > _SEARCHABLE_M:
+        raise ShapeError(
+            "points lie too far apart to be searched",
+            got=f"{farthest_m:.3g} m",
+            expected=f"at most {_SEARCHABLE_M:.0e} m",
+        )
+    near_origin, points = (_tensor(xyz) for xyz in moved)
     with _quiet():
         search = o3d.core.nns.NearestNeighborSearch(near_origin)
         search.knn_index()

@@ -33,6 +33,12 @@ def session() -> Iterator[None]:
         _fail(str(error))
     except MemoryError:
         _fail("out of memory; use smaller images, fewer disparities or a coarser map")
+    except ImportError as error:
+        # Ctrl-C inside a native library that initialises comes out as its failure.
+        if not _interrupted(error):
+            raise
+        typer.echo("interrupted", err=True)
+        raise typer.Exit(INTERRUPTED) from None
     except OSError as error:
         name = f"{error.filename}: " if error.filename else ""
         _fail(f"{name}{error.strerror or error}")
@@ -102,6 +108,14 @@ def _standard_output_kept_clean() -> Iterator[None]:
     finally:
         os.dup2(saved, 1)
         os.close(saved)
+
+
+def _interrupted(error: BaseException) -> bool:
+    """Whether Ctrl-C is what an error came of."""
+    earlier = error.__cause__ or error.__context__
+    if earlier is None:
+        return isinstance(error, KeyboardInterrupt)
+    return isinstance(error, KeyboardInterrupt) or _interrupted(earlier)
 
 
 def _fail(line: str) -> None:

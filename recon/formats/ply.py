@@ -35,6 +35,8 @@ _SCALARS: Final = (
 )
 _FRAME: Final = "frame "
 _PIECE_POINTS: Final = 1 << 19
+# Less than any stereo camera or laser scanner measures.
+_LARGEST_ROUNDING_M: Final = 0.005
 _FRAMES: Final[tuple[Frame, ...]] = ("camera", "world", "map")
 
 
@@ -106,8 +108,8 @@ def read_ply(path: str | PathLike[str]) -> PointCloud:
         The cloud, in the frame named in the file, else ``camera``. It may be empty.
 
     Raises:
-        FormatError: The file is missing, truncated, not a PLY, has no x, y, z, or has points none
-            of which is finite.
+        FormatError: The file is missing, truncated, not a PLY, has no x, y, z, has points none of
+            which is finite, or doubles that float32 would move by millimetres.
     """
     header, tables = read_tables(path, ["vertex"])
     vertex = _vertices(tables.get("vertex"), path)
@@ -192,7 +194,27 @@ def _vertices(vertex: Table | None, path: str | PathLike[str]) -> Table:
     """Check that the vertex table exists and has positions."""
     if vertex is None or not _has(vertex, _XYZ):
         raise FormatError("the PLY file has no vertices with x, y and z", where=path)
+    _check_precision(vertex, path)
     return vertex
+
+
+def _check_precision(vertex: Table, path: str | PathLike[str]) -> None:
+    """Refuse places that float32 would move: UTM coordinates become steps of half a metre."""
+    for name in _XYZ:
+        exact = vertex[name]
+        if exact.dtype.itemsize <= 4:
+            continue
+        exact = exact[np.isfinite(exact)]
+        with np.errstate(over="ignore"):
+            moved_m = np.abs(exact.astype(np.float32) - exact).max(initial=0.0)
+        if moved_m > _LARGEST_ROUNDING_M:
+            raise FormatError(
+                "coordinates are too large to be kept in single precision",
+                where=path,
+                got=f"{name} up to {np.abs(exact).max():.10g}, rounded by {moved_m:.2g} m",
+                expected=f"rounded by at most {_LARGEST_ROUNDING_M:g} m",
+                hint="subtract an offset, such as the first point, from all coordinates",
+            )
 
 
 def _shape(vertex: Table, header: PlyHeader) -> PointCloud:

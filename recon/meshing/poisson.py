@@ -152,8 +152,14 @@ def _usable(cloud: PointCloud) -> PointCloud:
     centred = cloud.xyz.astype(np.float64) - cloud.xyz.mean(axis=0, dtype=np.float64)
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred)), 0))
     # 1e-5 of the extent is what float32 coordinates resolve.
-    if spread[1] <= 1e-5 * max(spread[2], float(np.abs(cloud.xyz).max())):
-        raise MeshingError("all points lie in one place or on one line", got=f"{len(cloud)} points")
+    farthest = float(np.abs(cloud.xyz).max())
+    if spread[1] <= 1e-5 * max(spread[2], farthest):
+        distant = spread[1] > 1e-5 * spread[2] and spread[1] > 0
+        raise MeshingError(
+            "all points lie in one place or on one line",
+            got=f"{len(cloud)} points, up to {farthest:.3g} m from the origin",
+            hint="subtract an offset from all coordinates" if distant else None,
+        )
     return cloud
 
 

@@ -85,3 +85,8 @@ def test_no_foreign_exception_leaks() -> None:
         open3d_clouds.voxel_downsample(frozen(np.eye(3) * 1e9), np.zeros((3, 0)), 1e-9)
     with pytest.raises(ReconError, match="too few points"):
         open3d_clouds.nearest(CLOUD, CLOUD[:2], 3)
+
+
+def test_points_that_are_too_far_apart_to_search_are_refused() -> None:
+    with pytest.raises(ShapeError, match=r"too far apart to be searched \(got .*e\+30 m"):
+        open3d_clouds.nearest(CLOUD * np.float32(1e31), CLOUD * np.float32(1e31))

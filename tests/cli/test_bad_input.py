@@ -10,7 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import typer
 
+from recon.cli.session import session
 from recon.sources.synthetic import SyntheticSource, write_kitti
 from recon.synthetic import StreetSettings
 
@@ -223,3 +225,17 @@ def test_a_prior_that_tells_nothing(
     done = recon("map", good_drive, "--prior", tmp_path / "prior.txt", "--out", out, "--quiet")
     assert_one_line(done, word)
     assert not out.exists()
+
+
+def test_ctrl_c_while_a_native_library_starts_is_an_interruption(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(typer.Exit) as ended, session():
+        raise ImportError("initialization failed") from KeyboardInterrupt()
+    assert ended.value.exit_code == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_a_library_that_is_missing_is_no_interruption() -> None:
+    with pytest.raises(ImportError, match="nothing of that name"), session():
+        raise ImportError("nothing of that name")

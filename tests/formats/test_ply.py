@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -277,3 +278,18 @@ def test_a_file_without_places_has_no_pieces(tmp_path: Path) -> None:
     path.write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
     with pytest.raises(FormatError, match="no vertices with x, y and z"):
         list(read_ply_pieces(path))
+
+
+@pytest.mark.parametrize("read", [read_ply, lambda path: list(read_ply_pieces(path))])
+def test_survey_coordinates_that_would_become_steps_are_refused(
+    tmp_path: Path, read: Callable[[Path], object]
+) -> None:
+    xyz = np.array([4.5e5, 5.4e6, 300]) + np.random.default_rng(0).uniform(0, 10, (100, 3))
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 100\nproperty double x\n"
+    header += "property double y\nproperty double z\nend_header\n"
+    path = tmp_path / "utm.ply"
+    path.write_bytes(header.encode() + xyz.astype("<f8").tobytes())
+    with pytest.raises(FormatError, match=r"utm\.ply: .* \(got x up to 4500.*subtract an offset"):
+        read(path)
+    path.write_bytes(header.encode() + (xyz - xyz[0]).astype("<f8").tobytes())
+    read(path)

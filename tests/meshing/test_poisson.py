@@ -130,6 +130,7 @@ def test_points_and_normals_that_are_not_finite_are_left_out() -> None:
         (np.full((500, 3), np.nan), "too few points"),
         (np.full((500, 3), 2.5), "one place or on one line"),
         (np.outer(np.linspace(0, 1, 500), [1.0, 2.0, 3.0]), "one place or on one line"),
+        (np.random.default_rng(0).normal(size=(500, 3)) + 4e6, "subtract an offset"),
     ],
 )
 def test_clouds_without_a_surface_are_refused(xyz: np.ndarray, complaint: str) -> None:
@@ -152,3 +153,12 @@ def test_the_depth_follows_the_spacing_of_the_points() -> None:
     assert chosen[1] - chosen[0] == 2
     assert _fitting_depth(fine.xyz, MeshSettings(max_depth=4)) == 4
     assert _fitting_depth((100 * fine.xyz).astype(np.float32), MeshSettings()) == chosen[1]
+
+
+def test_points_of_one_plane_give_that_plane() -> None:
+    xyz = np.random.default_rng(0).uniform(0, 1, (3000, 3)).astype(np.float32)
+    xyz[:, 2] = 2
+    mesh = reconstruct_mesh(PointCloud(xyz), MeshSettings())
+    assert len(mesh.faces) > 1000
+    # A tenth of the spacing of the points, which is 1 / sqrt(3000).
+    assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.002
