@@ -61,7 +61,7 @@ def check_chessboard(
         larger = any(n > m for n, m in zip(size, claimed, strict=True))
         # If the given board was seen whole, a smaller one is part of it.
         if most >= enough and size != claimed and (larger or not seen[claimed]):
-            raise _wrong_size(size, f"{most} of {voters} pictures", board)
+            raise _wrong_size(size, f"{most} of {voters} images", board)
 
 
 def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBoard) -> None:

@@ -218,5 +218,5 @@ def test_an_opencv_file_says_that_it_is_of_a_fisheye_and_refuses_two_models(tmp_
 
 
 def test_a_fisheye_needs_four_coefficients() -> None:
-    with pytest.raises(CalibrationError, match=r"four coefficients.*got 5"):
+    with pytest.raises(CalibrationError, match=r"four distortion coefficients.*got 5"):
         CameraIntrinsics(np.eye(3), np.zeros(5), 640, 480, "fisheye")

@@ -90,6 +90,6 @@ def test_blank_pictures_are_one_clear_line(tmp_path: Path) -> None:
     for side in ("l", "r"):
         write_image(tmp_path / f"{side}.png", np.full((100, 120), 80, np.uint8))
     options = RectifyOptions(out=tmp_path / "out")
-    with pytest.raises(CalibrationError, match="too few features"):
+    with pytest.raises(CalibrationError, match="too few matched features"):
         run_rectify(str(tmp_path / "l.png"), str(tmp_path / "r.png"), load_config(), options)
     assert not (tmp_path / "out").exists()
