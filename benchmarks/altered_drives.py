@@ -1,0 +1,266 @@
+"""How odometry copes with drives it was not made for: one drive, altered in many ways.
+
+The truth of an altered drive follows from that of the drive itself, so any drive with true poses
+will do. ``scale`` is the length of the estimated path relative to the true one: an error of
+disparities that all frames share shows there, and grows with the speed of the drive.
+
+Example: python benchmarks/altered_drives.py DRIVE --json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from recon.evaluation import evaluate_trajectory
+from recon.geometry import se3
+from recon.pipeline.config import load_config
+from recon.pipeline.sequence import map_sequence
+from recon.sources import StereoSource, open_source
+from recon.structures import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
+from recon.structures.arrays import Float64, UInt8
+
+NOISE_DN = 4.0
+EXPOSURE_SHARE = 0.15
+RIGHT_GAIN = 0.93
+KEPT_WIDTH = 0.6
+NOD_DEG = 4.0
+NOD_RAD_PER_FRAME = 0.9
+
+Change = Callable[[int, UInt8, UInt8], tuple[UInt8, UInt8]]
+
+
+@dataclass(frozen=True, eq=False)
+class Altered:
+    """A drive whose frames, images or poses differ from those of another.
+
+    Attributes:
+        drive: The drive itself.
+        calibration: Of the altered images.
+        order: Frames of the drive, in the order in which they are seen.
+        T_world_camera: float64 (N, 4, 4), true poses of these frames.
+        change: Makes the left and right image of a frame from those of the drive.
+    """
+
+    drive: StereoSource
+    calibration: RectifiedCamera
+    order: list[int]
+    T_world_camera: Float64
+    change: Change
+
+    name = "altered"
+    description = "altered drive"
+    files: Sequence[Path] = ()
+
+    @property
+    def truth(self) -> SequenceTruth:
+        """The true path; the first camera is its origin."""
+        poses = se3.invert(self.T_world_camera[0]) @ self.T_world_camera
+        return SequenceTruth(Trajectory(poses, self.stamps_s))
+
+    @property
+    def stamps_s(self) -> Float64:
+        """float64 (N,): of the drive, first to last, whatever the order of the frames."""
+        return true_path(self.drive).timestamps_s[sorted(self.order)]
+
+    def __len__(self) -> int:
+        return len(self.order)
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return self.frames()
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """The altered pairs from a frame on."""
+        for index in range(start, len(self)):
+            pair = next(iter(self.drive.frames(self.order[index])))
+            left, right = self.change(self.order[index], pair.left, pair.right)
+            stamp_s = float(self.stamps_s[index])
+            yield StereoPair(left, right, stamp_s, index=index, name=pair.name)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    options = parse(arguments)
+    drive = open_source(options.drive)
+    cases = alterations(drive)
+    chosen = options.only or list(cases)
+    result = {name: figures(cases[name], options) for name in chosen}
+    print(json.dumps(result, indent=2) if options.json else table(result))
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("drive", type=Path, help="rectified grey drive with true poses")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument("--odometry", default="fused", help="fused, visual or kiss")
+    parser.add_argument("--only", nargs="+", help="names of alterations")
+    parser.add_argument("--set", action="append", default=[], help="a setting of recon map")
+    return parser.parse_args(arguments)
+
+
+def alterations(drive: StereoSource) -> dict[str, Altered]:
+    """The drive as it is, and its alterations by name."""
+    camera = drive.calibration
+    if not isinstance(camera, RectifiedCamera):
+        raise SystemExit(f"{drive.name}: expected a rectified drive")
+    order = list(range(len(drive)))
+    plain = Altered(drive, camera, order, true_path(drive).T_world_camera, lambda _, *both: both)
+    return {
+        "as it is": plain,
+        "every 2nd frame": thinned(plain, 2),
+        "every 3rd frame": thinned(plain, 3),
+        "every 4th frame": thinned(plain, 4),
+        "backwards": replace(
+            plain, order=order[::-1], T_world_camera=plain.T_world_camera[::-1].copy()
+        ),
+        "half size": halved(plain),
+        "mirrored": mirrored(plain),
+        "narrow": narrowed(plain),
+        "noisy": replace(plain, change=noisy),
+        "nodding": nodding(plain),
+    }
+
+
+def true_path(drive: StereoSource | Altered) -> Trajectory:
+    if drive.truth is None or drive.truth.trajectory is None:
+        raise SystemExit(f"{drive.name}: has no true poses")
+    return drive.truth.trajectory
+
+
+def thinned(plain: Altered, step: int) -> Altered:
+    """A faster drive, or a slower camera."""
+    return replace(
+        plain, order=plain.order[::step], T_world_camera=plain.T_world_camera[::step].copy()
+    )
+
+
+def halved(plain: Altered) -> Altered:
+    """Images of half the size."""
+    camera = plain.calibration
+    width, height = camera.width_px // 2, camera.height_px // 2
+
+    def half(_: int, *both: UInt8) -> tuple[UInt8, UInt8]:
+        left, right = (
+            cv2.resize(
+                image[: 2 * height, : 2 * width], (width, height), None, 0, 0, cv2.INTER_AREA
+            )
+            for image in both
+        )
+        return left, right
+
+    # The centre of the first pixel lies at 0, its corner at -0.5.
+    smaller = replace(
+        camera,
+        focal_px=camera.focal_px / 2,
+        cx_px=(camera.cx_px + 0.5) / 2 - 0.5,
+        cy_px=(camera.cy_px + 0.5) / 2 - 0.5,
+        cx_right_px=(camera.cx_right_px + 0.5) / 2 - 0.5,
+        width_px=width,
+        height_px=height,
+    )
+    return replace(plain, calibration=smaller, change=half)
+
+
+def mirrored(plain: Altered) -> Altered:
+    """The world in a mirror: left bends become right ones, and the cameras change places."""
+    camera, mirror = plain.calibration, np.diag([-1.0, 1.0, 1.0, 1.0])
+    T_left_right = se3.make_transform(np.eye(3), np.array([camera.baseline_m, 0.0, 0.0]))
+    last = camera.width_px - 1
+    return replace(
+        plain,
+        calibration=replace(
+            camera, cx_px=last - camera.cx_right_px, cx_right_px=last - camera.cx_px
+        ),
+        T_world_camera=mirror @ plain.T_world_camera @ T_left_right @ mirror,
+        change=lambda _, left, right: (right[:, ::-1].copy(), left[:, ::-1].copy()),
+    )
+
+
+def narrowed(plain: Altered) -> Altered:
+    """The middle of the images alone: a narrow lens."""
+    camera = plain.calibration
+    width = round(KEPT_WIDTH * camera.width_px)
+    first = (camera.width_px - width) // 2
+    cut = replace(
+        camera,
+        cx_px=camera.cx_px - first,
+        cx_right_px=camera.cx_right_px - first,
+        width_px=width,
+    )
+    columns = slice(first, first + width)
+    return replace(
+        plain,
+        calibration=cut,
+        change=lambda _, left, right: (left[:, columns].copy(), right[:, columns].copy()),
+    )
+
+
+def noisy(index: int, left: UInt8, right: UInt8) -> tuple[UInt8, UInt8]:
+    """Noise, an exposure that comes and goes, and a darker right camera."""
+    random = np.random.default_rng(index)
+    gain = 1.0 + EXPOSURE_SHARE * np.sin(index / 7.0)
+    seen = (gain * left, gain * RIGHT_GAIN * right)
+    dark, darker = (
+        np.clip(np.rint(image + random.normal(0.0, NOISE_DN, image.shape)), 0, 255).astype(np.uint8)
+        for image in seen
+    )
+    return dark, darker
+
+
+def nodding(plain: Altered) -> Altered:
+    """A rig that pitches from frame to frame, as on a rough road; a turn about the baseline."""
+    camera = plain.calibration
+    angles = np.radians(NOD_DEG) * np.sin(NOD_RAD_PER_FRAME * np.arange(len(plain.order)))
+    turns = np.stack([se3.exp_so3(np.array([angle, 0.0, 0.0])) for angle in angles])
+    views = [replace(camera, cx_px=cx) for cx in (camera.cx_px, camera.cx_right_px)]
+
+    def nod(index: int, *both: UInt8) -> tuple[UInt8, UInt8]:
+        left, right = (
+            cv2.warpPerspective(
+                image,
+                view.matrix @ turns[index] @ np.linalg.inv(view.matrix),
+                (camera.width_px, camera.height_px),
+                flags=cv2.INTER_CUBIC,
+                borderMode=cv2.BORDER_CONSTANT,
+            )
+            for image, view in zip(both, views, strict=True)
+        )
+        return left, right
+
+    T_camera_nodded = np.tile(np.eye(4), (len(turns), 1, 1))
+    T_camera_nodded[:, :3, :3] = turns.transpose(0, 2, 1)
+    return replace(plain, T_world_camera=plain.T_world_camera @ T_camera_nodded, change=nod)
+
+
+def figures(altered: Altered, options: argparse.Namespace) -> dict[str, float]:
+    """Errors of the path of an altered drive."""
+    config = load_config(None, [f"odometry.method={options.odometry}", *options.set])
+    path, truth = map_sequence(altered, config).trajectory, true_path(altered)
+    found = evaluate_trajectory(path, truth)
+    return {
+        "frames": len(altered),
+        "t_rel_percent": round(found.t_rel_percent, 3),
+        "r_rel_deg_per_100m": round(found.r_rel_deg_per_100m, 3),
+        "ate_m": round(found.ate_m, 3),
+        "scale": round(path.path_length_m / truth.path_length_m, 4),
+    }
+
+
+def table(result: dict[str, dict[str, Any]]) -> str:
+    head = f"{'':18s}{'t_rel %':>10s}{'r_rel deg/100 m':>18s}{'ATE m':>8s}{'scale':>9s}"
+    lines = [
+        f"{name:18s}{row['t_rel_percent']:10.2f}{row['r_rel_deg_per_100m']:18.2f}"
+        f"{row['ate_m']:8.3f}{row['scale']:9.4f}"
+        for name, row in result.items()
+    ]
+    return "\n".join([head, *lines])
+
+
+if __name__ == "__main__":
+    main()
