@@ -4,6 +4,8 @@ The truth of an altered drive follows from that of the drive itself, so any driv
 will do. ``scale`` is the length of the estimated path relative to the true one: an error of
 disparities that all frames share shows there, and grows with the speed of the drive.
 
+Without DRIVE a rendered street is altered.
+
 Example: python benchmarks/altered_drives.py DRIVE --json
 """
 
@@ -22,6 +24,7 @@ import numpy as np
 from recon.evaluation import evaluate_trajectory
 from recon.geometry import se3
 from recon.pipeline.config import load_config
+from recon.pipeline.demo_source import demo_source
 from recon.pipeline.sequence import map_sequence
 from recon.sources import StereoSource, open_source
 from recon.structures import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
@@ -87,7 +90,8 @@ class Altered:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(arguments)
-    drive = open_source(options.drive)
+    rendered = demo_source(load_config(None, options.set))
+    drive = rendered if options.drive is None else open_source(options.drive)
     cases = alterations(drive)
     chosen = options.only or list(cases)
     result = {name: figures(cases[name], options) for name in chosen}
@@ -96,7 +100,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("drive", type=Path, help="rectified grey drive with true poses")
+    parser.add_argument(
+        "drive", type=Path, nargs="?", help="rectified drive with true poses; a rendered street"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     parser.add_argument("--odometry", default="fused", help="fused, visual or kiss")
     parser.add_argument("--only", nargs="+", help="names of alterations")
