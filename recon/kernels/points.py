@@ -95,13 +95,13 @@ class Points(NamedTuple):
 def make_points(maps: Maps, rules: PointRules) -> Points:
     """Points of all pixels that the rules let through."""
     step = rules.stride
-    room = int(np.count_nonzero(np.isfinite(maps.values[::step, ::step])))
+    capacity = int(np.count_nonzero(np.isfinite(maps.values[::step, ::step])))
     points = Points(
-        np.empty((room, 3), np.float32),
-        np.empty((room if rules.radius else 0, 3), np.float32),
-        np.empty(room, np.float32),
-        np.empty(room, np.float32),
-        np.empty((room, 3), np.uint8),
+        np.empty((capacity, 3), np.float32),
+        np.empty((capacity if rules.radius else 0, 3), np.float32),
+        np.empty(capacity, np.float32),
+        np.empty(capacity, np.float32),
+        np.empty((capacity, 3), np.uint8),
     )
     # Plain tuples: numba's cache on disk would remember the classes by name.
     used = _make_points(tuple(maps), tuple(rules), tuple(points))

@@ -71,7 +71,7 @@ class VoxelPoints(NamedTuple):
 
 
 def make_table(rows: int) -> NDArray[np.int64]:
-    """An empty hash with room for ``rows`` entries.
+    """An empty hash for up to ``rows`` entries.
 
     Returns:
         int64 (C, 2), C a power of two: packed cell and row of each entry; a cell of `EMPTY` marks

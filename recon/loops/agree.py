@@ -16,7 +16,7 @@ from recon.structures.arrays import Float64
 Poses: TypeAlias = Mapping[int, tuple[Float64, float]]
 """For each keyframe its pose by odometry, and the path up to it."""
 
-ALIKE: Final = Drift(0.3, np.deg2rad(1.0))
+LOOP_SIGMAS: Final = Drift(0.3, np.deg2rad(1.0))
 """Standard deviation of a verified loop, added to the drift: small, but never zero."""
 _MAJORITY: Final = 2  # keyframes that confirm a loop, for each that contradicts it
 
@@ -54,7 +54,7 @@ def _closes(one: Loop, other: Loop, poses: Poses, settings: LoopSettings) -> boo
     T_firsts, firsts_m = _between(one.first, other.first, poses)
     ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
     drift = drift_over(lasts_m + firsts_m, settings.drift)
-    return is_possible(ring, drift, ALIKE, settings.drift)
+    return is_possible(ring, drift, LOOP_SIGMAS, settings.drift)
 
 
 def _between(first: int, last: int, poses: Poses) -> tuple[Float64, float]:

@@ -10,7 +10,7 @@ from typing import Final, Protocol, runtime_checkable
 import numpy as np
 
 from recon.geometry.se3 import angle_rad, invert
-from recon.loops.agree import ALIKE, agreeing_loops
+from recon.loops.agree import LOOP_SIGMAS, agreeing_loops
 from recon.loops.drift import drift_over, is_possible
 from recon.loops.keyframe import Keyframe, make_keyframe, words_of
 from recon.loops.places import Place, Places
@@ -171,11 +171,11 @@ class LoopDetector:
         near = self._places.near(place, self._settings)
         if not near.any():
             return []
-        alike = self._places.likeness(place)
-        worth = np.flatnonzero(near & (alike >= candidates.min_likeness * alike[-1]))
+        likeness = self._places.likeness(place)
+        worth = np.flatnonzero(near & (likeness >= candidates.min_likeness * likeness[-1]))
         chosen: list[int] = []
         path_m = self._places.path_m
-        for number in worth[np.argsort(-alike[worth], kind="stable")].tolist():
+        for number in worth[np.argsort(-likeness[worth], kind="stable")].tolist():
             gaps_m = np.abs(path_m[chosen] - path_m[number])
             if gaps_m.min(initial=np.inf) >= candidates.apart_m:
                 chosen.append(number)
@@ -187,4 +187,4 @@ class LoopDetector:
         """Whether drift explains the difference between a loop and odometry."""
         T = invert(self._places.T_world_camera[old]) @ new.T_world_camera
         drift = drift_over(new.path_m - float(self._places.path_m[old]), self._settings.drift)
-        return is_possible(invert(T) @ loop.T_first_last, drift, ALIKE, self._settings.drift)
+        return is_possible(invert(T) @ loop.T_first_last, drift, LOOP_SIGMAS, self._settings.drift)

@@ -98,8 +98,8 @@ def explain_motion(
     blind = _power(samples, samples.now, count) < 2.0 * noise[1] ** 2
     if not telling.any() or blind[telling].mean() > 0.5:
         return Agreement(0, float("nan"))
-    alike = _correlation(samples, count, noise)[telling] >= settings.min_correlation
-    return Agreement(int(telling.sum()), float(alike.mean()))
+    agreeing = _correlation(samples, count, noise)[telling] >= settings.min_correlation
+    return Agreement(int(telling.sum()), float(agreeing.mean()))
 
 
 def noise_sigma(grey: UInt8) -> float:
