@@ -1,4 +1,4 @@
-"""From measures to findings: what is wrong, and what to do about it."""
+"""Findings of an audit, derived from its measures: each problem, with advice."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _SIDES = ("left", "right")
 
 @dataclass(frozen=True)
 class Gaps:
-    """Where frames are missing, by the times of all pairs.
+    """Missing frames, from the timestamps of all pairs.
 
     Attributes:
-        count: Places; 0 where the times are not known beforehand.
-        longest_s: Longest step of time.
+        count: Number of gaps; 0 if the timestamps are not known in advance.
+        longest_s: Longest time step.
         after: Frame before that step.
-        usual_s: Median step; NaN where it is not known.
+        usual_s: Median time step; NaN if unknown.
     """
 
     count: int = 0
@@ -34,7 +34,7 @@ class Gaps:
 
 
 def find_picture_faults(sample: Sample, settings: AuditSettings) -> Iterator[Finding]:
-    """What the pictures themselves tell: unreadable, black, blurred, of unequal brightness."""
+    """Problems of single images: unreadable, black, blurred, of unequal brightness."""
     if sample.broken is not None:
         code = "size" if "size" in sample.broken.what else "unreadable"
         yield Finding(code, True, str(sample.broken))
@@ -43,7 +43,7 @@ def find_picture_faults(sample: Sample, settings: AuditSettings) -> Iterator[Fin
         yield Finding(
             "black",
             True,
-            f"the {_SIDES[side]} camera shows nothing: its pictures are even, at grey level "
+            f"the {_SIDES[side]} camera shows nothing: its images are uniform, at grey level "
             f"{mean:.0f} of 255; check its cable, its lens cap and its exposure "
             "(16-bit images must fill their range)",
         )
@@ -61,7 +61,7 @@ def find_picture_faults(sample: Sample, settings: AuditSettings) -> Iterator[Fin
 
 
 def _blank_sides(sample: Sample, settings: AuditSettings) -> list[int]:
-    """Cameras that show nothing in most pictures."""
+    """Cameras that show nothing in most images."""
     blank = np.array(sample.contrast_dn).reshape(-1, 2) < settings.contrast_dn
     return [side for side in range(2) if len(blank) and blank[:, side].mean() >= 0.5]
 
@@ -76,25 +76,25 @@ def _find_blur(sample: Sample, settings: AuditSettings) -> Iterator[Finding]:
             "blur",
             False,
             f"the {worse} camera is blurred: sharpness {min(left, right):.2f}, the other "
-            f"{max(left, right):.2f}; focus it, clean its lens",
+            f"{max(left, right):.2f}; focus it or clean its lens",
         )
     elif max(left, right) < settings.sharpness:
         yield Finding(
             "blur",
             False,
-            f"both cameras are blurred: sharpness {left:.2f} and {right:.2f}, expected over "
-            f"{settings.sharpness:g}; focus them, expose shorter, or halve the pictures",
+            f"both cameras are blurred: sharpness {left:.2f} and {right:.2f}, expected above "
+            f"{settings.sharpness:g}; focus them, expose shorter, or halve the image size",
         )
 
 
 def find_series_faults(sample: Sample, gaps: Gaps, settings: AuditSettings) -> Iterator[Finding]:
-    """What the series of frames tells: repeats, frozen cameras, gaps."""
+    """Problems of the sequence: repeated frames, frozen cameras, gaps."""
     repeats = sample.repeats
     if repeats.steps and repeats.both > settings.repeated_share * repeats.steps:
         yield Finding(
             "duplicates",
             False,
-            f"{repeats.both} of {repeats.steps} frames repeat the one before; the recorder wrote "
+            f"{repeats.both} of {repeats.steps} frames repeat the previous one; the recorder wrote "
             "frames twice, or the rig stood still: drop them, or record at the cameras' own rate",
         )
     blank = _blank_sides(sample, settings)
@@ -104,7 +104,7 @@ def find_series_faults(sample: Sample, gaps: Gaps, settings: AuditSettings) -> I
             yield Finding(
                 "frozen",
                 True,
-                f"the {_SIDES[side]} camera stands still for {run} frames while the other goes on; "
+                f"the {_SIDES[side]} camera is frozen for {run} frames while the other goes on; "
                 "it hung or lost frames: record again",
             )
     if gaps.count:
@@ -117,7 +117,7 @@ def find_series_faults(sample: Sample, gaps: Gaps, settings: AuditSettings) -> I
 
 
 def find_gaps(source: StereoSource, settings: AuditSettings) -> Gaps:
-    """Look for steps of time that are too long, in sources that know their times."""
+    """Find time steps that are too long, in sources with known timestamps."""
     steps = np.diff(source.stamps_s) if isinstance(source, StampedSource) else np.zeros(0)
     usual_s = float(np.median(steps)) if len(steps) else 0.0
     if usual_s <= 0:
@@ -128,27 +128,28 @@ def find_gaps(source: StereoSource, settings: AuditSettings) -> Gaps:
 
 
 def find_geometry_faults(geometry: Geometry, settings: AuditSettings) -> Iterator[Finding]:
-    """What matched features tell: swapped, late, rows."""
+    """Problems of the geometry: swapped cameras, delays, row errors."""
     swapped, lag, skew = geometry.swapped_share, geometry.lag, geometry.skew
     if swapped >= settings.swapped_share:
         yield Finding(
             "swapped",
             True,
-            f"left and right are swapped: {100 * swapped:.0f} % of the near features lie farther "
-            "right in the right picture; exchange --left and --right (or un-mirror the pictures)",
+            f"left and right are swapped: {100 * swapped:.0f} % of the near features are farther "
+            "right in the right image; exchange --left and --right (or un-mirror the images)",
         )
     if lag:
         late = "right" if lag > 0 else "left"
         yield Finding(
             "lag",
             True,
-            f"the {late} camera is {abs(lag)} frames late; shift its series, or pair by stamps",
+            f"the {late} camera is {abs(lag)} frames late; shift its sequence, or pair the images "
+            "by timestamp",
         )
     elif skew is not None and abs(skew[0]) > max(settings.skew_frames, 4 * skew[1]):
         yield Finding(
             "skew",
             False,
-            f"the right pictures are taken {skew[0]:+.2f} frames after the left ones; trigger "
+            f"the right images are taken {skew[0]:+.2f} frames after the left ones; trigger "
             "both cameras together, or drive slowly",
         )
     yield from _find_row_faults(geometry, settings)
@@ -162,17 +163,17 @@ def _find_row_faults(geometry: Geometry, settings: AuditSettings) -> Iterator[Fi
         yield Finding(
             "features",
             False,
-            f"too few features agree in left and right ({geometry.matched} matched) to check the "
-            "geometry: the pictures show too little, or not the same",
+            f"too few features match between left and right ({geometry.matched} matched) to check "
+            "the geometry: the images show too little texture, or different scenes",
         )
     elif alignment.rms_px > settings.row_px:
         pitch, roll = np.degrees([alignment.pitch_rad, alignment.roll_rad])
         yield Finding(
             "rows",
             alignment.rms_px > settings.bad_row_px,
-            f"rows of left and right do not correspond: {alignment.rms_px:.2f} px rms, mean "
-            f"{alignment.mean_px:+.2f} px, spread {alignment.spread_px:.2f} px; turning the right "
-            f"camera by {pitch:+.3f} deg pitch and {roll:+.3f} deg roll mends it: "
+            f"rows of left and right are not aligned: {alignment.rms_px:.2f} px rms, mean "
+            f"{alignment.mean_px:+.2f} px, spread {alignment.spread_px:.2f} px; rotating the right "
+            f"camera by {pitch:+.3f} deg pitch and {roll:+.3f} deg roll corrects this: "
             "recon audit --mend FILE",
         )
 
@@ -180,11 +181,11 @@ def _find_row_faults(geometry: Geometry, settings: AuditSettings) -> Iterator[Fi
 def find_range_faults(
     geometry: Geometry, reach_px: int | None, camera: RectifiedCamera, settings: AuditSettings
 ) -> Iterator[Finding]:
-    """What is too near or too far for the rig.
+    """Scenes that are too near or too far for the rig.
 
     Args:
-        geometry: What the features tell.
-        reach_px: Largest disparity that will be searched, where that is fixed.
+        geometry: Measures of the matched features.
+        reach_px: Largest disparity that will be searched, if that is fixed.
         camera: The rectified camera.
         settings: Limits.
     """
@@ -192,7 +193,7 @@ def find_range_faults(
     if len(disparity_px) < settings.min_features:
         return
     scale = camera.focal_px * camera.baseline_m
-    # A matcher counts columns of the pictures.
+    # A matcher's disparity is in image columns, without doffs.
     columns_px = disparity_px - camera.doffs_px
     near = float(np.mean(columns_px > reach_px)) if reach_px else 0.0
     if reach_px and near > settings.near_share:
@@ -201,7 +202,7 @@ def find_range_faults(
         yield Finding(
             "near",
             False,
-            f"{100 * near:.0f} % of the features are nearer than the search reaches "
+            f"{100 * near:.0f} % of the features are nearer than the disparity range covers "
             f"({reach_px} px, {reach_m:.1f} m); give the matcher an ndisp of {most}",
         )
     middle = float(np.median(disparity_px))
@@ -209,7 +210,7 @@ def find_range_faults(
         yield Finding(
             "far",
             False,
-            f"half of the features are farther off than {scale / middle:.0f} m, at less than "
+            f"half of the features are farther away than {scale / middle:.0f} m, at less than "
             f"{middle:.1f} px of disparity: the baseline of {camera.baseline_m:.3g} m is too short "
             "for this scene",
         )
@@ -221,7 +222,7 @@ def find_calibration_faults(
     camera: RectifiedCamera,
     settings: AuditSettings,
 ) -> Iterator[Finding]:
-    """What is implausible about the calibration: its size, its baseline."""
+    """Implausible calibration: image size, baseline."""
     for name, centre, size in _centres(rig):
         off = np.abs(np.array(centre) / size - 0.5)
         if off.max() > settings.centre_share:
@@ -230,7 +231,7 @@ def find_calibration_faults(
                 True,
                 f"the calibration is of another size: principal point of the {name} camera at "
                 f"({centre[0]:.0f}, {centre[1]:.0f}) of {size[0]}x{size[1]} pixels; scale it, or "
-                "take the pictures that were calibrated",
+                "use images of the calibrated size",
             )
             break
     shortest, longest = settings.baseline_m

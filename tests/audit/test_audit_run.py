@@ -113,7 +113,7 @@ def test_a_frozen_camera_is_found(street: faults.Spoiled) -> None:
     findings = run_audit(replace(street, take=take), CONFIG).findings
     frozen = next(finding for finding in findings if finding.code == "frozen")
     assert frozen.fatal
-    assert "the right camera stands still for 5 frames" in frozen.text
+    assert "the right camera is frozen for 5 frames" in frozen.text
 
 
 @pytest.mark.real
