@@ -14,7 +14,7 @@ import recon
 
 
 def main(drive: str | None, folder: Path) -> None:
-    """Map a drive and tell what came of it."""
+    """Map a drive and print the main results."""
     # Any setting has a dotted key; the `config.yaml` of a run lists them all.
     config = recon.load_config(overrides=["fusion.voxel_m=0.1", "street.frames=20"])
     source = recon.open_source(drive) if drive else recon.SyntheticSource(config.street)
