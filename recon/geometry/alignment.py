@@ -65,9 +65,9 @@ def fit_points(from_m: Float64, to_m: Float64, *, scaled: bool = False) -> Simil
 def fit_paths(from_path: Trajectory, to_path: Trajectory) -> Similarity:
     """The rigid transform that brings a trajectory closest to another, pose by pose.
 
-    Each pose contributes its camera centre and the ends of its axes, as long as the typical
-    mapping distance. On a nearly straight street, the centres alone would leave the rotation about
-    it to noise, and the map would rotate with it.
+    Each pose contributes its camera centre and the ends of its axes, whose length is the typical
+    distance of mapped points. On a nearly straight street, the centres alone would leave the
+    rotation about it to noise, and the map would rotate with it.
 
     Args:
         from_path: N ≥ 1 poses.
