@@ -18,7 +18,7 @@ from recon.settings import Settings
 from recon.structures.arrays import UInt8
 
 _HEAD_BYTES: Final = 4096
-_ANEW: Final = "start the run anew, without --resume"
+ANEW: Final = "start the run anew, without --resume"
 #: What a saved odometry may consist of. Loading anything else would run what others wrote.
 _SAFE: Final = ("recon.", "numpy")
 
@@ -62,7 +62,7 @@ class Checkpoint:
         try:
             return read_tree(self._path)
         except FormatError as error:
-            raise FormatError(error.what, where=error.where, got=error.got, hint=_ANEW) from error
+            raise FormatError(error.what, where=error.where, got=error.got, hint=ANEW) from error
 
     def restore(self, use: Callable[[dict[str, Any]], None]) -> None:
         """Let ``use`` go on from the state.
@@ -75,7 +75,7 @@ class Checkpoint:
             use(state)
         except (KeyError, TypeError, ValueError) as error:
             raise FormatError(
-                "the file holds no state of this run", where=self._path, got=error, hint=_ANEW
+                "the file holds no state of this run", where=self._path, got=error, hint=ANEW
             ) from error
 
 

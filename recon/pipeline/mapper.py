@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,6 +14,7 @@ from recon.odometry import Odometry, OdometryFrame, OdometryHealth
 from recon.pipeline.checkpoint import pack_object, unpack_object
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.frame import ReconstructedFrame
+from recon.pipeline.frame_log import FrameLog
 from recon.pipeline.lookahead import OneBehind
 from recon.pipeline.observer import FrameResult
 from recon.pipeline.ray_log import RayLog
@@ -46,26 +47,24 @@ class Mapper:
         self._fusion_range_m = fusion_range_m(camera, config.fusion)
         self._behind = OneBehind()
         self._builder: SubmapBuilder | None = None
-        self._poses: list[Float64] = []
-        self._times_s: list[float] = []
-        self._health: list[OdometryHealth] = []
+        self._frames = FrameLog(workspace.frames)
         self._rays = RayLog(workspace.rays, config.occupancy)
         self.submaps = SubmapStore(workspace.submaps, config.memory.cached_submaps)
         self.T_map_world: Float64 = np.eye(4)
 
     def __len__(self) -> int:
         """Number of frames so far."""
-        return len(self._poses)
+        return len(self._frames)
 
     @property
     def trajectory(self) -> Trajectory:
         """The poses so far; there must be one."""
-        return Trajectory(np.stack(self._poses), np.array(self._times_s))
+        return self._frames.trajectory
 
     @property
     def health(self) -> tuple[OdometryHealth, ...]:
         """How far each pose can be trusted."""
-        return tuple(self._health)
+        return self._frames.health
 
     def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
         """Take the next frame."""
@@ -79,9 +78,7 @@ class Mapper:
         rays = frame.rays if health.ok else None
         builder = self._builder_from(frame)
         self._behind.begin(partial(self._integrate, builder, cloud, rays, T_world_camera))
-        self._poses.append(T_world_camera)
-        self._times_s.append(frame.pair.timestamp_s)
-        self._health.append(health)
+        self._frames.add(T_world_camera, frame.pair.timestamp_s, health)
         valid_share = float(np.mean(frame.disparity.valid))
         return FrameResult(
             len(self) - 1, total, 0.0, valid_share, len(frame.cloud), T_world_camera, health
@@ -134,9 +131,7 @@ class Mapper:
             "submaps": self.submaps.state(),
             "rays": self._rays.state(),
             "T_map_world": self.T_map_world,
-            "poses": np.array(self._poses).reshape(-1, 4, 4),
-            "times_s": np.array(self._times_s),
-            "health": [asdict(record) for record in self._health],
+            "frames": self._frames.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -145,9 +140,7 @@ class Mapper:
         self.submaps.restore(state["submaps"])
         self._rays.restore(state["rays"])
         self.T_map_world = state["T_map_world"]
-        self._poses = list(state["poses"])
-        self._times_s = state["times_s"].tolist()
-        self._health = [_health(record) for record in state["health"]]
+        self._frames.restore(state["frames"])
         if state["builder"] is not None:
             self._builder = self._new_builder()
             self._builder.restore(state["builder"])
@@ -169,9 +162,3 @@ class Mapper:
             self.T_map_world,
             config.memory.submap_bytes,
         )
-
-
-def _health(record: dict[str, Any]) -> OdometryHealth:
-    """A health record as a checkpoint holds it: lists were tuples."""
-    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in record.items()}
-    return OdometryHealth(**fields)

@@ -46,6 +46,11 @@ class Workspace:
         return None if self.folder is None else self.folder / RAYS
 
     @property
+    def frames(self) -> Path | None:
+        """File of the poses and health of all frames."""
+        return None if self.folder is None else self.folder / "frames.jsonl"
+
+    @property
     def checkpoint(self) -> Checkpoint | None:
         """What the run goes on from."""
         return None if self.folder is None else Checkpoint(self.folder / "checkpoint.zip")

@@ -189,6 +189,23 @@ def test_a_damaged_checkpoint_is_one_line_and_stays(
     assert checkpoint.exists()
 
 
+@pytest.mark.parametrize("damage", ["cut", "changed", "missing"])
+def test_damaged_frames_are_one_line(drive: Path, tmp_path: Path, damage: str) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        _run(drive, tmp_path, _Breaks(12, KeyboardInterrupt()))
+    frames = tmp_path / ".partial" / ".state" / "frames.jsonl"
+    content = frames.read_bytes()
+    last = content.rstrip(b"}]\n")
+    if damage == "missing":
+        frames.unlink()
+    else:
+        # Still a pose, but another one.
+        frames.write_bytes(last if damage == "cut" else content.replace(b"1", b"2", 1))
+    with pytest.raises(FormatError, match=r"frames.jsonl: .*without --resume") as told:
+        _run(drive, tmp_path, resume=True)
+    assert "\n" not in str(told.value)
+
+
 @contextmanager
 def _largest_file(size: int) -> Iterator[None]:
     """A limit on the file size, which Python reports as an error."""
