@@ -1,11 +1,13 @@
-"""How much memory `recon map` takes for short and for long drives.
+"""How much memory `recon map` takes for short and for long drives, and what is made of its runs.
 
 One street that looks the same every 50 m is rendered once and driven along for as many frames as
 are asked for, so the map grows with every frame while the pictures stay those of one street. Each
 drive is mapped by a process of its own, whose peak is that of its resident memory; ``libraries``
 is the peak for a drive of a few frames: what the program takes before there is a map.
 
-Example: python benchmarks/memory.py --json --frames 1000 --frames 4000
+Examples:
+    python benchmarks/memory.py --json --frames 1000 --frames 4000
+    python benchmarks/memory.py --json --frames 600 --frames 2400 --again mesh --again occupancy
 """
 
 from __future__ import annotations
@@ -43,17 +45,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # The first run may compile kernels, which takes more memory than it will ever again.
         measure(period, COMPILING_FRAMES, options)
         rows = [measure(period, count, options) for count in (LIBRARIES_FRAMES, *counts)]
+    shortest, longest = rows[1], rows[-1]
     result = {
         "picture": [options.width, height_of(options.width)],
         "mesh": options.mesh,
         "settings": options.set,
         "libraries": rows[0],
         "drives": rows[1:],
-        "longest / shortest": ratio(rows[-1]["peak_mb"], rows[1]["peak_mb"]),
+        "longest / shortest": ratio(longest["peak_mb"], shortest["peak_mb"]),
         "longest / shortest, libraries aside": ratio(
-            rows[-1]["peak_mb"] - rows[0]["peak_mb"], rows[1]["peak_mb"] - rows[0]["peak_mb"]
+            longest["peak_mb"] - rows[0]["peak_mb"], shortest["peak_mb"] - rows[0]["peak_mb"]
         ),
     }
+    for name in options.again:
+        peaks = (row["again"][name]["peak_mb"] for row in (longest, shortest))
+        result[f"longest / shortest, recon {name}"] = ratio(*peaks)
     print(json.dumps(result, indent=2) if options.json else table(result))
 
 
@@ -65,6 +71,13 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--width", type=int, default=320, help="of the pictures, pixels")
     parser.add_argument("--mesh", action="store_true", help="also reconstruct a surface")
+    parser.add_argument(
+        "--again",
+        action="append",
+        default=[],
+        choices=["mesh", "occupancy"],
+        help="also what this command takes for the run of each drive; repeatable",
+    )
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--folder", type=Path, help="where to work; 2 MB for each frame at most")
     return parser.parse_args(arguments)
@@ -107,14 +120,10 @@ def measure(period: Path, frames: int, options: argparse.Namespace) -> dict[str,
     """Map so many frames in a process of its own."""
     drive, out = period.parent / f"drive_{frames}", period.parent / f"run_{frames}"
     repeat(period, drive, frames)
-    command = [sys.executable, "-m", "recon", "map", str(drive), "--out", str(out)]
     settings = [part for text in options.set for part in ("--set", text)]
     mesh = [] if options.mesh else ["--no-mesh"]
-    command += [*mesh, *settings, "--json", "--quiet"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        sys.exit(done.stderr)
-    summary = json.loads(done.stdout)
+    summary = run_recon("map", drive, out, [*mesh, *settings])
+    again = options.again if frames > LIBRARIES_FRAMES else ()
     files_mb = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6
     return {
         "frames": frames,
@@ -125,7 +134,26 @@ def measure(period: Path, frames: int, options: argparse.Namespace) -> dict[str,
         "files_mb": round(files_mb, 1),
         "seconds": summary["seconds"],
         "stages": summary["stages"],
+        "again": {name: make_again(name, out) for name in again},
     }
+
+
+def make_again(command: str, run: Path) -> dict[str, Any]:
+    """What it takes to make something of a run."""
+    summary = run_recon(command, run, run.with_name(f"{run.name}_{command}"), [])
+    names = {"peak_mb": "peak_memory_mb", "seconds": "seconds", "stages": "stages"}
+    return {name: summary[key] for name, key in names.items()}
+
+
+def run_recon(command: str, source: Path, out: Path, options: list[str]) -> dict[str, Any]:
+    """The summary of a command, in a process of its own."""
+    words = [sys.executable, "-m", "recon", command, str(source), "--out", str(out)]
+    done = subprocess.run(
+        [*words, *options, "--json", "--quiet"], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        sys.exit(done.stderr)
+    return dict(json.loads(done.stdout))
 
 
 def repeat(period: Path, drive: Path, frames: int) -> None:

@@ -87,6 +87,7 @@ def test_a_limit_that_cannot_be_held_is_one_line_and_the_run_can_be_resumed(
 @pytest.mark.slow
 def test_a_drive_twice_as_long_takes_hardly_more_memory() -> None:
     command = [sys.executable, str(BENCHMARK), "--json", "--width", "192"]
+    command += ["--again", "mesh", "--again", "occupancy"]
     # What is kept of submaps and of places is full after some 500 frames.
     done = subprocess.run(
         [*command, "--frames", "600", "--frames", "1200"],
@@ -98,3 +99,6 @@ def test_a_drive_twice_as_long_takes_hardly_more_memory() -> None:
     short, long = found["drives"]
     assert long["voxels"] > 1.9 * short["voxels"]
     assert long["peak_mb"] / short["peak_mb"] < 1.1
+    for name in ("mesh", "occupancy"):
+        peaks_mb = [row["again"][name]["peak_mb"] for row in (long, short)]
+        assert peaks_mb[0] / peaks_mb[1] < 1.1
