@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from recon.errors import FormatError
+from recon.errors import CalibrationError, FormatError
 from recon.formats.camera_info import read_camera_info
 from recon.formats.files import StrPath, read_text
 from recon.formats.kalibr import read_kalibr
@@ -20,6 +20,7 @@ _MIDDLEBURY: Final = re.compile(r"^\s*cam[01]\s*=", re.MULTILINE)
 _OURS: Final = re.compile(rf"^format:\s*{MARK}", re.MULTILINE)
 _CAMERA_INFO: Final = re.compile(r"^projection_matrix:", re.MULTILINE)
 _KALIBR: Final = re.compile(r"^cam0:", re.MULTILINE)
+_HOMOGRAPHIES: Final = re.compile(r"^H_left:", re.MULTILINE)
 _OPENCV: Final = re.compile(r"^%YAML|<opencv_storage>|opencv-matrix")
 
 
@@ -63,6 +64,13 @@ def read_calibration(
         known = list_kitti_cameras(path)
         grey = known.issuperset(GREY_CAMERAS) or not known.issuperset(COLOUR_CAMERAS)
         return read_kitti_calib(path, width_px, height_px, GREY_CAMERAS if grey else COLOUR_CAMERAS)
+    if _HOMOGRAPHIES.search(text):
+        raise CalibrationError(
+            "homographies know no focal length and no baseline: there is no depth in them",
+            where=path,
+            hint="recon disparity takes the rectified images as they are; for depth use a "
+            "calibration of the cameras (recon calibrate)",
+        )
     raise FormatError(
         "not a calibration file",
         where=path,
