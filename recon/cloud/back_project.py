@@ -51,7 +51,7 @@ def back_project(disparity: Disparity, pair: RectifiedPair, settings: CloudSetti
     """
     if disparity.values.shape != pair.left.shape:
         raise ShapeError(
-            "disparity and picture differ in size",
+            "disparity and image differ in size",
             got=f"disparity {disparity.values.shape}",
             expected=f"{pair.left.shape}",
         )

@@ -15,7 +15,7 @@ from recon.structures.arrays import Float64
 # Files print rotations with four to seven digits; a larger deviation means it is not a rotation.
 _RIGID_TOLERANCE = 1e-3
 _UNIT_TOLERANCE = 1e-2
-# Geocentric and map coordinates stay under 1e7 m; a number beyond is none of a place.
+# Geocentric and projected map coordinates stay below 1e7 m.
 _FARTHEST_M = 1e8
 
 
@@ -141,7 +141,7 @@ def _check_positions(xyz_m: Float64, lines: list[int], path: StrPath) -> None:
     worst = int(np.argmax(far_m))
     if far_m[worst] > _FARTHEST_M:
         raise FormatError(
-            "position is farther off than any on Earth",
+            "position is implausibly far from the origin",
             where=f"{path}:{lines[worst]}",
             got=f"{far_m[worst]:.3g} m",
             expected=f"at most {_FARTHEST_M:.0e} m",

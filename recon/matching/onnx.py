@@ -119,7 +119,7 @@ class OnnxMatcher:
         output = outputs[number]
         if output.ndim < 2 or output.size != output.shape[-1] * output.shape[-2]:
             raise MatchingError(
-                "the network's output is no disparity map",
+                "the network's output is not a disparity map",
                 got=output.shape,
                 expected="(1, 1, H, W) or with fewer ones",
             )

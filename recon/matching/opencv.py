@@ -224,9 +224,9 @@ def _range(settings: OpencvSettings, camera: RectifiedCamera) -> int:
     first, last = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1
     if first <= -_LIMIT_PX or last >= _LIMIT_PX:
         raise MatchingError(
-            "OpenCV cannot count so far",
+            "disparities exceed the range of OpenCV",
             got=f"disparities from {first} to {last} px",
             expected=f"between {-_LIMIT_PX} and {_LIMIT_PX} px",
-            hint="check min_disparity_px and ndisp, or match smaller pictures",
+            hint="check min_disparity_px and ndisp, or match smaller images",
         )
     return ndisp

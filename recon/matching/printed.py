@@ -57,14 +57,14 @@ class PrintedMatcher:
         """Match one rectified pair.
 
         Raises:
-            MatchingError: The patch is larger than the picture.
+            MatchingError: The patch is larger than the image.
 
         Ref: Eq. 9-10 of the seed paper, see docs/paper.md.
         """
         patch_px = self._settings.patch_px
         if patch_px > min(pair.left.shape):
             raise MatchingError(
-                "patch is larger than the picture",
+                "patch is larger than the image",
                 got=f"{patch_px} px",
                 expected=f"at most {min(pair.left.shape)} px",
             )

@@ -99,7 +99,7 @@ class SearchSettings(Settings):
         last = self.min_disparity_px + ndisp - 1
         if self.min_disparity_px >= camera.width_px or last <= -camera.width_px:
             raise MatchingError(
-                "no disparity of the range lies within the picture",
+                "no disparity of the range lies within the image",
                 got=f"{self.min_disparity_px} to {last} px",
                 expected=f"some within {1 - camera.width_px} to {camera.width_px - 1} px",
                 hint="check min_disparity_px and ndisp",

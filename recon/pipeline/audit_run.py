@@ -115,9 +115,9 @@ def mend_calibration(
     alignment = audit.alignment
     if alignment is None:
         raise CalibrationError(
-            "too few features to mend a calibration",
+            "too few features to correct the calibration",
             where=source.name,
-            hint="give pictures that show more, or calibrate the cameras anew",
+            hint="record scenes with more texture, or recalibrate the cameras",
         )
     rig = source.calibration
     if isinstance(rig, RectifiedCamera):

@@ -71,9 +71,9 @@ def find_views(pictures: PicturePairs, board: CalibrationBoard, threads: int) ->
         check_charuco(len(files), lambda n: _read_grey(files[n]), board)
     if not any(look.seen for look in looks):
         raise CalibrationError(
-            "the board is seen in no picture",
+            "the board was not found in any image",
             where=files[0].parent,
-            got=f"{len(files)} pictures",
+            got=f"{len(files)} images",
             expected=str(board),
             hint="all of it must be in view, with a light margin, sharp and evenly lit",
         )
@@ -125,7 +125,7 @@ def _one_size(files: Sequence[Path], looks: Sequence[_Look]) -> tuple[int, int]:
     for path, look in zip(files, looks, strict=True):
         if look.size_px != first:
             raise SourceError(
-                "pictures differ in size",
+                "images differ in size",
                 where=path,
                 got=f"{look.size_px[0]}x{look.size_px[1]}",
                 expected=f"{first[0]}x{first[1]} as {files[0].name}",

@@ -27,7 +27,7 @@ class CheckpointSettings(Settings):
     """How often a run writes down what it goes on from; changes no result."""
 
     every_frames: int = Field(
-        50, ge=1, le=1_000_000, description="Frames after which the state is written."
+        50, ge=1, le=1_000_000, description="Number of frames between two checkpoints."
     )
 
 

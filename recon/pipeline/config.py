@@ -53,10 +53,11 @@ class ReconConfig(Settings):
     edges: EdgeSettings = EdgeSettings()
     cloud: CloudSettings = CloudSettings()
     filters: FilterSettings = Field(
-        default=NO_FILTER, description="Of the cloud of one frame; fusing thins and cleans anyway."
+        default=NO_FILTER,
+        description="Filters of the cloud of one frame; fusion thins and cleans it anyway.",
     )
     map_filters: FilterSettings = Field(
-        default=NO_ISLANDS, description="Of the fused cloud, when it is exported."
+        default=NO_ISLANDS, description="Filters of the fused cloud on export."
     )
     odometry: OdometrySettings = OdometrySettings()
     loops: LoopSettings = LoopSettings()

@@ -198,7 +198,7 @@ def _path_motion(estimate: _Estimate, poses: Path) -> Float64:
     """The rigid motion that brings the run's path closest to the true one."""
     if estimate.folder is None:
         raise EvaluationError(
-            "a cloud of no run has no path to align", hint="give the folder of a run"
+            "a cloud without a run has no path to align", hint="give the folder of a run"
         )
     path, truth = read_trajectory(estimate.folder / _PATH), read_trajectory(poses)
     if holds_times(poses):
@@ -246,7 +246,9 @@ def _read_estimate(run: Path) -> _Estimate:
     """The cloud, and the run that it belongs to, if any."""
     if run.is_dir():
         if not (run / RECORD).is_file():
-            raise FormatError("folder holds no finished run", where=run, expected=f"a {RECORD}")
+            raise FormatError(
+                "folder does not contain a finished run", where=run, expected=f"a {RECORD}"
+            )
         return _Estimate(read_ply(run / "map" / "cloud.ply"), run, _read_axes(run / RECORD))
     folder = run.parent.parent
     if run.parent.name == "map" and (folder / RECORD).is_file():
@@ -261,5 +263,5 @@ def _read_axes(record: Path) -> Float64:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise FormatError("record of the run has no T_map_world", where=record) from error
     if T_map_world.shape != (4, 4) or not np.isfinite(T_map_world).all():
-        raise FormatError("T_map_world is no 4x4 matrix", where=record)
+        raise FormatError("T_map_world is not a 4x4 matrix", where=record)
     return T_map_world

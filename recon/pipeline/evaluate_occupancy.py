@@ -39,7 +39,7 @@ def compare_occupancy(folder: Path, least_frames: int = LEAST_FRAMES) -> Occupan
         least_frames: Frames that must have seen what is compared.
 
     Raises:
-        FormatError: The folder holds no finished run, or a map is missing or damaged.
+        FormatError: The folder does not contain a finished run, or a map is missing or damaged.
         EvaluationError: The truth of the run is not known, or nothing was seen often enough.
     """
     run = open_run(folder)

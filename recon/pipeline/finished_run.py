@@ -48,7 +48,7 @@ def open_run(folder: Path) -> FinishedRun:
     """Read the record and the configuration of a run with maps.
 
     Raises:
-        FormatError: The folder holds no finished run, or one without maps.
+        FormatError: The folder does not contain a finished run, or one without maps.
         SettingsError: Its configuration is not one of this version.
     """
     record = _read_record(folder / RECORD)
@@ -81,7 +81,7 @@ def _matrix(value: Any) -> Float64 | None:
 def _read_record(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FormatError(
-            "folder holds no finished run", where=path.parent, expected=f"a {path.name}"
+            "folder does not contain a finished run", where=path.parent, expected=f"a {path.name}"
         )
     try:
         record = json.loads(path.read_text(encoding="utf-8"))

@@ -28,8 +28,8 @@ class MemorySettings(Settings):
     limit_mb: float | None = Field(
         None,
         gt=0.0,
-        description="Largest resident memory of the process, in 10⁶ bytes; null = no limit. "
-        "Submaps and tiles are cut smaller to keep to it, so that results differ by rounding.",
+        description="Largest resident memory of the process, in 10⁶ bytes; none = no limit. "
+        "Submaps and tiles are made smaller to meet it, so results may differ by rounding.",
     )
 
     @property
@@ -59,7 +59,7 @@ class MemorySettings(Settings):
                 where=where,
                 got=f"{peak_memory_mb():.0f} MB",
                 expected=f"at most {self.limit_mb:g} MB",
-                hint="give more with --memory-limit, or take smaller pictures, fewer disparities "
+                hint="give more with --memory-limit, or take smaller images, fewer disparities "
                 "or a coarser map",
             )
 

@@ -98,7 +98,7 @@ def run_middlebury(folder: Path, config: ReconConfig, options: MiddleburyOptions
         skipped = [name for name, figures in scenes.items() if not figures]
         if len(skipped) == len(scenes):
             raise SourceError(
-                "no scene has a truth to compare with",
+                "no scene has ground truth to compare with",
                 where=folder,
                 got=", ".join(skipped),
                 hint="name a folder of scenes that have one with --truth",

@@ -49,7 +49,7 @@ def find_scenes(folder: Path) -> dict[str, Path]:
     paths = sorted(_scenes_below(folder))
     if not paths:
         raise SourceError(
-            "folder holds no Middlebury scene",
+            "folder contains no Middlebury scene",
             where=folder,
             expected="folders with im0 and im1 and calib.txt, view1 and view5, or im2 and im6",
         )

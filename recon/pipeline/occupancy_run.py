@@ -125,7 +125,7 @@ class _Drive:
         _check_grain(self._rays, self.config)
         if len(self._rays) != len(self.trajectory):
             raise FormatError(
-                "the run has not as many frames of rays as poses",
+                "the run has different numbers of ray frames and poses",
                 where=self.run.folder,
                 got=f"{len(self._rays)} and {len(self.trajectory)}",
             )
@@ -163,7 +163,7 @@ def _configure(run: FinishedRun, request: OccupancyRequest) -> ReconConfig:
     other = [name for name in known if name not in _REMADE and known[name] != changed[name]]
     if other:
         raise SettingsError(
-            "this setting changes nothing here: the drive is not mapped again",
+            "this setting has no effect here: the drive is not mapped again",
             got=other[0],
             expected=f"settings of {', '.join(_REMADE)}",
             hint="recon map takes it",
@@ -174,7 +174,7 @@ def _configure(run: FinishedRun, request: OccupancyRequest) -> ReconConfig:
 def _open_rays(path: Path) -> RayFile:
     if not path.is_file():
         raise FormatError(
-            "the run kept no rays to make occupancy of",
+            "the run kept no rays to build occupancy from",
             where=path,
             hint="map the drive again with --set occupancy.keep_rays=true",
         )
@@ -187,14 +187,14 @@ def _check_grain(rays: RayFile, config: ReconConfig) -> None:
     # Half a per mille for resolutions that were typed, such as 0.33 for a third.
     if wanted.resolution_m < grain.cell_m * 0.9995:
         raise SettingsError(
-            "the run kept no rays for voxels so fine",
+            "the rays kept by the run are too coarse for these voxels",
             got=f"{wanted.resolution_m:g} m",
             expected=f"at least {grain.cell_m:g} m",
             hint="map the drive again with --set occupancy.rays_per_voxel= or resolution_m=",
         )
     if wanted.max_range_m > grain.max_range_m * (1 + 1e-9):
         raise SettingsError(
-            "the run kept no rays that reach so far",
+            "the rays kept by the run do not reach that far",
             got=f"{wanted.max_range_m:g} m",
             expected=f"at most {grain.max_range_m:g} m",
             hint="map the drive again with --set occupancy.max_range_m=",

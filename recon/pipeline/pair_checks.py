@@ -108,7 +108,7 @@ def check_found(
     if np.array_equal(pair.left, pair.right):
         advice = "left and right are the same picture"
     raise MatchingError(
-        "no pixel has a partner in the other picture",
+        "no pixel has a match in the other image",
         where=pair.name or None,
         got=_reasons(disparity),
         hint=next((fault.text for fault in faults if fault.fatal), advice),

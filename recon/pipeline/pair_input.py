@@ -61,7 +61,7 @@ def _read_truth(path: Path, shape: tuple[int, ...]) -> DisparityTruth:
     values = read_disparity(path)
     if values.shape != shape:
         raise FormatError(
-            "truth is not of the size of the pictures",
+            "size of the ground truth differs from the images",
             where=path,
             got=f"{values.shape[1]}x{values.shape[0]}",
             expected=f"{shape[1]}x{shape[0]}",

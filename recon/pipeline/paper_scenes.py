@@ -115,7 +115,9 @@ def camera_of_table_1(camera: RectifiedCamera) -> RectifiedCamera:
     """
     if camera.doffs_px <= 0:
         raise CalibrationError(
-            "doffs cannot pass for a focal length", got=f"{camera.doffs_px:g} px", expected="> 0 px"
+            "doffs cannot be used as a focal length",
+            got=f"{camera.doffs_px:g} px",
+            expected="> 0 px",
         )
     return replace(camera, focal_px=camera.doffs_px, cx_right_px=camera.cx_px)
 

@@ -156,9 +156,9 @@ def _by_file(options: RectifyOptions, config: ReconConfig, first: StereoPair) ->
     rig = read_calibration(path or "", width, height, metres_per_unit=options.metres_per_unit)
     if not isinstance(rig, StereoCalibration):
         raise CalibrationError(
-            "the calibration is one of pictures that are rectified already",
+            "the calibration is of images that are already rectified",
             where=path,
-            hint="nothing is left to do: recon pair and recon map take them as they are",
+            hint="use them directly with recon pair or recon map",
         )
     rectifier = Rectifier(rig, config.rectification)
     turns, camera = plan_turns(rig, config.rectification), rectifier.camera
@@ -233,7 +233,7 @@ def _pairs(pictures: PicturePairs) -> Iterator[tuple[StereoPair, tuple[Path, Pat
         shape = shape or pair.left.shape[:2]
         if pair.left.shape[:2] != shape:
             raise CalibrationError(
-                "pictures differ in size",
+                "images differ in size",
                 where=files[0],
                 got=f"{pair.left.shape[1]}x{pair.left.shape[0]}",
                 expected=f"{shape[1]}x{shape[0]}",

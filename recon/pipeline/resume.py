@@ -98,7 +98,9 @@ def _plan_resumed(
     if asked.memory.limit_mb is not None:
         settings = settings.model_copy(update={_MEMORY: asked.memory})
     if request.out is not None and request.out.resolve() != folder.resolve():
-        raise SettingsError("--out and --resume name two folders", got=request.out, expected=folder)
+        raise SettingsError(
+            "--out and --resume name different folders", got=request.out, expected=folder
+        )
     if not request.mesh and known.get("mesh"):
         raise SettingsError("the run was started with a mesh", where=folder, hint="drop --no-mesh")
     request = replace(
@@ -125,7 +127,7 @@ def open_requested(request: MapRequest, config: ReconConfig) -> StereoSource:
         ReconError: The source cannot give pairs.
     """
     if request.source is None:
-        raise SettingsError("it is not known what to map", hint="name SOURCE")
+        raise SettingsError("there is no source to map", hint="name SOURCE")
     return open_source(request.source, request.kind, config.source)
 
 

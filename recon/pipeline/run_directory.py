@@ -205,7 +205,7 @@ def _refuse_foreign(folder: Path) -> None:
         raise _unwritable(folder, error) from error
     if occupied and not (folder / RECORD).is_file():
         raise OutputError(
-            "output folder holds files that are not of a run",
+            "output folder contains files that are not of a run",
             where=folder,
             hint="choose another --out or empty it",
         )
@@ -232,5 +232,5 @@ def _unwritable(folder: Path, error: OSError) -> OutputError:
         "output folder cannot be written",
         where=folder,
         got=error.strerror or str(error),
-        hint="choose another --out or mend its permissions",
+        hint="choose another --out or fix its permissions",
     )

@@ -137,7 +137,7 @@ def _names(folder: Path) -> set[str]:
 def _read_times(
     folder: Path, frames: int, settings: SourceSettings
 ) -> tuple[Float64, tuple[Path, ...]]:
-    """Seconds of each frame, and the file that tells them; none where a rate is given."""
+    """Times of the frames in seconds, and their file; no file if a rate is given."""
     if settings.rate_hz is not None:
         return np.arange(frames) / settings.rate_hz, ()
     path = folder / "times.txt"

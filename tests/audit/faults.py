@@ -137,7 +137,7 @@ def wrong_size(source: StereoSource) -> Spoiled:
     def take(index: int) -> StereoPair:
         pair = half.take(index)
         raise FormatError(
-            "picture has another size than the calibration",
+            "image size differs from the calibration",
             where=pair.name,
             got=f"{pair.left.shape[1]}x{pair.left.shape[0]}",
         )

@@ -190,7 +190,7 @@ def test_figures_do_not_depend_on_what_runs_beside(
     [
         (("nowhere",), "does not exist"),
         (("empty",), "no Middlebury scene"),
-        (("MiddEval3/trainingH",), "no scene has a truth"),
+        (("MiddEval3/trainingH",), "no scene has ground truth"),
         (("MiddEval3/trainingH", "--truth", "nowhere"), "nowhere: folder does not exist"),
         (("MiddEval3/trainingQ", "--matcher", "sad,nonsense"), "unknown matcher"),
         (("MiddEval3/trainingQ", "--matcher", "sad,sad"), "named twice"),

@@ -66,7 +66,7 @@ def test_a_run_whose_truth_is_not_known_is_refused(run: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("lost", "words"),
     [
-        ("run.json", "no finished run"),
+        ("run.json", "not contain a finished run"),
         ("map/octomap.ot", "OctoMap"),
         ("map/grid.yaml", "YAML"),
         ("map/grid.pgm", "picture"),

@@ -86,10 +86,13 @@ def test_a_shorter_range_knows_less(small_demo: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        ("occupancy.resolution_m=0.09", r"so fine \(got 0\.09 m, expected at least 0\.1 m"),
-        ("occupancy.max_range_m=26", r"so far \(got 26 m, expected at most 25 m"),
-        ("matching.matcher=sgm", "changes nothing here.*matching"),
-        ("fusion.voxel_m=0.2", "changes nothing here.*fusion"),
+        (
+            "occupancy.resolution_m=0.09",
+            r"too coarse for these voxels \(got 0\.09 m, expected at least 0\.1 m",
+        ),
+        ("occupancy.max_range_m=26", r"that far \(got 26 m, expected at most 25 m"),
+        ("matching.matcher=sgm", "has no effect here.*matching"),
+        ("fusion.voxel_m=0.2", "has no effect here.*fusion"),
         ("grid.min_height_m=7", "height band"),
         ("grid.heigth=7", "heigth"),
     ],
@@ -128,7 +131,7 @@ def test_rays_and_poses_must_be_of_the_same_frames(small_demo: Path, tmp_path: P
 
 
 def test_a_folder_that_is_no_run_is_told(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="no finished run"):
+    with pytest.raises(FormatError, match="not contain a finished run"):
         _remake(tmp_path, tmp_path / "out")
 
 

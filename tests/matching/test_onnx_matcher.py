@@ -93,7 +93,7 @@ def test_what_is_not_finite_is_no_match(tmp_path: Path) -> None:
 
 
 def test_a_network_that_gives_no_map_or_takes_other_inputs_is_refused(difference: Path) -> None:
-    with pytest.raises(MatchingError, match="no disparity map"):
+    with pytest.raises(MatchingError, match="not a disparity map"):
         match(difference, pair_of(1, 2), channels=3)
     with pytest.raises(MatchingError, match="number of inputs"):
         match(difference, pair_of(1, 2), inputs="stacked")

@@ -93,9 +93,9 @@ def blank(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [
-        (shrink, SourceError, r"right01\.png: pictures differ in size \(got 320x240"),
+        (shrink, SourceError, r"right01\.png: images differ in size \(got 320x240"),
         (lose, SourceError, r"no partner \(got left01\.png\)"),
-        (blank, CalibrationError, r"the board is seen in no picture \(got 18 pictures"),
+        (blank, CalibrationError, r"the board was not found in any image \(got 18 images"),
     ],
 )
 def test_what_is_wrong_is_one_clear_line_and_nothing_is_left(

@@ -81,7 +81,7 @@ def test_a_calibration_of_rectified_pictures_is_refused(street: Path, tmp_path: 
     camera = RectifiedCamera(700, 600, 180, 600, 0.5, 1242, 375)
     write_recon_calibration(tmp_path / "c.yaml", camera)
     options = RectifyOptions(tmp_path / "c.yaml", out=tmp_path / "out")
-    with pytest.raises(CalibrationError, match=r"c\.yaml: .*rectified already"):
+    with pytest.raises(CalibrationError, match=r"c\.yaml: .*already rectified"):
         run_rectify(str(street / "left"), str(street / "right"), load_config(), options)
     assert not (tmp_path / "out").exists()
 
