@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import subprocess
 import sys
@@ -47,6 +48,9 @@ def test_the_command_prints_json_and_draws_what_is_wrong(run: Path, tmp_path: Pa
 
     colours = cv2.imread(str(picture))[..., ::-1].reshape(-1, 3)
     counts = {kind: int((colours == rgb).all(axis=1).sum()) for kind, rgb in GRID_ERRORS.items()}
+    # A cell is a square of pixels.
+    side_px = math.isqrt(sum(counts.values()) // printed["grid"]["cells"])
+    counts = {kind: pixels / side_px**2 for kind, pixels in counts.items()}
     assert sum(counts.values()) == printed["grid"]["cells"]
     true = sum(n for (kind, _), n in counts.items() if kind == 100)
     assert true == printed["grid"]["true_occupied"]
@@ -69,7 +73,7 @@ def test_a_run_whose_truth_is_not_known_is_refused(run: Path, tmp_path: Path) ->
         ("run.json", "not contain a finished run"),
         ("map/octomap.ot", "OctoMap"),
         ("map/grid.yaml", "YAML"),
-        ("map/grid.pgm", "picture"),
+        ("map/grid.pgm", "image"),
     ],
 )
 def test_a_folder_without_its_files_is_refused(
