@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.compiled import kernel
 
-@njit(cache=True, nogil=True)
+
+@kernel
 def continue_row(row: NDArray[np.uint8], at: int, longer: NDArray[np.uint8]) -> None:
     """Copy a row into a longer one, whose other values become the nearest value of the row.
 

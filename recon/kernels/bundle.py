@@ -12,8 +12,9 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from recon.kernels.compiled import kernel
 
 Float64 = NDArray[np.float64]
 
@@ -96,7 +97,7 @@ def solve_step(normal: NormalEquations, damping: float) -> tuple[Float64, Float6
     return step_pose, step_point
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cost(
     T_camera_world: Float64, uvd: Float64, xyz_world: Float64, model: tuple[float, ...]
 ) -> float:
@@ -111,7 +112,7 @@ def cost(
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _observe(
     T: Float64,
     xyz: Float64,
@@ -132,18 +133,18 @@ def _observe(
         residual[2] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _square(vector: Float64) -> float:
     return float(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _linearise(
     T_camera_world: Float64,
     uvd: Float64,
     xyz_world: Float64,
     model: tuple[float, ...],
-    normal: tuple[Float64, Float64, Float64, Float64, Float64],
+    normal: tuple[Float64, ...],
 ) -> None:
     H_pose, g_pose, H_point, g_point, H_cross = normal
     focal, _, _, fb, _, sigma_uv, sigma_d, cauchy = model
@@ -187,9 +188,9 @@ def _linearise(
                         H_point[n, i, j] += scaled * by_point[j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _solve(
-    normal: tuple[Float64, Float64, Float64, Float64, Float64],
+    normal: tuple[Float64, ...],
     damping: float,
     step_pose: Float64,
     step_point: Float64,
@@ -238,7 +239,7 @@ def _solve(
         step_pose[w] = g[6 * (w - 1) : 6 * w]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _invert(H: Float64, damping: float, inverse: Float64) -> None:
     """Inverse of a symmetric 3x3 block with a raised diagonal, by cofactors."""
     raised = 1.0 + damping
@@ -256,7 +257,7 @@ def _invert(H: Float64, damping: float, inverse: Float64) -> None:
             inverse[i, j] /= determinant
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _multiply(block: Float64, inverse: Float64, folded: Float64) -> None:
     for i in range(6):
         for j in range(3):
@@ -264,7 +265,7 @@ def _multiply(block: Float64, inverse: Float64, folded: Float64) -> None:
             folded[i, j] = total + block[i, 2] * inverse[2, j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _subtract(S: Float64, row: int, column: int, folded: Float64, block: Float64) -> None:
     for i in range(6):
         for j in range(6):
@@ -272,7 +273,7 @@ def _subtract(S: Float64, row: int, column: int, folded: Float64, block: Float64
             S[row + i, column + j] -= total + folded[i, 2] * block[j, 2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _solve_symmetric(S: Float64, g: Float64) -> None:
     """Solve ``S x = g`` in place from the lower half of S, as L·D·Lᵀ.
 

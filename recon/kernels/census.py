@@ -12,10 +12,10 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from recon.kernels.borders import continue_row
+from recon.kernels.compiled import kernel
 from recon.kernels.lanes import LANES, load_row, splat, store_row, where_less
 
 PLANES: Final = 3
@@ -42,7 +42,7 @@ class Descriptor(NamedTuple):
         return 1 + PLANES * max(1, -(-neighbours // (8 * PLANES)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def write_planes(
     grey: NDArray[np.uint8],
     descriptor: Descriptor,
@@ -79,7 +79,7 @@ def write_planes(
                 continue_row(row[n, :width], place, planes[y, n])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _write_gradient(
     around: NDArray[np.uint8], y: int, radius: int, cap: int, gradient: NDArray[np.uint8]
 ) -> None:
@@ -97,7 +97,7 @@ def _write_gradient(
         gradient[x] = np.uint8(np.int16(min(max(slope, np.int16(-most)), most) + most))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _write_census(
     around: NDArray[np.uint8],
     y: int,

@@ -19,9 +19,9 @@ import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.compiled import kernel
 from recon.kernels.raycast import (
     BLOCK_BITS,
     BLOCK_CELLS,
@@ -109,7 +109,7 @@ def add_evidence(
     return blocks
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_evidence(
     blocks: tuple[NDArray[Any], ...],
     evidence: tuple[NDArray[Any], ...],
@@ -131,7 +131,7 @@ def _add_evidence(
     frame_used[0] = 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _chain(
     cells: NDArray[np.float32],
     row: int,
@@ -179,7 +179,7 @@ def chain_rows(blocks: ClampedBlocks, rows: CellRows) -> ClampedBlocks:
     return blocks
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _chain_rows(blocks: tuple[NDArray[Any], ...], rows: tuple[NDArray[Any], ...]) -> None:
     """The loop of `chain_rows`; the map has room for every block."""
     table, keys, cells, used = blocks
@@ -202,7 +202,8 @@ def move_blocks(blocks: ClampedBlocks, T_new_old: NDArray[np.float64]) -> Clampe
     moved.keys[: len(targets)] = targets
     moved.used[0] = len(targets)
     enter_keys(moved.table, targets)
-    _fill_moved(tuple(blocks), tuple(moved), np.linalg.inv(T_new_old))
+    T_old_new = np.asarray(np.linalg.inv(T_new_old), np.float64)
+    _fill_moved(tuple(blocks), tuple(moved), T_old_new)
     return moved
 
 
@@ -215,7 +216,7 @@ def _blocks_reached(blocks: ClampedBlocks, T_new_old: NDArray[np.float64]) -> ND
     return np.unique(pack_keys((home[:, None].astype(np.int64) + around).reshape(-1, 3)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill_moved(
     old: tuple[NDArray[Any], ...], new: tuple[NDArray[Any], ...], T_old_new: NDArray[np.float64]
 ) -> None:

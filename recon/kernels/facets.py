@@ -16,9 +16,9 @@ import math
 from typing import Final
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.compiled import kernel
 from recon.kernels.voxels import EMPTY, enter_keys, find, make_table, pack_key
 
 AROUND: Final = 27
@@ -51,7 +51,7 @@ def crossed_cells(
     return crossed
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _crossed_cells(
     cells: NDArray[np.int32],
     table: NDArray[np.int64],
@@ -78,7 +78,7 @@ def _crossed_cells(
         crossed[n] = own if found < LEAST else _crosses(points[:found], weights[:found])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _crosses(points: NDArray[np.float64], weights: NDArray[np.float64]) -> bool:
     """Whether the plane through points around a cell's centre crosses the cell."""
     normal = _normal(points, weights)
@@ -93,7 +93,7 @@ def _crosses(points: NDArray[np.float64], weights: NDArray[np.float64]) -> bool:
     return bool(abs(distance) <= reach * total)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _normal(points: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
     """float64 (3,), the direction in which weighted points spread least."""
     total = weights.sum()

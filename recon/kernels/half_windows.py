@@ -16,10 +16,10 @@ from __future__ import annotations
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from recon.kernels.borders import continue_row
+from recon.kernels.compiled import kernel
 from recon.kernels.lanes import LANES, distance, fit, least, load, splat, store
 from recon.kernels.tiles import GROUP, Offer
 
@@ -117,7 +117,7 @@ def empty_views(search: Search, block: int, height: int, width: int) -> Views:
     return Views(np.empty((height, columns), np.uint8), right, width)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def lay_out(
     left: NDArray[np.uint8],
     right: NDArray[np.uint8],
@@ -178,7 +178,7 @@ def _stride(search: Search, block: int) -> int:
     return -(-(block + 2 * search.radius) // 32) * 32
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def next_half(
     views: Views, search: Search, first: int, y: int, x0: int, scratch: Scratch
 ) -> Halves:
@@ -200,7 +200,7 @@ def next_half(
     return Halves(upper, lower, scratch.stride)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def enlist(
     views: Views, search: Search, now: Offer, soon: Offer, y: int, x0: int, scratch: Scratch
 ) -> None:
@@ -220,7 +220,7 @@ def enlist(
     _begin(views, search, y - 1, x0, scratch)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _list_runs(now: Offer, soon: Offer, ndisp: int, more: int, runs: NDArray[np.int64]) -> None:
     """Write the runs of what is offered now or soon, each ``more`` places longer."""
     count = 0
@@ -234,7 +234,7 @@ def _list_runs(now: Offer, soon: Offer, ndisp: int, more: int, runs: NDArray[np.
             runs[count - 1, 1] = end
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _begin(views: Views, search: Search, y: int, x0: int, scratch: Scratch) -> None:
     """Bring the column sums of the runs up to date for row ``y``."""
     last, before = views.left.shape[0] - 1, 0
@@ -253,7 +253,7 @@ def _begin(views: Views, search: Search, y: int, x0: int, scratch: Scratch) -> N
     scratch.alive[before:] = False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_row(views: Views, n: int, cost_cap: int, y: int, x0: int, scratch: Scratch) -> None:
     """Add the costs of the pixels of row ``y`` to the column sums of place ``n``."""
     sums, left, right = scratch.columns, views.left[y], views.right[y]
@@ -264,7 +264,7 @@ def _add_row(views: Views, n: int, cost_cap: int, y: int, x0: int, scratch: Scra
         store(sums, at, load(sums, at) + fit(plus, sums))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _slide_row(
     views: Views,
     n0: int,
@@ -288,7 +288,7 @@ def _slide_row(
             at, other = at + stride, other - 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_columns(
     scratch: Scratch, first: int, end: int, window: int, sums: NDArray[np.uint16]
 ) -> None:

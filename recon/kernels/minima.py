@@ -8,8 +8,9 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from recon.kernels.compiled import kernel
 
 NO_COST: Final = 65535
 """Stands for the cost of a candidate that does not exist; real costs stay below it."""
@@ -37,7 +38,7 @@ def empty_minima(height: int, width: int) -> Minima:
     return Minima(winner=block[0], costs=block[1:5], right_winner=block[5])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def claim_right(ndisp: int, minimum: int, y: int, minima: Minima) -> None:
     """Match each pixel of row ``y`` of the right view to the left pixel that chose it best.
 

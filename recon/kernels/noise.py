@@ -9,8 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from recon.kernels.compiled import kernel
 
 MAX_TAPS = 8
 
@@ -22,16 +23,16 @@ _AM1, _AM2, _SHIFT, _TOP = np.uint64(_M1), np.uint64(_M2), np.uint64(33), np.uin
 _UNIT = 2.0**-51
 
 
-@njit(cache=True, nogil=True)
-def _mix(h):  # type: ignore[no-untyped-def]
+@kernel
+def _mix(h: Any) -> Any:
     """Spread the bits of a 64-bit key and map it to [-1, 1)."""
     h = (h ^ (h >> _SHIFT)) * _AM1
     h = (h ^ (h >> _SHIFT)) * _AM2
     return np.float64(h >> _TOP) * _UNIT - 1.0
 
 
-@njit(cache=True, nogil=True)
-def _value_noise(x, y, z, seed):  # type: ignore[no-untyped-def]
+@kernel
+def _value_noise(x: float, y: float, z: float, seed: Any) -> Any:
     """Random values on the integer lattice, interpolated with quintic weights."""
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
     tx, ty, tz = x - fx, y - fy, z - fz
@@ -49,8 +50,17 @@ def _value_noise(x, y, z, seed):  # type: ignore[no-untyped-def]
     return near * (1.0 - tz) + far * tz
 
 
-@njit(cache=True, nogil=True)
-def _octaves(x, y, z, width, wavelength, octaves, gain, seed):  # type: ignore[no-untyped-def]
+@kernel
+def _octaves(
+    x: float,
+    y: float,
+    z: float,
+    width: float,
+    wavelength: float,
+    octaves: int,
+    gain: float,
+    seed: Any,
+) -> float:
     """Sum of octaves at one point, those finer than two widths faded out."""
     total, amplitude = 0.0, 1.0
     for octave in range(octaves):
@@ -71,7 +81,7 @@ def _octaves(x, y, z, width, wavelength, octaves, gain, seed):  # type: ignore[n
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fractal_noise(
     xyz: NDArray[np.float64],
     smear: NDArray[np.float64],

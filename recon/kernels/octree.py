@@ -10,8 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from recon.kernels.compiled import kernel
 
 
 class TreeWalk(NamedTuple):
@@ -70,7 +71,7 @@ def find_leaves(children: NDArray[np.uint8], walk: TreeWalk) -> tuple[int, Leave
     return int(seen), leaves
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _find_leaves(children: NDArray[np.uint8], walk: TreeWalk, found: Leaves) -> tuple[int, int]:
     level, number = walk.level[0], 0
     for node in range(len(children)):
@@ -93,7 +94,7 @@ def _find_leaves(children: NDArray[np.uint8], walk: TreeWalk, found: Leaves) -> 
     return len(children), number
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _next_place(level: int, walk: TreeWalk) -> tuple[int, int, int]:
     """Take the next child of the node above; where it is."""
     if level == 0:

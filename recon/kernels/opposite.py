@@ -6,11 +6,12 @@ The twin in plain numpy is `recon.kernels.opposite_reference.average_opposite_re
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.compiled import kernel
 
-@njit(cache=True, nogil=True)
+
+@kernel
 def average_opposite(
     values: NDArray[np.float32],
     radius: int,
@@ -57,7 +58,7 @@ def average_opposite(
             total[x] /= count[x]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_pair(
     one: NDArray[np.float32],
     other: NDArray[np.float32],

@@ -13,9 +13,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.compiled import kernel
 from recon.kernels.lanes import (
     LANES,
     Lanes,
@@ -83,7 +83,7 @@ def empty_row_scratch(columns: int, paths: Paths) -> RowScratch:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def follow_row(
     costs: NDArray[np.uint8], grey: NDArray[np.uint8], paths: Paths, scratch: RowScratch
 ) -> None:
@@ -104,7 +104,7 @@ def follow_row(
             transpose(scratch.paths, x, k, scratch.means, k, x)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _transpose_costs(costs: NDArray[np.uint8], scratch: RowScratch) -> None:
     """Write the costs column by column."""
     ndisp, columns = costs.shape
@@ -121,7 +121,7 @@ def _transpose_costs(costs: NDArray[np.uint8], scratch: RowScratch) -> None:
         transpose(scratch.last, 0, x, scratch.columns, x, whole)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _set_steps(grey: NDArray[np.uint8], paths: Paths, steps: NDArray[np.uint8]) -> None:
     """Write the large penalty between neighbours; where a path starts there is none."""
     edge, large = np.uint8(paths.edge), np.uint8(paths.large)
@@ -131,7 +131,7 @@ def _set_steps(grey: NDArray[np.uint8], paths: Paths, steps: NDArray[np.uint8]) 
     steps[0] = steps[grey.size] = np.uint8(0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _follow(width: int, small: np.uint8, scratch: RowScratch) -> None:
     """Follow both paths from end to end."""
     right = left = splat(np.uint8(0))
@@ -149,7 +149,7 @@ def _follow(width: int, small: np.uint8, scratch: RowScratch) -> None:
         left = _step(back, scratch.steps[back + 1], LEFTWARD, left, penalty, scratch, True)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _step(
     x: int,
     large: np.uint8,
@@ -181,7 +181,7 @@ def _step(
     return spread_lowest(least(fresh, cost))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _keep(cost: Lanes, path: int, x: int, k: int, scratch: RowScratch, met: bool) -> None:
     """Store path costs, or their means with those of the other path where it has been."""
     store_row(scratch.now, path, k + LANES, cost)

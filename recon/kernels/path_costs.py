@@ -12,10 +12,10 @@ from __future__ import annotations
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from recon.kernels.census import PLANES, Descriptor, write_planes
+from recon.kernels.compiled import kernel
 from recon.kernels.lanes import (
     LANES,
     Lanes,
@@ -181,7 +181,7 @@ def empty_cost_rows(columns: int, window: Window) -> CostRows:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def write_costs(
     views: Views,
     window: Window,
@@ -215,7 +215,7 @@ def write_costs(
             _write_block(views, window, columns, first, end, y, rows, costs[middle])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _write_block(
     views: Views,
     window: Window,
@@ -243,7 +243,7 @@ def _write_block(
     _slide_window(rows.pixels, window, oldest, rows.sums, first, end, costs)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _compare(
     left: NDArray[np.uint8],
     right: NDArray[np.uint8],
@@ -270,7 +270,7 @@ def _compare(
             store_row(pixels, k - first, x, apart + one + two + three)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_bits(
     left: NDArray[np.uint8],
     right: NDArray[np.uint8],
@@ -292,7 +292,7 @@ def _add_bits(
             store_row(pixels, k - first, x, cost)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_across(pixels: NDArray[np.uint8], n: int, x: int, radius: int) -> Lanes:
     """Sum the costs over the window's width; the sums fit into uint8."""
     total = load_row(pixels, n, x)
@@ -301,7 +301,7 @@ def _sum_across(pixels: NDArray[np.uint8], n: int, x: int, radius: int) -> Lanes
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_across_wide(
     pixels: NDArray[np.uint8], n: int, x: int, window: Window, sums: NDArray[np.uint16]
 ) -> Lanes:
@@ -312,7 +312,7 @@ def _sum_across_wide(
     return narrow(total >> splat(np.uint16(window.row_shift)))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _slide_window(
     pixels: NDArray[np.uint8],
     window: Window,

@@ -17,9 +17,9 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.compiled import kernel
 from recon.kernels.lanes import LANES, Lanes, least, load_row, mean, splat, store_row
 from recon.kernels.plane_minima import MARGIN
 
@@ -84,7 +84,7 @@ def begin(paths: Paths, row: PathRow) -> None:
     row.lowest[:] = row.limits[:] = 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def advance(
     costs: NDArray[np.uint8],
     grey: NDArray[np.uint8],
@@ -127,7 +127,7 @@ def advance(
     lowest[:] = now
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _set_limits(
     grey: NDArray[np.uint8],
     others: NDArray[np.uint8],
@@ -143,7 +143,7 @@ def _set_limits(
         limits[x] = np.uint8(lowest[x] + penalty)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def large_penalty(
     grey: np.uint8, before: np.uint8, edge: np.uint8, large: np.uint8, large_at_edge: np.uint8
 ) -> np.uint8:
@@ -152,7 +152,7 @@ def large_penalty(
     return large_at_edge if step > edge else large
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def next_cost(
     same: Lanes, below: Lanes, above: Lanes, penalty: Lanes, limit: Lanes, low: Lanes, cost: Lanes
 ) -> Lanes:
@@ -171,7 +171,7 @@ def next_cost(
     return least(least(same, limit), beside) - low + cost
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _advance_from_right(
     costs: NDArray[np.uint8], first: int, end: int, small: int, row: PathRow
 ) -> None:
@@ -192,7 +192,7 @@ def _advance_from_right(
         store_row(now, FROM_RIGHT, here, fresh)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _advance_others(
     costs: NDArray[np.uint8],
     first: int,

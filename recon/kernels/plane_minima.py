@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.compiled import kernel
 from recon.kernels.lanes import LANES, least, load_row, splat, store_row, where_less
 from recon.kernels.minima import NO_COST, Minima
 from recon.kernels.path_costs import aligned, padded
@@ -84,7 +84,7 @@ def empty_best(columns: int, width: int, rows: int) -> Best:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def choose_row(
     costs: NDArray[np.uint8],
     minimum: int,
@@ -128,14 +128,14 @@ def choose_row(
     _write_row(best, ndisp, y, band, minima)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _close(costs: NDArray[np.uint8], first: int, end: int) -> None:
     """Mark the columns outside ``first`` to ``end - 1``."""
     costs[: min(first, costs.size)] = np.uint8(NONE)
     costs[max(end, 0) :] = np.uint8(NONE)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _search_left(costs: NDArray[np.uint8], first: int, end: int, known: NDArray[np.uint8]) -> None:
     """Compare a block of candidates with the best so far, and note the costs around it."""
     one = splat(np.uint8(1))
@@ -170,7 +170,7 @@ def _search_left(costs: NDArray[np.uint8], first: int, end: int, known: NDArray[
         store_row(known, PRIOR, x, prior)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _search_right(
     costs: NDArray[np.uint8],
     minimum: int,
@@ -196,7 +196,7 @@ def _search_right(
         store_row(known, WHICH, x, which)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _settle(known: NDArray[np.uint8], first: int, which: NDArray[np.uint16]) -> None:
     """Take over the winners of a block that beat those of the blocks before."""
     lowest, settled, place = known[LOWEST], known[SETTLED], known[WHICH]
@@ -206,7 +206,7 @@ def _settle(known: NDArray[np.uint8], first: int, which: NDArray[np.uint16]) -> 
         settled[x] = lowest[x]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _write_row(best: Best, ndisp: int, y: int, band: Band, minima: Minima) -> None:
     """Write the winners of the left view, their costs and those around them."""
     winner, costs = minima.winner[y, band.first : band.last], minima.costs[:, y]
@@ -219,7 +219,7 @@ def _write_row(best: Best, ndisp: int, y: int, band: Band, minima: Minima) -> No
         after[x] = after[x] if winner[x] < last else np.uint16(NO_COST)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _write_costs(known: NDArray[np.uint8], costs: NDArray[np.uint16]) -> None:
     """Write costs as `Minima` has them."""
     for x in range(costs.size):

@@ -14,8 +14,9 @@ from __future__ import annotations
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from recon.kernels.compiled import kernel
 
 Float32 = NDArray[np.float32]
 
@@ -108,7 +109,7 @@ def make_points(maps: Maps, rules: PointRules) -> Points:
     return Points(*(array[:used].copy() for array in points))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _make_points(maps: tuple[Any, ...], rules: tuple[Any, ...], points: tuple[Any, ...]) -> int:
     values, confidence, sigma, colours, usable = maps
     focal, cx, cy, fb, doffs, nearest, farthest, relative_sigma, least, stride, radius = rules
@@ -149,7 +150,7 @@ def _make_points(maps: tuple[Any, ...], rules: tuple[Any, ...], points: tuple[An
     return used
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _with_frame(values: Float32, radius: int) -> tuple[Float32, Float32]:
     """Ones where a value is known, and the values with 0 elsewhere, in a frame of zeros."""
     height, width = values.shape
@@ -163,7 +164,7 @@ def _with_frame(values: Float32, radius: int) -> tuple[Float32, Float32]:
     return known, masked
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_columns(known: Float32, masked: Float32, v: int, radius: int, columns: Float32) -> None:
     """Sums down the columns around row v: 1, v, v², d, v·d of the known pixels."""
     columns[:] = 0.0
@@ -179,7 +180,7 @@ def _sum_columns(known: Float32, masked: Float32, v: int, radius: int, columns: 
             columns[4, u] += at * d
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_windows(columns: Float32, radius: int, sums: Float32) -> None:
     """Sums over windows: 1, u, v, u², v², u·v, d, u·d, v·d of the known pixels."""
     sums[:] = 0.0
@@ -201,7 +202,7 @@ def _sum_windows(columns: Float32, radius: int, sums: Float32) -> None:
             sums[8, u] += columns[4, u + k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _fit_normals(
     sums: Float32, values: Float32, v: int, rules: tuple[Any, ...], normal: Float32
 ) -> None:

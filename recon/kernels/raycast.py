@@ -21,9 +21,9 @@ import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.compiled import kernel
 from recon.kernels.voxels import find_or_add, make_table, pack_key, reserve
 
 BLOCK_BITS: Final = 3
@@ -103,7 +103,7 @@ def measure_points(
     return ends, values
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _measure_points(
     xyz: NDArray[np.float32],
     sigma: NDArray[np.float32],
@@ -160,7 +160,7 @@ def limit_points(
     return moved, left
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _limit_points(
     xyz: NDArray[np.float32], sigma: NDArray[np.float32], limits: tuple[float, float, float]
 ) -> None:
@@ -188,13 +188,13 @@ def make_blocks(rows: int) -> Blocks:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def block_key(i: int, j: int, k: int) -> int:
     """Packed index of the block that a cell lies in."""
     return int(pack_key(i >> BLOCK_BITS, j >> BLOCK_BITS, k >> BLOCK_BITS))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cell_in_block(i: int, j: int, k: int) -> int:
     """Column of a cell in the row of its block."""
     return ((i & _LOW) << (2 * BLOCK_BITS)) | ((j & _LOW) << BLOCK_BITS) | (k & _LOW)
@@ -226,7 +226,7 @@ def cast_rays(evidence: Blocks, rays: Rays, spread: float) -> Blocks:
         evidence = reserve(evidence, len(evidence.keys) + 1, make_blocks)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cast_rays(
     evidence: tuple[NDArray[Any], ...], rays: tuple[NDArray[Any], ...], start: int, spread: float
 ) -> int:
@@ -292,7 +292,7 @@ def _cast_rays(
     return len(ends)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _axis(origin: float, direction: float, cell: int) -> tuple[int, float, float]:
     """Step along one axis, length to the first boundary, length between boundaries."""
     if direction > 0:
@@ -302,7 +302,7 @@ def _axis(origin: float, direction: float, cell: int) -> tuple[int, float, float
     return 0, np.inf, np.inf
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _normal_cdf(value: float, mean: float, sigma: float) -> float:
     """Share of a normal distribution below ``value``; a step where ``sigma`` is 0."""
     if sigma <= 0:

@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.compiled import kernel
 from recon.kernels.minima import NO_COST, Minima
 
 VALID, LOW_TEXTURE, AMBIGUOUS, LEFT_RIGHT, OCCLUDED, OUT_OF_RANGE, BORDER = range(7)
@@ -84,7 +84,7 @@ def refined_in(memory: NDArray[np.uint8], height: int, width: int) -> Refined:
     return Refined(values, confidence, sigma_px, reason)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def refine_minima(
     minima: Minima,
     texture: NDArray[np.float32],
@@ -142,7 +142,7 @@ def refine_minima(
         _measure(minima, rules, y, refined)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def reject(mask: NDArray[np.bool_], code: int, refined: Refined) -> None:
     """Invalidate the pixels of a mask, in place.
 
@@ -159,7 +159,7 @@ def reject(mask: NDArray[np.bool_], code: int, refined: Refined) -> None:
                 refined.confidence[y, x], refined.reason[y, x] = np.float32(0), np.uint8(code)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mark_chosen(right_winner: NDArray[np.uint16], rules: Rules, chosen: NDArray[np.uint8]) -> None:
     """Mark the columns of the left view where a pixel of the right view has its best match."""
     width = right_winner.size
@@ -170,7 +170,7 @@ def _mark_chosen(right_winner: NDArray[np.uint16], rules: Rules, chosen: NDArray
             chosen[x + 1] = 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _compare_views(
     winner: NDArray[np.uint16],
     right_winner: NDArray[np.uint16],
@@ -183,7 +183,7 @@ def _compare_views(
         apart[x] = abs(right_winner[x - rules.minimum - k] - k) if k < rules.ndisp else -1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _judge(
     minima: Minima,
     texture: NDArray[np.float32],
@@ -219,7 +219,7 @@ def _judge(
         reason[x] = np.uint8(BORDER) if nothing else code
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _measure(minima: Minima, rules: Rules, y: int, refined: Refined) -> None:
     """Write disparity, standard deviation and confidence of one row.
 

@@ -20,9 +20,9 @@ from __future__ import annotations
 from typing import TypeAlias
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.compiled import kernel
 from recon.kernels.half_windows import Halves, Scratch, Search, Views, enlist, next_half
 from recon.kernels.lanes import (
     LANES,
@@ -42,7 +42,7 @@ Found: TypeAlias = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
 """The best so far in `LANES` columns; see `_weigh`."""
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sad_minima(
     views: Views,
     search: Search,
@@ -90,7 +90,7 @@ def sad_minima(
         claim_right(search.ndisp, search.minimum, y, minima)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _choose(
     halves: Halves, search: Search, scratch: Scratch, y: int, x0: int, x1: int, minima: Minima
 ) -> None:
@@ -116,7 +116,7 @@ def _choose(
             second[x:] = row[4 * LANES : 4 * LANES + rest]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _search(
     halves: Halves, search: Search, offers: NDArray[np.int64], x: int, column: int, width: int
 ) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes]:
@@ -139,7 +139,7 @@ def _search(
     return winner, best, before, after, second
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _offer_all(
     halves: Halves, search_lean: int, k0: int, k1: int, column: int, found: Found
 ) -> Found:
@@ -160,7 +160,7 @@ def _offer_all(
     return found
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _offer_some(
     halves: Halves,
     search_lean: int,
@@ -191,7 +191,7 @@ def _offer_some(
     return found
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _weigh(
     upright: Lanes,
     leaning: Lanes,

@@ -21,9 +21,9 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from recon.kernels.compiled import kernel
 from recon.kernels.lanes import LANES
 from recon.kernels.minima import Minima
 from recon.kernels.path_along import RowScratch, empty_row_scratch, follow_row
@@ -190,7 +190,7 @@ def _search_band(
             _sweep_up(views.grey, paths, band, bottom, wanted, end, place, buffers, best, minima)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sweep_down(
     grey: NDArray[np.uint8], paths: Paths, band: Band, first: int, end: int, buffers: BandScratch
 ) -> None:
@@ -201,7 +201,7 @@ def _sweep_down(
         advance(costs, here, before, paths, buffers.above, means, buffers.along.means, DOWN)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sweep_up(
     grey: NDArray[np.uint8],
     paths: Paths,

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from recon.kernels.compiled import kernel
 
 
 class _Runs(NamedTuple):
@@ -39,7 +40,7 @@ class _Row(NamedTuple):
     breaks: NDArray[np.uint8]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_speckles(
     values: NDArray[np.float32], largest_step: float, smallest_size: int
 ) -> NDArray[np.bool_]:
@@ -78,7 +79,7 @@ def find_speckles(
     return small
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cut_row(
     row: NDArray[np.float32], place: int, step: np.float32, runs: _Runs, count: int, here: _Row
 ) -> int:
@@ -101,7 +102,7 @@ def _cut_row(
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mark_touching(
     one: NDArray[np.float32], other: NDArray[np.float32], step: np.float32, marks: NDArray[np.uint8]
 ) -> None:
@@ -110,7 +111,7 @@ def _mark_touching(
         marks[x] = np.uint8(1) if abs(one[x] - other[x]) <= step else np.uint8(0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join_rows(
     touches: NDArray[np.uint8],
     parents: NDArray[np.int32],
@@ -130,7 +131,7 @@ def _join_rows(
             _join(parents, here.runs[x], above.runs[x])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mark_small(runs: _Runs, count: int, smallest_size: int, small: NDArray[np.bool_]) -> None:
     """Mark the runs of regions of fewer pixels."""
     parents = runs.parents
@@ -143,7 +144,7 @@ def _mark_small(runs: _Runs, count: int, smallest_size: int, small: NDArray[np.b
             small[runs.starts[run] : runs.ends[run]] = True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join(parents: NDArray[np.int32], one: int, other: int) -> None:
     """Give two regions one root: the smaller index."""
     a, b = _root(parents, one), _root(parents, other)
@@ -153,7 +154,7 @@ def _join(parents: NDArray[np.int32], one: int, other: int) -> None:
         parents[a] = b
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _root(parents: NDArray[np.int32], node: int) -> int:
     """The root of a node's region; every step halves the path for the next call."""
     while parents[node] != node:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from recon.kernels.compiled import kernel
 
 MAX_STRETCH: Final = 24.0
 """Beyond this ratio of its sides a footprint is widened instead of lengthened."""
@@ -55,7 +56,7 @@ class SurfaceHits(NamedTuple):
     spread: Float64
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def describe_hits(
     table: SurfaceTable,
     faces: NDArray[np.int32],

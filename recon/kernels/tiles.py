@@ -9,8 +9,9 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from recon.kernels.compiled import kernel
 
 GROUP: Final = 8
 """Candidates that are offered or left out together."""
@@ -65,7 +66,7 @@ def make_tiles(shape: tuple[int, int], size: tuple[int, int], ndisp: int) -> Til
     return Tiles(np.ones((across, down, -(-ndisp // GROUP)), np.bool_), *size)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def offer_supported(
     halved: NDArray[np.float32],
     minimum: int,
@@ -102,14 +103,14 @@ def offer_supported(
                 tiles.offered[i, j, group] = everything or supporters >= least
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _reach(tile: int, size: int, margin: int, halved: int) -> tuple[int, int]:
     """Range at half size that counts for a tile, along one axis: first and one after the last."""
     start, end = tile * size - margin, (tile + 1) * size + margin
     return max(start, 0) // 2, min(end // 2, halved)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _count(halved: NDArray[np.float32], minimum: int, counts: NDArray[np.int64]) -> int:
     """Count the matches at each candidate of full size; return their number."""
     matched = 0

@@ -17,8 +17,9 @@ from functools import partial
 from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from recon.kernels.compiled import kernel
 
 KEY_BITS: Final = 21
 KEY_LIMIT: Final = 1 << (KEY_BITS - 1)
@@ -133,21 +134,21 @@ def pack_keys(cells: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
     return np.asarray((i << (2 * KEY_BITS)) | (j << KEY_BITS) | k)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pack_key(i: int, j: int, k: int) -> int:
     """One int64 of three cell indices in ``[-KEY_LIMIT, KEY_LIMIT)``; never negative."""
     high = (i + KEY_LIMIT) << (2 * KEY_BITS)
     return high | ((j + KEY_LIMIT) << KEY_BITS) | (k + KEY_LIMIT)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def unpack_key(key: int) -> tuple[int, int, int]:
     """The three cell indices of a packed cell."""
     i, j, k = key >> (2 * KEY_BITS), (key >> KEY_BITS) & _MASK, key & _MASK
     return i - KEY_LIMIT, j - KEY_LIMIT, k - KEY_LIMIT
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _place(key: int, mask: int) -> int:
     """Where the search for a packed cell begins."""
     # Two rounds of multiplicative hashing; 32-bit factors keep the products inside an int64.
@@ -155,7 +156,7 @@ def _place(key: int, mask: int) -> int:
     return ((mixed * 0x85EBCA6B) >> 22) & mask
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_or_add(table: NDArray[np.int64], key: int, next_row: int) -> int:
     """Row of a packed cell; where it is new it is entered with ``next_row``.
 
@@ -172,7 +173,7 @@ def find_or_add(table: NDArray[np.int64], key: int, next_row: int) -> int:
     return next_row
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find(table: NDArray[np.int64], key: int) -> int:
     """Row of a packed cell, or `EMPTY` where it is not in the hash."""
     mask = len(table) - 1
@@ -184,7 +185,7 @@ def find(table: NDArray[np.int64], key: int) -> int:
     return EMPTY
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_or_append(
     table: NDArray[np.int64], keys: NDArray[np.int64], used: NDArray[np.int64], key: int
 ) -> int:
@@ -196,7 +197,7 @@ def find_or_append(
     return row
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def enter_keys(table: NDArray[np.int64], keys: NDArray[np.int64]) -> None:
     """Enter the cells of rows 0 … N - 1 into an empty hash."""
     for row in range(len(keys)):
@@ -225,7 +226,7 @@ def add_points(voxels: VoxelSums, points: VoxelPoints, edge: float, frame: int) 
         voxels = reserve_sums(voxels, len(voxels.keys) + 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_points(
     voxels: tuple[NDArray[Any], ...],
     points: tuple[NDArray[Any], ...],
@@ -292,7 +293,7 @@ def add_rows(
     return voxels
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_rows(
     voxels: tuple[NDArray[Any], ...],
     new_keys: NDArray[np.int64],

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
+from recon.kernels.cache import cache_parent
 from recon.pipeline.machine import available_cores
 
 MIN_PYTHON: Final = (3, 10)
@@ -164,11 +165,9 @@ def check_numba() -> Iterator[Check]:
         hint="unset NUMBA_DISABLE_JIT; runs take hours with it" if off else "",
         needed=False,
     )
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    beside = Path(__file__).parents[1] / "kernels" / "__pycache__"
     yield check_folder(
         "kernels can be cached",
-        Path(given) if given else beside,
+        cache_parent(),
         needed=False,
         hint="set NUMBA_CACHE_DIR to a folder that can be written, or each run compiles anew",
     )
