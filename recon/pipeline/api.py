@@ -1,4 +1,4 @@
-"""The flow for one pair as plain functions, for those who write Python."""
+"""Python API: matching and reconstruction of one stereo pair as plain functions."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ def match(
     matcher: str = "sad",
     **settings: Any,
 ) -> Disparity:
-    """Disparity of two pictures.
+    """Disparity of two images.
 
     Args:
         left: uint8 (H, W) grey or (H, W, 3) RGB.
         right: The same shape as ``left``.
-        calibration: Needed where the pictures are not rectified; it also tells the range.
+        calibration: Needed if the images are not rectified; it also gives the disparity range.
         matcher: Name of the matcher: a key of `recon.matching.MATCHERS`.
         **settings: Settings of that matcher, such as ``ndisp=64`` or ``window_px=9``.
 
     Raises:
-        ShapeError: The pictures differ in size.
+        ShapeError: The images differ in size.
         SettingsError: There is no such matcher, or a setting is unknown or out of its range.
     """
     height_px, width_px = left.shape[:2]
@@ -45,7 +45,7 @@ def match(
 def reconstruct(
     left: UInt8, right: UInt8, calibration: Calibration, config: ReconConfig | None = None
 ) -> ReconstructedFrame:
-    """Rectified pair, disparity and cloud (camera axes, metres) of two pictures.
+    """Rectified pair, disparity and cloud (camera axes, metres) of two images.
 
     Args:
         left: uint8 (H, W) grey or (H, W, 3) RGB.
@@ -54,7 +54,7 @@ def reconstruct(
         config: Settings of the stages; None = those of ``recon pair``.
 
     Raises:
-        ReconError: The pictures, the calibration and the settings do not fit.
+        ReconError: The images, the calibration and the settings do not fit together.
     """
     settings = config or load_config(defaults=PAIR_DEFAULTS)
     return FrameReconstructor(calibration, settings).reconstruct(StereoPair(left, right))

@@ -1,4 +1,4 @@
-"""The figures of an audit, as JSON can hold them."""
+"""The figures of an audit, ready for JSON."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from recon.structures.arrays import Float64
 RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)
 """Distances for which the depth error is predicted."""
 
-# No matcher is better than a twentieth of a pixel on real pictures.
+# No matcher is more accurate than a twentieth of a pixel on real images.
 _LEAST_SIGMA_PX: Final = 0.05
 
 
 def audit_figures(
     source: StereoSource, sample: Sample, geometry: Geometry, gaps: Gaps, camera: RectifiedCamera
 ) -> dict[str, Any]:
-    """All that was measured; null where it is not known."""
+    """All measures of the audit; None if unknown."""
     sharpness = np.median(sample.sharpness, axis=0).tolist() if sample.sharpness else [None, None]
     gains = np.concatenate([np.zeros(0), *sample.gains])
     return {
@@ -71,7 +71,7 @@ def _row_figures(alignment: RowAlignment | None) -> dict[str, Any]:
 def _depth_figures(
     alignment: RowAlignment | None, disparity_px: Float64, camera: RectifiedCamera
 ) -> dict[str, Any]:
-    """Disparities in use, and the depth error if columns are as exact as rows."""
+    """Observed disparities, and the depth error if columns are as accurate as rows."""
     if alignment is None or not len(disparity_px):
         return {}
     sigma_px = np.float32(max(alignment.residual_px, _LEAST_SIGMA_PX))

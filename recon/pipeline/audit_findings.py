@@ -61,7 +61,7 @@ def find_picture_faults(sample: Sample, settings: AuditSettings) -> Iterator[Fin
 
 
 def _blank_sides(sample: Sample, settings: AuditSettings) -> list[int]:
-    """Cameras that show nothing in most images."""
+    """Cameras whose images are uniform in most pairs."""
     blank = np.array(sample.contrast_dn).reshape(-1, 2) < settings.contrast_dn
     return [side for side in range(2) if len(blank) and blank[:, side].mean() >= 0.5]
 
@@ -99,7 +99,7 @@ def find_series_faults(sample: Sample, gaps: Gaps, settings: AuditSettings) -> I
         )
     blank = _blank_sides(sample, settings)
     for side, run in enumerate(repeats.frozen):
-        # A camera that shows nothing does not change either.
+        # A camera with uniform images would count as frozen, too.
         if run >= settings.frozen_frames and side not in blank:
             yield Finding(
                 "frozen",

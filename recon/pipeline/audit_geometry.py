@@ -1,4 +1,4 @@
-"""What the features of all sampled pairs tell together: rows, swapped eyes, late cameras."""
+"""Row errors, swapped cameras and delays, from the features of all sampled pairs together."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from recon.rectification import PairFeatures, inspect_features
 from recon.structures import RectifiedCamera
 from recon.structures.arrays import Float64
 
-# A late camera fits so much better with frames of another time.
+# Agreement at a lag, relative to that at lag 0, from which a delay is reported.
 _LAG_FACTOR: Final = 1.25
 
-# A skew beyond is nearer to one whole frame.
+# A larger skew, in frames, is closer to a lag of one frame.
 _LARGEST_SKEW: Final = 0.75
 
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """What the features of a drive tell.
+    """Stereo geometry measured from the features of a drive.
 
     Attributes:
         pairs: Number of pairs whose features were matched.
-        features: Of all of them; where one camera is late, of pairs that are not.
-        matched: Number of features that were matched in pairs as they came.
-        alignment: Row errors; None where too few features tell.
-        disparity_px: float64 (M,), of the features whose rows agree; 0 is infinitely far.
-        swapped_share: Near features that lie farther right in the right picture; NaN where too
-            few tell.
-        lag: Whole frames by which the right camera is late.
-        skew: Fraction of a frame by which it is late, and its standard error; None where nothing
-            moves enough, or a camera is late by whole frames.
+        features: Features of all pairs; if one camera is delayed, of pairs shifted by the lag.
+        matched: Number of features matched in pairs as recorded.
+        alignment: Row errors; None if there are too few features.
+        disparity_px: float64 (M,), of the features whose rows agree; 0 is at infinity.
+        swapped_share: Share of near features that lie farther right in the right image; NaN if
+            there are too few.
+        lag: Delay of the right camera in whole frames.
+        skew: Its delay as a fraction of a frame, and the standard error; None if there is too
+            little motion, or if the delay is whole frames.
     """
 
     pairs: int
@@ -48,10 +48,10 @@ class Geometry:
 
 
 def measure_geometry(sample: Sample, camera: RectifiedCamera, settings: AuditSettings) -> Geometry:
-    """Put the features of all pairs together.
+    """Measure the geometry from the features of all pairs.
 
     Args:
-        sample: What was looked at.
+        sample: The sampled pairs.
         camera: The rectified camera.
         settings: Limits.
     """
@@ -91,7 +91,7 @@ def _align(
 def _disparities(
     features: PairFeatures, alignment: RowAlignment | None, camera: RectifiedCamera
 ) -> Float64:
-    """float64 (M,), pixels; wrong matches are left out by their rows."""
+    """float64 (M,), pixels; matches with a large row error are left out."""
     if alignment is None:
         return np.zeros(0)
     rows = alignment.turned_rows(features.right_uv, camera) - features.left_uv[:, 1]
@@ -100,13 +100,13 @@ def _disparities(
 
 
 def _best_lag(sample: Sample, skew: tuple[float, float] | None) -> int:
-    """The lag that fits best, where it fits clearly better than none.
+    """The lag that fits best, if it fits clearly better than none.
 
-    Half a frame late fits both neighbours badly: then the skew tells, and not the lag.
+    A delay of half a frame fits both neighbours badly and is reported as skew, not as lag.
     """
     if not sample.by_lag:
         return 0
-    # Each lag was tried on its own number of pairs.
+    # Lags were tried on different numbers of pairs.
     fit = {lag: n / len(sample.lagged[lag]) for lag, n in sample.by_lag.items()}
     best = max(fit, key=lambda lag: (fit[lag], -abs(lag)))
     between = skew is not None and 4 * skew[1] < abs(skew[0]) < _LARGEST_SKEW
@@ -124,7 +124,7 @@ def _time_skew(
     errors, flows = [np.zeros(0)], [np.zeros(0)]
     for features, flow in zip(sample.features, sample.flows, strict=True):
         rows = alignment.turned_rows(features.right_uv, camera) - features.left_uv[:, 1]
-        # What is farther off is a wrong match, whatever the skew: half a frame at most.
+        # The skew is at most half a frame, so a larger row error means a wrong match.
         known = np.isfinite(flow) & (np.abs(rows) < 1.5 + 0.5 * np.abs(flow))
         errors.append(rows[known])
         flows.append(flow[known])

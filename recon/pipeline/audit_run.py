@@ -32,13 +32,13 @@ from recon.structures import RectifiedCamera
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """What was found.
+    """The result of an audit.
 
     Attributes:
         verdict: good, usable or not usable.
-        findings: What is wrong, worst first.
-        figures: All that was measured, as JSON can hold it.
-        alignment: Row errors of all pairs together; None where too few features tell.
+        findings: Problems found, fatal ones first.
+        figures: All measures, ready for JSON.
+        alignment: Row errors of all pairs together; None if there are too few features.
     """
 
     verdict: Verdict
@@ -48,7 +48,7 @@ class Audit:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """What ``--json`` prints."""
+        """The content of ``--json``."""
         findings = [
             {"code": f.code, "severity": "fatal" if f.fatal else "warning", "text": f.text}
             for f in self.findings
@@ -57,12 +57,12 @@ class Audit:
 
 
 def run_audit(source: StereoSource, config: ReconConfig, *, quick: bool = False) -> Audit:
-    """Look at a drive before a long run.
+    """Check a drive before a long run.
 
     Args:
         source: The drive.
-        config: Its ``audit`` and ``rectification`` count.
-        quick: A short look of a second or two, as `recon map` takes.
+        config: The configuration; its ``audit``, ``rectification`` and ``matching`` are used.
+        quick: A short check of a second or two, as in `recon map`.
 
     Raises:
         CalibrationError: The calibration cannot rectify anything.
@@ -87,9 +87,9 @@ def run_audit(source: StereoSource, config: ReconConfig, *, quick: bool = False)
 
 
 def quick_warnings(source: StereoSource, config: ReconConfig) -> tuple[str, ...]:
-    """What a quick look finds, one line each; nothing where it is switched off.
+    """Findings of a quick audit, one line each; none if it is switched off.
 
-    An input that cannot be read says so itself when the run gets there.
+    A calibration that cannot rectify is reported by the run itself, not here.
     """
     if not config.audit.quick:
         return ()
@@ -103,13 +103,13 @@ def quick_warnings(source: StereoSource, config: ReconConfig) -> tuple[str, ...]
 def mend_calibration(
     source: StereoSource, config: ReconConfig, audit: Audit, path: Path
 ) -> dict[str, Any]:
-    """Write the calibration with the right camera turned so that rows correspond.
+    """Write the calibration with the right camera rotated so that rows correspond.
 
     Returns:
-        The turn in degrees, and the row error that it leaves.
+        The rotation in degrees, and the remaining row error.
 
     Raises:
-        CalibrationError: Too few features tell the row error.
+        CalibrationError: There are too few features to measure the row error.
         OutputError: The file cannot be written.
     """
     alignment = audit.alignment
@@ -134,7 +134,7 @@ def mend_calibration(
 
 
 def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None:
-    """The largest disparity that is searched; None where the range widens to what pairs need."""
+    """The largest disparity that is searched; None if the range adapts to each pair."""
     own = getattr(matching, field_of(matching.matcher), None)
     if not isinstance(own, SearchSettings):
         return None

@@ -1,4 +1,4 @@
-"""What an audit looks at: stretches of a drive, and pairs in them whose features are matched."""
+"""Sampling of a drive for an audit: stretches of frames, and pairs with matched features."""
 
 from __future__ import annotations
 
@@ -23,34 +23,36 @@ from recon.sources import StereoSource
 from recon.structures import RectifiedPair
 from recon.structures.arrays import Float64
 
-# A quick look: two stretches, as many frames each as tell a camera that is late.
+# Stretches of a quick audit; each is just long enough to detect a delayed camera.
 _QUICK_RUNS = 2
+# Pairs that are also compared at other lags.
 _LAG_PAIRS = 4
-# A video is decoded up to where one looks.
+# A quick audit stays near the start, since a video is decoded up to each frame.
 _QUICK_REACH = 300
-# Smaller pictures have neither features nor a quarter of their size to compare detail with.
+# Smaller images have no features, and are too small to measure their sharpness.
 _LEAST_SIDE_PX = 16
 _NO_FEATURES = PairFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
 
 
 @dataclass(eq=False)
 class Sample:
-    """What was measured on the pictures that were looked at.
+    """Measures of the sampled images.
 
     Attributes:
-        frames: Pairs that were read.
-        repeats: Repeated and frozen pictures.
-        contrast_dn: (left, right) standard deviation of each picture.
-        brightness_dn: Mean of each.
-        sharpness: Share of the finest detail, of each.
-        gains: Ratios of brightness around features.
-        features: Of each pair whose features were matched.
-        by_lag: Features that agree on one rotation, summed over pairs, by frames that the right
-            picture is taken later in the series.
-        lagged: Features of pairs at each lag.
-        speeds_m_per_s: Of each of those pairs.
-        flows: float64 (N,) rows that each feature of a pair moves to the next frame, NaN unknown.
-        broken: What a pair could not be read for.
+        frames: Number of pairs that were read.
+        repeats: Counts of repeated and frozen images.
+        contrast_dn: (left, right) standard deviation of the grey levels of each measured pair.
+        brightness_dn: (left, right) mean grey level.
+        sharpness: (left, right) share of the finest detail.
+        gains: Brightness ratios around features.
+        features: Matched features of each pair.
+        by_lag: Number of features that agree on one rotation, summed over pairs; the key is how
+            many frames after the left image the right image is taken from.
+        lagged: Matched features of the pairs at each lag.
+        speeds_m_per_s: Speed of the rig at each pair where it could be measured.
+        flows: float64 (N,) per pair, rows by which each feature moves to the next frame; NaN if
+            unknown.
+        broken: The error that ended the sampling, if any.
     """
 
     frames: int = 0
@@ -70,7 +72,7 @@ class Sample:
 def take_sample(
     source: StereoSource, rectifier: Rectifier, settings: AuditSettings, *, quick: bool
 ) -> Sample:
-    """Look at a drive. What cannot be read ends the look, and is noted."""
+    """Sample a drive; an error of a pair ends the sampling and is kept in ``broken``."""
     stretches = plan_stretches(len(source), settings, quick=quick)
     centres = plan_centres(stretches, settings, quick=quick)
     sampler = _Sampler(source, rectifier, settings, centres)
@@ -83,16 +85,16 @@ def take_sample(
 
 
 def plan_stretches(frames: int, settings: AuditSettings, *, quick: bool) -> list[tuple[int, int]]:
-    """First frame and end of each stretch: the whole drive, or runs spread over it evenly.
+    """First frame and end of each stretch: the whole drive, or stretches evenly spread over it.
 
-    A quick look stays near the start.
+    A quick audit stays near the start.
     """
     frames = min(frames, _QUICK_REACH) if quick else frames
     runs = _QUICK_RUNS if quick else settings.runs
     length = 2 * settings.max_lag + 1 if quick else max(2, settings.frames // runs)
     if frames <= runs * length:
         return [(0, frames)]
-    # In the middle of equal parts: a drive may begin and end at rest.
+    # In the middle of equal parts, since a drive may begin and end at rest.
     starts = [int((k + 0.5) * frames / runs - length / 2) for k in range(runs)]
     return [(start, start + length) for start in starts]
 
@@ -100,12 +102,12 @@ def plan_stretches(frames: int, settings: AuditSettings, *, quick: bool) -> list
 def plan_centres(
     stretches: list[tuple[int, int]], settings: AuditSettings, *, quick: bool
 ) -> list[int]:
-    """Frames whose features are matched, spread evenly, with room for lags around each."""
+    """Frames whose features are matched, evenly spread, with a margin for the lags."""
     pairs = _QUICK_RUNS if quick else settings.pairs
     each = max(1, pairs // len(stretches))
     chosen: list[int] = []
     for start, stop in stretches:
-        # Of a short drive, several pairs with a few lags tell more than one with all.
+        # On a short drive, several pairs with a few lags are better than one pair with all.
         margin = min(settings.max_lag, (stop - start - 1) // (2 if quick else 3))
         places = np.linspace(start + margin, stop - 1 - margin, each)
         chosen += sorted({int(place) for place in np.rint(places)})
@@ -113,7 +115,7 @@ def plan_centres(
 
 
 class _Sampler:
-    """Walks through stretches with the pairs around the current one at hand."""
+    """Reads stretches, keeping the pairs around the current one."""
 
     def __init__(
         self,
@@ -129,7 +131,7 @@ class _Sampler:
         self._recent: dict[int, RectifiedPair] = {}
 
     def look(self, start: int, stop: int) -> None:
-        """Read one stretch; a pair is measured when all that it is compared with is there."""
+        """Read one stretch; a pair is measured once its neighbours have been read."""
         self.sample.repeats.restart()
         self._recent.clear()
         reach = self._settings.max_lag
@@ -147,7 +149,7 @@ class _Sampler:
             yield self._rectifier.rectify(recorded)
 
     def _measure(self, centre: int) -> None:
-        """Everything about one pair and its neighbours."""
+        """Measure one pair, alone and against its neighbours."""
         pair, sample, settings = self._recent[centre], self.sample, self._settings
         sample.contrast_dn.append((float(pair.left.std()), float(pair.right.std())))
         sample.brightness_dn.append((float(pair.left.mean()), float(pair.right.mean())))
@@ -167,7 +169,7 @@ class _Sampler:
         self._follow(centre, features)
 
     def _compare_lags(self, centre: int, features: PairFeatures) -> None:
-        """How well the left picture fits right ones before and after."""
+        """Match the left image with the right images before and after it."""
         ends = (min(self._recent), max(self._recent))
         span = min(self._settings.max_lag, *(abs(end - centre) for end in ends))
         pair, sample = self._recent[centre], self.sample
@@ -181,7 +183,7 @@ class _Sampler:
             sample.lagged.setdefault(lag, []).append(found)
 
     def _follow(self, centre: int, features: PairFeatures) -> None:
-        """Speed and row flow, from the left picture of the next frame."""
+        """Measure speed and row flow against the left image of the next frame."""
         flow = np.full(len(features), np.nan)
         later = self._recent.get(centre + 1)
         if later is not None:

@@ -1,4 +1,4 @@
-"""Pictures of a board in, views of it out: reading, finding, and saying what is wrong."""
+"""Detection of a calibration board in images, with clear errors if it is not found."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from recon.structures.board import CalibrationBoard
 
 @dataclass(frozen=True, eq=False)
 class BoardViews:
-    """What the pictures show of a board.
+    """Views of a board in the images of a rig.
 
     Attributes:
-        views: Those in which both cameras see it, named by the left file.
-        pairs: Left and right file of each of these views, by its name.
-        empty: Files in which it is not seen.
-        size_px: (width, height) of every picture.
-        count: Number of pairs of pictures.
-        board: The board as it is seen.
+        views: Views in which both cameras see the board, named by the left file.
+        pairs: Left and right file of each view, by name.
+        empty: Files in which the board is not found.
+        size_px: (width, height) of every image.
+        count: Number of image pairs.
+        board: The board as detected; its ``legacy`` pattern may differ from the one given.
     """
 
     views: tuple[View, ...]
@@ -47,7 +47,7 @@ class BoardViews:
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """What one picture shows; the picture itself is not kept."""
+    """The detection in one image; the image itself is not kept."""
 
     size_px: tuple[int, int]
     seen: Sighting | None
@@ -55,12 +55,12 @@ class _Look:
 
 
 def find_views(pictures: PicturePairs, board: CalibrationBoard, threads: int) -> BoardViews:
-    """Find a board in all pictures of a rig.
+    """Find a board in all images of a rig.
 
     Raises:
-        FormatError: A picture is missing or damaged.
-        SourceError: Pictures differ in size.
-        CalibrationError: The board is seen in no pair, or is another one; its size is told.
+        FormatError: An image is missing or damaged.
+        SourceError: Images differ in size.
+        CalibrationError: No pair shows the board, or it is of another size, which is named.
     """
     files = [path for pair in pictures.pairs for path in pair]
     board, looks = _look_at_all(files, board, threads)
@@ -91,7 +91,7 @@ def find_views(pictures: PicturePairs, board: CalibrationBoard, threads: int) ->
 def _look_at_all(
     files: Sequence[Path], board: CalibrationBoard, threads: int
 ) -> tuple[CalibrationBoard, list[_Look]]:
-    """What every picture shows; and the board, which may be of an older pattern than was said."""
+    """Detections in all images, and the board, which may have OpenCV's legacy pattern."""
     with ThreadPoolExecutor(threads) as pool:
         looks = list(pool.map(lambda path: _look(path, board), files))
         if board.kind == "chess" or any(look.seen for look in looks):
@@ -111,7 +111,7 @@ def _look(path: Path, board: CalibrationBoard) -> _Look:
 
 
 def _same_order(left: Sighting, right: Sighting, board: CalibrationBoard) -> Sighting:
-    if board.kind == "charuco":  # its corners have numbers
+    if board.kind == "charuco":  # its corners have ids
         return right
     return replace(right, pixels=orient_like(left.pixels, right.pixels, board.inner))
 

@@ -1,4 +1,4 @@
-"""`recon calibrate` without its command line: pictures of a board in, a calibration file out."""
+"""`recon calibrate` without its command line: from images of a board to a calibration file."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from recon.structures.board import CalibrationBoard
 
 CalibrationForm = Literal["recon", "opencv", "ros", "kalibr"]
 
-# Figures that the calibration file keeps.
+# Figures that are also written into the calibration file.
 _KEPT: Final = (
     "board", "stereo_rms_px", "epipolar_px", "baseline_interval_m", "focal_interval_px",
     "views_used", "views_dropped", "depth_error_cm",
@@ -48,15 +48,15 @@ _KEPT: Final = (
 
 @dataclass(frozen=True, eq=False)
 class CalibrationRun:
-    """All that a run knows when its results are made.
+    """The results of a run.
 
     Attributes:
         board: The board.
         config: The configuration.
-        seen: What the pictures show.
+        seen: The views of the board.
         fit: The calibrated rig.
-        spread: How sure it is.
-        turns: How the rig is rectified.
+        spread: Its bootstrap intervals.
+        turns: Its rectifying rotations.
         rows_px: float64 (N,), row errors of all corners after rectification.
         summary: The figures of ``summary.json``.
     """
@@ -73,14 +73,14 @@ class CalibrationRun:
 
 @dataclass(frozen=True)
 class CalibrateOptions:
-    """How a run is made, apart from the configuration.
+    """Options of a run that are not part of the configuration.
 
     Attributes:
-        file: The calibration file; None = ``calibration.yaml`` in the run's folder alone.
+        file: The calibration file; None = only ``calibration.yaml`` in the run's folder.
         form: Its format.
-        folder: Where report, pictures and figures go; None = a new folder below ``outputs/``.
-        threads: Threads to use; None = all cores. Changes no result.
-        present: Writes pictures and the report of the run into its folder.
+        folder: Folder for report, images and figures; None = a new one below ``outputs/``.
+        threads: Threads to use; None = all cores. Does not change results.
+        present: Writes the images and the report of the run into its folder.
     """
 
     file: Path | None = None
@@ -97,18 +97,18 @@ def run_calibration(
     config: ReconConfig,
     options: CalibrateOptions,
 ) -> CalibrationRun:
-    """Calibrate a rig from pictures of a board.
+    """Calibrate a rig from images of a board.
 
     Args:
-        left: Folder or pattern of the left pictures.
-        right: Folder or pattern of the right pictures.
-        board: What they show.
+        left: Folder or pattern of the left images.
+        right: Folder or pattern of the right images.
+        board: The board that they show.
         config: The configuration.
-        options: Where results go.
+        options: Output files and threads.
 
     Raises:
-        ReconError: Pictures do not pair up, do not show the board, or fit no rig, or a file
-            cannot be written; then nothing is left behind.
+        ReconError: The images do not pair up, do not show the board, or fit no rig, or a file
+            cannot be written; then no output is left behind.
     """
     start = time.perf_counter()
     threads, watch = use_threads(options.threads), Stopwatch()
@@ -153,7 +153,7 @@ def _run(config: ReconConfig, seen: BoardViews, fit: StereoFit, spread: Spread) 
 
 
 def _rows_apart(turns: RectifyingTurns, fit: StereoFit, view: View) -> Float64:
-    """float64 (N,), row of each corner in the rectified left picture less that in the right."""
+    """float64 (N,), row of each corner in the rectified left image minus that in the right one."""
     left_px, right_px = shared_pixels(view)
     left = turns.place(fit.calibration, left_px)
     right = turns.place(fit.calibration, right_px, right=True)
@@ -169,13 +169,13 @@ def _write(run: CalibrationRun, options: CalibrateOptions, directory: RunDirecto
 
 
 def write_calibration(path: Path, run: CalibrationRun, form: CalibrationForm) -> tuple[Path, ...]:
-    """Write the rig of a run in a format.
+    """Write the calibrated rig in a given format.
 
     Returns:
-        The files: two of ROS, else one.
+        The files: two for ROS, else one.
 
     Raises:
-        CalibrationError: The format cannot hold the lens.
+        CalibrationError: The format cannot represent the lens model.
         OutputError: A file cannot be written.
     """
     rig = run.fit.calibration

@@ -1,4 +1,4 @@
-"""The figures of a calibration, and what should be done better."""
+"""The figures of a calibration, and advice on improving it."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from recon.structures.board import CalibrationBoard
 _FEW_VIEWS: Final = 10
 _SMALL_COVERAGE: Final = 0.5
 _SMALL_TILT_DEG: Final = 15.0
-_UNSURE_FOCAL: Final = 0.01  # half of the interval, of the focal length
+_UNSURE_FOCAL: Final = 0.01  # half of the interval, relative to the focal length
 _USUAL_BASELINE_M: Final = (0.01, 2.0)
-_APART: Final = 2.0  # error together against alone
+_APART: Final = 2.0  # stereo error relative to that of each camera alone
 
 
 def summarise(seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64) -> dict[str, Any]:
-    """The figures of ``summary.json``, but for the run's cost."""
+    """The figures of ``summary.json``, without time and memory of the run."""
     rig = fit.calibration
     return {
         "board": str(seen.board),
@@ -58,7 +58,7 @@ def summarise(seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64
 
 
 def advise(board: CalibrationBoard, pictures: PicturePairs, summary: dict[str, Any]) -> list[str]:
-    """What is less than well, and what to do about it, one line each."""
+    """Weaknesses of the calibration, each with advice, one line each."""
     lines = []
     if not board.metric:
         lines.append("size of a square not given: every length is in squares; add it, as in :25mm")
@@ -95,7 +95,7 @@ def advise(board: CalibrationBoard, pictures: PicturePairs, summary: dict[str, A
 
 
 def tell_depths(summary: dict[str, Any]) -> dict[str, str]:
-    """The depth errors of a summary in words, one line for each distance."""
+    """The depth errors of a summary as text, one line per distance."""
     lines = {}
     for depth, cm in summary["depth_error_cm"].items():
         known = "no common view"
@@ -107,7 +107,7 @@ def tell_depths(summary: dict[str, Any]) -> dict[str, str]:
 
 
 def _short(value: float) -> str:
-    """Two digits, and never a power of ten."""
+    """Two significant digits, without an exponent."""
     return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
 
 

@@ -1,4 +1,4 @@
-"""`recon capture` without its command line: cameras in, a folder of pairs out."""
+"""`recon capture` without its command line: record cameras into a folder of pairs."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from recon.formats.atomic import write_text
 from recon.sources.capture import CapturedPair, CaptureSettings, capture_pairs, warm_up
 from recon.sources.capture_folder import CaptureFolder
 
-# Pairs that wait for the disk: more would only hide that it is too slow.
+# Length of the write queue: a longer one would only hide that the disk is too slow.
 _WAITING: Final = 32
-# A longer pause than this many periods lost at least one frame.
+# A time step longer than this many periods means that a frame was lost.
 _GAP_PERIODS: Final = 1.5
 
 
 @dataclass(eq=False)
 class _Log:
-    """Stamps of what was written."""
+    """Timestamps of the pairs that were written."""
 
     left_s: list[float] = field(default_factory=list)
     right_s: list[float] = field(default_factory=list)
@@ -47,17 +47,17 @@ def run_capture(
     calibration: Path | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
-    """Record until told to stop; the folder can be mapped at once where there is a calibration.
+    """Record until told to stop; with a calibration, the folder can be mapped as it is.
 
     Args:
-        devices: Left and right, or one with both views: numbers, paths or video files.
-        folder: Where to; must be new or empty.
-        settings: Size, rate, length.
-        calibration: Copied into the folder.
-        stopped: Asked before every pair.
+        devices: Left and right camera, or one with both views: numbers, paths or video files.
+        folder: Output folder; must be new or empty.
+        settings: Image size, frame rate, duration.
+        calibration: File to copy into the folder.
+        stopped: Called before each pair; True ends the recording.
 
     Returns:
-        The figures, as ``capture.json`` in the folder has them.
+        The figures, as written to ``capture.json`` in the folder.
 
     Raises:
         SourceError: A camera cannot be opened, or stops; what was recorded before stays.
@@ -83,7 +83,7 @@ def record(
     calibration: Path | None,
     stopped: Callable[[], bool],
 ) -> dict[str, Any]:
-    """Record from cameras that are open; see `run_capture`."""
+    """Record from opened cameras; see `run_capture`."""
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
     log = _Log()
     with CaptureFolder(folder, settings.suffix) as target:
@@ -101,7 +101,7 @@ def record(
                 "calibration": calibration is not None,
                 "out": str(folder),
             }
-            # A disk that is full leaves the pairs readable without this.
+            # An empty recording has no summary.
             if target.frames:
                 _write_summary(folder, summary)
     return summary
@@ -110,14 +110,14 @@ def record(
 def _write_all(
     pairs: Iterable[CapturedPair], target: CaptureFolder, settings: CaptureSettings, log: _Log
 ) -> None:
-    """Write in a second thread, so that the disk does not keep the cameras waiting."""
+    """Write in a second thread, so that the disk does not block the cameras."""
     waiting: queue.Queue[CapturedPair | None] = queue.Queue(_WAITING)
     failed: list[Exception] = []
 
     def work() -> None:
         while (pair := waiting.get()) is not None:
             if failed:
-                continue  # drained, so that the other thread does not wait for ever
+                continue  # keep draining the queue, so that the other thread does not block
             try:
                 target.add(pair)
                 log.add(pair)

@@ -1,4 +1,4 @@
-"""What a killed run goes on from: its state after a frame, written atomically now and then."""
+"""Checkpoints: the state of a run after a frame, written atomically, to resume it from."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from recon.structures.arrays import UInt8
 
 _HEAD_BYTES: Final = 4096
 ANEW: Final = "start the run anew, without --resume"
-#: What a saved odometry may consist of. Loading anything else would run what others wrote.
+#: Modules that a checkpoint may load: unpickling any other could run foreign code.
 _SAFE: Final = ("recon.", "numpy")
 
 
 class CheckpointSettings(Settings):
-    """How often a run writes down what it goes on from; changes no result."""
+    """How often a run writes a checkpoint; does not change results."""
 
     every_frames: int = Field(
         50, ge=1, le=1_000_000, description="Number of frames between two checkpoints."
@@ -32,7 +32,7 @@ class CheckpointSettings(Settings):
 
 
 class Checkpoint:
-    """The newest state of a run, in one file.
+    """The latest state of a run, in one file.
 
     Args:
         path: The file.
@@ -42,11 +42,11 @@ class Checkpoint:
         self._path = path
 
     def exists(self) -> bool:
-        """Whether there is a state to go on from."""
+        """Whether there is a state to resume from."""
         return self._path.is_file()
 
     def save(self, state: Mapping[str, Any]) -> None:
-        """Replace the state; a kill at any moment leaves the old or the new one.
+        """Replace the state; if killed at any moment, the old or the new one is intact.
 
         Raises:
             OutputError: It cannot be written; the old one stays.
@@ -54,7 +54,7 @@ class Checkpoint:
         write_tree(self._path, state)
 
     def load(self) -> dict[str, Any]:
-        """The state.
+        """Read the state.
 
         Raises:
             FormatError: The file is damaged.
@@ -65,7 +65,7 @@ class Checkpoint:
             raise FormatError(error.what, where=error.where, got=error.got, hint=ANEW) from error
 
     def restore(self, use: Callable[[dict[str, Any]], None]) -> None:
-        """Let ``use`` go on from the state.
+        """Pass the state to ``use``, which resumes from it.
 
         Raises:
             FormatError: The file is damaged, or holds something else.
@@ -80,15 +80,15 @@ class Checkpoint:
 
 
 def pack_object(value: object) -> UInt8:
-    """uint8 (N,), one of our stateful objects as bytes; `unpack_object` gives it back."""
+    """uint8 (N,), a stateful object of this project as bytes; `unpack_object` restores it."""
     return np.frombuffer(pickle.dumps(value, protocol=5), np.uint8)
 
 
 def unpack_object(content: UInt8) -> Any:
-    """The object that `pack_object` was given.
+    """Restore the object given to `pack_object`.
 
     Raises:
-        FormatError: The bytes are damaged, or hold what is not ours.
+        FormatError: The bytes are damaged, or contain an object of another package.
     """
     try:
         return _OurUnpickler(io.BytesIO(content.tobytes())).load()
@@ -97,10 +97,10 @@ def unpack_object(content: UInt8) -> Any:
 
 
 class _OurUnpickler(pickle.Unpickler):
-    """Makes objects of this project and numpy's arrays, and nothing else."""
+    """Unpickles classes of this project and numpy arrays, nothing else."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """The class or function of a name that may be used."""
+        """The class or function of a name, if it is allowed."""
         found = super().find_class(module, name)
         ours = module.startswith(_SAFE) and (isinstance(found, type) or module.startswith("numpy"))
         if not ours:
@@ -109,9 +109,9 @@ class _OurUnpickler(pickle.Unpickler):
 
 
 def quick_fingerprint(files: Iterable[Path]) -> dict[str, Any]:
-    """Number, sizes and a hash of the names and beginnings of files, to tell sources apart.
+    """Number, total size, and a hash of names and first bytes of files, to tell sources apart.
 
-    Whole files are hashed when a run is done; here a drive of many gigabytes must open at once.
+    Hashing whole files, as at the end of a run, would delay the start of a large drive.
     """
     digest, count, size = hashlib.sha256(), 0, 0
     for path in files:

@@ -1,4 +1,4 @@
-"""An even sample of a cloud that is too large to be held, for pictures and reports."""
+"""An even sample of a cloud that is too large for memory, for images and reports."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _GROWTH: Final = 1.25
 
 
 class CloudSample:
-    """Keeps the first point of each cell of a grid, whose cells grow with what is added.
+    """Keeps the first point of each grid cell; cells grow as points are added.
 
     Args:
-        limit: Points that are kept at most; up to there, all are.
-        cell_m: Edge of the cells when the limit is first reached.
+        limit: Largest number of points kept; up to it, all are kept.
+        cell_m: Cell size when the limit is first reached.
     """
 
     def __init__(self, limit: int, cell_m: float) -> None:
@@ -29,18 +29,18 @@ class CloudSample:
         self._kept: list[PointCloud] = []
 
     def add(self, cloud: PointCloud) -> None:
-        """Take some more points; clouds are in one frame and have the same fields."""
+        """Add points; all clouds are in one frame and have the same fields."""
         self._kept.append(self._thinned(cloud))
         if sum(map(len, self._kept)) > self._limit:
             whole = join_clouds(self._kept)
             self._kept = [] if whole is None else [self._within_the_limit(whole)]
 
     def cloud(self) -> PointCloud | None:
-        """The sample; None where nothing was added."""
+        """The sample; None if nothing was added."""
         return join_clouds(self._kept)
 
     def _within_the_limit(self, cloud: PointCloud) -> PointCloud:
-        """Thinned by cells that grow until few enough points are left."""
+        """Thin a cloud, with growing cells, until it is within the limit."""
         self._cell_m = self._cell_m or self._first_cell_m
         thinned = self._thinned(cloud)
         while len(thinned) > self._limit:
@@ -53,6 +53,6 @@ class CloudSample:
 
 
 def _first_of_cells(cloud: PointCloud, cell_m: float) -> NDArray[np.intp]:
-    """Rows of the first points in each cell, in order."""
+    """Indices of the first point in each cell, in order."""
     keys = voxels.pack_keys(np.floor(cloud.xyz / cell_m).astype(np.int64))
     return np.sort(np.unique(keys, return_index=True)[1])

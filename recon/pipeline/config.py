@@ -1,4 +1,4 @@
-"""The configuration: the sum of the stages' settings, read from YAML and from the command line."""
+"""The configuration: settings of all stages, from YAML files and the command line."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ NO_ISLANDS: Final = FilterSettings(voxel_m=None, radius_m=0.3, radius_neighbours
 
 
 class ReconConfig(Settings):
-    """All that decides a result. Written beside every result as ``config.yaml``."""
+    """Everything that determines a result; written beside each result as ``config.yaml``."""
 
     source: SourceSettings = SourceSettings()
     capture: CaptureSettings = CaptureSettings()
@@ -79,7 +79,7 @@ PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
     "filters": ANY_SCALE.model_dump(),
     "mesh": {"max_depth": 9},
 }
-"""What one pair sets differently from a drive: nobody knows the scale of its scene beforehand."""
+"""Defaults of a single pair that differ from a drive: the scale of its scene is unknown."""
 
 
 def load_config(
@@ -92,7 +92,7 @@ def load_config(
     Args:
         path: A YAML file with any part of the configuration, such as a run's ``config.yaml``.
         overrides: ``key=value`` texts with dotted keys, such as ``matching.sad.window_px=9``.
-        defaults: What a command sets differently from the stages.
+        defaults: Defaults of a command that differ from those of the stages.
 
     Raises:
         SettingsError: The file cannot be read, a key is unknown, or a value is out of range.
@@ -108,12 +108,12 @@ def load_config(
         return ReconConfig.parse(values)
     except SettingsError:
         if path is not None:
-            ReconConfig.parse(told, where=str(path))  # the file's fault, not that of the overrides
+            ReconConfig.parse(told, where=str(path))  # blames the file if it is invalid by itself
         raise
 
 
 def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> list[str]:
-    """Overrides that choose a matcher, and the range of whichever is chosen; None = as it is."""
+    """Overrides for the matcher and its disparity range; None = unchanged."""
     chosen = [] if matcher is None else [f"matching.matcher={matcher}"]
     fields = MatchingSettings.model_fields
     ranged = [
@@ -127,14 +127,14 @@ def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> 
 def source_overrides(
     calib: Path | None, left: str | None, right: str | None, tolerance_s: float | None
 ) -> list[str]:
-    """Overrides that say what the files of a source do not tell; None = as it is."""
+    """Overrides for facts that the files of a source do not contain; None = unchanged."""
     given = {
         "calibration": None if calib is None else str(calib),
         "left": left,
         "right": right,
         "tolerance_s": tolerance_s,
     }
-    # Quoted, for a topic or folder may be called 0 or null.
+    # Quoted, since a topic or folder may be named 0 or null.
     return [
         f"source.{key}={json.dumps(value)}" for key, value in given.items() if value is not None
     ]
@@ -147,10 +147,10 @@ def capture_overrides(
     seconds: float | None,
     preview_every: int | None,
 ) -> list[str]:
-    """Overrides that say what to record; None = as it is.
+    """Overrides for a recording; None = unchanged.
 
     Raises:
-        SettingsError: The size is not like 1280x720.
+        SettingsError: The size is not of the form 1280x720.
     """
     width, cross, height = (size or "").partition("x")
     if size is not None and not (cross and width.isdigit() and height.isdigit()):
@@ -167,12 +167,12 @@ def capture_overrides(
 
 
 def dump_config(config: ReconConfig) -> str:
-    """The configuration as YAML; `load_config` gives the same configuration back."""
+    """The configuration as YAML; `load_config` restores the same configuration."""
     return str(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
 
 
 def _merge(base: dict[str, Any], update: Mapping[str, Any]) -> None:
-    """Merge nested mappings into ``base``; other values replace what was there."""
+    """Merge nested mappings into ``base``; other values replace those in it."""
     for key, value in update.items():
         if isinstance(value, Mapping):
             below = base.get(key)

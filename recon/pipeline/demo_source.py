@@ -13,9 +13,9 @@ FARTHEST_M: Final = 30.0
 
 
 def demo_source(config: ReconConfig) -> SyntheticSource:
-    """A street whose true surface reaches as far as the map does.
+    """A street whose true surface extends as far as the map does.
 
-    Farther surfaces are not fused by design, so they are no part of the truth to find.
+    Surfaces beyond the range limit are not fused, so the ground truth leaves them out.
     """
     range_m = fusion_range_m(rig(config.street), config.fusion)
     return SyntheticSource(config.street, surface_range_m=min(range_m, FARTHEST_M))

@@ -1,4 +1,4 @@
-"""What a run needs of the machine, and whether it is there."""
+"""Checks of the installation and the machine."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MIN_MEMORY_GB: Final = 3.0
 MIN_DISK_GB: Final = 1.0
 _IMPORT_TIMEOUT_S: Final = 120.0
 
-# Name to install -> name to import.
+# Package name -> module name.
 PACKAGES: Final[Mapping[str, str]] = MappingProxyType(
     {
         "numpy": "numpy",
@@ -43,7 +43,7 @@ PACKAGES: Final[Mapping[str, str]] = MappingProxyType(
         "pyyaml": "yaml",
     }
 )
-# Shared library -> Debian or Ubuntu package that has it.
+# Shared library -> Debian or Ubuntu package that provides it.
 SYSTEM_LIBRARIES: Final[Mapping[str, str]] = MappingProxyType(
     {
         "libGL.so.1": "libgl1",
@@ -57,14 +57,14 @@ SYSTEM_LIBRARIES: Final[Mapping[str, str]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at.
+    """The result of one check.
 
     Attributes:
-        name: What was looked at.
-        ok: Whether it is as it should be.
-        found: What there is.
-        hint: What to do where it is not ok, else "".
-        needed: Whether runs fail without it; else it is good to have.
+        name: What was checked.
+        ok: Whether it passed.
+        found: What was found.
+        hint: What to do if it failed, else "".
+        needed: Whether runs fail without it; else it is optional.
     """
 
     name: str
@@ -75,13 +75,13 @@ class Check:
 
 
 def examine(outputs: Path = Path("outputs")) -> list[Check]:
-    """Look at Python, packages, system libraries, machine and folders.
+    """Check Python, packages, system libraries, machine and folders.
 
-    Each package is imported in a process of its own, so that one that crashes is reported too;
-    this takes some seconds.
+    Each package is imported in a process of its own, so that a crash is reported as well; this
+    takes some seconds.
 
     Args:
-        outputs: The folder that runs write to; it need not exist yet, and is not made.
+        outputs: The folder that runs write to; it need not exist, and is not created.
     """
     return [
         check_python(),
@@ -114,7 +114,7 @@ def check_packages(packages: Mapping[str, str]) -> list[Check]:
 
 
 def check_package(name: str, module: str) -> Check:
-    """One package, imported in a process of its own."""
+    """One package, imported in its own process."""
     try:
         installed = version(name)
     except PackageNotFoundError:
@@ -126,14 +126,14 @@ def check_package(name: str, module: str) -> Check:
 
 
 def check_system_libraries(libraries: Mapping[str, str]) -> list[Check]:
-    """The shared libraries that the packages load; nothing to look at outside Linux."""
+    """The shared libraries that the packages load; no checks outside Linux."""
     if sys.platform != "linux":
         return []
     return [_check_library(library, package) for library, package in libraries.items()]
 
 
 def check_cores() -> Check:
-    """The cores that this process may use."""
+    """CPU cores available to this process."""
     return Check("cores", ok=True, found=str(available_cores()), needed=False)
 
 
@@ -141,7 +141,7 @@ def check_memory() -> Check:
     """The memory of the machine."""
     try:
         memory_gb = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
-    except (AttributeError, ValueError, OSError):  # a system that does not tell
+    except (AttributeError, ValueError, OSError):  # not available on this system
         return Check("memory", ok=True, found="unknown", needed=False)
     ok = memory_gb >= MIN_MEMORY_GB
     hint = "" if ok else f"long drives need {MIN_MEMORY_GB:g} GB: map fewer frames"
@@ -149,14 +149,14 @@ def check_memory() -> Check:
 
 
 def check_opencv_threads() -> Check:
-    """The threads that OpenCV takes by default."""
+    """Default number of threads of OpenCV."""
     done, told = _run_python("import cv2; print(cv2.getNumThreads())")
     found = told if done else "unknown"
     return Check("OpenCV threads", done, found, "" if done else "see opencv", needed=False)
 
 
 def check_numba() -> Iterator[Check]:
-    """Whether loops are compiled, and whether they stay compiled for the next run."""
+    """Whether kernels are compiled, and whether the compiled code is cached for the next run."""
     off = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
     yield Check(
         "compiled kernels",
@@ -174,7 +174,7 @@ def check_numba() -> Iterator[Check]:
 
 
 def check_kiss_icp_environment() -> Check:
-    """Variables ``kiss_icp_…`` would silently change kiss-icp's settings."""
+    """Environment variables ``kiss_icp_…``, which would silently change kiss-icp's settings."""
     names = sorted(name for name in os.environ if name.lower().startswith("kiss_icp"))
     hint = f"unset {' '.join(names)}" if names else ""
     found = ", ".join(names) or "none set"
@@ -192,7 +192,7 @@ def check_data() -> Check:
 
 
 def check_folder(name: str, folder: Path, *, needed: bool, hint: str) -> Check:
-    """Whether a folder, or the one that it would be made in, can be written."""
+    """Whether a folder, or the one that it would be created in, is writable."""
     nearest = next((p for p in (folder, *folder.absolute().parents) if p.exists()), Path())
     try:
         with tempfile.TemporaryFile(dir=nearest):
@@ -203,7 +203,7 @@ def check_folder(name: str, folder: Path, *, needed: bool, hint: str) -> Check:
 
 
 def check_disk(folder: Path) -> Check:
-    """Free space where results go."""
+    """Free disk space for results."""
     nearest = next((p for p in (folder, *folder.absolute().parents) if p.exists()), Path())
     free_gb = shutil.disk_usage(nearest).free / 1e9
     ok = free_gb >= MIN_DISK_GB
@@ -220,7 +220,7 @@ def _check_library(library: str, package: str) -> Check:
 
 
 def _run_python(code: str) -> tuple[bool, str]:
-    """Whether code runs in a fresh Python, and the last line that it printed."""
+    """Whether code runs in a new Python process, and the last line that it printed."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", code],

@@ -1,4 +1,4 @@
-"""The loops of a drive: looked for frame by frame, closed when the drive is over."""
+"""The loops of a drive: detected frame by frame, closed at its end."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from recon.structures import Trajectory
 from recon.structures.arrays import Float64
 
 _CACHED: Final = 64
-_TELLING: Final = 3  # places recognised where the drive cannot have been, that are worth a warning
-_BEHIND: Final = 4  # frames by which looking for loops may be late
+_TELLING: Final = 3  # implausible place recognitions from which a warning is given
+_BEHIND: Final = 4  # frames by which loop detection may lag behind
 
 
 @dataclass(frozen=True, eq=False)
 class DriveLoops:
-    """What loop closure did to a drive.
+    """The result of loop closure on a drive.
 
     Attributes:
-        odometry: The path before.
-        closure: The path after, and the loops.
-        keyframes: Number of places that were remembered.
-        found: Loops that geometry confirmed, whether neighbours did or not.
-        refused: How many candidates were refused, and why.
+        odometry: The path before closure.
+        closure: The path after closure, and the loops.
+        keyframes: Number of keyframes.
+        found: Number of loops that passed the geometric check, confirmed by neighbours or not.
+        refused: Number of rejected candidates by reason.
     """
 
     odometry: Trajectory
@@ -55,9 +55,9 @@ class DriveLoops:
         return np.asarray(np.linalg.norm(moved, axis=1))
 
     def submap_corrections(self, entries: Sequence[SubmapEntry]) -> Float64 | None:
-        """``T_corrected_world`` (S, 4, 4), the motion of each submap: that of its middle frame.
+        """``T_corrected_world`` (S, 4, 4), the correction of each submap: that of its middle frame.
 
-        None where no loop was closed, so that nothing moves by a rounding error.
+        None if no loop was closed, so that no submap moves by a rounding error.
         """
         if not self.closure.closed:
             return None
@@ -77,7 +77,7 @@ class DriveLoops:
         }
 
     def edges(self) -> dict[str, Any]:
-        """The loops themselves, for ``loops.json``."""
+        """The loops, for ``loops.json``."""
         return {
             name: [
                 {
@@ -93,7 +93,7 @@ class DriveLoops:
         }
 
     def warnings(self) -> list[str]:
-        """What a user should know about loops that were not closed."""
+        """Warnings about loops that were not closed."""
         closed, refused = len(self.closure.closed), len(self.closure.refused)
         if refused and not closed:
             what = "they contradict the odometry; the map may show a place twice"
@@ -108,12 +108,12 @@ class DriveLoops:
 
 
 class LoopWatch:
-    """Looks for loops while a drive is mapped, in a thread of its own, and closes them at its end.
+    """Detects loops in its own thread while a drive is mapped, and closes them at its end.
 
     Args:
-        settings: What is kept, compared and believed.
-        folder: Where keyframes are written; None = they stay in memory.
-        stopwatch: Told the seconds.
+        settings: Settings of loop detection and closure.
+        folder: Folder for keyframes; None = they stay in memory.
+        stopwatch: Records the time spent.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class LoopWatch:
         self._last: Float64 = np.eye(4)
 
     def add(self, frame: ReconstructedFrame, T_world_camera: Float64, *, measured: bool) -> None:
-        """Take the next frame, while those before may still be looked at.
+        """Add the next frame; earlier ones may still be in progress.
 
         Raises:
             OutputError: A keyframe cannot be written.
@@ -154,7 +154,7 @@ class LoopWatch:
         self._waiting.append(self._pool.submit(look))
 
     def settle(self) -> None:
-        """Wait until all frames so far have been looked at.
+        """Wait until all frames so far have been processed.
 
         Raises:
             OutputError: A keyframe cannot be written.
@@ -162,11 +162,11 @@ class LoopWatch:
         self._wait(0)
 
     def stop(self) -> None:
-        """End the thread; what it has not begun is left."""
+        """End the thread; pending frames are dropped."""
         self._pool.shutdown(cancel_futures=True)
 
     def restore(self, T_world_camera: Iterable[Float64], measured: Iterable[bool]) -> None:
-        """Go on after frames with these poses; their keyframes are in the store.
+        """Resume after frames with these poses; their keyframes are in the store.
 
         Raises:
             FormatError: A keyframe's file is damaged.
@@ -196,12 +196,12 @@ class LoopWatch:
         )
 
     def _wait(self, left: int) -> None:
-        """Wait until no more frames than these are left to look at."""
+        """Wait until at most ``left`` frames are pending."""
         while len(self._waiting) > left:
             self._waiting.popleft().result()
 
     def _advance(self, T_world_camera: Float64, *, measured: bool) -> float:
-        """The path up to the next frame, as the detector counts it."""
+        """Path length up to the next frame, as the detector measures it."""
         before = self._last if self._path_m else T_world_camera
         step = doubtful_path(
             np.stack([before, T_world_camera]), np.array([True, measured]), self._settings.drift
@@ -212,10 +212,10 @@ class LoopWatch:
 
 
 class KeyframeFiles:
-    """Keeps keyframes in files, one each, and the last few that were read in memory.
+    """Keeps each keyframe in a file, and those read last in memory.
 
     Args:
-        folder: Where they are written; made if missing.
+        folder: The folder of the files; created if missing.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -223,7 +223,7 @@ class KeyframeFiles:
         self._held: OrderedDict[int, StoredKeyframe] = OrderedDict()
 
     def put(self, stored: StoredKeyframe) -> None:
-        """Keep a keyframe.
+        """Store a keyframe.
 
         Raises:
             OutputError: It cannot be written.
@@ -244,7 +244,7 @@ class KeyframeFiles:
         return self._held[frame]
 
     def __iter__(self) -> Iterator[StoredKeyframe]:
-        """All that were written, in order of their frames."""
+        """All stored keyframes, in frame order."""
         return (_read(path) for path in sorted(self._folder.glob("keyframe_*.zip")))
 
     def _path(self, frame: int) -> Path:

@@ -1,4 +1,4 @@
-"""The map of a drive, put together from its submaps tile by tile."""
+"""The map of a drive, assembled from its submaps tile by tile."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from recon.structures.arrays import Float64
 
 Tile = tuple[int, int]
 _MARGIN_M: Final = 1.0
-"""What the filters of the fused cloud see beyond a tile, at least."""
+"""Least margin around a tile for the filters of the fused cloud."""
 _LEAST_TILE_M: Final = 5.0
 _FUSED_BYTES: Final = 60
 _BLOCK_BYTES: Final = 4 * 3 * BLOCK_EDGE**3
@@ -35,14 +35,14 @@ _ROW_ZERO: Final = 1 << (_ROW_BITS - 1)
 
 @dataclass(frozen=True)
 class _Reach:
-    """Where a submap has something, margins of tiles included, and what it knows of points.
+    """The extent of a submap in tiles, margins included, and its point attributes.
 
     Attributes:
-        fused: Number of voxels in tiles of the fused cloud.
-        occupancy: Number of blocks in tiles of the occupancy.
-        known: Which fields of a cloud it has.
-        low: Smallest x and y of its cells.
-        high: Largest ones, plus one.
+        fused: Number of voxels in each tile of the fused cloud.
+        occupancy: Number of blocks in each tile of the occupancy.
+        known: Cloud attributes that the submap has.
+        low: Smallest x and y of its occupancy cells.
+        high: Largest x and y, plus one.
     """
 
     fused: Mapping[Tile, int]
@@ -59,8 +59,8 @@ class DriveMap:
         store: The submaps.
         config: The configuration.
         T_map_world: float64 (4, 4), from world to map axes.
-        T_corrected_world: float64 (S, 4, 4), a rigid correction of each submap; None = they
-            stay where the odometry put them.
+        T_corrected_world: float64 (S, 4, 4), a rigid correction of each submap; None = none is
+            corrected.
     """
 
     def __init__(
@@ -84,22 +84,22 @@ class DriveMap:
         filters = config.map_filters
         margin_m = max(_MARGIN_M, 2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
         self._margin_voxels = math.ceil(margin_m / config.fusion.voxel_m)
-        # A cell depends on those joined to it, their blob, and the points and free cells beside.
+        # A cell depends on the cells joined to it, on their blob, and on adjacent cells.
         beyond = config.grid.min_blob_cells + config.grid.joined_cells + 2
         self._margin_blocks = math.ceil(beyond / BLOCK_EDGE)
         self._reach = self._fitting_reach()
         shared = frozenset(KNOWABLE).intersection(*(reach.known for reach in self._reach))
-        # What one submap does not know, the map does not know: all tiles have the same fields.
+        # Attributes missing in one submap are dropped, so that all tiles have the same fields.
         self._known = tuple(name for name in KNOWABLE if name in shared)
 
     @property
     def cloud_tile_m(self) -> float:
-        """Edge of a tile of the cloud."""
+        """Side of a cloud tile."""
         return self._voxels_per_tile * self._config.fusion.voxel_m
 
     @property
     def occupancy_tile_cells(self) -> int:
-        """Edge of a tile of the occupancy, in cells; a power of two, at least 8."""
+        """Side of an occupancy tile in cells; a power of two, at least 8."""
         return self._blocks_per_tile << BLOCK_BITS
 
     @property
@@ -119,8 +119,8 @@ class DriveMap:
     def cloud_tiles(self) -> Iterator[tuple[Tile, PointCloud]]:
         """The fused and filtered cloud, frame ``world``, tile by tile along the drive.
 
-        Filters see a margin around the tile, so that the tiles together are the filtered whole
-        (statistical limits are those of the tile).
+        Filters see a margin around the tile, so that the tiles together equal the filtered whole
+        (except for statistical limits, which are those of the tile).
         """
         for tile in _along_the_drive(reach.fused for reach in self._reach):
             cloud = self._cloud_of(tile)
@@ -136,11 +136,11 @@ class DriveMap:
             yield tile, voxels
 
     def occupancy_of(self, tile: Tile) -> OccupancyVoxels:
-        """The observed voxels of a tile, and of the cells around it that they depend on."""
+        """The observed voxels of a tile, and of its margin."""
         edge, margin = self._blocks_per_tile, self._margin_blocks
         low, high = np.array(tile) * edge - margin, (np.array(tile) + 1) * edge + margin
         near = self._near(tile, lambda reach: reach.occupancy)
-        # One after the other: a place that was passed often takes no more than one passed once.
+        # Joined one by one, so that a place passed often takes no more memory than one passed once.
         parts = (self._submap(index).occupancy for index in near)
         inside = (part.select(_inside(part.blocks[:, :2], low, high)) for part in parts)
         return join_occupancy(inside).voxels(self._config.occupancy.resolution_m)
@@ -151,13 +151,13 @@ class DriveMap:
         return OccupancyVoxels(voxels.keys[keep], voxels.log_odds[keep], voxels.resolution_m)
 
     def cloud(self) -> PointCloud:
-        """The whole cloud, frame ``world``: memory in proportion to the map."""
+        """The whole cloud, frame ``world``; memory grows with the map."""
         nothing = PointCloud(np.zeros((0, 3), np.float32), frame="world")
         whole = join_clouds([cloud for _, cloud in self.cloud_tiles()])
         return nothing if whole is None else whole
 
     def voxels(self) -> OccupancyVoxels:
-        """All observed voxels, map axes: memory in proportion to the map."""
+        """All observed voxels, map axes; memory grows with the map."""
         tiles = [self.inner(tile, voxels) for tile, voxels in self.occupancy_tiles()]
         return OccupancyVoxels(
             np.concatenate([np.zeros((0, 3), np.int32), *(tile.keys for tile in tiles)]),
@@ -172,7 +172,7 @@ class DriveMap:
         parts = (self._submap(index).fused for index in self._near(tile, lambda reach: reach.fused))
         inside = (part.select(_inside(part.cells[:, [0, 2]], low, high)) for part in parts)
         fused = replace(join_fused(inside), known=self._known)
-        # A drive of fewer frames than the least count must still give a map.
+        # A drive with fewer frames than the minimum count must still give a map.
         least = min(config.fusion.min_count, self._frames)
         points = fused.cloud(config.fusion.voxel_m, least, config.fusion.precise_sigma_m)
         cloud = filter_cloud(points, config.map_filters)
@@ -180,7 +180,7 @@ class DriveMap:
         return cloud.select((home == tile).all(axis=1))
 
     def _fitting_reach(self) -> list[_Reach]:
-        """Where the submaps are, in tiles that are halved until the fullest one is small enough."""
+        """The extents of the submaps; tiles are halved until the fullest one fits into memory."""
         limit = self._config.memory.tile_bytes
         while True:
             reach = [self._reach_of(self._submap(n)) for n in range(len(self._store))]
@@ -196,7 +196,7 @@ class DriveMap:
             self._blocks_per_tile //= 1 + blocks
 
     def _near(self, tile: Tile, kind: Callable[[_Reach], Mapping[Tile, int]]) -> list[int]:
-        """Numbers of the submaps that have something in a tile or its margin, in order."""
+        """Indices of the submaps with content in a tile or its margin, in order."""
         return [n for n, reach in enumerate(self._reach) if tile in kind(reach)]
 
     def _reach_of(self, submap: Submap) -> _Reach:
@@ -214,7 +214,7 @@ class DriveMap:
         )
 
     def _submap(self, index: int) -> Submap:
-        """A submap where it was moved to."""
+        """A submap with its correction applied."""
         if self._T_corrected_world is None or np.array_equal(
             self._T_corrected_world[index], np.eye(4)
         ):
@@ -234,7 +234,7 @@ class DriveMap:
 
 
 def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud | None:
-    """Clouds of one frame as one, None of none; what one of them does not know is left out."""
+    """Concatenate clouds of one frame; attributes missing in one are dropped, no cloud is None."""
     if not clouds:
         return None
     fields: dict[str, Any] = {}
@@ -247,14 +247,15 @@ def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud | None:
 
 
 def _tiles(cells: NDArray[np.int32], edge: int, margin: int) -> dict[Tile, int]:
-    """Tiles of ``edge`` cells that have a cell (N, 2) in them or within the margin; how many.
+    """Number of cells (N, 2) in each tile of ``edge`` cells, its margin included.
 
-    The number counts the cells that one corner of the margin brings in, where that is most.
+    The margin is counted by moving all cells to each of its four corners; the largest count is
+    kept.
     """
     found: dict[Tile, int] = {}
     for move in product((-margin, margin), repeat=2):
         column, row = ((cells.astype(np.int64) + move) // edge).T
-        # One number for two: numpy sorts rows slowly.
+        # Packed into one integer, since numpy sorts rows slowly.
         packed = (column << _ROW_BITS) + row + _ROW_ZERO
         numbers, counts = np.unique(packed, return_counts=True)
         for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
@@ -264,7 +265,7 @@ def _tiles(cells: NDArray[np.int32], edge: int, margin: int) -> dict[Tile, int]:
 
 
 def _most(groups: Iterable[Mapping[Tile, int]]) -> int:
-    """Largest sum that a tile has over all groups."""
+    """Largest sum over all groups of any tile."""
     total: Counter[Tile] = Counter()
     for group in groups:
         total.update(group)

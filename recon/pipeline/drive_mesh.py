@@ -1,4 +1,4 @@
-"""The surface of a drive: tile by tile, cut where tiles meet, so that memory stays bounded."""
+"""The mesh of a drive, built tile by tile and cut at tile borders to bound memory."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from recon.structures import TriangleMesh
 from recon.structures.arrays import Float32
 
 SAMPLE_FACES: Final = 2_000_000
-"""Triangles up to which the whole mesh is kept to look at."""
+"""Largest number of triangles of a mesh that is loaded whole for images."""
 _MOST_AT_ONCE: Final = 4
 _SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))
-"""Axis, and whether it is the far side, of the four sides of a tile."""
+"""The four sides of a tile: (axis, 1 for the far side)."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,10 @@ class MeshTile:
     """A tile whose mesh is written.
 
     Attributes:
-        tile: Its number.
-        path: Its PLY.
-        vertices: How many.
-        faces: How many.
+        tile: Its index.
+        path: Its PLY file.
+        vertices: Number of vertices.
+        faces: Number of faces.
     """
 
     tile: Tile
@@ -56,11 +56,11 @@ class MeshTile:
 
 @dataclass(frozen=True, eq=False)
 class WrittenMesh:
-    """What is known of a mesh whose files are written.
+    """A mesh whose files are written.
 
     Attributes:
         tiles: Its tiles.
-        warnings: What could not be meshed.
+        warnings: Parts that could not be meshed.
     """
 
     tiles: tuple[MeshTile, ...]
@@ -78,7 +78,7 @@ class WrittenMesh:
 
 
 def store_map(mapped: MappedSequence, folder: Path) -> TileStore:
-    """Put the fused cloud and the voxels of a drive by, tile by tile.
+    """Store the fused cloud and the voxels of a drive tile by tile.
 
     Raises:
         OutputError: The folder cannot be written.
@@ -99,15 +99,15 @@ def write_drive_mesh(
     cloud: Path,
     threads: int | None = None,
 ) -> WrittenMesh:
-    """Write ``mesh/mesh.ply``, its tiles where there are several, and ``mesh/mesh.mlp``.
+    """Write ``mesh/mesh.ply``, its tiles if there are several, and ``mesh/mesh.mlp``.
 
     Args:
-        store: Points, and voxels where the cameras' free space is known.
-        settings: How; ``target_faces`` is that of all tiles together.
+        store: Points, and voxels if free space is known.
+        settings: Settings of the mesh; ``target_faces`` is the total over all tiles.
         directory: The folder of the run.
-        cloud: A PLY in it, for the MeshLab project.
-        threads: Tiles that are reconstructed at a time, each in a process of its own; None = one
-            per core, at most four, since each takes its memory. Changes no result.
+        cloud: A PLY file in it, for the MeshLab project.
+        threads: Tiles reconstructed at a time, each in its own process; None = one per core, at
+            most four, since each needs memory. Does not change results.
 
     Raises:
         MeshingError: No tile has a surface.
@@ -130,13 +130,13 @@ def write_drive_mesh(
 
 
 def mesh_to_show(written: WrittenMesh, whole: Path) -> TriangleMesh | None:
-    """The mesh for pictures; None where it is too large to be held."""
+    """The mesh for images; None if it is too large for memory."""
     return read_mesh(whole) if written.faces <= SAMPLE_FACES else None
 
 
 @dataclass(eq=False)
 class _Mesher:
-    """Reconstructs some tiles at a time; in order, a tile closes its seams to those before it."""
+    """Reconstructs tiles in parallel; each tile closes its seams to earlier ones, in order."""
 
     store: TileStore
     settings: MeshSettings
@@ -160,7 +160,7 @@ class _Mesher:
         return WrittenMesh(tuple(tiles), self._warnings(failed))
 
     def _warnings(self, failed: dict[Tile, MeshingError]) -> tuple[str, ...]:
-        """One line about the tiles without a surface, of which the worst is named."""
+        """One line about the tiles without a surface, naming the one with the most points."""
         if not failed:
             return ()
         worst = max(failed, key=self.store.points)
@@ -169,14 +169,14 @@ class _Mesher:
         return (f"no surface in {tiles}, {share:.1%} of the points ({failed[worst]})",)
 
     def _surface(self, tile: Tile) -> TriangleMesh | MeshingError:
-        """The surface of a tile; or, for its turn, why there is none."""
+        """The surface of a tile, or the error why there is none, handled when its turn comes."""
         try:
             return self._cut(tile)
         except MeshingError as error:
             return error
 
     def _cut(self, tile: Tile) -> TriangleMesh:
-        """The surface of a tile with its margin, cut at the tile's sides."""
+        """The surface of a tile with its margin, cut at the sides of the tile."""
         overlap_m = self.settings.overlap_m
         cloud = self.store.cloud_in(tile, overlap_m)
         if cloud is None:
@@ -193,14 +193,14 @@ class _Mesher:
         return mesh
 
     def _target(self, seen: int) -> int | None:
-        """Triangles for a tile with its margin: as its points are to those of the drive."""
+        """Target number of triangles of a tile with its margin, by its share of the points."""
         target = self.settings.target_faces
         if target is None:
             return None
         return max(4, round(target * seen / self.store.total))
 
     def _joined(self, tile: Tile, mesh: TriangleMesh) -> TriangleMesh:
-        """A tile's mesh, joined to those of its neighbours that were before it."""
+        """The mesh of a tile, joined to those of its earlier neighbours."""
         for axis, far in _SIDES:
             plane = self._plane(tile, axis, far)
             step = np.zeros(2, int)

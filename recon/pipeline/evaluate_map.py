@@ -1,4 +1,4 @@
-"""`recon evaluate map` without its command line: a run and a reference in, figures out."""
+"""`recon evaluate map` without its command line: compare a map with a reference cloud."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from recon.structures.arrays import Float64
 
 ReferenceFrame = Literal["camera", "map"]
 _PATH = "trajectory_tum.txt"
-# Half of either cloud near the other is a fit, however bad; a tenth of both is none.
+# From half of either cloud near the other it is a fit; below a tenth of both it is none.
 _FITS, _HARDLY_MEETS = 0.5, 0.1
 
 
 @dataclass(frozen=True)
 class MapFiles:
-    """What is compared, and how it is brought together.
+    """The clouds to compare, and how they are aligned.
 
     Attributes:
-        run: A run's folder, or a PLY. A PLY inside a run's folder is in that run's map axes; any
-            other PLY is taken to be in the axes of the reference already.
-        reference: A PLY.
+        run: A run's folder, or a PLY file. A PLY inside a run's folder is in that run's map axes;
+            any other PLY is taken to be in the axes of the reference already.
+        reference: A PLY file.
         frame: Axes of the reference: those of the first left camera, or the map's.
-        align_to: True poses of the run's cameras, in the axes of the reference; the run's path is
-            moved rigidly to lie closest, and its map with it.
-        icp: Whether the cloud is then laid onto the reference.
-        thresholds_m: Distances below which a point counts as right.
+        align_to: Ground-truth poses of the run's cameras, in the axes of the reference; the run's
+            path is aligned rigidly to them, and its map moves with it.
+        icp: Whether the cloud is then aligned to the reference by ICP.
+        thresholds_m: Distances below which a point counts as correct.
     """
 
     run: Path
@@ -55,7 +55,7 @@ class MapFiles:
 
 @dataclass(frozen=True, eq=False)
 class MapComparison:
-    """All that a comparison knows; its clouds are coloured from it.
+    """The result of a comparison, from which its clouds are coloured.
 
     Attributes:
         files: What was compared.
@@ -72,7 +72,7 @@ class MapComparison:
 
 @dataclass(frozen=True, eq=False)
 class _Estimate:
-    """A cloud, and the run that it belongs to (None = it belongs to none)."""
+    """A cloud, and the run that it belongs to (None = no run)."""
 
     cloud: PointCloud
     folder: Path | None
@@ -88,12 +88,12 @@ def run_evaluate_map(
     """Compare a map with a reference cloud; with a folder, write the coloured clouds into it.
 
     Returns:
-        The figures of the first threshold, those of each in ``by_threshold``, and by what the
-        cloud was moved.
+        The figures of the first threshold, those of each in ``by_threshold``, and how far the
+        alignment moved the cloud.
 
     Raises:
         ReconError: A file cannot be read, the two cannot be compared, or the folder cannot be
-            written; then nothing is left behind.
+            written; then no output is left behind.
     """
     if not files.thresholds_m:
         raise SettingsError("there is no threshold", where="--threshold")
@@ -121,7 +121,7 @@ def _doubt(
     reference: PointCloud,
     figures: dict[str, Any],
 ) -> str | None:
-    """Whether the two lie in different axes, or far apart: figures of that say nothing."""
+    """A warning if the clouds are in different axes or far apart, so that figures are useless."""
     best = max(figures["precision"], figures["recall"])
     if best >= _FITS:
         return None
@@ -149,7 +149,7 @@ def _in_reach(
     path: Trajectory | None,
     by_threshold: list[dict[str, Any]],
 ) -> dict[str, Any]:
-    """Add the figures of the points that the reference could judge; how many it could not."""
+    """Add the figures of the points within reach of the reference; return the share beyond."""
     if path is None:
         return {}
     judged = within_reach(cloud, reference, path)
@@ -186,7 +186,7 @@ def _aligned(
 
 
 def _path_of(folder: Path) -> Trajectory | None:
-    """The path of a run; one that was written without is still a map."""
+    """The path of a run, if it has one."""
     return read_trajectory(folder / _PATH) if (folder / _PATH).is_file() else None
 
 
@@ -195,7 +195,7 @@ def _moved(path: Trajectory | None, T: Float64) -> Trajectory | None:
 
 
 def _path_motion(estimate: _Estimate, poses: Path) -> Float64:
-    """The rigid motion that brings the run's path closest to the true one."""
+    """The rigid motion that brings the run's path closest to ground truth."""
     if estimate.folder is None:
         raise EvaluationError(
             "a cloud without a run has no path to align", hint="give the folder of a run"
@@ -216,9 +216,9 @@ def _path_motion(estimate: _Estimate, poses: Path) -> Float64:
 def _icp_motion(
     cloud: PointCloud, reference: PointCloud, reach_m: float
 ) -> tuple[Float64, dict[str, Any]]:
-    """The motion that ICP finds, and how far it is."""
+    """The motion found by ICP, and its size."""
     T, share = register_cloud(cloud, reference, reach_m)
-    # By how much the middle of the map moves: a turn about a far origin is no distance.
+    # Measured at the centre of the map: a rotation about a far origin would look like a shift.
     middle = np.eye(4)
     middle[:3, 3] = cloud.xyz.mean(axis=0, dtype=np.float64)
     return T, {**_size("icp", invert(middle) @ T @ middle), "icp_share": share}

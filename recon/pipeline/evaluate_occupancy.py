@@ -1,4 +1,4 @@
-"""`recon evaluate occupancy` without its command line: the maps of a run beside the truth."""
+"""`recon evaluate occupancy` without its command line: compare a run with ground truth."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from recon.structures import OccupancyGrid, OccupancyMetrics, OccupancyTruth
 
 @dataclass(frozen=True, eq=False)
 class OccupancyComparison:
-    """A run's occupancy and the truth.
+    """The occupancy of a run and its ground truth.
 
     Attributes:
         metrics: The figures.
-        grid: The flat grid of the run.
-        truth: What is true, in the cells of the run.
+        grid: The 2-D grid of the run.
+        truth: Ground truth, in the cells of the run.
     """
 
     metrics: OccupancyMetrics
@@ -32,15 +32,15 @@ class OccupancyComparison:
 
 
 def compare_occupancy(folder: Path, least_frames: int = LEAST_FRAMES) -> OccupancyComparison:
-    """Compare the files that a run wrote, ``map/octomap.ot`` and ``map/grid.*``, with the truth.
+    """Compare ``map/octomap.ot`` and ``map/grid.*`` of a run with ground truth.
 
     Args:
         folder: A run of a rendered street: of ``recon demo``, or of ``recon occupancy`` on one.
-        least_frames: Frames that must have seen what is compared.
+        least_frames: Number of frames that must have seen a cell for it to be compared.
 
     Raises:
         FormatError: The folder does not contain a finished run, or a map is missing or damaged.
-        EvaluationError: The truth of the run is not known, or nothing was seen often enough.
+        EvaluationError: The run has no ground truth, or no cell was seen often enough.
     """
     run = open_run(folder)
     source = _source_that_knows(run)

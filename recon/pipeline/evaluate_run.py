@@ -1,4 +1,4 @@
-"""`recon evaluate` without its command line: files in, figures out."""
+"""`recon evaluate disparity` without its command line: compare disparity files."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def compare_disparities(
 
     Args:
         estimate: The map; holes are filled for the dense figures, KITTI's ``d1`` among them.
-        truth: The true one, of the same size.
-        mask: A picture that is 255 where pixels are compared; None = all with a truth.
+        truth: Ground truth of the same size.
+        mask: An image that is 255 where pixels are compared; None = all with ground truth.
         scale: Pixels of the size that figures are given in per pixel here.
-        confidence: PFM of the map's confidence, in [0, 1]; a pixel is right when it is off by no
-            more than a pixel of the map.
+        confidence: PFM of the map's confidence, in [0, 1]; a pixel is correct if its error is at
+            most one pixel of the map.
 
     Raises:
         FormatError: A file cannot be read.
-        EvaluationError: The two cannot be compared.
+        EvaluationError: The maps cannot be compared.
     """
     values, true = read_disparity(estimate), read_disparity(truth)
     counted = np.isfinite(true) if mask is None else read_grey_levels(mask) == _COUNTED
@@ -67,7 +67,7 @@ def compare_disparities(
 
 
 def _rated(values: Float32, path: Path) -> Disparity:
-    """A map with the confidence of a file."""
+    """A disparity map with the confidence read from a file."""
     confidence = read_pfm(path)
     if confidence.shape != values.shape:
         raise EvaluationError(

@@ -1,4 +1,4 @@
-"""`recon evaluate trajectory` without its command line: two files in, figures and a report out."""
+"""`recon evaluate trajectory` without its command line: compare two trajectory files."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from recon.sources.times import read_times
 from recon.structures import Trajectory
 
 TOLERANCE_S: Final = 0.01
-"""How far the times of two poses of the same moment may differ."""
+"""Largest time difference of two associated poses."""
 
 
 @dataclass(frozen=True)
 class TrajectoryFiles:
-    """What is compared.
+    """The trajectories to compare.
 
     Attributes:
         estimate: KITTI or TUM file.
-        truth: The true one, in either format.
-        times: Seconds of the poses of a KITTI file, one a line; None = unknown.
-        tolerance_s: How far the times of two poses of the same moment may differ.
+        truth: Ground truth, KITTI or TUM file.
+        times: Timestamps of the poses of a KITTI file in seconds, one per line; None = unknown.
+        tolerance_s: Largest time difference of two associated poses.
     """
 
     estimate: Path
@@ -38,11 +38,11 @@ class TrajectoryFiles:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryRun:
-    """All that a comparison knows; its report is made from it.
+    """The result of a comparison, from which its report is made.
 
     Attributes:
         files: What was compared.
-        comparison: The two paths, aligned, and how they differ.
+        comparison: The two paths, aligned, and their differences.
         summary: The figures of ``summary.json``.
     """
 
@@ -62,11 +62,11 @@ def run_evaluate_trajectory(
 ) -> dict[str, Any]:
     """Compare two trajectory files; with a folder, write figures and report into it.
 
-    Poses belong together by their times where both files tell them, else in their order.
+    Poses are associated by time if both files have timestamps, else in order.
 
     Raises:
         ReconError: A file cannot be read, the two cannot be compared, or the folder cannot be
-            written; then nothing is left behind.
+            written; then no output is left behind.
     """
     estimate, truth, by_time = _read_paths(files)
     poses = {"estimate_poses": len(estimate), "true_poses": len(truth)}

@@ -1,4 +1,4 @@
-"""What the folder of a run that is done tells about it."""
+"""The record and configuration of a finished run, read from its folder."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ RAYS_FILE: Final = "map/rays.bin"
 CLOUD: Final = "map/cloud.ply"
 TRAJECTORY: Final = "trajectory_kitti.txt"
 MAPPED_BY: Final = "mapped_by"
-"""In the record of a run that took its drive from another: the command that mapped the drive."""
+"""Record key of a run made from another run: the command that mapped the drive."""
 
 
 @dataclass(frozen=True, eq=False)
 class FinishedRun:
-    """A run with maps.
+    """A finished run with maps.
 
     Attributes:
-        folder: Where it is.
+        folder: Its folder.
         mapped_by: The command that mapped the drive, such as ``demo``.
-        config: The configuration that it was made with.
+        config: Its configuration.
         T_map_world: float64 (4, 4), from world to map axes.
     """
 
@@ -49,7 +49,7 @@ def open_run(folder: Path) -> FinishedRun:
 
     Raises:
         FormatError: The folder does not contain a finished run, or one without maps.
-        SettingsError: Its configuration is not one of this version.
+        SettingsError: Its configuration is not valid in this version.
     """
     record = _read_record(folder / RECORD)
     T_map_world = _matrix(record.get("T_map_world"))
@@ -60,7 +60,7 @@ def open_run(folder: Path) -> FinishedRun:
 
 
 def refuse_as_target(run: Path, out: Path | None) -> None:
-    """Refuse to write what is made of a run into its own folder, from which it would vanish.
+    """Refuse to write derived results into the folder of the run, which would replace it.
 
     Raises:
         SettingsError: ``out`` is the folder of the run.
@@ -70,7 +70,7 @@ def refuse_as_target(run: Path, out: Path | None) -> None:
 
 
 def _matrix(value: Any) -> Float64 | None:
-    """A finite 4×4 matrix, or None where it is none."""
+    """A finite 4×4 matrix, or None if the value is not one."""
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""One frame, from the recorded pair to a clean cloud: the part of the flow without state."""
+"""One frame, from the recorded pair to a filtered cloud: the stateless part of the pipeline."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from recon.structures import (
 
 @dataclass(frozen=True, eq=False)
 class ReconstructedFrame:
-    """What one pair of pictures gives.
+    """The results of one stereo pair.
 
     Attributes:
-        pair: The rectified pictures.
-        disparity: Its disparity, flying edges removed.
+        pair: The rectified images.
+        disparity: Its disparity, with flying edges removed.
         cloud: Its points in camera axes, filtered.
-        warnings: What is wrong with the pictures though they gave something.
-        rays: What of it is kept for occupancy; None where no map is made.
+        warnings: Problems of the images that did not prevent a result.
+        rays: Its rays for the occupancy map; None if no map is made.
     """
 
     pair: RectifiedPair
@@ -41,13 +41,13 @@ class ReconstructedFrame:
 
 
 class FrameReconstructor:
-    """Walks one pair through rectify, inspect, match, edges, back-project, filter.
+    """Reconstructs pairs: rectify, inspect, match, remove edges, back-project, filter.
 
     Args:
-        calibration: Of the source of the pairs.
+        calibration: Calibration of the cameras.
         config: The configuration.
-        threads: Threads for the matcher; None = all cores. Changes no result.
-        stopwatch: Told the seconds per stage.
+        threads: Threads for the matcher; None = all cores. Does not change results.
+        stopwatch: Records the time per stage.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class FrameReconstructor:
         return self._rectifier.camera
 
     def match(self, pair: StereoPair) -> tuple[RectifiedPair, Disparity]:
-        """Rectify and match one pair, and take the flying edges away."""
+        """Rectify and match one pair, and remove flying edges."""
         config, stage = self._config, self._stopwatch.stage
         with stage("rectify"):
             rectified = self._rectifier.rectify(pair)
@@ -80,7 +80,7 @@ class FrameReconstructor:
         return rectified, disparity
 
     def inspect(self, pair: RectifiedPair) -> tuple[str, ...]:
-        """Warnings about the geometry of a pair whose turn it is; of others none.
+        """Warnings about the geometry of a pair; only every so many pairs are inspected.
 
         Raises:
             CalibrationError: Left and right are swapped.

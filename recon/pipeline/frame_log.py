@@ -1,4 +1,4 @@
-"""What a drive knows of each of its frames; on the disk in a file that only grows."""
+"""Pose, time and health of each frame of a drive, in an append-only file."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _LOST: Final = "the frames of the unfinished run are missing or damaged"
 class FrameLog:
     """Poses, times and health of the frames so far.
 
-    A `state` writes down the frames since the last one, so that a long drive costs no more for
-    each frame than a short one. A killed run may leave more in the file than its checkpoint
-    counts: that is cut off.
+    `state` appends the frames since its last call, so that the cost per frame does not grow
+    with the drive. A killed run may leave more frames in the file than its checkpoint counts;
+    the next `state` cuts them off.
 
     Args:
-        path: The file, one frame a line; its folder exists. None = all stays in memory.
+        path: The file, one frame per line, in an existing folder. None = keep frames in memory.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -43,7 +43,7 @@ class FrameLog:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The poses so far; there must be one."""
+        """The poses so far, at least one."""
         return Trajectory(np.stack(self._poses), np.array(self._times_s))
 
     @property
@@ -52,13 +52,13 @@ class FrameLog:
         return tuple(self._health)
 
     def add(self, T_world_camera: Float64, time_s: float, health: OdometryHealth) -> None:
-        """Take the next frame."""
+        """Add the next frame."""
         self._poses.append(T_world_camera)
         self._times_s.append(time_s)
         self._health.append(health)
 
     def state(self) -> list[int] | None:
-        """Frames, bytes and checksum of the file, all on the disk; None = no file.
+        """Flush new frames to disk; return frames, bytes and checksum of the file, None if no file.
 
         Raises:
             OSError: The disk is full or cannot be written.
@@ -77,10 +77,10 @@ class FrameLog:
         return self._written
 
     def restore(self, state: list[int] | None) -> None:
-        """Go on from a `state`; what the file holds beyond it is forgotten.
+        """Resume from a `state`; later frames in the file are ignored.
 
         Raises:
-            FormatError: The file has been lost, cut or damaged.
+            FormatError: The file is missing, truncated or damaged.
         """
         if self._path is None or state is None:
             return
@@ -98,13 +98,13 @@ class FrameLog:
         self._written = state
 
     def _line(self, number: int) -> str:
-        """A frame as text; Python's numbers come back bit by bit."""
+        """A frame as one line of text; floats are restored exactly."""
         health = asdict(self._health[number])
         record = [self._poses[number].tolist(), self._times_s[number], health]
         return json.dumps(record) + "\n"
 
 
 def _health(record: dict[str, Any]) -> OdometryHealth:
-    """A health record as the file holds it: lists were tuples."""
+    """A health record from the file, in which tuples became lists."""
     fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in record.items()}
     return OdometryHealth(**fields)

@@ -1,4 +1,4 @@
-"""What the ground of a drive is looked for in, kept on the disk tile by tile."""
+"""Points from which the ground of a drive is estimated, stored on disk tile by tile."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Window:
 
     Attributes:
         low: Smallest x and y, metres.
-        high: Largest x and y.
+        high: Largest x and y, metres.
     """
 
     low: tuple[float, float]
@@ -31,7 +31,7 @@ class Window:
 
     @classmethod
     def around(cls, tile: Tile, edge_m: float, margin_m: float) -> Window:
-        """A tile and what lies within a margin of it."""
+        """A tile with a margin around it."""
         column, row = tile
         return cls(
             (column * edge_m - margin_m, row * edge_m - margin_m),
@@ -39,29 +39,29 @@ class Window:
         )
 
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which points (N, 2 or 3) lie in it."""
+        """Which points (N, 2 or 3) lie in the window."""
         return np.asarray(((points[:, :2] >= self.low) & (points[:, :2] < self.high)).all(axis=1))
 
     def meets(self, other: Window) -> bool:
-        """Whether the two have a place in common."""
+        """Whether two windows overlap."""
         sides = zip(self.low, self.high, other.low, other.high, strict=True)
         return all(
             low <= their_high and their_low <= high for low, high, their_low, their_high in sides
         )
 
     def path(self, path_m: Float64) -> Float64:
-        """The pieces of a path (N, 3) in it, with a row of NaN after each that goes on outside."""
+        """The pieces of a path (N, 3) inside, with a row of NaN after each piece that leaves."""
         inside = self.contains(path_m)
         leaves = np.r_[False, inside[:-1]] & ~inside
         return np.asarray(np.where(inside[:, None], path_m, np.nan)[inside | leaves])
 
 
 class GroundStore:
-    """Points that may be ground, map axes; the files of one run.
+    """Candidate ground points of one run, map axes, in files.
 
     Args:
-        folder: Where they are written.
-        settings: How the ground is followed.
+        folder: The folder of the files.
+        settings: Settings of the ground estimate.
     """
 
     def __init__(self, folder: Path, settings: GroundSettings) -> None:
@@ -71,7 +71,7 @@ class GroundStore:
         self._parts: Counter[Tile] = Counter()
 
     def put_cloud(self, tile: Tile, cloud: PointCloud) -> None:
-        """Put by a tile of the fused cloud, or a part of one; where it has normals, what faces up.
+        """Store a tile of the fused cloud, or a part of it; with normals, only points facing up.
 
         Raises:
             OutputError: It cannot be written.
@@ -84,7 +84,7 @@ class GroundStore:
         self._put(f"cloud_{tile[0]}_{tile[1]}_{self._parts[tile]}", xyz)
 
     def put_floors(self, tile: Tile, xyz: Float32) -> None:
-        """Put by the floors of a tile of voxels.
+        """Store the floors of a tile of voxels.
 
         Raises:
             OutputError: It cannot be written.
@@ -92,7 +92,7 @@ class GroundStore:
         self._put(f"floors_{tile[0]}_{tile[1]}", xyz)
 
     def cloud_in(self, window: Window) -> PointCloud:
-        """What the ground in a window is looked for in, frame ``map``."""
+        """Candidate ground points in a window, frame ``map``."""
         points, floors = (self._read(kind, window) for kind in ("cloud", "floors"))
         return add_floors(PointCloud(points, frame="map"), floors, self._settings)
 
@@ -103,7 +103,7 @@ class GroundStore:
             write_tree(self._folder / f"{name}.zip", {"xyz": xyz})
 
     def _read(self, kind: str, window: Window) -> Float32:
-        """float32 (N, 3), the points of a kind in a window."""
+        """float32 (N, 3), the points of one kind in a window."""
         found = [np.zeros((0, 3), np.float32)]
         for name, box in self._boxes.items():
             if name.startswith(kind) and window.meets(box):
