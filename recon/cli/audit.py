@@ -1,4 +1,4 @@
-"""`recon audit`: is an input good enough, before a long run?"""
+"""`recon audit`: check a recording before a long run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`recon calibrate`: pictures of a board in, a calibration file out."""
+"""`recon calibrate`: calibrate a rig from images of a board."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def calibrate(
         from recon.reports import present_calibration
         from recon.structures.board import parse_board
 
-        # kalibr has two radial terms.
+        # kalibr's lens model has two radial terms.
         fitting = ["calibration.radial_terms=2"] if form is Form.kalibr else []
         chosen = [] if model is None else [f"calibration.model={model.value}"]
         settings = load_config(config, [*fitting, *(set_ or ()), *chosen])

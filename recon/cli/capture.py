@@ -1,4 +1,4 @@
-"""`recon capture`: two cameras in, a folder that `recon map` takes out."""
+"""`recon capture`: record two cameras into a folder that `recon map` reads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`recon demo`: the whole flow on a rendered street, with truth to compare against."""
+"""`recon demo`: the whole pipeline on a rendered street, compared with ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`recon doctor`: is everything there that a run needs?"""
+"""`recon doctor`: check the installation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`recon evaluate`: results against truth."""
+"""`recon evaluate`: compare results with ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`recon evaluate disparity`: one map against its truth."""
+"""`recon evaluate disparity`: compare a disparity map with ground truth."""
 
 from __future__ import annotations
 

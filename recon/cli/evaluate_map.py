@@ -1,4 +1,4 @@
-"""`recon evaluate map`: a cloud against a reference cloud."""
+"""`recon evaluate map`: compare a cloud with a reference cloud."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class ReferenceFrame(str, Enum):
 
 
 class MapAlignment(str, Enum):
-    """How a cloud is laid onto its reference."""
+    """How a cloud is aligned to its reference."""
 
     none = "none"
     icp = "icp"

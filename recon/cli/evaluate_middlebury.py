@@ -1,4 +1,4 @@
-"""`recon evaluate middlebury`: matchers on benchmark scenes, side by side."""
+"""`recon evaluate middlebury`: compare matchers on benchmark scenes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from recon.cli.session import print_json, session
 
 
 class Range(str, Enum):
-    """Where the range of disparities comes from."""
+    """Where the disparity range comes from."""
 
     scene = "scene"
     auto = "auto"

@@ -1,4 +1,4 @@
-"""`recon evaluate occupancy`: voxels and grid of a run against the exact truth."""
+"""`recon evaluate occupancy`: compare voxels and grid of a run with ground truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`recon evaluate trajectory`: a path against the true one."""
+"""`recon evaluate trajectory`: compare a trajectory with ground truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from recon.cli.session import print_evaluation, print_json, session
 
 
 class Alignment(str, Enum):
-    """What is done to the estimate before it is compared."""
+    """How the estimate is aligned before it is compared."""
 
     none = "none"
     origin = "origin"

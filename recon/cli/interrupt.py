@@ -1,4 +1,4 @@
-"""Ctrl-C as a wish to end, instead of an error in the middle of something."""
+"""Ctrl-C as a request to stop, instead of an exception at an arbitrary point."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def until_interrupted() -> Iterator[Callable[[], bool]]:
-    """Tell whether SIGINT or SIGTERM has come since; a second one ends the program at once."""
+    """Yield a test for SIGINT or SIGTERM; a second signal ends the program at once."""
     asked = threading.Event()
     before = {int(n): signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
 

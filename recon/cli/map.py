@@ -1,4 +1,4 @@
-"""`recon map`: a drive in, maps out."""
+"""`recon map`: map a stereo drive."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from recon.cli.session import print_json, print_run, session
 
 
 class OdometryName(str, Enum):
-    """Ways to find the poses."""
+    """Odometry methods."""
 
     fused = "fused"
     visual = "visual"

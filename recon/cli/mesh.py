@@ -1,4 +1,4 @@
-"""`recon mesh`: a surface for any cloud, or for the map of a run."""
+"""`recon mesh`: a mesh of any cloud, or of the map of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`recon occupancy`: other occupancy maps of a drive that was mapped."""
+"""`recon occupancy`: other occupancy maps of a mapped drive."""
 
 from __future__ import annotations
 

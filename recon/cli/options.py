@@ -1,4 +1,4 @@
-"""The options that all commands share, each defined once."""
+"""Options shared by commands, each defined once."""
 
 from __future__ import annotations
 
@@ -95,10 +95,10 @@ Tolerance = Annotated[
 
 
 def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:
-    """The numbers of an option that takes several, separated by commas.
+    """Parse an option that takes several numbers, separated by commas.
 
     Raises:
-        SettingsError: One of them is no number.
+        SettingsError: One of them is not a number.
     """
     if text is None:
         return None

@@ -1,4 +1,4 @@
-"""`recon pair` and `recon disparity`: two pictures in."""
+"""`recon pair` and `recon disparity`: process one stereo pair."""
 
 from __future__ import annotations
 

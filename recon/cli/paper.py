@@ -1,4 +1,4 @@
-"""`recon paper`: the seed paper's experiments, repeated and corrected."""
+"""`recon paper`: repeat the experiments of the seed paper, with its misprints corrected."""
 
 from __future__ import annotations
 

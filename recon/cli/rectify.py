@@ -1,4 +1,4 @@
-"""`recon rectify`: pictures whose rows correspond."""
+"""`recon rectify`: rectify images so that rows correspond."""
 
 from __future__ import annotations
 

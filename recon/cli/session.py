@@ -1,6 +1,6 @@
-"""What every command shares: a clean standard output, one line for an error, the exit codes.
+"""Shared by all commands: clean standard output, one-line errors, exit codes.
 
-0 = good, 1 = an error of ours told in one line, 2 = wrong usage (typer), 130 = interrupted.
+0 = success, 1 = an error reported in one line, 2 = wrong usage (typer), 130 = interrupted.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ INTERRUPTED = 130
 
 @contextmanager
 def session() -> Iterator[None]:
-    """Run a command's body: errors of ours become one line on standard error and exit code 1.
+    """Run a command's body; a `ReconError` becomes one line on standard error and exit code 1.
 
-    While the body runs, file descriptor 1 leads to standard error, so that nothing that a
-    native library prints can get into the output of ``--json``.
+    Meanwhile file descriptor 1 is redirected to standard error, so that the output of native
+    libraries cannot get into that of ``--json``.
     """
     try:
         with _standard_output_kept_clean():
@@ -34,7 +34,7 @@ def session() -> Iterator[None]:
     except MemoryError:
         _fail("out of memory; use smaller images, fewer disparities or a coarser map")
     except ImportError as error:
-        # Ctrl-C inside a native library that initialises comes out as its failure.
+        # Ctrl-C while a native library initialises surfaces as an import failure.
         if not _interrupted(error):
             raise
         typer.echo("interrupted", err=True)
@@ -53,7 +53,7 @@ def print_json(content: Mapping[str, Any]) -> None:
 
 
 def print_figures(title: str, figures: Mapping[str, Any]) -> None:
-    """Print a two-column table of figures; nested values are left to ``--json``."""
+    """Print a two-column table of figures; nested values appear only in ``--json``."""
     from rich.console import Console
     from rich.table import Table
 
@@ -67,7 +67,7 @@ def print_figures(title: str, figures: Mapping[str, Any]) -> None:
 
 
 def print_evaluation(title: str, figures: Mapping[str, Any]) -> None:
-    """Print the figures of a comparison, those of each part too, its warnings and its folder."""
+    """Print the figures of a comparison and of each part, its warnings and its folder."""
     shown = {key: value for key, value in figures.items() if key != "out"}
     limits = figures.get("by_threshold", ())
     if len(limits) > 1:
@@ -83,7 +83,7 @@ def print_evaluation(title: str, figures: Mapping[str, Any]) -> None:
 
 
 def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
-    """Print a run's figures, its warnings, and where its results are."""
+    """Print a run's figures, its warnings and its folder."""
     shown = {key: value for key, value in summary.items() if key != "out"}
     for group in ("loops", "trajectory", "map", "disparity"):
         shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
@@ -111,7 +111,7 @@ def _standard_output_kept_clean() -> Iterator[None]:
 
 
 def _interrupted(error: BaseException) -> bool:
-    """Whether Ctrl-C is what an error came of."""
+    """Whether an error was caused by Ctrl-C."""
     earlier = error.__cause__ or error.__context__
     if earlier is None:
         return isinstance(error, KeyboardInterrupt)
