@@ -1,4 +1,4 @@
-"""From a disparity to a clean cloud of points with their errors."""
+"""Filtered point clouds with uncertainties, from disparity maps."""
 
 from recon.cloud.back_project import CloudSettings, back_project
 from recon.cloud.edges import EdgeSettings, remove_flying_edges

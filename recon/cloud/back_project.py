@@ -1,4 +1,4 @@
-"""From a disparity map to points in space, each with its uncertainty."""
+"""Back-projection of a disparity map to 3-D points with uncertainties."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def back_project(disparity: Disparity, pair: RectifiedPair, settings: CloudSetti
     """Points of the pixels that have a disparity, ``Z = f·b / (d + doffs)``.
 
     Args:
-        disparity: What a matcher found in ``pair``.
-        pair: Gives the camera, the colours and the pixels that rectification left valid.
+        disparity: The disparity of ``pair``.
+        pair: Provides the camera, the colours and the pixels valid after rectification.
         settings: Range, confidence and thinning.
 
     Returns:
@@ -93,5 +93,5 @@ def _rules(camera: RectifiedCamera, settings: CloudSettings) -> points.PointRule
 
 
 def _or_infinity(limit: float | None) -> float:
-    # The largest number, not infinity: 0 · inf is NaN, and a depth that is infinite is none.
+    # The largest float, not infinity: 0 · inf is NaN, and infinite depths must be rejected.
     return sys.float_info.max if limit is None else limit

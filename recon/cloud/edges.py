@@ -1,4 +1,4 @@
-"""Flying edges: pixels that hang in the air between a foreground and its background."""
+"""Removal of flying edges: pixels floating between a foreground and its background."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from recon.structures.arrays import Float32, UInt8
 
 
 class EdgeSettings(Settings):
-    """Which pixels count as hanging between two surfaces."""
+    """Which pixels count as floating between two surfaces."""
 
     enabled: bool = Field(default=True, description="Whether flying edges are removed.")
     radius_px: int = Field(default=2, ge=1, le=5, description="Half width of the window.")
@@ -34,17 +34,17 @@ class EdgeSettings(Settings):
 
 
 def remove_flying_edges(disparity: Disparity, settings: EdgeSettings) -> Disparity:
-    """Drop the pixels that too few of their neighbours could share a surface with.
+    """Drop pixels that too few of their neighbours could share a surface with.
 
-    The noise of depth grows with distance, that of disparity does not, so the test is on
-    disparities. A surface that both cameras see changes by less than ``max_gradient`` pixels per
-    pixel (the disparity gradient limit); a neighbour within that cone supports the centre. At a
-    clean step each side keeps half of its window, at a convex corner a third, while the mixed
-    pixels on the ramp between the sides keep little more than their own column. Pixels without a
-    disparity support none; outside the picture the border is mirrored.
+    Depth noise grows with distance, disparity noise does not, so disparities are tested. A
+    surface that both cameras see changes by less than ``max_gradient`` pixels per pixel (the
+    disparity gradient limit); a neighbour within that cone supports the centre. At a clean step
+    each side keeps half of its window, at a convex corner a third, while the mixed pixels on the
+    ramp between the sides keep little more than their own column. Pixels without a disparity
+    support none; the image is mirrored at its border.
 
     Args:
-        disparity: What a matcher found.
+        disparity: The disparity from a matcher.
         settings: The window and its limits.
 
     Returns:
@@ -59,7 +59,7 @@ def remove_flying_edges(disparity: Disparity, settings: EdgeSettings) -> Dispari
 
 
 def _support(values: Float32, settings: EdgeSettings) -> UInt8:
-    """uint8 (H, W): pixels of each window, centre included, on the surface of its centre."""
+    """uint8 (H, W): number of pixels in each window that support its centre, itself included."""
     r = settings.radius_px
     height, width = values.shape
     padded = cv2.copyMakeBorder(values, r, r, r, r, cv2.BORDER_REFLECT_101)

@@ -1,4 +1,4 @@
-"""Thinning and cleaning of clouds: voxels, outliers, normals."""
+"""Filters of clouds: voxel downsampling, outlier removal, normals."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _MIN_POINTS_OF_A_PLANE = 3
 
 
 class FilterSettings(Settings):
-    """Which filters a cloud passes, in this order; null turns one off.
+    """Which filters are applied to a cloud, in this order; null turns one off.
 
-    The defaults suit one frame of a drive: searching for outliers takes several times as long as
-    the voxels and gains about two per cent of precision, while the map that the frame goes into
-    drops whatever few frames saw.
+    The defaults suit one frame of a drive: outlier removal takes several times as long as voxel
+    downsampling and gains about two per cent of precision, while the map drops points that few
+    frames saw anyway.
     """
 
     voxel_m: float | None = Field(
@@ -47,7 +47,7 @@ class FilterSettings(Settings):
     )
 
 
-#: For the cloud of one pair, whose scale is not known beforehand: no filter that counts metres.
+#: For the cloud of one pair, whose scale is unknown: no filter with a length in metres.
 ANY_SCALE = FilterSettings(voxel_m=None, statistical_neighbours=20)
 
 
@@ -58,17 +58,17 @@ def filter_cloud(
 ) -> PointCloud:
     """Thin a cloud, drop its outliers, and estimate its normals.
 
-    The voxels come first, because what is left makes the searches of the others cheap and even.
+    Downsampling comes first, which makes the neighbour searches cheap and evenly spaced.
 
     Args:
         cloud: Any cloud.
-        settings: Which filters, and how.
-        viewpoint_m: Where new normals turn to where the cloud had none to agree with: the
-            camera, in the frame of the cloud.
+        settings: The filters and their settings.
+        viewpoint_m: The camera, in the frame of the cloud. Estimated normals point to it if the
+            cloud had none to agree with.
 
     Returns:
         A cloud in the same frame. In a voxel every attribute is averaged (``sigma_m`` too: the
-        errors of neighbouring pixels are not independent), normals are unit again.
+        errors of neighbouring pixels are not independent), and normals are renormalised.
 
     Raises:
         SettingsError: The voxel is too small for the extent of the cloud.
@@ -108,10 +108,10 @@ def voxel_downsample(cloud: PointCloud, voxel_m: float) -> PointCloud:
 def with_normals(
     cloud: PointCloud, neighbours: int, viewpoint_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> PointCloud:
-    """The cloud with normals estimated from nearest neighbours.
+    """Estimate normals from nearest neighbours.
 
     Args:
-        cloud: Any cloud; under three points no plane exists, and it comes back as it is.
+        cloud: Any cloud; with fewer than three points it is returned unchanged.
         neighbours: Number of neighbours, the point included.
         viewpoint_m: See `filter_cloud`.
     """
@@ -125,7 +125,7 @@ def with_normals(
     return replace(cloud, normals=np.where(away[:, None], -normals, normals))
 
 
-#: Every attribute of a point but its place, and the dtype that a mean goes back to.
+#: Attributes of a point except its position, and the dtype that a mean is converted to.
 _ATTRIBUTES = {
     "rgb": np.uint8,
     "normals": np.float32,
@@ -137,7 +137,7 @@ _ATTRIBUTES = {
 
 
 def _restored(name: str, mean: Float32) -> NDArray[Any]:
-    """The mean of an attribute in the dtype and shape that a cloud keeps it in."""
+    """The mean of an attribute, converted to the dtype and shape used in a cloud."""
     if name == "normals":
         length = np.linalg.norm(mean, axis=1, keepdims=True)
         return np.asarray(mean / np.maximum(length, np.float32(1e-12)), dtype=np.float32)

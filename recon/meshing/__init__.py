@@ -1,4 +1,4 @@
-"""From a cloud to a trimmed surface, in one piece or in tiles that meet."""
+"""Surface meshes from point clouds, whole or in tiles with closed seams."""
 
 from recon.meshing.cut import Plane, cut_mesh
 from recon.meshing.free_space import looked_through

@@ -14,34 +14,34 @@ from recon.structures.arrays import Bool, Float32, Float64, Int32
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane across an axis.
+    """A plane perpendicular to an axis.
 
     Attributes:
         axis: 0 = x, 1 = y, 2 = z.
-        at_m: Where.
+        at_m: Coordinate on that axis.
     """
 
     axis: int
     at_m: float
 
     def holds(self, vertices: Float32) -> Bool:
-        """bool (V,): vertices that lie exactly in it, as those of a cut do."""
+        """bool (V,): vertices that lie exactly in the plane, as those of a cut do."""
         return np.asarray(vertices[:, self.axis] == np.float32(self.at_m))
 
 
 def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleMesh:
-    """The part of a mesh on one side of a plane; triangles that cross it are split in it.
+    """The part of a mesh on one side of a plane; triangles that cross it are split.
 
-    Two meshes of one surface that are cut along one plane meet there without an overlap.
+    Two meshes of one surface, cut along the same plane, meet there without overlap.
 
     Args:
         mesh: Any mesh.
         plane: Where to cut.
-        keep_above: Keep what lies at larger coordinates, else what lies at smaller ones.
+        keep_above: Keep the side of larger coordinates, else that of smaller ones.
 
     Returns:
-        The part; it may be empty. New vertices lie exactly in the plane, their normals and
-        colours are between those of the edge that they cut.
+        The part; it may be empty. New vertices lie exactly in the plane; their normals and
+        colours are interpolated along the cut edges.
     """
     away = mesh.vertices[:, plane.axis] - np.float32(plane.at_m)
     away = away if keep_above else -away
@@ -49,7 +49,7 @@ def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleM
     count = inside[mesh.faces].sum(axis=1)
     whole = mesh.faces[count == 3]
     one, two = (_first_turned(mesh.faces[count == n], inside, n) for n in (1, 2))
-    # The edges that are cut: both at the only corner inside, or both at the only one outside.
+    # The two cut edges meet at the only corner inside, or at the only one outside.
     cut = np.concatenate([one[:, [0, 1]], one[:, [0, 2]], two[:, [1, 2]], two[:, [0, 2]]])
     edges, where = np.unique(np.sort(cut, axis=1), axis=0, return_inverse=True)
     new = (len(mesh.vertices) + where.ravel()).astype(np.int32)
@@ -66,13 +66,13 @@ def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleM
 
 
 def with_vertices(mesh: TriangleMesh, new: Float32, edges: Int32, share: Float64) -> TriangleMesh:
-    """The mesh with vertices that no face uses yet, on its edges.
+    """Add vertices on edges of a mesh; no face uses them yet.
 
     Args:
         mesh: Any mesh.
         new: float32 (N, 3), the vertices.
-        edges: int32 (N, 2), the edge that each lies on; its normal and colour come from there.
-        share: float64 (N,), how far along the edge, from 0 to 1.
+        edges: int32 (N, 2), the edge of each vertex; normals and colours are interpolated on it.
+        share: float64 (N,), position along the edge, from 0 to 1.
     """
     normals, rgb = mesh.normals, mesh.rgb
     if normals is not None:
@@ -86,15 +86,15 @@ def with_vertices(mesh: TriangleMesh, new: Float32, edges: Int32, share: Float64
 
 
 def between(values: NDArray[Any], edges: Int32, share: Float64) -> Float64:
-    """float64 (N, 3): values (V, 3) of vertices, at a share of the way along edges."""
+    """float64 (N, 3): vertex values (V, 3), interpolated linearly along edges."""
     first, last = values[edges[:, 0]], values[edges[:, 1]]
     return np.asarray((1 - share[:, None]) * first + share[:, None] * last)
 
 
 def _first_turned(faces: Int32, inside: Bool, corners: int) -> Int32:
-    """Faces (F, 3) turned so that their ``corners`` corners inside come first."""
+    """Faces (F, 3), each rotated so that its ``corners`` corners inside come first."""
     odd = inside[faces] if corners == 1 else ~inside[faces]
-    # The odd corner goes first where it is inside, last where it is outside.
+    # The odd corner comes first if it is inside, last if it is outside.
     start = (np.argmax(odd, axis=1) + (0 if corners == 1 else 1)) % 3
     order = (start[:, None] + np.arange(3)) % 3
     return np.asarray(np.take_along_axis(faces, order, axis=1), dtype=np.int32)
@@ -110,7 +110,7 @@ def _with_cuts(mesh: TriangleMesh, edges: Int32, away: Float32, plane: Plane) ->
 
 
 def _compact(mesh: TriangleMesh, faces: Int32) -> TriangleMesh:
-    """The faces with the vertices that they use; what a cut left of no area is dropped."""
+    """The faces with the vertices that they use; degenerate faces of a cut are dropped."""
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     used, renumbered = np.unique(faces, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Free space that the cameras looked through, where no surface can be."""
+"""Vertices in observed free space, where there can be no surface."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from recon.structures.arrays import Bool, Float32
 
 
 def looked_through(vertices: Float32, voxels: OccupancyVoxels) -> Bool:
-    """Which vertices are in free space: their voxel is free, and none around it is occupied.
+    """Which vertices are in free space: their voxel is free, and no neighbour is occupied.
 
-    A surface follows occupied voxels, but half of it is in their free neighbours.
+    Neighbours count because a surface along occupied voxels lies half in free ones.
 
     Args:
         vertices: float32 (V, 3), map axes.
-        voxels: What was observed there; what was not is not free.
+        voxels: The observed voxels; unobserved space is not free.
 
     Returns:
         bool (V,).
@@ -39,7 +39,7 @@ def looked_through(vertices: Float32, voxels: OccupancyVoxels) -> Bool:
 
 
 def _holds(keys: NDArray[np.int64], wanted: NDArray[np.int64]) -> Bool:
-    """bool (N,): which of the wanted keys are among the sorted ones."""
+    """bool (N,): which of the wanted keys are in the sorted ``keys``."""
     if not len(keys):
         return np.zeros(len(wanted), dtype=bool)
     place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)

@@ -1,4 +1,4 @@
-"""From a cloud with normals to a surface: screened Poisson, cut back to where there is data."""
+"""Screened Poisson reconstruction of a cloud, trimmed to where there is data."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Point = tuple[float, float, float]
 
 
 class MeshSettings(Settings):
-    """How a surface is reconstructed, and how much of it is believed."""
+    """How a surface is reconstructed and trimmed."""
 
     depth: int | None = Field(
         default=None,
@@ -93,23 +93,24 @@ def reconstruct_mesh(
 ) -> TriangleMesh:
     """Reconstruct the surface that a cloud was sampled from.
 
-    Poisson's surface is closed: it bridges every gap with a balloon. What lies farther from the
-    points than they lie from each other, or is hardly supported, is cut off again, so holes in
-    the data stay holes in the mesh.
+    A Poisson surface is closed: it bridges every gap with a bulge. Parts that are farther from
+    the points than the point spacing, or weakly supported, are removed, so that holes in the
+    data stay holes in the mesh.
 
     Args:
-        cloud: Points, with normals if possible; colours go to the vertices.
-        settings: How.
-        viewpoint_m: Where the points were seen from, in the frame of the cloud; used only where
-            the cloud has no normals. None = neighbours agree, the sign of the whole is a guess.
-        wrong: Tells which vertices (V, 3) cannot be on a surface; None = nothing is known.
+        cloud: Points, with normals if possible; vertices take their colours.
+        settings: Settings of the reconstruction.
+        viewpoint_m: The position that the points were seen from, in the frame of the cloud; used
+            only if the cloud has no normals. None = normals are only made consistent, and may
+            all be flipped.
+        wrong: Returns which vertices (V, 3) cannot be on a surface; None = unknown.
 
     Returns:
-        The mesh, with unit normals out of the surface, and colours if the cloud has any.
+        The mesh, with outward unit normals, and colours if the cloud has any.
 
     Raises:
-        MeshingError: The points are too few, in one place or in one line; Poisson failed; or
-            trimming left nothing.
+        MeshingError: The points are too few, coincident or collinear; Poisson failed; or
+            trimming left no face.
 
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
@@ -140,7 +141,7 @@ def reconstruct_mesh(
 
 
 def _usable(cloud: PointCloud) -> PointCloud:
-    """The finite points of a cloud, if a surface can go through them."""
+    """The finite points of a cloud, if they can span a surface."""
     finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
     if finite.sum() < _MIN_POINTS:
         raise MeshingError(
@@ -151,7 +152,7 @@ def _usable(cloud: PointCloud) -> PointCloud:
     cloud = cloud.select(finite)
     centred = cloud.xyz.astype(np.float64) - cloud.xyz.mean(axis=0, dtype=np.float64)
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred)), 0))
-    # 1e-5 of the extent is what float32 coordinates resolve.
+    # float32 coordinates resolve about 1e-5 of the extent.
     farthest = float(np.abs(cloud.xyz).max())
     if spread[1] <= 1e-5 * max(spread[2], farthest):
         distant = spread[1] > 1e-5 * spread[2] and spread[1] > 0
@@ -164,9 +165,9 @@ def _usable(cloud: PointCloud) -> PointCloud:
 
 
 def _oriented(cloud: PointCloud, settings: MeshSettings, viewpoint_m: Point | None) -> PointCloud:
-    """The points that have a normal, or all of them with normals estimated."""
+    """The points that have a normal, or all points with estimated normals."""
     if cloud.normals is not None:
-        # NaN fails the comparison, so it counts as none.
+        # NaN fails the comparison, so it counts as no normal.
         known = np.asarray(np.linalg.norm(cloud.normals, axis=1) > 0.5)
         if known.sum() >= _MIN_POINTS:
             return cloud.select(known)
@@ -186,7 +187,7 @@ def _required(normals: Float32 | None) -> Float32:
 
 
 def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
-    """The least depth of the octree whose cells are no wider than the settings allow."""
+    """The smallest octree depth whose cells are no wider than the settings allow."""
     step = max(1, len(xyz) // _SPACING_SAMPLES)
     cell_m = settings.cell_spacings * float(np.median(_spacing(xyz[::step], xyz)))
     extent_m = float(np.ptp(xyz, axis=0).max()) * _OCTREE_SCALE
@@ -196,16 +197,16 @@ def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
 
 
 def _spacing(some_xyz: Float32, xyz: Float32) -> Float32:
-    """float32 (N,): how far points of a cloud are from their neighbours in it."""
+    """float32 (N,): distance of points of a cloud to their neighbours in it."""
     return open3d_clouds.nearest(some_xyz, xyz, _SPACING_NEIGHBOURS)[1][:, -1]
 
 
 def _near_data(vertices: Float32, xyz: Float32, spacings: float) -> Bool:
-    """bool (V,): vertices no farther from the nearest point than points are from each other."""
+    """bool (V,): vertices within ``spacings`` local point spacings of the nearest point."""
     index, distance_m = open3d_clouds.nearest(vertices, xyz)
     near, where = np.unique(index[:, 0], return_inverse=True)
     local_m = _spacing(xyz[near], xyz)
-    # A lone point is far from its neighbours, which must not earn it a large patch of surface.
+    # A lone point is far from its neighbours, and must not support a large patch of surface.
     local_m = np.minimum(local_m, 2 * np.median(local_m))
     return np.asarray(distance_m[:, 0] <= spacings * local_m[where])
 

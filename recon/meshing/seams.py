@@ -1,4 +1,4 @@
-"""Closing of seams between meshes that were cut along the same plane."""
+"""Closing of seams between meshes that are cut along the same plane."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _SAME_M: Final = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class OnEdges:
-    """Where points come to lie on line segments.
+    """Projections of points onto line segments.
 
     Attributes:
-        edge: int64 (N,), the segment.
-        share: float64 (N,), how far along it, from 0 to 1.
-        feet: float64 (N, 3), the place.
-        distance_m: float64 (N,), how far the point is from there.
+        edge: int64 (N,), index of the segment.
+        share: float64 (N,), position along it, from 0 to 1.
+        feet: float64 (N, 3), the projected points.
+        distance_m: float64 (N,), distance of each point to its projection.
     """
 
     edge: np.ndarray[tuple[int], np.dtype[np.int64]]
@@ -34,21 +34,21 @@ class OnEdges:
 
 
 def open_edges(mesh: TriangleMesh, plane: Plane) -> Float32:
-    """Edges of a mesh that lie in a plane and belong to one triangle: float32 (E, 2, 3)."""
+    """Boundary edges of a mesh that lie in a plane: float32 (E, 2, 3)."""
     return np.asarray(mesh.vertices[_open_corners(mesh, plane)[:, :2]])
 
 
 def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float) -> TriangleMesh:
-    """Fit a mesh to the border of its neighbour that was cut in the same plane.
+    """Fit a mesh to the border of its neighbour, cut along the same plane.
 
     The vertices of the mesh move onto the border, and those of the border are inserted into the
-    mesh, so that both follow one line.
+    mesh, so that both follow the same line.
 
     Args:
         mesh: The mesh.
-        plane: Where both were cut.
+        plane: The plane of the cut.
         border: float32 (E, 2, 3), the neighbour's `open_edges`.
-        reach_m: What is farther from the other mesh stays: there the other has no surface.
+        reach_m: Vertices farther from the other mesh stay, since it has no surface there.
     """
     rows = np.flatnonzero(plane.holds(mesh.vertices))
     if not len(rows) or not len(border):
@@ -62,7 +62,7 @@ def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float
 
 
 def nearest_on_edges(points: Float32, edges: Float32) -> OnEdges:
-    """The nearest points on line segments, of those whose middles are nearest.
+    """The nearest points on line segments, among those with the nearest midpoints.
 
     Args:
         points: float32 (N, 3).
@@ -86,7 +86,7 @@ def nearest_on_edges(points: Float32, edges: Float32) -> OnEdges:
 def _with_inserted(
     mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float
 ) -> TriangleMesh:
-    """The mesh with the vertices of a border on those of its open edges that they lie beside."""
+    """Insert the vertices of a border into the boundary edges that they lie next to."""
     corners = _open_corners(mesh, plane)
     if not len(corners):
         return mesh
@@ -96,7 +96,7 @@ def _with_inserted(
     to_ends_m = np.linalg.norm(points[:, None] - ends[found.edge], axis=2).min(axis=1)
     inside = (found.distance_m <= reach_m) & (found.share > 0) & (found.share < 1)
     inside &= to_ends_m > _SAME_M
-    # A triangle with two open edges takes vertices on the first of them alone.
+    # In a triangle with two boundary edges, only the first takes new vertices.
     _, first = np.unique(corners[:, 3], return_index=True)
     inside &= np.isin(found.edge, first)
     chosen = np.flatnonzero(inside)
@@ -110,13 +110,13 @@ def _with_inserted(
 def _split_faces(
     faces: Int32, corners: Int32, edge: np.ndarray[tuple[int], np.dtype[np.int64]], new: Int32
 ) -> Int32:
-    """Faces whose open edges have new vertices become fans about their opposite corners.
+    """Split faces with new vertices on a boundary edge into fans around the opposite corner.
 
     Args:
         faces: int32 (F, 3).
-        corners: As of `_open_corners`.
-        edge: int64 (N,), row of ``corners`` that each new vertex lies on, rising.
-        new: int32 (N,), the new vertices, in their order along each edge.
+        corners: Boundary edges from `_open_corners`.
+        edge: int64 (N,), row of ``corners`` of each new vertex, ascending.
+        new: int32 (N,), indices of the new vertices, in order along each edge.
     """
     kept = np.ones(len(faces), dtype=bool)
     fans = [faces[:0]]
@@ -130,9 +130,9 @@ def _split_faces(
 
 
 def _open_corners(mesh: TriangleMesh, plane: Plane) -> Int32:
-    """Edges in a plane that belong to one triangle: int32 (E, 4).
+    """Boundary edges in a plane: int32 (E, 4).
 
-    First and last vertex in the order of the triangle, its third vertex, and its number.
+    First and last vertex in the order of the triangle, its third vertex, and its index.
     """
     number = np.repeat(np.arange(len(mesh.faces), dtype=np.int32), 3)
     turned = mesh.faces[:, [[0, 1, 2], [1, 2, 0], [2, 0, 1]]].reshape(-1, 3)

@@ -37,7 +37,7 @@ def drop_small_components(vertices: Float32, faces: Int32, min_faces: int) -> tu
 
 
 def vertex_normals(vertices: Float32, faces: Int32) -> Float32:
-    """float32 (V, 3): unit normals of the vertices, the mean of their faces' by area."""
+    """float32 (V, 3): unit vertex normals, the area-weighted mean of those of their faces."""
     corners = vertices[faces].astype(np.float64)
     # The length of the cross product is twice the area, so the mean is weighted by area.
     of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
