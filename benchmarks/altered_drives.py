@@ -1,10 +1,10 @@
-"""How odometry copes with drives it was not made for: one drive, altered in many ways.
+"""Robustness of odometry: one drive, altered in many ways.
 
-The truth of an altered drive follows from that of the drive itself, so any drive with true poses
-will do. ``scale`` is the length of the estimated path relative to the true one: an error of
-disparities that all frames share shows there, and grows with the speed of the drive.
+The ground truth of an altered drive follows from that of the original, so any drive with true
+poses will do. ``scale`` is the length of the estimated path relative to the true one: it shows a
+disparity error common to all frames, and grows with the speed of the drive.
 
-Without DRIVE a rendered street is altered.
+Without DRIVE, a rendered street is altered.
 
 Example: python benchmarks/altered_drives.py DRIVE --json
 """
@@ -42,14 +42,14 @@ Change = Callable[[int, UInt8, UInt8], tuple[UInt8, UInt8]]
 
 @dataclass(frozen=True, eq=False)
 class Altered:
-    """A drive whose frames, images or poses differ from those of another.
+    """A drive derived from another by changing its frames, images or poses.
 
     Attributes:
-        drive: The drive itself.
-        calibration: Of the altered images.
-        order: Frames of the drive, in the order in which they are seen.
+        drive: The original drive.
+        calibration: Calibration of the altered images.
+        order: Frames of the original drive, in playback order.
         T_world_camera: float64 (N, 4, 4), true poses of these frames.
-        change: Makes the left and right image of a frame from those of the drive.
+        change: Makes the left and right image of a frame from the original ones.
     """
 
     drive: StereoSource
@@ -70,7 +70,7 @@ class Altered:
 
     @property
     def stamps_s(self) -> Float64:
-        """float64 (N,): of the drive, first to last, whatever the order of the frames."""
+        """float64 (N,): timestamps of the original drive, ascending regardless of ``order``."""
         return true_path(self.drive).timestamps_s[sorted(self.order)]
 
     def __len__(self) -> int:
@@ -80,7 +80,7 @@ class Altered:
         return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """The altered pairs from a frame on."""
+        """The altered pairs, from frame ``start`` on."""
         for index in range(start, len(self)):
             pair = next(iter(self.drive.frames(self.order[index])))
             left, right = self.change(self.order[index], pair.left, pair.right)
@@ -111,7 +111,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def alterations(drive: StereoSource) -> dict[str, Altered]:
-    """The drive as it is, and its alterations by name."""
+    """The original drive and its alterations, by name."""
     camera = drive.calibration
     if not isinstance(camera, RectifiedCamera):
         raise SystemExit(f"{drive.name}: expected a rectified drive")
@@ -140,7 +140,7 @@ def true_path(drive: StereoSource | Altered) -> Trajectory:
 
 
 def thinned(plain: Altered, step: int) -> Altered:
-    """A faster drive, or a slower camera."""
+    """Every ``step``-th frame: a faster drive, or a lower frame rate."""
     return replace(
         plain, order=plain.order[::step], T_world_camera=plain.T_world_camera[::step].copy()
     )
@@ -160,7 +160,7 @@ def halved(plain: Altered) -> Altered:
         )
         return left, right
 
-    # The centre of the first pixel lies at 0, its corner at -0.5.
+    # The first pixel has its centre at 0 and its corner at -0.5.
     smaller = replace(
         camera,
         focal_px=camera.focal_px / 2,
@@ -174,7 +174,7 @@ def halved(plain: Altered) -> Altered:
 
 
 def mirrored(plain: Altered) -> Altered:
-    """The world in a mirror: left bends become right ones, and the cameras change places."""
+    """The mirrored world: left turns become right turns, and the cameras swap places."""
     camera, mirror = plain.calibration, np.diag([-1.0, 1.0, 1.0, 1.0])
     T_left_right = se3.make_transform(np.eye(3), np.array([camera.baseline_m, 0.0, 0.0]))
     last = camera.width_px - 1
@@ -189,7 +189,7 @@ def mirrored(plain: Altered) -> Altered:
 
 
 def narrowed(plain: Altered) -> Altered:
-    """The middle of the images alone: a narrow lens."""
+    """Images cropped to their middle: a narrow field of view."""
     camera = plain.calibration
     width = round(KEPT_WIDTH * camera.width_px)
     first = (camera.width_px - width) // 2
@@ -208,7 +208,7 @@ def narrowed(plain: Altered) -> Altered:
 
 
 def noisy(index: int, left: UInt8, right: UInt8) -> tuple[UInt8, UInt8]:
-    """Noise, an exposure that comes and goes, and a darker right camera."""
+    """Image noise, varying exposure and a darker right camera."""
     random = np.random.default_rng(index)
     gain = 1.0 + EXPOSURE_SHARE * np.sin(index / 7.0)
     seen = (gain * left, gain * RIGHT_GAIN * right)
@@ -220,7 +220,7 @@ def noisy(index: int, left: UInt8, right: UInt8) -> tuple[UInt8, UInt8]:
 
 
 def nodding(plain: Altered) -> Altered:
-    """A rig that pitches from frame to frame, as on a rough road; a turn about the baseline."""
+    """A rig that pitches from frame to frame, as on a rough road: rotation about the baseline."""
     camera = plain.calibration
     angles = np.radians(NOD_DEG) * np.sin(NOD_RAD_PER_FRAME * np.arange(len(plain.order)))
     turns = np.stack([se3.exp_so3(np.array([angle, 0.0, 0.0])) for angle in angles])

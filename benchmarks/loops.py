@@ -1,9 +1,9 @@
-"""What loop closure is worth: a drive around a block, with and without it, and one that deceives.
+"""Benefit of loop closure: a drive around a block with and without it, and perceptual aliasing.
 
-- `block`: the drive as its odometry sees it. How far the end is from the truth before and after
-  closing, and how the fused cloud and the occupied voxels compare with the true surface.
-- `drift`: the same with a drift planted into the odometry.
-- `alike`: a straight street that repeats itself. Every loop would be a false one.
+- `block`: the drive with its own odometry. End-point error before and after loop closure, and the
+  fused cloud and occupied grid cells against the true surface.
+- `drift`: the same with drift added to the odometry.
+- `alike`: a straight street that repeats itself, where every loop would be false.
 
 Example: python benchmarks/loops.py --json
 """
@@ -48,26 +48,26 @@ BAND_M = (0.3, 2.0)
 
 
 class Filmed(SyntheticSource):
-    """A drive whose pictures are rendered once."""
+    """A drive whose images are rendered once and kept."""
 
     @cached_property
     def pairs(self) -> list[StereoPair]:
-        """All pictures."""
+        """All stereo pairs."""
         return [self.camera.pair(index) for index in range(len(self))]
 
     def frames(self, first: int = 0) -> Iterator[StereoPair]:
-        """The pairs from a frame on."""
+        """The pairs, from frame ``first`` on."""
         return iter(self.pairs[first:])
 
 
 @dataclass
 class Drifting:
-    """An odometry whose steps are too long, and turn a little too much.
+    """An odometry with added scale and heading drift.
 
     Attributes:
-        inner: The odometry.
-        share: By how much each step is too long.
-        turn_deg_per_m: How much it turns too much.
+        inner: The original odometry.
+        share: Relative excess length of each step.
+        turn_deg_per_m: Excess rotation.
     """
 
     inner: Odometry
@@ -78,7 +78,7 @@ class Drifting:
         self._true, self._drifted = np.eye(4), np.eye(4)
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """Register the next frame, and drift a little more."""
+        """Register the next frame and add the drift of its step."""
         result = self.inner.register(frame)
         step = se3.invert(self._true) @ result.T_world_camera
         angle = np.radians(self.turn_deg_per_m) * float(np.linalg.norm(step[:3, 3]))
@@ -114,7 +114,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def config_of(options: argparse.Namespace, drive: str) -> ReconConfig:
-    """A street, filmed small."""
+    """The configuration of a street with small images."""
     street = {
         "seed": options.seed,
         "width_px": options.width,
@@ -133,7 +133,7 @@ def config_of(options: argparse.Namespace, drive: str) -> ReconConfig:
 def closing(
     source: Filmed, config: ReconConfig, drift_percent: float, pictures: Path | None
 ) -> dict[str, Any]:
-    """A drive around a block, before and after closing."""
+    """A drive around a block, before and after loop closure."""
     mapped, seconds = mapped_with(source, config, drift_percent)
     if mapped.loops is None:
         raise SystemExit("loop closure is off")
@@ -153,7 +153,7 @@ def closing(
 
 
 def deceiving(source: Filmed, options: argparse.Namespace) -> dict[str, Any]:
-    """A street that repeats itself: what is closed, and what would be without the odometry."""
+    """A repetitive street: loops closed, and loops found without the odometry check."""
     config = config_of(options, "alike")
     blind = load_config_with(config, {"share": 1.0, "turn_deg": 5.0})
     loops, trusting = (mapped_with(source, c, 0.0)[0].loops for c in (config, blind))
@@ -177,7 +177,7 @@ def load_config_with(config: ReconConfig, drift: dict[str, float]) -> ReconConfi
 def mapped_with(
     source: Filmed, config: ReconConfig, drift_percent: float
 ) -> tuple[MappedSequence, dict[str, float]]:
-    """The drive mapped, its odometry drifting; and the seconds of loop closure."""
+    """Map the drive with drifting odometry; also the seconds of loop closure and of the run."""
 
     def drifting(method: str, settings: Any) -> Odometry:
         inner = make_odometry(method, settings)
@@ -192,10 +192,10 @@ def mapped_with(
 
 
 def quality(mapped: MappedSequence, source: Filmed, surface: PointCloud) -> dict[str, Any]:
-    """How far path and maps are from the truth."""
+    """Errors of path and maps against the ground truth."""
     truth, path = source.trajectory, mapped.trajectory
     off_m = np.linalg.norm(path.positions_m - truth.positions_m, axis=1)
-    # A map is judged by its shape: the error of the first metres' heading turns all of it.
+    # Maps are aligned first: a heading error in the first metres rotates the whole map.
     T_true_world = fit_points(path.positions_m, truth.positions_m).T_to_from
     cells, obstacles = footprints(mapped, surface, source, T_true_world)
     cloud = transform_cloud(mapped.cloud, T_true_world, frame="world")
@@ -228,12 +228,12 @@ def rms_m(positions_m: Float64, truth: Trajectory) -> float:
 def footprints(
     mapped: MappedSequence, surface: PointCloud, source: Filmed, T_true_world: Float64
 ) -> tuple[PointCloud, PointCloud]:
-    """Occupied cells of the flat grid, and the obstacles that were seen, both on the ground."""
+    """Occupied cells of the flat grid and visible true obstacles, both projected to the ground."""
     T, grid = mapped.T_map_world, flat_grid(mapped)
     row, column = np.nonzero(grid.cells == OCCUPIED)
     cells_m = (np.column_stack([column, row]) + 0.5) * grid.resolution_m + grid.origin_m
     level = np.column_stack([cells_m, np.full(len(cells_m), -source.settings.camera_height_m)])
-    # The grid is a plane in space, near the road; it is laid onto the true road from above.
+    # The grid is a plane near the road; it is projected vertically onto the true road.
     laid = se3.apply(source.world.T_map_world @ T_true_world @ se3.invert(T), level)
     true = se3.apply(source.world.T_map_world, surface.xyz.astype(np.float64))
     height_m = true[:, 2] + source.settings.camera_height_m
@@ -252,7 +252,7 @@ def flat_grid(mapped: MappedSequence) -> OccupancyGrid:
 
 
 def draw(folder: Path, name: str, before: MappedSequence, after: MappedSequence) -> None:
-    """Path and grids before and after closing, to look at."""
+    """Draw path and grids before and after loop closure."""
     folder.mkdir(parents=True, exist_ok=True)
     if after.loops is None:
         return

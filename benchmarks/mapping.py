@@ -1,12 +1,12 @@
-"""How fast a drive becomes a map, stage by stage; and our ray casting beside OctoMap's.
+"""Speed of mapping stage by stage, and of our ray casting against OctoMap's.
 
-A drive is mapped as `recon map` does it, mesh and report included. ``fps`` and
-``frame_ms`` are of the mapping alone, from the first frame to the last; stages overlap, so they add
-up to more than a frame takes. ``after_s`` is what comes once all frames are in.
+A drive is mapped as by `recon map`, mesh and report included. ``fps`` and ``frame_ms`` cover
+mapping alone, from the first frame to the last; stages overlap, so they add up to more than the
+time per frame. ``after_s`` covers the stages after the last frame.
 
-For the rays, both start from an empty map, and every round runs both in turn, so that a busy
-machine is busy for both; the figures are medians over the rounds. ``agreement`` compares the cells
-that both call occupied or free: their share among the cells that either names.
+For ray casting, both start from an empty map and run in turn in every round, so that other load
+affects both alike; the figures are medians over the rounds. ``agreement`` is the intersection over
+union of the cells that each calls occupied, or free.
 
 Example: python benchmarks/mapping.py --json --drive DRIVE
 """
@@ -48,8 +48,8 @@ PER_FRAME = (
     *("rectify", "match", "edges", "inspect", "back_project", "filter", "thin"),
     *("odometry", "map", "store", "loops", "checkpoint"),
 )
-"""Stages that every frame goes through; the first seven, those from the odometry on, mapping
-and the search for loops each run in a thread of their own."""
+"""Stages of every frame; the first seven, odometry, mapping and the search for loops run in
+separate threads."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -77,13 +77,13 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def real_drive() -> Path | None:
-    """The drive that the figures of the documentation are of, where there is one."""
+    """The drive used for the figures in the documentation, if available."""
     folder = Path(os.environ.get("RECON_DATA", "")) / "driven" / "kitti_raw_0013"
     return folder if folder.is_dir() else None
 
 
 def budget(drive: Path, overrides: Sequence[str]) -> dict[str, Any]:
-    """Milliseconds per frame of each stage of a drive, and seconds of what comes after."""
+    """Milliseconds per frame of each stage of a drive, and seconds of each later stage."""
     source, config = open_source(drive), load_config(None, overrides)
     with tempfile.TemporaryDirectory() as folder:
         options = MapOptions(out=Path(folder) / "run", present=present_map)
@@ -125,7 +125,7 @@ def ray_casting(rays: int, rounds: int) -> list[dict[str, Any]]:
 
 
 def street(rays: int) -> Float64:
-    """Ends of rays of a camera on a road between two walls, up to the range."""
+    """Ray end points of a camera on a road between two walls, up to the range."""
     rng = np.random.default_rng(0)
     directions = pinhole(rng.uniform(-1, 1, rays), rng.uniform(-0.4, 0.4, rays))
     with np.errstate(divide="ignore"):
@@ -135,7 +135,7 @@ def street(rays: int) -> Float64:
 
 
 def scattered(rays: int) -> Float64:
-    """Ends of rays of a camera, at random lengths up to the range: nearly each in its own cell."""
+    """Ray end points of a camera at random ranges: nearly each in its own cell."""
     rng = np.random.default_rng(1)
     directions = pinhole(rng.uniform(-1, 1, rays), rng.uniform(-0.4, 0.4, rays))
     return np.asarray(directions * rng.uniform(2.0, RANGE_M, (rays, 1)))
@@ -148,15 +148,15 @@ def pinhole(x: Float64, y: Float64) -> Float64:
 
 
 def to_centres(xyz: Float64, resolution_m: float) -> Float64:
-    """Ends moved to the centres of their cells, in map axes.
+    """Ray end points moved to the centres of their cells, in map axes.
 
-    OctoMap aims there; we aim at the mean of the points of a cell, which is the same then.
+    OctoMap casts rays to cell centres, we cast to the mean point of a cell: now the same.
     """
     return np.asarray((np.floor((xyz + ORIGIN_M) / resolution_m) + 0.5) * resolution_m)
 
 
 def ours(ends_m: Float64, resolution_m: float) -> OccupancyBuilder:
-    """A map of one frame, without errors, which OctoMap does not know."""
+    """A map of one frame, without point uncertainty, which OctoMap does not model."""
     settings = OccupancySettings(resolution_m=resolution_m, max_range_m=RANGE_M + 1.0, min_points=1)
     builder = OccupancyBuilder(settings, np.eye(4))
     cloud = PointCloud((ends_m - ORIGIN_M).astype(np.float32))
@@ -183,7 +183,7 @@ def medians_ms(runs: dict[str, Callable[[], object]], rounds: int) -> dict[str, 
 
 
 def ours_cells(ends_m: Float64, resolution_m: float) -> dict[str, Int64]:
-    """Occupied and free cells, one sorted number each."""
+    """Occupied and free cells, each packed into one number, sorted."""
     voxels = ours(ends_m, resolution_m).voxels()
     return split(voxels.keys.astype(np.int64), voxels.log_odds > 0)
 
@@ -200,13 +200,13 @@ def octomap_cells(ends_m: Float64, resolution_m: float) -> dict[str, Int64]:
 
 
 def split(keys: Int64, occupied: Any) -> dict[str, Int64]:
-    """Cells (N, 3) as one number each, by kind."""
+    """Cells (N, 3), each packed into one number, by kind."""
     packed = ((keys[:, 0] + (1 << 20)) << 42) + ((keys[:, 1] + (1 << 20)) << 21) + keys[:, 2]
     return {"occupied": np.unique(packed[occupied]), "free": np.unique(packed[~occupied])}
 
 
 def agreement(one: dict[str, Int64], other: dict[str, Int64]) -> dict[str, float]:
-    """Cells in both over cells in either, by kind, and how many there are."""
+    """Intersection over union of the cells by kind, and the number of cells of ``one``."""
     shares: dict[str, float] = {}
     for kind, cells in one.items():
         both = len(np.intersect1d(cells, other[kind], assume_unique=True))

@@ -1,8 +1,8 @@
-"""How fast our matchers are beside OpenCV's: same pictures, range, window, threads and checks.
+"""Speed of our matchers against OpenCV's, with the same images, range, window, threads and checks.
 
-Every round runs all matchers in turn, so that a busy machine is busy for all of them; the
-figures are medians over the rounds. The checks are switched on everywhere: texture, uniqueness,
-left-right and speckles. The peak memory of a large pair is that of a process of its own.
+Every round runs all matchers in turn, so that other load affects all alike; the figures are
+medians over the rounds. All checks are enabled: texture, uniqueness, left-right and speckles. The
+peak memory for a large pair is measured in a separate process.
 
 Example: python benchmarks/matching.py --json --threads 1
 """
@@ -74,7 +74,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def compare(height: int, width: int, ndisp: int, threads: int, rounds: int) -> dict[str, Any]:
-    """Median milliseconds of every matcher at one size, and the ratios that are asked for."""
+    """Median milliseconds of every matcher at one size, and the speed ratios in `RATIOS`."""
     pair = make_pair(height, width, ndisp)
     ms = medians_ms({**ours(pair, threads), **opencv(pair, ndisp)}, rounds)
     ratios = {f"{b} / {a}": round(ms[b] / ms[a], 3) for a, b in RATIOS}
@@ -82,7 +82,7 @@ def compare(height: int, width: int, ndisp: int, threads: int, rounds: int) -> d
 
 
 def growth(threads: int, rounds: int) -> list[dict[str, Any]]:
-    """Nanoseconds per pixel and disparity of our matchers as the pictures grow."""
+    """Nanoseconds per pixel and disparity of our matchers, by image size and range."""
     rows = []
     for height, width, ndisp in GROWTH:
         ms = medians_ms(ours(make_pair(height, width, ndisp), threads), max(1, rounds // 2))
@@ -109,7 +109,7 @@ def peak_mb(name: str, threads: int) -> float:
 
 
 def make_pair(height: int, width: int, ndisp: int) -> RectifiedPair:
-    """A textured ground whose disparity grows from row to row through half of the range."""
+    """A textured plane whose disparity grows row by row up to half of the range."""
     rng = np.random.default_rng(0)
     scene = cv2.GaussianBlur(rng.integers(0, 256, (height, width), dtype=np.uint8), (0, 0), 1.5)
     scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
@@ -124,7 +124,7 @@ def add_noise(image: UInt8, rng: np.random.Generator) -> UInt8:
 
 
 def ours(pair: RectifiedPair, threads: int) -> dict[str, Run]:
-    """`sad` as it comes, without its second, slanted window (as StereoBM has none), and `sgm`."""
+    """`sad`, `sad` without its second, slanted window (StereoBM has none), and `sgm`."""
     window = {"window_px": WINDOW_PX, "window_height_px": WINDOW_PX}
     matchers = {
         "sad": SadMatcher(SadSettings(**window), threads),

@@ -1,9 +1,9 @@
-"""How much memory `recon map` takes for short and for long drives, and what is made of its runs.
+"""Peak memory of `recon map` on short and long drives, and of commands that reuse its runs.
 
-One street that looks the same every 50 m is rendered once and driven along for as many frames as
-are asked for, so the map grows with every frame while the pictures stay those of one street. Each
-drive is mapped by a process of its own, whose peak is that of its resident memory; ``libraries``
-is the peak for a drive of a few frames: what the program takes before there is a map.
+A street that repeats every 50 m is rendered once and driven along for any number of frames, so
+the map grows with every frame while the images repeat. Each drive is mapped in a separate process
+and its peak resident memory is reported; ``libraries`` is the peak for a drive of a few frames,
+where the map is negligible.
 
 Examples:
     python benchmarks/memory.py --json --frames 1000 --frames 4000
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         period = render_period(Path(folder) / "period", options.width)
         counts = sorted(set(options.frames or FRAMES))
-        # The first run may compile kernels, which takes more memory than it will ever again.
+        # The first run may compile kernels, which takes extra memory.
         measure(period, COMPILING_FRAMES, options)
         rows = [measure(period, count, options) for count in (LIBRARIES_FRAMES, *counts)]
     shortest, longest = rows[1], rows[-1]
@@ -84,10 +84,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def render_period(folder: Path, width_px: int) -> Path:
-    """A drive that is as long as the street takes to repeat, in KITTI's layout."""
+    """Render a drive along one period of the street, in the KITTI layout."""
     period = round(REPEAT_M / STEP_M)
     settings = StreetSettings(
-        # Two more periods: all that the last picture shows is there.
+        # Two more periods, so that the last image shows no end of the street.
         frames=3 * period,
         speed_m_per_frame=STEP_M,
         path="straight",
@@ -102,7 +102,7 @@ def render_period(folder: Path, width_px: int) -> Path:
 
 
 class _Beginning(SyntheticSource):
-    """The first frames of a drive."""
+    """A synthetic drive cut to its first frames."""
 
     def __init__(self, settings: StreetSettings, length: int) -> None:
         super().__init__(settings)
@@ -117,7 +117,7 @@ def height_of(width_px: int) -> int:
 
 
 def measure(period: Path, frames: int, options: argparse.Namespace) -> dict[str, Any]:
-    """Map so many frames in a process of its own."""
+    """Map a drive of ``frames`` frames in a separate process."""
     drive, out = period.parent / f"drive_{frames}", period.parent / f"run_{frames}"
     repeat(period, drive, frames)
     settings = [part for text in options.set for part in ("--set", text)]
@@ -139,14 +139,14 @@ def measure(period: Path, frames: int, options: argparse.Namespace) -> dict[str,
 
 
 def make_again(command: str, run: Path) -> dict[str, Any]:
-    """What it takes to make something of a run."""
+    """Run a command on a finished run; its cost."""
     summary = run_recon(command, run, run.with_name(f"{run.name}_{command}"), [])
     names = {"peak_mb": "peak_memory_mb", "seconds": "seconds", "stages": "stages"}
     return {name: summary[key] for name, key in names.items()}
 
 
 def run_recon(command: str, source: Path, out: Path, options: list[str]) -> dict[str, Any]:
-    """The summary of a command, in a process of its own."""
+    """Run a command in a separate process and return its summary."""
     words = [sys.executable, "-m", "recon", command, str(source), "--out", str(out)]
     done = subprocess.run(
         [*words, *options, "--json", "--quiet"], capture_output=True, text=True, check=False
@@ -157,7 +157,7 @@ def run_recon(command: str, source: Path, out: Path, options: list[str]) -> dict
 
 
 def repeat(period: Path, drive: Path, frames: int) -> None:
-    """The drive again and again, by links."""
+    """Build a longer drive that repeats the period, by symbolic links."""
     names = sorted(path.name for path in (period / CAMERAS[0]).iterdir())
     for camera in CAMERAS:
         (drive / camera).mkdir(parents=True)
@@ -173,7 +173,7 @@ def repeat(period: Path, drive: Path, frames: int) -> None:
 
 
 def ratio(one: float, other: float) -> float | None:
-    """None where a drive is so short that its map takes nothing beside the libraries."""
+    """The ratio; None if the shorter drive takes no more than the libraries."""
     return round(one / other, 3) if other > 0 else None
 
 

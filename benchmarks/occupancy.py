@@ -1,8 +1,8 @@
-"""How right occupancy is: rendered streets, mapped with the defaults, against the exact truth.
+"""Accuracy of occupancy: rendered streets, mapped with the defaults, against exact ground truth.
 
-Every street is another seed; nothing else is set. ``worst`` has the least of each figure, beside
-what is asked for. With ``--runs FOLDER`` the runs are kept, and ``recon evaluate occupancy`` gives
-the same figures from their files.
+Streets differ only in their seed. ``worst`` has the lowest value of each figure and its target.
+With ``--runs FOLDER`` the runs are kept, and ``recon evaluate occupancy`` gives the same figures
+from their files.
 
 Example: python benchmarks/occupancy.py --json
 """

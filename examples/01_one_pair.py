@@ -1,9 +1,9 @@
-"""One pair of pictures: disparity, how good it is, and a coloured cloud.
+"""One stereo pair: disparity, its accuracy, and a coloured point cloud.
 
     python examples/01_one_pair.py [FOLDER]
 
-The pair is rendered, so the truth is known. With pictures of your own, replace `pair` by
-`recon.read_image` and the calibration by `recon.read_calibration`.
+The pair is rendered, so the ground truth is known. For your own images, read them with
+`recon.read_image` and their calibration with `recon.read_calibration`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""A drive: trajectory, fused cloud, Nav2 grid, OctoMap, mesh.
+"""Map a drive: trajectory, fused cloud, Nav2 grid, OctoMap, mesh.
 
     python examples/02_map_a_drive.py [DRIVE [FOLDER]]
 
-DRIVE is a folder in KITTI's odometry layout; without one, a street is rendered.
+DRIVE is a folder in the KITTI odometry layout; without one, a street is rendered.
 """
 
 from __future__ import annotations

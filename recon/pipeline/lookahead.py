@@ -1,4 +1,4 @@
-"""Work on the next items while this one is being used, and on the last one still."""
+"""Overlap work in threads: prefetch the next items, finish the last one in the background."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def look_ahead(
 ) -> Iterator[Result]:
     """Yield ``function(item)`` in order, computed up to ``depth`` items ahead in one thread.
 
-    The items are drawn in that thread too, so reading overlaps as well. At most ``depth + 1``
+    The iterator is advanced in that thread too, so reading overlaps as well. At most ``depth + 1``
     results exist at a time. An error in an item or in the function is raised at its turn.
     """
     source = iter(items)
@@ -45,8 +45,8 @@ def side_by_side(
 ) -> Iterator[Result]:
     """Yield ``function(item)`` in order, computed in several threads.
 
-    At most ``threads + 1`` results exist at a time. An error is raised at its item's turn; when
-    the caller leaves off, what has begun is waited for and nothing else is begun.
+    At most ``threads + 1`` results exist at a time. An error is raised at its item's turn. When
+    the caller stops early, running items are waited for and no others start.
     """
     pool = ThreadPoolExecutor(threads, thread_name_prefix="side-by-side")
     waiting: deque[Future[Result]] = deque()
@@ -62,10 +62,10 @@ def side_by_side(
 
 
 class OneBehind:
-    """Does jobs in one thread, in order, while the caller goes on: one at a time.
+    """Runs jobs in one background thread, in order and one at a time.
 
-    A job begins when the one before has ended; who brings the next one earlier waits. So at most
-    one job is under way, and what it holds is all that is held longer.
+    `begin` blocks until the previous job has ended, so at most one job is running and only its
+    data stays in memory.
     """
 
     def __init__(self) -> None:
@@ -73,10 +73,10 @@ class OneBehind:
         self._job: Future[None] | None = None
 
     def begin(self, job: Callable[[], None]) -> None:
-        """Begin a job, once the last one has ended.
+        """Start a job once the previous one has ended.
 
         Raises:
-            Exception: What the last job raised; then this one is not begun.
+            Exception: Whatever the previous job raised; the new job is then not started.
         """
         self.settle()
         self._job = self._pool.submit(job)
@@ -85,13 +85,13 @@ class OneBehind:
         """Wait until the last job has ended.
 
         Raises:
-            Exception: What it raised, once.
+            Exception: Whatever it raised, once.
         """
         job, self._job = self._job, None
         if job is not None:
             job.result()
 
     def abandon(self) -> None:
-        """Wait until the last job has ended, whatever came of it; no other can begin."""
+        """Wait until the last job has ended, ignoring its errors; no other can start."""
         self._job = None
         self._pool.shutdown(wait=True)

@@ -1,4 +1,4 @@
-"""What the run may use of the machine, and what it used."""
+"""Threads, memory and package versions of the running process."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ def use_threads(threads: int | None) -> int:
 def serial_algebra() -> Iterator[None]:
     """Keep numpy's linear algebra on one thread for the body of a ``with`` statement.
 
-    Its matrices are small here: more threads make it slower while stages overlap, and sums that are
-    split among another number of threads round otherwise, so a path would depend on the machine.
+    The matrices here are small: more threads are slower while stages overlap, and sums split over
+    a different number of threads round differently, so a path would depend on the machine.
     """
     with threadpool_limits(limits=1, user_api="blas"):
         yield
 
 
 def available_cores() -> int:
-    """Cores that this process may use, which in a container are fewer than the machine has."""
+    """Cores that this process may use; in a container, fewer than the machine has."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -58,7 +58,7 @@ def available_cores() -> int:
 
 def peak_memory_mb() -> float:
     """Largest resident memory of this process so far, in 10⁶ bytes."""
-    # On Linux, what getrusage tells begins at the peak of whoever started the process.
+    # On Linux, the peak from getrusage is inherited from the parent process.
     told = _PEAK.search(_STATUS.read_text()) if _STATUS.exists() else None
     if told is not None:
         return int(told[1]) * 1024 / 1e6
@@ -67,7 +67,7 @@ def peak_memory_mb() -> float:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide results."""
+    """Versions of Python and of the packages that affect results."""
     return {"python": platform.python_version(), **{name: _version(name) for name in _RECORDED}}
 
 

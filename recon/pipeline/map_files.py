@@ -1,4 +1,4 @@
-"""The files of a map, written tile by tile: memory does not grow with the drive."""
+"""Writing the files of a map tile by tile, so that memory does not grow with the drive."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from recon.pipeline.stopwatch import Stopwatch
 from recon.structures import OccupancyGrid, PointCloud
 
 SAMPLE_POINTS: Final = 300_000
-"""Points of the fused cloud that are kept to look at."""
+"""Points of the fused cloud that are kept for display."""
 
 
 @dataclass(frozen=True, eq=False)
 class WrittenMap:
-    """What is known of a map whose files are written.
+    """What is kept in memory of a map after its files are written.
 
     Attributes:
-        cloud: Points of the fused cloud, spread evenly; all of a small one. Frame ``map``.
-        points: Number of points of the whole.
+        cloud: Even sample of the fused cloud; all points of a small one. Frame ``map``.
+        points: Number of points in the whole fused cloud.
         voxels: Number of observed voxels.
         grid: The flat grid.
         warnings: What could not be written.
@@ -45,9 +45,9 @@ def write_map(mapped: MappedSequence, directory: RunDirectory, watch: Stopwatch)
     """Write ``map/cloud.ply``, ``map/octomap.*`` and ``map/grid.*``.
 
     Args:
-        mapped: The drive.
-        directory: Its folder.
-        watch: Told the seconds per stage.
+        mapped: The mapped drive.
+        directory: Result folder of the run.
+        watch: Times each stage.
 
     Raises:
         MappingError: Nothing was observed, or the height band of the grid is empty.
@@ -67,7 +67,7 @@ def write_map(mapped: MappedSequence, directory: RunDirectory, watch: Stopwatch)
 def _write_cloud(
     mapped: MappedSequence, directory: RunDirectory, writer: OccupancyWriter
 ) -> tuple[PointCloud, int]:
-    """Write the cloud; a sample of it and the number of its points."""
+    """Write the cloud; return a sample of it and its number of points."""
     sample = CloudSample(SAMPLE_POINTS, mapped.config.fusion.voxel_m)
     path = directory.path("map/cloud.ply")
     points = write_ply_tiles(path, _clouds(mapped, sample, writer), frame="map")
@@ -79,7 +79,7 @@ def _write_cloud(
 def _clouds(
     mapped: MappedSequence, sample: CloudSample, writer: OccupancyWriter
 ) -> Iterator[PointCloud]:
-    """The tiles in map axes."""
+    """The tiles of the fused cloud, in map axes."""
     for tile, cloud in mapped.map.cloud_tiles():
         in_map = transform_cloud(cloud, mapped.T_map_world, frame="map")
         sample.add(in_map)

@@ -1,4 +1,4 @@
-"""`recon map` without its command line: a source in, a folder of maps out."""
+"""The pipeline behind `recon map`: a source in, a folder of maps out."""
 
 from __future__ import annotations
 
@@ -39,27 +39,27 @@ from recon.structures import (
 )
 
 SURFACE_THRESHOLD_M: Final = 0.2
-"""Distance to the true surface below which a point of the map counts as right."""
+"""Distance to the true surface below which a map point counts as correct."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapRun:
-    """All that a run knows when its maps are made; reports are made from it.
+    """Results of a run, from which its report is made.
 
     Attributes:
-        name: What a user calls the source.
+        name: Display name of the source.
         config: The configuration.
         mapped: Trajectory, health, fused cloud, voxels.
-        cloud: Points of the fused cloud, spread evenly; all of a small one. Frame ``map``.
+        cloud: Even sample of the fused cloud; all points of a small one. Frame ``map``.
         grid: The flat grid.
-        mesh: The surface, map axes, or None where none was asked for, none could be made, or it
-            is too large to be held.
-        truth: What is known of the true path and surface.
-        metrics: Distance to the true path, or None without one.
-        map_metrics: Distance to the true surface, or None without one.
-        occupancy_metrics: Distance to the true occupancy, or None without one.
+        mesh: The surface in map axes, or None if none was requested, none could be made, or it
+            does not fit in memory.
+        truth: Ground truth of path and surface, as far as the source knows it.
+        metrics: Errors against the true path, or None without one.
+        map_metrics: Errors against the true surface, or None without one.
+        occupancy_metrics: Errors against the true occupancy, or None without one.
         summary: The figures of ``summary.json``.
-        warnings: What went less than well.
+        warnings: Problems that did not stop the run.
     """
 
     name: str
@@ -78,20 +78,20 @@ class MapRun:
 
 @dataclass(frozen=True)
 class MapOptions:
-    """How a run is made, apart from the configuration.
+    """Options of a run that are not part of the configuration.
 
     Attributes:
-        command: Named in the record and in the default folder.
+        command: Command name, for the record and the default folder.
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores. Changes no result.
         known_poses: Poses to use instead of odometry, one per frame.
-        prior: How the left camera moved by other means, on the clock of the source.
+        prior: Motion of the left camera from another sensor, in the time base of the source.
         mesh: Whether to reconstruct a surface.
-        observers: Told of the progress.
-        present: Writes pictures and the report of the run into its folder.
-        resume: Go on with the unfinished run in ``out``.
-        arguments: What a command line needs to resume the run without being told again.
-        warnings: What was found out about the source beforehand.
+        observers: Notified of progress.
+        present: Writes figures and the report into the result folder.
+        resume: Resume the unfinished run in ``out``.
+        arguments: Command-line arguments, stored so that resuming need not repeat them.
+        warnings: Findings of the audit of the source before the run.
     """
 
     command: str = "map"
@@ -111,8 +111,8 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
     """Map a source; write trajectory, clouds, grids, mesh, report, summary and record.
 
     Raises:
-        ReconError: The source cannot be read or registered; then nothing is left behind. Or the
-            folder cannot be written, or the memory limit not be kept; then the run can be resumed.
+        ReconError: The source cannot be read or registered; nothing is left behind. Or the folder
+            cannot be written or the memory limit is exceeded; the run can then be resumed.
     """
     start = time.perf_counter()
     threads = use_threads(options.threads)
@@ -166,7 +166,7 @@ def _finish(
     directory: RunDirectory,
     watch: Stopwatch,
 ) -> MapRun:
-    """Make the products that need the whole drive; those of the map are written at once."""
+    """Make the products that need the whole drive; map files are written immediately."""
     config = mapped.config
     warnings = [*options.warnings, *health_warnings(mapped.health)]
     if mapped.loops is not None:
@@ -182,7 +182,7 @@ def _finish(
         config.memory.check("mesh")
     truth = source.truth
     with watch.stage("compare"):
-        # Poses that were given are no estimate; a drift of 0 % would be a lie.
+        # Given poses are not an estimate; reporting 0 % drift would be misleading.
         given = options.known_poses is not None
         metrics = None if given else _compare_paths(mapped.trajectory, truth, warnings)
         map_metrics = _compare_surfaces(mapped, truth, warnings)
@@ -210,9 +210,9 @@ def _finish(
 def _mesh(
     mapped: MappedSequence, directory: RunDirectory, threads: int | None, warnings: list[str]
 ) -> tuple[TriangleMesh | None, int]:
-    """Write the surface; a map without one is still a map, so its failure is a warning."""
+    """Write the surface; failure is only a warning, since the map is usable without one."""
     store = store_map(mapped, directory.state("mesh"))
-    # Each tile that is worked on takes its memory.
+    # Each tile being meshed takes memory of its own.
     at_once = threads if mapped.config.memory.limit_mb is None else 1
     layer = directory.path("map/cloud.ply")
     try:
@@ -242,7 +242,7 @@ def _compare_surfaces(
     if truth is None or truth.surface is None:
         return None
     try:
-        # The whole cloud, in memory: only where there is a whole true surface in memory too.
+        # Loads the whole cloud, but only where the whole true surface is in memory as well.
         return evaluate_map(mapped.cloud, truth.surface, SURFACE_THRESHOLD_M)
     except EvaluationError as error:
         warnings.append(f"not compared with the true surface: {error}")

@@ -1,4 +1,4 @@
-"""The part of the flow that holds state: odometry, and the maps that are being built."""
+"""The stateful part of mapping: odometry and the maps under construction."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from recon.structures.arrays import Float64
 
 
 class Mapper:
-    """Registers frames and adds them to the submap of the moment, which happens a frame behind.
+    """Registers frames; integrates each into the current submap while the next is registered.
 
     Args:
         config: The configuration.
         camera: The rectified camera.
-        odometry: Finds the poses.
-        workspace: Where closed submaps go, and who times it.
+        odometry: Estimates the poses.
+        workspace: Storage for closed submaps, and the stopwatch.
     """
 
     def __init__(
@@ -58,22 +58,22 @@ class Mapper:
 
     @property
     def trajectory(self) -> Trajectory:
-        """The poses so far; there must be one."""
+        """The poses so far; at least one frame must have been added."""
         return self._frames.trajectory
 
     @property
     def health(self) -> tuple[OdometryHealth, ...]:
-        """How far each pose can be trusted."""
+        """Health of each pose."""
         return self._frames.health
 
     def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
-        """Take the next frame."""
+        """Register the next frame and start its integration."""
         stage = self._workspace.stopwatch.stage
         with stage("odometry"):
             registered = self._odometry.register(OdometryFrame(frame.pair, frame.disparity))
         T_world_camera = registered.T_world_camera
         health = replace(registered.health, warnings=(*frame.warnings, *registered.health.warnings))
-        # A map that is wrong is worse than one with a hole.
+        # A hole in the map is better than wrong geometry.
         cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))
         rays = frame.rays if health.ok else None
         builder = self._builder_from(frame)
@@ -91,7 +91,7 @@ class Mapper:
         rays: RayCloud | None,
         T_world_camera: Float64,
     ) -> None:
-        """Add what a frame saw to the maps, while the next one is registered."""
+        """Integrate a frame into the maps; runs while the next one is registered."""
         stage = self._workspace.stopwatch.stage
         with stage("map"):
             rays = thin_rays(cloud, self._config.occupancy) if rays is None else rays
@@ -104,26 +104,26 @@ class Mapper:
                 self.submaps.add(builder.close())
 
     def settle(self) -> None:
-        """Wait until all frames are in the map.
+        """Wait until all frames are integrated.
 
         Raises:
-            ReconError: One of them cannot be mapped.
+            ReconError: A frame cannot be integrated.
         """
         self._behind.settle()
 
     def abandon(self) -> None:
-        """Leave off, once what is being done is done; needed after an error, harmless always."""
+        """Stop after the integration in progress; required after an error, otherwise harmless."""
         self._behind.abandon()
 
     def close(self) -> None:
-        """Close the submap of the moment, after the last frame."""
+        """Close the current submap after the last frame."""
         self._behind.settle()
         if self._builder is not None and self._builder.frames:
             self.submaps.add(self._builder.close())
         self._rays.close()
 
     def state(self) -> dict[str, Any]:
-        """All that decides what comes later, as a tree of arrays and plain values."""
+        """Everything that later results depend on, as a tree of arrays and plain values."""
         self._behind.settle()
         return {
             "odometry": pack_object(self._odometry),
@@ -135,7 +135,7 @@ class Mapper:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a `state`."""
+        """Continue from a `state`."""
         self._odometry = unpack_object(state["odometry"])
         self.submaps.restore(state["submaps"])
         self._rays.restore(state["rays"])
@@ -146,7 +146,7 @@ class Mapper:
             self._builder.restore(state["builder"])
 
     def _builder_from(self, frame: ReconstructedFrame) -> SubmapBuilder:
-        """The maps that are being built; the first frame fixes their axes."""
+        """The submap under construction; the first frame fixes the map axes."""
         if self._builder is None:
             ground = estimate_ground(frame.cloud, self._config.axes)
             self.T_map_world = map_axes(ground, self._config.axes)

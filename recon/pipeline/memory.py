@@ -1,4 +1,4 @@
-"""A limit for the memory of a run: what is cut smaller to keep to it, and who watches it."""
+"""The memory limit of a run: sizes derived from it, and the check that it is kept."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from recon.settings import Settings
 
 _UNITS_MB: Final = {"": 1, "M": 1, "MB": 1, "G": 1000, "GB": 1000}
 _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*")
-#: What of a limit an open submap, and the cells of one tile, may take. Stores grow by doubling and
-#: are copied when they are closed, so each costs some times as much for a moment; the larger
-#: part of the limit is left to the libraries, the pictures and the matcher.
+#: Shares of the limit for an open submap and for the cells of one tile. Stores grow by doubling
+#: and are copied when closed, so each briefly costs several times its size; most of the limit is
+#: left to the libraries, the images and the matcher.
 _SUBMAP_SHARE: Final = 1 / 40
 _TILE_SHARE: Final = 1 / 24
 _CACHED: Final = 6
@@ -34,24 +34,24 @@ class MemorySettings(Settings):
 
     @property
     def submap_bytes(self) -> int | None:
-        """Size at which a submap is closed; None = only where the path says so."""
+        """Size at which a submap is closed; None = closed by the path alone."""
         return None if self.limit_mb is None else int(1e6 * self.limit_mb * _SUBMAP_SHARE)
 
     @property
     def tile_bytes(self) -> int | None:
-        """Most that the cells of a tile take before they are put together; None = any."""
+        """Largest size of a tile's cells before they are merged; None = unlimited."""
         return None if self.limit_mb is None else int(1e6 * self.limit_mb * _TILE_SHARE)
 
     @property
     def cached_submaps(self) -> int:
-        """How many submaps are kept after they were read."""
+        """Number of submaps kept in memory after being read."""
         return _CACHED if self.limit_mb is None else _FEW_CACHED
 
     def check(self, where: str) -> None:
-        """Stop a run that takes more than it may.
+        """Stop a run that exceeds the limit.
 
         Raises:
-            MemoryLimitError: The process took more at some time.
+            MemoryLimitError: The peak memory of the process is above the limit.
         """
         if self.limit_mb is not None and peak_memory_mb() > self.limit_mb:
             raise MemoryLimitError(
@@ -65,19 +65,19 @@ class MemorySettings(Settings):
 
 
 def memory_overrides(limit: str | None) -> list[str]:
-    """The setting for a size such as ``2G`` or ``1500M``; None = as it is.
+    """The override for a size such as ``2G`` or ``1500M``; None = no override.
 
     Raises:
-        SettingsError: It is no size.
+        SettingsError: The text is not a size.
     """
     return [] if limit is None else [f"memory.limit_mb={parse_size_mb(limit):g}"]
 
 
 def parse_size_mb(text: str) -> float:
-    """A size in 10⁶ bytes; without a unit it is in those.
+    """Parse a size into 10⁶ bytes, which is also the unit if none is given.
 
     Raises:
-        SettingsError: It is no size.
+        SettingsError: The text is not a size.
     """
     found = _SIZE.fullmatch(text)
     unit = None if found is None else _UNITS_MB.get(found[2].upper())

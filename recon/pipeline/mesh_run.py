@@ -1,4 +1,4 @@
-"""`recon mesh` without its command line: a PLY or a run in, a surface in several formats out."""
+"""The pipeline behind `recon mesh`: a PLY or a run in, a surface in several formats out."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from recon.pipeline.tile_store import TileStore
 
 @dataclass(frozen=True)
 class MeshOptions:
-    """How a run is made, apart from the configuration.
+    """Options of a run that are not part of the configuration.
 
     Attributes:
         out: Result folder; None = a new one below ``outputs/``.
@@ -42,17 +42,17 @@ class MeshOptions:
 
 
 def run_mesh(source: Path, config: ReconConfig, options: MeshOptions) -> dict[str, Any]:
-    """Reconstruct the surface of a cloud file, or of a run's map, with a MeshLab project.
+    """Reconstruct the surface of a cloud file or of a run's map, and write a MeshLab project.
 
-    The cloud of a file is meshed in one piece, since nothing is known of its scale. The map of a
-    run is meshed in tiles, and cut where the run's cameras looked through.
+    A cloud file is meshed in one piece, since its scale is unknown. The map of a run is meshed in
+    tiles, and faces in observed free space are removed.
 
     Returns:
         The figures of ``summary.json``.
 
     Raises:
         ReconError: The cloud cannot be read or gives no surface, a format is unknown, or the
-            folder cannot be written; then nothing is left behind.
+            folder cannot be written; nothing is left behind.
     """
     start = time.perf_counter()
     threads = use_threads(options.threads)
@@ -92,7 +92,7 @@ def run_mesh(source: Path, config: ReconConfig, options: MeshOptions) -> dict[st
 def _mesh_cloud(
     path: Path, settings: MeshSettings, directory: RunDirectory, watch: Stopwatch
 ) -> dict[str, Any]:
-    """Write the surface of a cloud in one piece."""
+    """Mesh a cloud file in one piece and write the surface."""
     with watch.stage("read"):
         cloud = read_ply(path)
         write_ply(directory.path("mesh/cloud.ply"), cloud)
@@ -112,7 +112,7 @@ def _mesh_cloud(
 def _mesh_run(
     run: Path, settings: MeshSettings, directory: RunDirectory, threads: int, watch: Stopwatch
 ) -> dict[str, Any]:
-    """Write the surface of a run's map tile by tile."""
+    """Mesh the map of a run tile by tile and write the surface."""
     warnings = []
     store = TileStore(directory.state("mesh"), settings.tile_m)
     layer = directory.path("mesh/cloud.ply")

@@ -26,16 +26,16 @@ _WARM_UP_ROWS: Final = 64
 
 @dataclass(frozen=True, eq=False)
 class SceneResult:
-    """What one matcher made of one scene.
+    """Result of one matcher on one scene.
 
     Attributes:
         scene: The scene.
         matcher: Name of the matcher.
-        disparity: What it found, at the size of the pictures.
+        disparity: Its disparity, at the size of the images.
         figures: As `score_result` gives them; ``ndisp``, the number of disparities searched; and
-            ``confidence`` as `confidence_figures` gives it, None of a matcher that does not tell
-            how sure it is.
-        seconds: Of matching alone.
+            ``confidence`` as `confidence_figures` gives it, None for a matcher that does not
+            estimate confidence.
+        seconds: Time of matching alone.
     """
 
     scene: ScoredScene
@@ -52,17 +52,16 @@ class SceneResult:
 
 
 class Bench:
-    """Matches and scores; each thread has matchers of its own, warmed up once.
+    """Matches and scores scenes; each thread has its own matchers, warmed up once.
 
-    Compiled loops are compiled, and networks loaded, at the first use of a matcher: that is not
-    counted.
+    The warm-up keeps kernel compilation and network loading out of the timings.
 
     Args:
         names: The matchers.
-        config: Their settings, and how pictures become grey.
+        config: Their settings, and the conversion of images to grey.
         threads: Threads of each matcher.
-        auto_range: Whether the range of disparities is found from each pair, as where none is
-            known, instead of taken from the scene.
+        auto_range: Whether the disparity range is estimated from each pair, as if unknown,
+            instead of taken from the scene.
     """
 
     def __init__(
@@ -75,7 +74,7 @@ class Bench:
         self._own = threading.local()
 
     def results(self, scene: ScoredScene) -> Iterator[SceneResult]:
-        """One result for each matcher, in their order.
+        """One result for each matcher, in the order given.
 
         Raises:
             ReconError: A matcher cannot match the scene; the message names it.
@@ -104,7 +103,7 @@ class Bench:
 
 
 def _upper_rows(pair: RectifiedPair) -> RectifiedPair:
-    """The top of a pair: of the same kind, but quickly matched."""
+    """The top rows of a pair, for a quick warm-up on images of the same kind."""
     rows = min(_WARM_UP_ROWS, pair.camera.height_px)
     return RectifiedPair(
         left=np.ascontiguousarray(pair.left[:rows]),

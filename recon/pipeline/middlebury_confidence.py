@@ -1,4 +1,4 @@
-"""Whether matchers know how sure they are: the figures, as ``summary.json`` holds them."""
+"""Quality of matcher confidence: the figures, as ``summary.json`` holds them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from recon.structures import Disparity, DisparityTruth
 Figures = dict[str, Any]
 
 _RIGHT_PX: Final = 1.0
-"""A pixel is right when it is off by no more than this, in pixels of the result."""
+"""Largest error of a correct pixel, in pixels of the result."""
 
 _KEPT: Final = 5
 """Every fifth point of a sparsification curve is kept: 20 of 100."""
@@ -29,19 +29,19 @@ _MEANS: Final = ("ece", "ause", "within_1_sigma", "within_2_sigma")
 
 
 def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | None:
-    """What the confidence and the standard deviation of a result are worth.
+    """How well the confidence and the standard deviation of a result predict its errors.
 
-    Pixels count that have a value and a known truth, those too that only the left camera sees.
+    Counts all pixels with a value and known ground truth, occluded ones included.
 
     Args:
         estimate: The result.
-        truth: The truth, of its size, or of 2 or 4 times or a half or a quarter of it.
+        truth: Ground truth at the same size, or at 2, 4, 1/2 or 1/4 times it.
 
     Returns:
-        The figures, or None where no pixel can be compared.
+        The figures, or None if no pixel can be compared.
 
     Raises:
-        EvaluationError: The sizes do not fit.
+        EvaluationError: The sizes do not match.
     """
     sized, step = estimate_at_truth_size(estimate, truth.values.shape)
     if not (sized.valid & np.isfinite(truth.values)).any():
@@ -51,12 +51,12 @@ def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | 
 
 
 def curve_figures(estimate: Disparity, truth: DisparityTruth, limit_px: float) -> Figures:
-    """The same without the standard deviation, of maps of one size.
+    """The same for the confidence alone, of maps of equal size.
 
     Args:
         estimate: The result; its ``sigma_px`` is not read.
-        truth: The truth.
-        limit_px: Pixels are right when they are off by no more than this.
+        truth: The ground truth.
+        limit_px: Largest error of a correct pixel.
 
     Raises:
         EvaluationError: The sizes differ, or no pixel can be compared.
@@ -72,10 +72,10 @@ def curve_figures(estimate: Disparity, truth: DisparityTruth, limit_px: float) -
 
 
 def weighted_confidence(scenes: Mapping[str, Figures | None]) -> Figures | None:
-    """The mean over scenes, weighted as the table is; None where no scene has figures.
+    """The mean over scenes with the benchmark's weights; None if no scene has figures.
 
     Args:
-        scenes: Of each scene; those with None are left out.
+        scenes: Figures by scene name; scenes with None are skipped.
     """
     found = {name: one for name, one in scenes.items() if one is not None}
     if not found:
@@ -91,7 +91,7 @@ def weighted_confidence(scenes: Mapping[str, Figures | None]) -> Figures | None:
 
 
 def _of_bins(reliability: Reliability) -> Figures:
-    """Equal bins from 0 to 1; an empty one has None."""
+    """Equal bins of confidence from 0 to 1; None in an empty bin."""
     return {
         "confidence": _rounded(reliability.confidence),
         "right": _rounded(reliability.right),
@@ -105,7 +105,7 @@ def _of_steps(sparsification: Sparsification) -> Figures:
 
 
 def _pooled_bins(bins: Sequence[Figures], weights: Any) -> Figures:
-    """As if each scene had as many pixels as it has weight."""
+    """Pool the bins with the share of each scene scaled to its weight."""
     share = np.array([one["share"] for one in bins]) * (weights / weights.sum())[:, None]
     total = share.sum(axis=0)
     pooled: Figures = {}
@@ -125,5 +125,5 @@ def _mean_steps(steps: Sequence[Figures], weights: Any) -> Figures:
 
 
 def _rounded(values: Any) -> list[float | None]:
-    """As JSON has it: six digits, and None for NaN."""
+    """Values for JSON: six decimals, None for NaN."""
     return [None if np.isnan(value) else round(float(value), 6) for value in values]

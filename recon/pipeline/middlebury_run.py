@@ -1,4 +1,4 @@
-"""`recon evaluate middlebury` without its command line: scenes in, tables out."""
+"""The pipeline behind `recon evaluate middlebury`: scenes in, tables out."""
 
 from __future__ import annotations
 
@@ -31,35 +31,35 @@ SceneFigures = dict[str, Figures]
 
 
 class SceneObserver(Protocol):
-    """Is told of an evaluation's progress, by the thread that runs it."""
+    """Receives the progress of an evaluation, in the thread that runs it."""
 
     def on_start(self, name: str, total: int) -> None:
         """An evaluation of ``total`` scenes begins."""
         ...
 
     def on_scene(self, name: str, figures: Mapping[str, Figures]) -> None:
-        """One more scene is matched and scored; no figures = it has no truth."""
+        """A scene is matched and scored; empty figures = it has no ground truth."""
         ...
 
     def on_finish(self) -> None:
-        """The evaluation has ended, well or not."""
+        """The evaluation has ended, successfully or not."""
         ...
 
 
 @dataclass(frozen=True)
 class MiddleburyOptions:
-    """How an evaluation is made, apart from the configuration.
+    """Options of an evaluation that are not part of the configuration.
 
     Attributes:
         matchers: Names of the matchers; () = the configured one.
-        truth: Folder of scenes whose truth is taken for scenes that have none.
+        truth: Folder of scenes that supply ground truth for scenes without their own.
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores. Changes no result.
-        parallel: Scenes worked on at once; they share the threads. Above 1 the seconds are those
-            of a busy machine.
-        auto_range: Whether the range of disparities is found from each pair.
-        observer: Is told of each scene.
-        draw: Draws the pictures of one result.
+        parallel: Scenes processed at once, sharing the threads. Above 1, timings are those of a
+            busy machine.
+        auto_range: Whether the disparity range is estimated from each pair.
+        observer: Notified of each scene.
+        draw: Draws the figures of one result.
         present: Writes the tables.
     """
 
@@ -75,16 +75,16 @@ class MiddleburyOptions:
 
 
 def run_middlebury(folder: Path, config: ReconConfig, options: MiddleburyOptions) -> Figures:
-    """Match all scenes of a folder with each matcher, score them, and write tables and pictures.
+    """Match all scenes of a folder with each matcher, score them, and write tables and figures.
 
     Returns:
         The content of ``summary.json``.
 
     Raises:
         SettingsError: A matcher is unknown or named twice.
-        SourceError: There is no scene, or none with a truth; or a folder is missing.
-        ReconError: A scene cannot be read or matched, or the folder not be written; then nothing
-            is left behind.
+        SourceError: There is no scene, or none with ground truth; or a folder is missing.
+        ReconError: A scene cannot be read or matched, or the folder cannot be written; nothing is
+            left behind.
     """
     start = time.perf_counter()
     names = _checked(options.matchers or (config.matching.matcher,))
@@ -137,7 +137,7 @@ def _scenes(
     options: MiddleburyOptions,
     directory: RunDirectory,
 ) -> Iterator[tuple[str, SceneFigures]]:
-    """Figures of each scene, in their order; nothing for a scene without truth."""
+    """Figures of each scene, in order; empty for a scene without ground truth."""
 
     def work(name: str) -> SceneFigures:
         scene = read_scored_scene(name, paths[name], options.truth)
@@ -154,14 +154,14 @@ def _scenes(
                 observer.on_scene(name, figures)
             yield name, figures
     finally:
-        # After an error the scenes that have not begun are left out.
+        # After an error, scenes that have not started are cancelled.
         pool.shutdown(cancel_futures=True)
         if observer is not None:
             observer.on_finish()
 
 
 def _kept(result: SceneResult, options: MiddleburyOptions, directory: RunDirectory) -> Figures:
-    """Write the maps of a result, and keep its figures alone."""
+    """Write the disparity map of a result and return its figures, so that the map can be freed."""
     scene = result.scene
     path = directory.path(f"disparity/{result.matcher}/{scene.name}.pfm")
     write_pfm(path, result.disparity.values)
@@ -178,7 +178,7 @@ def _kept(result: SceneResult, options: MiddleburyOptions, directory: RunDirecto
 
 
 def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str) -> Figures:
-    """What ``summary.json`` has of one matcher."""
+    """The entry of one matcher in ``summary.json``."""
     own = {name: figures[matcher] for name, figures in scenes.items() if figures}
     masked = {name: {mask: figures[mask] for mask in MASKS} for name, figures in own.items()}
     rated = {name: figures["confidence"] for name, figures in own.items()}

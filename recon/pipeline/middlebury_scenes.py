@@ -1,4 +1,4 @@
-"""Middlebury scenes of a folder, each with the truth that results for it are scored against."""
+"""Middlebury scenes of a folder, each with the ground truth it is scored against."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class ScoredScene:
     """One scene, ready to be matched and scored.
 
     Attributes:
-        name: Name of its folder; with the folders above it where several scenes share a name.
-        pair: The pictures.
-        camera: For matching; its ``ndisp`` is set.
-        truth: True disparity, of the size of the pictures or of another.
-        truth_camera: The camera at the size of the truth, or None where none is published.
-        rules: How results are counted.
+        name: Name of its folder, with parent folders if several scenes share a name.
+        pair: The images.
+        camera: The camera for matching; its ``ndisp`` is set.
+        truth: True disparity, at the size of the images or another size.
+        truth_camera: The camera at the size of the ground truth, or None if none is published.
+        rules: The rules of scoring.
     """
 
     name: str
@@ -40,10 +40,10 @@ class ScoredScene:
 
 
 def find_scenes(folder: Path) -> dict[str, Path]:
-    """The folders of all scenes in a folder or below it, or the folder itself, by name.
+    """Folders of all scenes at or below a folder, by scene name.
 
     Raises:
-        SourceError: The folder is missing, or there is no scene in it.
+        SourceError: The folder is missing or contains no scene.
     """
     check_folder(folder)
     paths = sorted(_scenes_below(folder))
@@ -57,10 +57,10 @@ def find_scenes(folder: Path) -> dict[str, Path]:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse what is no folder.
+    """Check that a path is an existing folder.
 
     Raises:
-        SourceError: It is none.
+        SourceError: It is not.
     """
     if not folder.is_dir():
         what = "not a folder" if folder.exists() else "folder does not exist"
@@ -68,19 +68,19 @@ def check_folder(folder: Path) -> None:
 
 
 def read_scored_scene(name: str, path: Path, truth: Path | None) -> ScoredScene | None:
-    """Read a scene with its truth.
+    """Read a scene with its ground truth.
 
     Args:
-        name: What the scene is called.
+        name: Name of the scene.
         path: Its folder.
-        truth: Folder of scenes whose truth is taken where the scene has none of its own, at
-            another size perhaps: a scene of the same name, or that scene itself.
+        truth: Folder that supplies ground truth, possibly at another size, if the scene has none
+            of its own: it holds a scene of the same name, or is that scene.
 
     Returns:
-        The scene, or None where there is no truth for it.
+        The scene, or None if there is no ground truth for it.
 
     Raises:
-        FormatError: A file is missing, damaged or of another size.
+        FormatError: A file is missing, damaged or of the wrong size.
         CalibrationError: A calibration file cannot give depth.
     """
     scene = read_middlebury_scene(path)
@@ -88,7 +88,7 @@ def read_scored_scene(name: str, path: Path, truth: Path | None) -> ScoredScene 
     if judge is None or judge.truth is None:
         return None
     width_px, truth_width_px = scene.pair.left.shape[1], judge.truth.values.shape[1]
-    # Sizes differ by a row or column; those that do not fit at all are refused when compared.
+    # Sizes may be off by a row or column; real mismatches are rejected by the comparison.
     factor = max(round(4 * truth_width_px / width_px), 1) / 4
     camera = _matching_camera(scene, judge.truth, factor)
     rules = MiddleburyRules(
@@ -102,10 +102,10 @@ def read_scored_scene(name: str, path: Path, truth: Path | None) -> ScoredScene 
 def _matching_camera(
     scene: MiddleburyScene, truth: DisparityTruth, factor: float
 ) -> RectifiedCamera:
-    """The camera with a range; where none is published, the one that holds all of the truth.
+    """The camera with a disparity range; if none is published, the range of the ground truth.
 
-    So the scenes before 2014 are matched with as much knowledge as the later ones, which publish
-    a range, and all matchers with the same.
+    Scenes before 2014 are thus matched with the same prior knowledge as later ones, which publish
+    a range, and the range is the same for all matchers.
     """
     height_px, width_px = scene.pair.left.shape[:2]
     camera = scene.camera or stand_in_camera(width_px, height_px)
@@ -127,7 +127,7 @@ def _judge(name: str, folder: Path | None) -> MiddleburyScene | None:
 
 
 def _scenes_below(folder: Path) -> Iterator[Path]:
-    """Scenes lie in no scenes: below one there are only its own files."""
+    """Find scenes recursively; they do not nest, so the search stops at each scene."""
     if find_layout(folder) is not None:
         yield folder
         return

@@ -1,4 +1,4 @@
-"""The figures of one result, and of all scenes together, as ``summary.json`` holds them."""
+"""The figures of one result and of all scenes together, as ``summary.json`` holds them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from recon.structures import DisparityMetrics
 from recon.structures.arrays import Float32
 
 MASKS: Final = {"nonocc": False, "all": True}
-"""What is counted: pixels that both cameras see, or those too that only the left one sees."""
+"""Pixels that are scored: those seen by both cameras, or occluded ones as well."""
 
 Figures = dict[str, Any]
 
@@ -24,8 +24,8 @@ Figures = dict[str, Any]
 def dense_map(values: Float32) -> Float32:
     """A map without holes: float32 (H, W).
 
-    Where filling finds nothing to fill from, the disparity is 0, which is wrong nearly
-    everywhere: no matcher gains by silence.
+    Holes that cannot be filled get disparity 0, which is wrong nearly everywhere, so that no
+    matcher gains by leaving pixels out.
     """
     filled = fill_holes(values)
     return np.where(np.isfinite(filled), filled, np.float32(0))
@@ -39,18 +39,17 @@ def score_result(scene: ScoredScene, values: Float32) -> Figures:
         values: float32 (h, w), pixels; NaN = none.
 
     Raises:
-        EvaluationError: The result does not fit the truth.
+        EvaluationError: The size of the result does not match the ground truth.
     """
     maps = {"dense": dense_map(values), "sparse": values}
     return {mask: _of_mask(scene, maps, occluded=occluded) for mask, occluded in MASKS.items()}
 
 
 def weighted_figures(scenes: Mapping[str, Figures]) -> Figures:
-    """The mean of each figure over scenes, weighted as the table is.
+    """The mean of each figure over scenes, with the benchmark's weights.
 
     Args:
-        scenes: Nested figures of each scene, by the scene's name. A figure that some scene lacks
-            is left out.
+        scenes: Nested figures by scene name. A figure that any scene lacks is left out.
     """
     first, *others = scenes.values()
     shared = [key for key in first if all(key in other for other in others)]
@@ -58,7 +57,7 @@ def weighted_figures(scenes: Mapping[str, Figures]) -> Figures:
 
 
 def named_figures(metrics: DisparityMetrics) -> Figures:
-    """Names as the table has them; pixels and per cent."""
+    """Figures named as in the benchmark's table, in pixels and per cent."""
     return {
         "bad": {f"{limit:g}": share for limit, share in metrics.bad.items()},
         "avgerr": metrics.avgerr_px,
@@ -78,7 +77,7 @@ def _of_mask(scene: ScoredScene, maps: Mapping[str, Float32], *, occluded: bool)
     for name, values in maps.items():
         metrics = evaluate_middlebury(values, scene.truth, scene.rules, occluded=occluded)
         figures[name] = named_figures(metrics) | _depth(scene, values, occluded=occluded)
-        # The sparse map comes last: what it lacks is what the matcher did not find.
+        # The sparse map comes last: its holes are what the matcher did not find.
         figures["invalid"] = metrics.invalid
     return figures
 

@@ -1,4 +1,4 @@
-"""Who watches a run: the pipeline tells, and knows nothing of bars, files or windows."""
+"""Observers of a run, which keep the pipeline independent of progress bars and viewers."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from recon.structures.arrays import Float64, freeze
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """What became of one frame.
+    """Result of one frame.
 
     Attributes:
         index: Position in the run, from 0.
         total: Number of frames in the run.
-        seconds: Time since the last frame was done.
+        seconds: Time since the previous frame was done.
         valid_share: Share of pixels with a disparity, in [0, 1].
-        points: Points that the frame gave to the map.
+        points: Number of points in the cloud of the frame.
         T_world_camera: float64 (4, 4), its pose.
-        health: How far that pose can be trusted.
+        health: Health of that pose.
     """
 
     index: int
@@ -39,20 +39,20 @@ class FrameResult:
 
 @runtime_checkable
 class Observer(Protocol):
-    """Is told of a run's progress, from the thread that runs it."""
+    """Receives the progress of a run, in the thread that runs it."""
 
     def on_start(self, name: str, total: int) -> None:
         """A run of ``total`` frames begins."""
         ...
 
     def on_frame(self, result: FrameResult) -> None:
-        """One more frame is in the map."""
+        """A frame is registered."""
         ...
 
     def on_stage(self, name: str) -> None:
-        """A stage that is not per frame begins, such as ``mesh``."""
+        """A stage that is not per frame, such as ``mesh``, begins."""
         ...
 
     def on_finish(self) -> None:
-        """The run has ended, well or not."""
+        """The run has ended, successfully or not."""
         ...

@@ -1,4 +1,4 @@
-"""The files of an occupancy map, written tile by tile: memory does not grow with the drive."""
+"""Writing an occupancy map tile by tile, so that memory does not grow with the drive."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from recon.structures.arrays import Float64
 
 
 class OccupancyWriter:
-    """Writes ``map/octomap.*`` and ``map/grid.*``, in the order in which they need each other.
+    """Writes ``map/octomap.*`` and ``map/grid.*``; call the methods in the order below.
 
-    First comes the fused cloud, in which the ground is looked for; then the octrees, which put
-    the floors of voxels by; then the grid.
+    `put_cloud` stores the fused cloud, from which the ground is estimated; `octomap` writes the
+    octrees and stores floor voxels; `grid` needs both.
 
     Args:
         drive: The occupancy of the drive.
         config: The configuration.
-        path_m: float64 (N, 3), where the camera was, map axes.
+        path_m: float64 (N, 3), camera positions in map axes.
         directory: The run's folder.
     """
 
@@ -52,7 +52,7 @@ class OccupancyWriter:
         self._edge_cells = drive.occupancy_tile_cells
 
     def put_cloud(self, tile: Tile, cloud: PointCloud) -> None:
-        """Take a tile of the fused cloud, map axes.
+        """Store a tile of the fused cloud, map axes.
 
         Raises:
             OutputError: It cannot be written.
@@ -60,7 +60,7 @@ class OccupancyWriter:
         self._store.put_cloud(tile, cloud)
 
     def octomap(self) -> tuple[int, list[str]]:
-        """Write the octrees; the number of voxels, and warnings.
+        """Write the octrees; return the number of voxels, and warnings.
 
         Raises:
             OutputError: A file cannot be written.
@@ -71,13 +71,13 @@ class OccupancyWriter:
         try:
             write_octomap_tiles(path, tiles, depth, self._resolution_m)
         except MappingError as error:
-            for _ in self._known(counts := []):  # the floors are needed all the same
+            for _ in self._known(counts := []):  # stores the floors, which the grid needs
                 continue
             return sum(counts), [f"no OctoMap: {error}"]
         return sum(counts), []
 
     def _known(self, counts: list[int]) -> Iterator[OccupancyVoxels]:
-        """The voxels that are occupied or free; all are counted."""
+        """The occupied and free voxels of each tile; ``counts`` includes undecided ones."""
         for tile, wide in self._drive.occupancy_tiles():
             voxels = self._drive.inner(tile, wide)
             counts.append(len(voxels))
@@ -108,7 +108,7 @@ class OccupancyWriter:
     def _flat(
         self, tile: Tile, voxels: OccupancyVoxels, settings: GroundSettings
     ) -> OccupancyGrid | None:
-        """The grid of a tile and its margin; None where no path is near, so no ground is known."""
+        """The grid of a tile and its margin; None without voxels or a path nearby."""
         window = Window.around(tile, self._edge_cells * self._resolution_m, settings.reach_m)
         path_m = window.path(self._path_m)
         if not len(path_m) or not len(voxels):
@@ -117,7 +117,7 @@ class OccupancyWriter:
         return flatten(voxels, ground, self._config.grid)
 
     def _with_camera_height(self) -> GroundSettings:
-        """The settings with one height for the whole drive, where it can be measured."""
+        """The settings with one camera height for the whole drive, if it can be measured."""
         settings = self._config.ground
         if settings.camera_height_m is not None:
             return settings
@@ -133,7 +133,7 @@ class OccupancyWriter:
 
 
 def _paste(cells: NDArray[np.int8], low: Tile, part: OccupancyGrid, tile: Tile, edge: int) -> None:
-    """Copy what a grid has of a tile, ``edge`` cells a side, to cells that begin at ``low``."""
+    """Copy the part of a grid in a tile, ``edge`` cells a side, to cells that start at ``low``."""
     corner = np.rint(np.array(part.origin_m) / part.resolution_m).astype(int)
     size = np.array(part.cells.shape[::-1])
     begin = np.maximum(corner, np.array(tile) * edge)

@@ -1,6 +1,6 @@
-"""`recon occupancy` without its command line: other occupancy maps of a drive that was mapped.
+"""The pipeline behind `recon occupancy`: rebuild the occupancy maps of a run with other settings.
 
-They are made of the rays that the run kept, its path and its fused cloud; no picture is read.
+The input is the run's stored rays, trajectory and fused cloud; no image is read.
 """
 
 from __future__ import annotations
@@ -41,17 +41,17 @@ from recon.pipeline.summary import cost
 from recon.structures import FREE, OCCUPIED, OccupancyGrid, PointCloud, Trajectory
 
 _REMADE: Final = ("occupancy", "grid", "ground", "submaps")
-"""Sections of the configuration that can differ from those of the run."""
+"""Sections of the configuration that may differ from those of the run."""
 
 
 @dataclass(frozen=True)
 class OccupancyRequest:
-    """What is asked for.
+    """A request to rebuild the occupancy maps of a run.
 
     Attributes:
         run: Folder of the run that mapped the drive.
         overrides: ``key=value`` settings; all others are those of the run.
-        config: A YAML file of settings that come before the overrides; None = none.
+        config: YAML file of settings, applied before the overrides; None = none.
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores.
     """
@@ -64,14 +64,14 @@ class OccupancyRequest:
 
 
 def run_occupancy(request: OccupancyRequest) -> dict[str, Any]:
-    """Make voxels and grid of a run again with other settings, and write them.
+    """Rebuild voxels and grid of a run with other settings, and write them.
 
     Returns:
         The figures of ``summary.json``.
 
     Raises:
-        ReconError: The run kept no rays or is damaged, a setting asks for what the rays do not
-            hold, or the folder cannot be written; then nothing is left behind.
+        ReconError: The run kept no rays or is damaged, a setting needs finer or longer rays than
+            it kept, or the folder cannot be written; nothing is left behind.
     """
     start = time.perf_counter()
     use_threads(request.threads)
@@ -114,7 +114,7 @@ def run_occupancy(request: OccupancyRequest) -> dict[str, Any]:
 
 
 class _Drive:
-    """What a run kept of its drive, checked against what is asked for."""
+    """The stored data of a run, checked against the request."""
 
     def __init__(self, request: OccupancyRequest) -> None:
         self.run = open_run(request.run)
@@ -131,7 +131,7 @@ class _Drive:
             )
 
     def submaps(self, directory: RunDirectory) -> SubmapStore:
-        """The occupancy, in submaps on the disk."""
+        """The occupancy, in submaps on disk."""
         config = self.config
         store = SubmapStore(directory.state("submaps"))
         builder = SubmapBuilder(
@@ -147,7 +147,7 @@ class _Drive:
         return store
 
     def clouds(self, edge_m: float) -> Iterator[tuple[Tile, PointCloud]]:
-        """The fused cloud, map axes, in parts of tiles."""
+        """The fused cloud in map axes, in parts that each lie in one tile."""
         for cloud in read_ply_pieces(self.run.folder / CLOUD):
             homes = np.floor(cloud.xyz[:, :2] / edge_m).astype(np.int64)
             tiles, where = np.unique(homes, axis=0, return_inverse=True)
@@ -156,7 +156,7 @@ class _Drive:
 
 
 def _configure(run: FinishedRun, request: OccupancyRequest) -> ReconConfig:
-    """The settings of the run, but for what is asked for."""
+    """The settings of the run with the requested changes."""
     known = run.config.model_dump(mode="json")
     config = load_config(request.config, request.overrides, defaults=known)
     changed = config.model_dump(mode="json")
@@ -182,9 +182,9 @@ def _open_rays(path: Path) -> RayFile:
 
 
 def _check_grain(rays: RayFile, config: ReconConfig) -> None:
-    """Refuse a map that is finer or larger than what was kept."""
+    """Refuse a cell size or range that the stored rays do not support."""
     grain, wanted = rays.grain, config.occupancy
-    # Half a per mille for resolutions that were typed, such as 0.33 for a third.
+    # The 0.05 % tolerance is for rounded input, such as 0.3333 for a third.
     if wanted.resolution_m < grain.cell_m * 0.9995:
         raise SettingsError(
             "the rays kept by the run are too coarse for these voxels",

@@ -1,4 +1,4 @@
-"""A run's occupancy beside that of a source that knows it."""
+"""Comparing the occupancy of a run with that of a source that knows the truth."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from recon.structures import OccupancyGrid, OccupancyMetrics, OccupancyTruth, Oc
 from recon.structures.arrays import Float64
 
 LEAST_FRAMES: Final = 3
-"""Frames that must have seen what is compared."""
+"""Number of frames that must have seen a cell for it to be compared."""
 
 
 def compare_with_source(
@@ -24,7 +24,7 @@ def compare_with_source(
     grid: OccupancyGrid,
     warnings: list[str],
 ) -> OccupancyMetrics | None:
-    """Figures of a run whose source knows its occupancy, else None."""
+    """Metrics of a run if its source knows the true occupancy, else None."""
     if not isinstance(source, KnowsOccupancy):
         return None
     truth = known_occupancy(source, config, mapped.T_map_world)
@@ -37,7 +37,7 @@ def known_occupancy(
     T_map_world: Float64,
     least_frames: int = LEAST_FRAMES,
 ) -> OccupancyTruth:
-    """What a source knows, in the cells, axes and height band of a map."""
+    """True occupancy of a source, in the cells, axes and height band of a map."""
     return source.occupancy_truth(
         resolution_m=config.occupancy.resolution_m,
         band_m=(config.grid.min_height_m, config.grid.max_height_m),
@@ -50,7 +50,7 @@ def known_occupancy(
 def compare(
     voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth, warnings: list[str]
 ) -> OccupancyMetrics | None:
-    """The figures, or a warning that says why there are none."""
+    """The metrics, or None and a warning that says why."""
     try:
         return evaluate_occupancy(voxels, grid, truth)
     except EvaluationError as error:

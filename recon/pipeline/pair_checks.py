@@ -1,4 +1,4 @@
-"""Whether a single pair can give what is asked of it, said before anybody believes the result."""
+"""Checks whether a single pair can give a trustworthy result."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ from recon.structures import (
     StereoPair,
 )
 
-#: What pictures tell by themselves, and what a calibration adds. Swapped eyes and rows are told by
-#: the inspection of the frame; few features mean little where the disparity is dense all the same.
+#: Findings that images alone support, and those that need a calibration. The inspection of the
+#: frame reports swapped cameras and misaligned rows; few features do not matter if the disparity
+#: is dense.
 _BY_PICTURES: Final = frozenset({"black", "gain", "blur"})
 _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
 
 FEW_VALID_SHARE: Final = 0.25
-"""Share of pixels with a disparity under which the two are hardly a pair: real ones, of bare walls
-too, have over 40 %, and pictures of different moments or swapped ones under 15 %."""
+"""Share of pixels with a disparity below which the images are hardly a stereo pair: real pairs,
+even of bare walls, exceed 40 %; swapped images, or those of different moments, stay under 15 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +38,9 @@ class OnePair:
     """A pair as a source of one frame.
 
     Attributes:
-        pair: The pictures.
-        calibration: Of the two cameras.
-        files: What they were read from.
+        pair: The images.
+        calibration: Calibration of the two cameras.
+        files: Files that the pair was read from.
     """
 
     pair: StereoPair
@@ -50,7 +51,7 @@ class OnePair:
 
     @property
     def name(self) -> str:
-        """That of the pair."""
+        """Name of the pair."""
         return self.pair.name
 
     def __len__(self) -> int:
@@ -60,17 +61,17 @@ class OnePair:
         return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Yield the pair, or nothing from any later start."""
+        """Yield the pair, or nothing if ``start`` is after it."""
         yield from (self.pair,)[start:]
 
 
 def find_pair_faults(given: OnePair, config: ReconConfig, *, metric: bool) -> tuple[Finding, ...]:
-    """What a quick look finds; nothing where it is switched off.
+    """Findings of a quick audit; none if it is switched off.
 
     Args:
         given: The pair.
-        config: Its ``audit`` and ``rectification`` count.
-        metric: Whether depth is wanted, so that the calibration counts.
+        config: The configuration; its ``audit`` and ``rectification`` sections are used.
+        metric: Whether depth is wanted, so that the calibration matters.
     """
     if not config.audit.quick:
         return ()
@@ -78,22 +79,22 @@ def find_pair_faults(given: OnePair, config: ReconConfig, *, metric: bool) -> tu
     try:
         audit = run_audit(given, config, quick=True)
     except CalibrationError:
-        return ()  # the run says so itself when it gets there
+        return ()  # the run itself reports this later
     return tuple(finding for finding in audit.findings if finding.code in telling)
 
 
 def check_found(
     disparity: Disparity, pair: StereoPair, faults: tuple[Finding, ...] = ()
 ) -> tuple[str, ...]:
-    """Warnings about how much was found.
+    """Warnings about the share of pixels with a disparity.
 
     Args:
-        disparity: What was found.
-        pair: In which pictures.
-        faults: What is known to be wrong with them.
+        disparity: The disparity map.
+        pair: The images it was computed from.
+        faults: Known problems of the images.
 
     Raises:
-        MatchingError: Nothing was found at all.
+        MatchingError: No pixel has a disparity.
     """
     share = float(disparity.valid.mean())
     if share >= FEW_VALID_SHARE:

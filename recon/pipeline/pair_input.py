@@ -1,4 +1,4 @@
-"""Reading one pair with its calibration and its truth."""
+"""Reading one pair with its calibration and ground truth."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ def read_pair_input(
     *,
     metres_per_unit: float = 1.0,
 ) -> PairInput:
-    """Read two pictures and what belongs to them.
+    """Read two images with their calibration and ground truth.
 
     Args:
-        left: Left picture.
-        right: Right picture.
+        left: Left image.
+        right: Right image.
         calibration: Any file that `read_calibration` understands; None = the pair is rectified
             and depth is not wanted.
-        truth: True disparity of the rectified left picture, PFM or 16-bit PNG.
-        metres_per_unit: Unit of the translation in an OpenCV file; the others define theirs.
+        truth: True disparity of the rectified left image, PFM or 16-bit PNG.
+        metres_per_unit: Unit of the translation in an OpenCV file; other formats define theirs.
 
     Raises:
-        FormatError: A file is missing, damaged or of another size.
-        SourceError: The pictures differ in size.
+        FormatError: A file is missing, damaged or of the wrong size.
+        SourceError: The images differ in size.
     """
     source = FilesSource(left, right, calibration, metres_per_unit=metres_per_unit)
     (pair,) = source

@@ -1,4 +1,4 @@
-"""`recon pair` without its command line: two pictures in, disparity, cloud and mesh out."""
+"""The pipeline behind `recon pair`: two images in; disparity, cloud and mesh out."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ from recon.structures import (
 
 @dataclass(frozen=True, eq=False)
 class PairInput:
-    """One pair, with all that is known of it.
+    """One pair with its calibration and ground truth.
 
     Attributes:
-        pair: The pictures.
-        calibration: Of the two cameras.
-        files: What they were read from.
+        pair: The images.
+        calibration: Calibration of the two cameras.
+        files: Files that the pair was read from.
         truth: True disparity of the rectified left view, or None.
     """
 
@@ -63,19 +63,19 @@ class PairInput:
 
 @dataclass(frozen=True, eq=False)
 class PairRun:
-    """All that a run knows when its results are made; reports are made from it.
+    """Results of a run, from which its report is made.
 
     Attributes:
-        name: What a user calls the pair.
+        name: Display name of the pair.
         config: The configuration.
-        pair: The rectified pictures.
-        disparity: Its disparity.
-        cloud: Its points in camera axes, or None where only the disparity was asked for.
-        mesh: The surface, camera axes, or None.
+        pair: The rectified images.
+        disparity: Their disparity.
+        cloud: The points in camera axes, or None if only the disparity was requested.
+        mesh: The surface in camera axes, or None.
         truth: True disparity, or None.
-        metrics: Distance to it, or None.
+        metrics: Errors against it, or None.
         summary: The figures of ``summary.json``.
-        warnings: What went less than well.
+        warnings: Problems that did not stop the run.
     """
 
     name: str
@@ -92,14 +92,14 @@ class PairRun:
 
 @dataclass(frozen=True)
 class PairOptions:
-    """How a run is made, apart from the configuration.
+    """Options of a run that are not part of the configuration.
 
     Attributes:
         command: ``pair``, or ``disparity`` for the disparity alone.
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores. Changes no result.
-        present: Writes pictures and the report of the run into its folder.
-        on_stage: Told the name of each stage that may take long when it begins.
+        present: Writes figures and the report into the result folder.
+        on_stage: Called with the name of each long stage when it begins.
     """
 
     command: str = "pair"
@@ -109,20 +109,20 @@ class PairOptions:
     on_stage: Callable[[str], None] | None = None
 
     def tell(self, stage: str) -> None:
-        """Tell whoever wants to know that a stage begins."""
+        """Report that a stage begins."""
         if self.on_stage is not None:
             self.on_stage(stage)
 
 
 def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> PairRun:
-    """Reconstruct one pair and write what it gives.
+    """Reconstruct one pair and write the results.
 
-    ``pair`` writes disparity, depth, reasons, cloud, mesh and report; ``disparity`` the first
-    and the third alone.
+    ``pair`` writes disparity, depth, reasons, cloud, mesh and report; ``disparity`` writes
+    disparity and reasons alone.
 
     Raises:
-        ReconError: The pair cannot be matched, or the folder not be written; then nothing is
-            left behind.
+        ReconError: The pair cannot be matched, or the folder cannot be written; nothing is left
+            behind.
     """
     start = time.perf_counter()
     threads, watch = use_threads(options.threads), Stopwatch()
@@ -163,14 +163,14 @@ def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> Pai
 def _look(
     given: PairInput, config: ReconConfig, options: PairOptions, watch: Stopwatch
 ) -> tuple[Finding, ...]:
-    """What is wrong with the pictures or their calibration before anything is matched."""
+    """Audit the images and their calibration before matching."""
     with watch.stage("audit"):
         one = OnePair(given.pair, given.calibration, given.files)
         return find_pair_faults(one, config, metric=options.command == "pair")
 
 
 def _match(given: PairInput, config: ReconConfig, reconstructor: FrameReconstructor) -> PairRun:
-    """The run of a disparity alone."""
+    """The results for ``disparity``: the disparity alone."""
     pair, disparity = reconstructor.match(given.pair)
     return replace(_run(given, config, pair, disparity), warnings=reconstructor.inspect(pair))
 
@@ -182,7 +182,7 @@ def _reconstruct(
     options: PairOptions,
     watch: Stopwatch,
 ) -> PairRun:
-    """The run of a pair with cloud and mesh; without a mesh it is still a run."""
+    """The results for ``pair``; a failed mesh is only a warning."""
     frame = reconstructor.reconstruct(given.pair)
     options.tell("mesh")
     mesh: TriangleMesh | None = None
@@ -202,7 +202,7 @@ def _reconstruct(
 def _run(
     given: PairInput, config: ReconConfig, pair: RectifiedPair, disparity: Disparity
 ) -> PairRun:
-    """The run of a disparity."""
+    """The results of matching, without cloud and mesh."""
     metrics = None if given.truth is None else evaluate_disparity(disparity, given.truth)
     summary = _summary(given.pair.name, disparity)
     if metrics is not None:

@@ -1,4 +1,4 @@
-"""The methods that `recon paper` tries on each experiment, and what the patch does to them."""
+"""The methods that `recon paper` runs on each experiment, and the effect of the patch size."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ TITLES: Final[Mapping[str, str]] = MappingProxyType(
         AS_PRINTED: "as printed",
     }
 )
-# Every point that the printed method finds, however far and however doubtful.
+# Keeps every point of the printed method, regardless of range and uncertainty.
 _EVERY_POINT: Final = CloudSettings(
     min_range_m=0.0, max_range_m=None, max_relative_sigma=None, normals_radius_px=None
 )
@@ -46,13 +46,13 @@ _EVERY_POINT: Final = CloudSettings(
 
 @dataclass(frozen=True)
 class DepthFigures:
-    """How deep a method finds the scene to be, over the pixels whose true depth is known.
+    """Depths of a method against the ground truth, over pixels that have both.
 
     Attributes:
-        median_m: Median of the depths found.
+        median_m: Median of the estimated depths.
         true_median_m: Median of the true depths of the same pixels.
         median_error_percent: Median of the absolute error, in per cent of the true depth.
-        median_ratio: Median of found ÷ true depth: 1 = the right scale.
+        median_ratio: Median of estimated ÷ true depth; 1 = correct scale.
         pixels: Number of pixels compared.
     """
 
@@ -65,16 +65,16 @@ class DepthFigures:
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """What one method makes of one experiment.
+    """Result of one method on one experiment.
 
     Attributes:
         method: A key of `TITLES`.
-        pair: The grey pictures, with the camera that the method believes in.
-        disparity: What was found.
+        pair: The grey images, with the camera that the method assumes.
+        disparity: The disparity map.
         depth_m: float32 (H, W), metres; NaN = unknown.
-        cloud: Its points in camera axes.
-        metrics: Distance of the disparity to the truth, or None.
-        depth: How deep the scene comes out, or None.
+        cloud: The points in camera axes.
+        metrics: Errors of the disparity, or None without ground truth.
+        depth: Errors of the depth, or None.
     """
 
     method: str
@@ -88,13 +88,13 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class PatchFigure:
-    """What one patch gives; the last three are None where there is no truth.
+    """Result for one patch size; the last three are None without ground truth.
 
     Attributes:
         patch_px: Edge of the patch.
         valid_percent: Share of all pixels that have a value.
-        bad_percent: Share of the pixels of known truth whose value is off by more than the limit.
-        right_percent: Share of the same pixels whose value is not.
+        bad_percent: Share of pixels with known truth whose error exceeds the limit.
+        right_percent: Share of the same pixels whose error is within the limit.
         avgerr_px: Mean absolute error of those that have a value.
     """
 
@@ -106,7 +106,7 @@ class PatchFigure:
 
 
 def methods_of(config: ReconConfig) -> tuple[str, ...]:
-    """The methods that a configuration asks for."""
+    """The methods that a configuration selects."""
     return tuple(TITLES) if config.paper.as_printed else (CORRECTED,)
 
 
@@ -116,9 +116,9 @@ def apply_method(
     """Reconstruct one experiment by one method.
 
     Args:
-        method: ``corrected`` is our matcher with the scene's calibration; ``absolute`` and
-            ``as_printed`` are whole disparities of Eq. 6 grey pictures, without and with the
-            misprint of Eq. 9-10, and both take Table 1's focal length at its word.
+        method: ``corrected`` is our matcher with the scene's calibration. ``absolute`` and
+            ``as_printed`` find integer disparities in Eq. 6 grey images, without and with the
+            misprint of Eq. 9-10, and both use Table 1's focal length as printed.
         experiment: The scene.
         config: Settings of the stages, and of the experiments.
         threads: Threads for our matcher; None = all cores.
@@ -138,7 +138,7 @@ def apply_method(
 def try_patches(
     method: str, experiment: Experiment, config: ReconConfig, threads: int | None = None
 ) -> list[PatchFigure]:
-    """What a method finds with each patch of the settings; ``corrected`` is the matcher `sad`."""
+    """Run a method with each patch size in the settings; ``corrected`` uses the matcher `sad`."""
     pair = _grey_pair(method, experiment, config)
     figures = []
     for patch_px in config.paper.patches_px:
@@ -151,7 +151,7 @@ def try_patches(
 def compare_depth(
     depth_m: Float32, truth: DisparityTruth, camera: RectifiedCamera
 ) -> DepthFigures | None:
-    """Depths against the truth, at pixels seen by both cameras; None = no pixel has both.
+    """Compare depths with the truth at pixels seen by both cameras; None = no pixel has both.
 
     Args:
         depth_m: float32 (H, W), metres; NaN = unknown.
@@ -193,7 +193,7 @@ def _result(
 
 
 def _matcher(method: str, patch_px: int, config: ReconConfig, threads: int | None) -> Matcher:
-    """The matcher of a method with a patch of that size."""
+    """The matcher of a method with the given patch size."""
     if method != CORRECTED:
         return PrintedMatcher(PrintedSettings(patch_px=patch_px, signed=method == AS_PRINTED))
     window = {"window_px": patch_px, "window_height_px": patch_px}
@@ -207,7 +207,7 @@ def _grey_pair(method: str, experiment: Experiment, config: ReconConfig) -> Rect
 
 
 def _printed_pair(experiment: Experiment) -> RectifiedPair:
-    """The pictures in the grey of Eq. 6."""
+    """The images converted to grey by Eq. 6."""
     settings = RectificationSettings(grey="paper")
     return Rectifier(experiment.camera, settings).rectify(experiment.pair)
 

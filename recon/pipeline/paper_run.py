@@ -1,4 +1,4 @@
-"""`recon paper` without its command line: the seed paper's experiments, repeated and corrected."""
+"""The pipeline behind `recon paper`: the seed paper's experiments, repeated and corrected."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ from recon.pipeline.summary import cost, plain
 
 @dataclass(frozen=True, eq=False)
 class ExperimentResult:
-    """What was found for one experiment.
+    """Results of one experiment.
 
     Attributes:
         experiment: Its input.
-        methods: One result for each method that was tried.
-        patches: Method -> what each patch gives.
-        table_1_depth_error_percent: Median depth error that Table 1's focal length alone makes,
-            with the true disparities; None = there is no truth, or doffs is no focal length.
+        methods: One result for each method.
+        patches: Method -> one result for each patch size.
+        table_1_depth_error_percent: Median depth error caused by Table 1's focal length alone,
+            given true disparities; None = no ground truth, or doffs is not positive.
     """
 
     experiment: Experiment
@@ -56,14 +56,14 @@ class ExperimentResult:
 
 @dataclass(frozen=True, eq=False)
 class PaperRun:
-    """All that a run knows when its results are made; the report is made from it.
+    """Results of a run, from which its report is made.
 
     Attributes:
-        folder: Where the scenes are.
+        folder: Folder of the scenes.
         config: The configuration.
         experiments: One result for each experiment.
         summary: The figures of ``summary.json``.
-        warnings: What went less than well.
+        warnings: Problems that did not stop the run.
     """
 
     folder: Path
@@ -75,12 +75,12 @@ class PaperRun:
 
 @dataclass(frozen=True)
 class PaperOptions:
-    """How a run is made, apart from the configuration.
+    """Options of a run that are not part of the configuration.
 
     Attributes:
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores. Changes no result.
-        present: Writes pictures and the report of the run into its folder.
+        present: Writes figures and the report into the result folder.
     """
 
     out: Path | None = None
@@ -89,16 +89,16 @@ class PaperOptions:
 
 
 def run_paper(folder: Path, config: ReconConfig, options: PaperOptions) -> PaperRun:
-    """Repeat the experiments 2 to 4 of the seed paper, and write what they give.
+    """Repeat experiments 2 to 4 of the seed paper and write the results.
 
     Args:
         folder: Holds the scenes ArtL, Jadeplant and Pipes, such as MiddEval3's trainingQ.
-        config: Settings; ``paper`` decides what is tried.
-        options: Where to, and with what.
+        config: Settings; ``paper`` selects methods and patch sizes.
+        options: Result folder, threads and report.
 
     Raises:
-        ReconError: A scene is missing or damaged, or the folder cannot be written; then nothing
-            is left behind.
+        ReconError: A scene is missing or damaged, or the folder cannot be written; nothing is left
+            behind.
     """
     start = time.perf_counter()
     threads, watch = use_threads(options.threads), Stopwatch()
@@ -180,7 +180,7 @@ def _summary(results: tuple[ExperimentResult, ...], config: ReconConfig) -> dict
 
 
 def _table_1_summary(result: ExperimentResult) -> dict[str, Any]:
-    """A row as printed, beside the right one."""
+    """A row of Table 1 as printed, and the corrected values."""
     row = result.experiment.table_1
     return {
         "experiment": row.experiment,

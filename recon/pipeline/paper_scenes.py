@@ -20,14 +20,14 @@ _INSIDE_DATA: Final = Path("middlebury", "MiddEval3", "trainingQ")
 
 @dataclass(frozen=True)
 class Table1Row:
-    """One row of Table 1: as printed, and what the numbers are.
+    """One row of Table 1, with its numbers under their correct names.
 
     Attributes:
-        experiment: As the paper counts.
+        experiment: Number of the experiment in the paper.
         scene: Name of the scene.
         doffs_px: Difference of the principal points; printed as the focal length.
-        baseline_mm: Distance of the cameras.
-        ndisp: Number of disparities, or None where the scene does not say.
+        baseline_mm: Baseline.
+        ndisp: Number of disparities, or None if the scene does not state it.
         focal_px: The true focal length, which Table 1 lacks.
     """
 
@@ -41,16 +41,16 @@ class Table1Row:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """One experiment's input.
+    """Input of one experiment.
 
     Attributes:
-        number: As the paper counts.
+        number: Number of the experiment in the paper.
         scene: Name of the scene.
-        pair: The pictures, in colour.
-        camera: Geometry as the scene's ``calib.txt`` has it.
+        pair: The colour images.
+        camera: Geometry from the scene's ``calib.txt``.
         truth: True disparity of the left view, or None.
-        table_1: What Table 1 says of it, and what the numbers are.
-        files: What it was read from.
+        table_1: Its row of Table 1.
+        files: Files that the experiment was read from.
     """
 
     number: int
@@ -63,17 +63,17 @@ class Experiment:
 
     @property
     def title(self) -> str:
-        """Number and scene, for people."""
+        """Number and scene, for display."""
         return f"Experiment {self.number}: {self.scene}"
 
     @property
     def folder(self) -> str:
-        """Where its results go within the run's folder."""
+        """Name of its folder in the result folder."""
         return f"experiment_{self.number}_{self.scene}"
 
 
 def default_scenes_folder() -> Path:
-    """MiddEval3's quarter-size training scenes within ``RECON_DATA``.
+    """MiddEval3's quarter-size training scenes in ``RECON_DATA``.
 
     Raises:
         SourceError: The environment variable is not set.
@@ -108,10 +108,10 @@ def read_experiments(folder: Path) -> list[Experiment]:
 
 
 def camera_of_table_1(camera: RectifiedCamera) -> RectifiedCamera:
-    """The camera that Table 1 describes: ``doffs`` is the focal length, and nothing is added to d.
+    """The camera of Table 1: ``doffs`` taken as the focal length, and no offset added to d.
 
     Raises:
-        CalibrationError: ``doffs`` is not positive and so cannot pass for a focal length.
+        CalibrationError: ``doffs`` is not positive, so it cannot be used as a focal length.
     """
     if camera.doffs_px <= 0:
         raise CalibrationError(
@@ -129,7 +129,7 @@ def _read_experiment(number: int, folder: Path) -> Experiment:
         number=number,
         scene=source.name,
         pair=source.scene.pair,
-        # The file rounds doffs and the principal points each for itself; depth is defined by doffs.
+        # The file rounds doffs and the principal points independently; doffs defines depth.
         camera=replace(camera, cx_right_px=camera.cx_px + row.doffs_px),
         truth=source.scene.truth,
         table_1=row,
@@ -138,7 +138,7 @@ def _read_experiment(number: int, folder: Path) -> Experiment:
 
 
 def _table_1_row(number: int, folder: Path) -> Table1Row:
-    """What Table 1 says of an experiment, from the scene's own calibration file."""
+    """The row of Table 1 for an experiment, from the scene's own calibration file."""
     calib = read_middlebury_calib(folder / "calib.txt")
     camera = calib.camera
     return Table1Row(

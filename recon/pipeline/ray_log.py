@@ -1,4 +1,4 @@
-"""Keeps the rays of a drive while it is mapped, where there is a place for them."""
+"""Storing the rays of a drive while it is mapped."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ class RayLog:
     """Appends the rays of frames to a file.
 
     Args:
-        path: The file; None = they are not kept.
-        settings: Of the map that they are for.
+        path: The file; None = rays are not kept.
+        settings: Settings of the occupancy map that the rays are for.
     """
 
     def __init__(self, path: Path | None, settings: OccupancySettings) -> None:
@@ -23,10 +23,10 @@ class RayLog:
         self._writer: RayWriter | None = None
 
     def add(self, rays: RayCloud) -> None:
-        """Keep the rays of the next frame.
+        """Append the rays of the next frame.
 
         Raises:
-            OSError: The disk is full or cannot be written.
+            OSError: The disk is full or not writable.
         """
         if self._path is None:
             return
@@ -35,19 +35,19 @@ class RayLog:
         self._writer.append(rays)
 
     def state(self) -> int | None:
-        """Bytes of the file, all on the disk; None = no file."""
+        """Size of the file in bytes, synced to disk; None = no file."""
         return None if self._writer is None else self._writer.sync()
 
     def restore(self, state: int | None) -> None:
-        """Go on from a `state`; what the file holds beyond it is forgotten.
+        """Continue from a `state`; later content of the file is discarded.
 
         Raises:
-            FormatError: The file has been lost or cut.
+            FormatError: The file is missing or truncated.
         """
         if self._path is not None and state is not None:
             self._writer = RayWriter(self._path, self._grain, state)
 
     def close(self) -> None:
-        """Nothing more comes."""
+        """Close the file after the last frame."""
         if self._writer is not None:
             self._writer.close()

@@ -1,4 +1,4 @@
-"""What is written beside every result: versions, inputs and their hashes, command, timings."""
+"""The record of a run: versions, inputs and their hashes, command, timings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def fingerprint(files: Iterable[Path]) -> dict[str, Any]:
     for path in files:
         length = path.stat().st_size
         digest.update(path.name.encode() + b"\0" + length.to_bytes(8, "little"))
-        # In pieces: a recording may be larger than the memory.
+        # In pieces: a recording may be larger than memory.
         with path.open("rb") as content:
             while piece := content.read(_PIECE_BYTES):
                 digest.update(piece)
@@ -32,7 +32,7 @@ def fingerprint(files: Iterable[Path]) -> dict[str, Any]:
 
 
 def write_record(run: RunDirectory, command: str, content: Mapping[str, Any]) -> None:
-    """Write ``run.json``; the last file of a run, since it lists the others."""
+    """Write ``run.json``, last, since it lists all other files of the run."""
     record = {
         "command": command,
         "finished_utc": datetime.now(timezone.utc).isoformat(timespec="seconds"),

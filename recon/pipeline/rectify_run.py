@@ -1,4 +1,4 @@
-"""`recon rectify` without its command line: pictures in, pictures out whose rows correspond."""
+"""The pipeline behind `recon rectify`: images in, row-aligned images out."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from recon.structures import StereoCalibration, StereoPair
 from recon.structures.arrays import Float64, UInt8
 
 _WARN_ROW_PX: Final = 0.5
-# A match so many times farther from its row than the median is wrong, not the calibration.
+# A row error above this multiple of the median is a false match, not a calibration error.
 _WRONG: Final = 5.0
 _NEVER_WRONG_PX: Final = 0.5
 
@@ -50,14 +50,15 @@ Lines = tuple[list[Float64], list[Float64]]
 
 @dataclass(frozen=True, eq=False)
 class RectifyRun:
-    """All that a run knows when its results are made.
+    """Results of a run.
 
     Attributes:
         pair: The first pair, as recorded.
-        rectified: Its pictures, rectified.
-        raw_px: float64 (N, 2) twice: features of the first pair that agree, as recorded.
-        raw_lines: For each the epipolar lines in the left and in the right picture.
-        rectified_px: The same features, rectified.
+        rectified: Its rectified images.
+        raw_px: float64 (N, 2) twice: feature matches of the first pair without false ones, in the
+            left and right image as recorded.
+        raw_lines: Their epipolar lines in the left and right image.
+        rectified_px: The same matches, rectified.
         summary: The figures of ``summary.json``.
     """
 
@@ -71,14 +72,14 @@ class RectifyRun:
 
 @dataclass(frozen=True)
 class RectifyOptions:
-    """How a run is made, apart from the configuration.
+    """Options of a run that are not part of the configuration.
 
     Attributes:
         calibration: Calibration file; None = homographies from features.
-        metres_per_unit: Unit of an OpenCV file.
+        metres_per_unit: Unit of the translation in an OpenCV file.
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores.
-        present: Draws the pictures of the run into its folder.
+        present: Draws the figures of the run into its folder.
     """
 
     calibration: Path | None = None
@@ -92,14 +93,14 @@ def run_rectify(left: str, right: str, config: ReconConfig, options: RectifyOpti
     """Rectify a pair, or all pairs of two folders.
 
     Args:
-        left: Picture, folder or pattern of the left camera.
-        right: The same of the right camera.
+        left: Image, folder or pattern of the left camera.
+        right: The same for the right camera.
         config: The configuration.
-        options: With which calibration, and where results go.
+        options: Calibration, result folder and figures.
 
     Raises:
-        ReconError: Pictures do not pair up or cannot be rectified, or the folder not be written;
-            then nothing is left behind.
+        ReconError: The images do not pair up or cannot be rectified, or the folder cannot be
+            written; nothing is left behind.
     """
     start = time.perf_counter()
     use_threads(options.threads)
@@ -140,7 +141,7 @@ def run_rectify(left: str, right: str, config: ReconConfig, options: RectifyOpti
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """One way to rectify: what becomes of pictures, of pixels, and what is told of it."""
+    """One way to rectify: how to warp images, map pixels, draw lines and write the result."""
 
     warp: Callable[[StereoPair], tuple[UInt8, UInt8]]
     place: Callable[[Float64, Float64], tuple[Float64, Float64]]
@@ -150,7 +151,7 @@ class _Plan:
 
 
 def _by_file(options: RectifyOptions, config: ReconConfig, first: StereoPair) -> _Plan:
-    """By a calibration file: metric."""
+    """Rectification by a calibration file; depth is metric."""
     path = options.calibration
     height, width = first.left.shape[:2]
     rig = read_calibration(path or "", width, height, metres_per_unit=options.metres_per_unit)
@@ -177,7 +178,7 @@ def _by_file(options: RectifyOptions, config: ReconConfig, first: StereoPair) ->
 
 
 def _by_features(pictures: PicturePairs, config: ReconConfig, first: StereoPair) -> _Plan:
-    """By homographies from features of some pairs: rows correspond, depth has no scale."""
+    """Rectification by homographies from feature matches; depth has no scale."""
     settings = config.uncalibrated
     height, width = first.left.shape[:2]
     size = (width, height)
@@ -226,7 +227,7 @@ def _uncalibrated_figures(result: UncalibratedRectification) -> dict[str, Any]:
 
 
 def _pairs(pictures: PicturePairs) -> Iterator[tuple[StereoPair, tuple[Path, Path]]]:
-    """Pictures and their files, one pair in memory at a time, all of one size."""
+    """Yield the pairs with their files, one in memory at a time; all must have the same size."""
     shape: tuple[int, ...] | None = None
     for files in pictures.pairs:
         pair = read_pair(*files)
@@ -246,7 +247,7 @@ def _features(pair: StereoPair, count: int) -> PairFeatures:
 
 
 def _measure(plan: _Plan, first: StereoPair, config: ReconConfig) -> RectifyRun:
-    """How well rows of the first pair correspond, by features."""
+    """Measure the row alignment of the first pair by feature matches."""
     found = _features(first, config.uncalibrated.features)
     raw = (found.left_uv.astype(np.float64), found.right_uv.astype(np.float64))
     left, right = plan.place(*raw)

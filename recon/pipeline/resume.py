@@ -1,4 +1,4 @@
-"""Going on with a run that was killed: what it was started with, and whether that is the same."""
+"""Resuming an interrupted run, after checking that its inputs and settings are unchanged."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ _START_ANEW: Final = "start it without --resume"
 
 @dataclass(frozen=True)
 class MapRequest:
-    """What the command line asked for, apart from settings.
+    """The command line of `recon map`, apart from settings.
 
     Attributes:
         source: Path of the source; None = that of the run that is resumed.
-        kind: What the source is; None = told by its files.
-        poses: Known poses.
-        prior: How the camera moved by other means.
+        kind: Kind of the source; None = inferred from its files.
+        poses: File of known poses.
+        prior: File of the camera's motion from another sensor.
         mesh: Whether to reconstruct a surface.
         out: Result folder; None = a new one.
-        resume: Folder of an unfinished run to go on with.
-        memory_limit: Most memory that the run may take, such as ``2G``.
+        resume: Folder of an unfinished run to resume.
+        memory_limit: Memory limit of the run, such as ``2G``.
     """
 
     source: Path | None
@@ -60,7 +60,7 @@ class MapRequest:
     memory_limit: str | None = None
 
     def arguments(self) -> dict[str, Any]:
-        """What has to be known to open the same source again."""
+        """The arguments needed to resume the run."""
         return {
             "source": None if self.source is None else str(self.source.resolve()),
             "kind": self.kind,
@@ -73,11 +73,10 @@ class MapRequest:
 def plan_map(
     request: MapRequest, config: Path | None, overrides: Sequence[str]
 ) -> tuple[MapRequest, ReconConfig]:
-    """Complete a request and its configuration by those of the run that is resumed.
+    """Complete a request and its configuration from the run that is resumed.
 
     Raises:
-        SettingsError: A setting is wrong, or the resumed run was started with others; there is
-            no source.
+        SettingsError: A setting is invalid, or contradicts the resumed run.
         OutputError: There is no run to resume.
     """
     if request.resume is not None:
@@ -123,7 +122,7 @@ def open_requested(request: MapRequest, config: ReconConfig) -> StereoSource:
     """Open the source of a planned request.
 
     Raises:
-        SettingsError: It names none.
+        SettingsError: The request names no source.
         ReconError: The source cannot give pairs.
     """
     if request.source is None:
@@ -137,7 +136,7 @@ def identity_of(
     known_poses: Trajectory | None,
     prior: Trajectory | None = None,
 ) -> dict[str, Any]:
-    """All that has to be the same for a run to go on to the same result."""
+    """Everything that must be unchanged for a resumed run to give the same result."""
     return {
         "config": config.model_dump(mode="json"),
         "source": {"frames": len(source), **quick_fingerprint(source.files)},
@@ -148,7 +147,7 @@ def identity_of(
 
 
 def _digest(path: Trajectory | None) -> str | None:
-    """What tells one path from another."""
+    """SHA-256 of the poses and timestamps; None = no trajectory."""
     if path is None:
         return None
     return hashlib.sha256(path.T_world_camera.tobytes() + path.timestamps_s.tobytes()).hexdigest()
@@ -157,11 +156,11 @@ def _digest(path: Trajectory | None) -> str | None:
 def begin_or_resume(
     directory: RunDirectory, identity: Mapping[str, Any], arguments: Mapping[str, Any]
 ) -> None:
-    """Write down what a run is started with; of a resumed one, check that it is the same.
+    """Store what a run is started with; for a resumed run, first check that it is unchanged.
 
     Raises:
-        SettingsError: The run was started with something else.
-        OutputError: It cannot be written, or there is no run to resume.
+        SettingsError: The run was started with other inputs or settings.
+        OutputError: The state cannot be written, or there is no run to resume.
     """
     if directory.resumes:
         started = read_started(directory.folder)
@@ -173,11 +172,11 @@ def begin_or_resume(
 
 @contextmanager
 def tell_how_to_resume(directory: RunDirectory) -> Iterator[None]:
-    """Let an error that leaves a state to go on from say how.
+    """Add a hint on how to resume to errors after which the run can be resumed.
 
     Raises:
-        OutputError: The disk is full, or the folder cannot be written any more.
-        MemoryLimitError: There is no more memory.
+        OutputError: The disk is full, or the folder can no longer be written.
+        MemoryLimitError: Memory is exhausted.
     """
     try:
         yield
@@ -189,7 +188,7 @@ def tell_how_to_resume(directory: RunDirectory) -> Iterator[None]:
 
 
 def _with_hint(error: BaseException, folder: Path) -> BaseException | None:
-    """The error with a line on how to go on; None where it cannot be helped."""
+    """The error with a hint on how to resume; None if it is raised unchanged."""
     hint = f"recon map --resume {shlex.quote(str(folder))} goes on from there"
     if isinstance(error, KeyboardInterrupt):
         return KeyboardInterrupt(hint)
@@ -208,10 +207,10 @@ def _with_hint(error: BaseException, folder: Path) -> BaseException | None:
 
 
 def read_started(folder: Path) -> dict[str, Any]:
-    """What an unfinished run was started with.
+    """Read what an unfinished run was started with.
 
     Raises:
-        OutputError: There is none in the folder.
+        OutputError: The folder holds no unfinished run.
     """
     path = state_folder(folder) / STARTED
     try:
@@ -226,8 +225,8 @@ def read_started(folder: Path) -> dict[str, Any]:
 
 
 def _refuse_others(now: Mapping[str, Any], then: Mapping[str, Any], folder: Path) -> None:
-    """Refuse to go on with anything but the same."""
-    # Through JSON, as what was read came: tuples and lists are the same.
+    """Refuse to resume with inputs or settings that differ."""
+    # Through JSON, like the stored values, so that tuples equal lists.
     for part, value in json.loads(json.dumps(dict(now))).items():
         after, before = _without_limit(value), _without_limit(then.get(part))
         if after == before:
@@ -243,7 +242,7 @@ def _refuse_others(now: Mapping[str, Any], then: Mapping[str, Any], folder: Path
 
 
 def _without_limit(part: Any) -> Any:
-    """A part of an identity apart from the memory limit, which a resumed run may change."""
+    """A part of an identity without the memory limit, which a resumed run may change."""
     if not isinstance(part, dict):
         return part
     return {name: value for name, value in part.items() if name != _MEMORY}

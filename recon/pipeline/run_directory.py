@@ -1,8 +1,8 @@
-"""The folder that a run leaves behind: whole, or not at all.
+"""The result folder of a run: complete, or not there at all.
 
 Everything is written below ``<folder>/.partial`` and moved up when the run is done. A run that
-fails takes its partial files away again; an earlier run in the same folder stays as it was. One
-that was killed, interrupted or met a full disk leaves them where it can be resumed from them.
+fails removes its partial files and leaves an earlier run in the same folder untouched. A run that
+was killed, interrupted or met a full disk keeps them if it can be resumed.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from recon.errors import MemoryLimitError, OutputError
 
 RECORD: Final = "run.json"
 STARTED: Final = "started.json"
-"""Name in the state of what a run that can be resumed was started with."""
+"""State file that records what a resumable run was started with."""
 _PARTIAL: Final = ".partial"
 _STATE: Final = ".state"
 _LOCK: Final = ".lock"
-#: What is no fault of the input: the run can go on later.
+#: Errors that the input did not cause: the run can be resumed later.
 _PASSING: Final = (OutputError, MemoryLimitError, OSError, MemoryError, KeyboardInterrupt)
 
 
 def state_folder(folder: Path) -> Path:
-    """Where an unfinished run in a folder keeps what it goes on from."""
+    """Folder where an unfinished run keeps the state it resumes from."""
     return folder / _PARTIAL / _STATE
 
 
@@ -44,16 +44,16 @@ def default_folder(command: str, base: Path = Path("outputs")) -> Path:
 
 
 class RunDirectory:
-    """Use as a context: files go to `path`, and appear in `folder` when the context ends well.
+    """Context manager: files are written to `path` and appear in `folder` on success.
 
     Args:
-        folder: Where the results are to be; made if missing.
+        folder: Result folder; created if missing.
         latest: Keep a link ``latest`` beside the folder (for the default folders).
-        resume: Go on with the unfinished run in the folder.
+        resume: Resume the unfinished run in the folder.
 
     Raises:
-        OutputError: The folder cannot be written, holds something that is no run of ours, or
-            another run is writing to it.
+        OutputError: The folder cannot be written, holds files that are not of a run, or another
+            run is writing to it.
     """
 
     def __init__(self, folder: Path, *, latest: bool = False, resume: bool = False) -> None:
@@ -65,7 +65,7 @@ class RunDirectory:
 
     @classmethod
     def for_command(cls, command: str, out: Path | None, *, resume: bool = False) -> Self:
-        """The folder that the user asked for, or a new one under ``outputs/``."""
+        """The requested folder, or a new one under ``outputs/``."""
         if out is None:
             return cls(default_folder(command), latest=True)
         # A run in a default folder keeps its link when it is resumed.
@@ -73,19 +73,19 @@ class RunDirectory:
         return cls(out, latest=resume and stamped, resume=resume)
 
     def path(self, name: str) -> Path:
-        """Where to write the file ``name``; its parent folder exists."""
+        """Path to write the file ``name`` to; its parent folder is created."""
         target = self._partial / name
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
 
     def state(self, name: str) -> Path:
-        """Where to keep under ``name`` what the run needs until it is done, and not after."""
+        """Path of the state file ``name``, which is deleted when the run is done."""
         target = self._partial / _STATE / name
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
 
     def keep(self, state: str, name: str) -> None:
-        """Make a file of the state a result too, without another copy where links are known."""
+        """Publish a state file as a result: hard-linked where links are supported, else copied."""
         source, target = self.state(state), self.path(name)
         try:
             os.link(source, target)
@@ -93,12 +93,12 @@ class RunDirectory:
             shutil.copyfile(source, target)
 
     def files(self) -> list[str]:
-        """Names of the files written so far, sorted; what is of the state is not among them."""
+        """Sorted names of the files written so far, without those of the state."""
         written = (p.relative_to(self._partial) for p in self._partial.rglob("*") if p.is_file())
         return sorted(p.as_posix() for p in written if p.parts[0] not in (_STATE, _LOCK))
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write a JSON file, NaN refused: it would not load elsewhere."""
+        """Write a JSON file; NaN is refused, since it is not valid JSON."""
         text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
         self.path(name).write_text(text + "\n", encoding="utf-8")
 
@@ -132,11 +132,11 @@ class RunDirectory:
 
     @property
     def resumable(self) -> bool:
-        """Whether the run has written down what it was started with."""
+        """Whether the run has recorded what it was started with."""
         return (state_folder(self.folder) / STARTED).is_file()
 
     def _take_lock(self) -> int:
-        """Be the only run that writes to the folder, until `_release` or the process ends."""
+        """Lock the folder against other runs until `_release` or the end of the process."""
         while True:
             self._partial.mkdir(parents=True, exist_ok=True)
             path = self._partial / _LOCK
@@ -161,7 +161,7 @@ class RunDirectory:
             self._lock = None
 
     def _clear(self) -> None:
-        """Take away what another run left half-written; a resumed one needs its state."""
+        """Remove partial files of an earlier run; a resumed run keeps its state."""
         kept = {_LOCK, _STATE} if self.resumes else {_LOCK}
         for path in self._partial.iterdir():
             if path.name in kept:
@@ -179,11 +179,11 @@ class RunDirectory:
         files = [Path(name) for name in self.files()]
         for stale in set(_earlier_files(self.folder)) - set(files):
             (self.folder / stale).unlink(missing_ok=True)
-        # The record goes last: a folder with a new run.json has all that it lists.
+        # The record goes last: a folder with a new run.json has every file it lists.
         for file in sorted(files, key=lambda f: f.name == RECORD):
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
             (self._partial / file).replace(self.folder / file)
-        # Nothing can be resumed from a state that is half removed.
+        # A state that is only half removed must not be resumable.
         (state_folder(self.folder) / STARTED).unlink(missing_ok=True)
         shutil.rmtree(self._partial)
         if self._latest:
@@ -192,7 +192,7 @@ class RunDirectory:
     def _withdraw(self) -> None:
         shutil.rmtree(self._partial, ignore_errors=True)
         for folder in self._made:
-            with suppress(OSError):  # not empty: somebody else's files, which stay
+            with suppress(OSError):  # not empty: files of others, which stay
                 folder.rmdir()
 
 
@@ -216,7 +216,7 @@ def _earlier_files(folder: Path) -> list[Path]:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
         names = [Path(name) for name in record.get("files", [])]
     except (OSError, ValueError, AttributeError):
-        return []  # no earlier run, or one whose record is broken: nothing is known to be stale
+        return []  # no earlier run or a broken record: no file is known to be stale
     return [name for name in names if not name.is_absolute() and ".." not in name.parts]
 
 

@@ -29,20 +29,20 @@ from recon.structures.arrays import Float64
 
 @dataclass(frozen=True, eq=False)
 class MappedSequence:
-    """What a drive gives before anything is written.
+    """A mapped drive, before its results are written.
 
     Attributes:
         trajectory: Pose of the left camera in each frame.
-        health: How far each pose can be trusted.
-        submaps: Fused cloud and occupancy in pieces of consecutive frames.
+        health: Health of each pose.
+        submaps: Fused cloud and occupancy, in submaps of consecutive frames.
         config: The configuration.
         T_map_world: float64 (4, 4).
         camera: The rectified camera.
-        sample: The frame in the middle of the drive, to look at.
+        sample: The frame in the middle of the drive, for display.
         seconds: Wall-clock time from the first frame to the last.
-        T_corrected_world: float64 (S, 4, 4), a motion that each submap still has to make; the
-            trajectory has made it. None = none.
-        loops: What loop closure did to the trajectory; None = it was not asked.
+        T_corrected_world: float64 (S, 4, 4), correction still to be applied to each submap; the
+            trajectory already includes it. None = none.
+        loops: Result of loop closure; None = it was not run.
     """
 
     trajectory: Trajectory
@@ -72,10 +72,10 @@ class MappedSequence:
         return self.map.voxels()
 
     def corrected(self, T_corrected_world: Float64) -> MappedSequence:
-        """The drive with each submap, and the path in it, moved rigidly.
+        """The drive with each submap and its part of the path moved rigidly.
 
         Args:
-            T_corrected_world: float64 (S, 4, 4), one motion for each submap.
+            T_corrected_world: float64 (S, 4, 4), one correction per submap.
         """
         entries = self.submaps.entries
         of_frame = np.repeat(np.arange(len(entries)), [entry.frames for entry in entries])
@@ -87,7 +87,7 @@ class MappedSequence:
         )
 
     def closed(self, loops: DriveLoops) -> MappedSequence:
-        """The drive after its loops were closed: the path is bent, submaps move with it."""
+        """The drive after loop closure: the corrected trajectory, and submaps that follow it."""
         return replace(
             self,
             trajectory=loops.closure.trajectory,
@@ -105,21 +105,21 @@ def map_sequence(
     observers: Iterable[Observer] = (),
     workspace: Workspace | None = None,
 ) -> MappedSequence:
-    """Register and fuse all frames of a source, and close the loops of the path.
+    """Register and fuse all frames of a source, and close loops in the path.
 
-    The next frames are matched while this one is registered and the last one still goes into the
-    map; the result does not depend on it.
+    Matching of the next frames, registration of this one and integration of the last one overlap,
+    which does not change the result.
 
     Args:
-        source: Where the pairs come from.
+        source: The source of stereo pairs.
         config: The configuration.
-        known_poses: Poses to use instead of odometry, one per frame of the source; they are
-            taken as they are, loops or not.
-        prior: How the left camera moved by wheels, an inertial unit or a satellite receiver, on
-            the clock of the source; only its motions count.
-        observers: Told of the progress.
-        workspace: What the run may keep on the disk, its threads, and who times it; None = in
-            memory, all cores, nobody.
+        known_poses: Poses to use instead of odometry, one per frame of the source; used
+            unchanged, without loop closure.
+        prior: Motion of the left camera from wheel odometry, an IMU or GNSS, in the time base of
+            the source; only relative motions are used.
+        observers: Notified of progress.
+        workspace: Disk storage, threads and stopwatch of the run; None = in memory, all cores,
+            not timed.
 
     Raises:
         ReconError: A frame cannot be read, matched or registered.
@@ -152,9 +152,9 @@ def map_sequence(
 
 
 class _Drive:
-    """A mapper, who looks for loops beside it, its checkpoints, and its clock.
+    """Couples the mapper with the search for loops, checkpoints and timing.
 
-    Where there is a checkpoint to go on from, it does; the time up to there counts as spent.
+    Resumes from a checkpoint if there is one; the time spent before it is included.
     """
 
     def __init__(
@@ -185,14 +185,14 @@ class _Drive:
         return replace(result, seconds=seconds)
 
     def settle(self) -> None:
-        """Wait for what is done beside the registration: the last frame, and the loops."""
+        """Wait for background work: the integration of the last frame, and the search for loops."""
         self.mapper.settle()
         if self._loops is not None:
             self._loops.settle()
         self._last = time.perf_counter()
 
     def stop(self) -> None:
-        """End what is done beside the registration, done or not."""
+        """Stop background work, finished or not."""
         self.mapper.abandon()
         if self._loops is not None:
             self._loops.stop()
@@ -230,7 +230,7 @@ class _Drive:
     def _save(self) -> None:
         if self._checkpoint is None:
             return
-        self.settle()  # or keyframes that a resumed run counts on might be missing
+        self.settle()  # else keyframes that a resumed run needs might be missing
         with self._stage("checkpoint"):
             seconds = time.perf_counter() - self._start
             self._checkpoint.save({"mapper": self.mapper.state(), "seconds": seconds})
@@ -239,7 +239,7 @@ class _Drive:
     def _sample_again(
         self, source: StereoSource, reconstructor: FrameReconstructor
     ) -> ReconstructedFrame:
-        """The frame to look at, which was mapped before this process began."""
+        """Reconstruct the sample again if it was mapped before this process started."""
         index = min(len(source) // 2, len(self.mapper) - 1)
         return reconstructor.reconstruct(next(source.frames(index)))
 

@@ -1,4 +1,4 @@
-"""Where the time goes: seconds per stage, summed over threads."""
+"""Timing of stages: seconds per stage, summed over threads."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Adds up the wall-clock seconds of named stages; safe to use from several threads."""
+    """Sums the wall-clock seconds of named stages; thread-safe."""
 
     def __init__(self) -> None:
         self._seconds: dict[str, float] = {}
@@ -17,7 +17,7 @@ class Stopwatch:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time the body of a ``with`` statement as a part of stage ``name``."""
+        """Time the body of a ``with`` statement as part of stage ``name``."""
         start = time.perf_counter()
         try:
             yield

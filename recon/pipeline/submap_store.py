@@ -1,4 +1,4 @@
-"""Where closed submaps wait: in memory, or on the disk where memory must not grow with a drive."""
+"""Storage of closed submaps: in memory, or on disk so that memory does not grow with the drive."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _CACHED: Final = 6
 
 @dataclass(frozen=True)
 class SubmapEntry:
-    """What is known of a closed submap without reading it.
+    """What is known about a closed submap without reading it.
 
     Attributes:
-        index: Its number.
-        first_frame: Number of its first frame.
+        index: Index of the submap.
+        first_frame: Index of its first frame.
         frames: Number of its frames.
         voxels: Voxels of its part of the fused cloud.
         cells: Cells of its part of the occupancy.
@@ -38,8 +38,8 @@ class SubmapStore:
     """Closed submaps of one drive, in order.
 
     Args:
-        folder: Where they are written, each atomically; None = they stay in memory.
-        cached: How many submaps that were read are kept in memory.
+        folder: Folder that each is written to, atomically; None = they stay in memory.
+        cached: Number of submaps kept in memory after being read.
     """
 
     def __init__(self, folder: Path | None = None, cached: int = _CACHED) -> None:
@@ -57,7 +57,7 @@ class SubmapStore:
         return tuple(self._entries)
 
     def add(self, submap: Submap) -> None:
-        """Take the next submap.
+        """Store the next submap.
 
         Raises:
             OutputError: It cannot be written.
@@ -77,7 +77,7 @@ class SubmapStore:
         )
 
     def get(self, index: int) -> Submap:
-        """A submap, read again where it is not in memory.
+        """A submap, read from disk if it is not in memory.
 
         Raises:
             FormatError: Its file is missing or damaged.
@@ -90,7 +90,7 @@ class SubmapStore:
         return self._held[index]
 
     def __iter__(self) -> Iterator[Submap]:
-        """The submaps in order, one in memory at a time where they are on the disk."""
+        """The submaps in order; those on disk are read one at a time."""
         for index in range(len(self)):
             yield self._held[index] if index in self._held else self._read(index)
 
@@ -99,7 +99,7 @@ class SubmapStore:
         return [[e.index, e.first_frame, e.frames, e.voxels, e.cells] for e in self._entries]
 
     def restore(self, state: Sequence[Sequence[int]]) -> None:
-        """Go on from a `state`; the files of these submaps are in the folder."""
+        """Continue from a `state`; the files of its submaps must be in the folder."""
         self._entries = [SubmapEntry(*entry) for entry in state]
         self._held.clear()
 

@@ -12,11 +12,11 @@ from recon.pipeline.machine import peak_memory_mb
 from recon.pipeline.stopwatch import Stopwatch
 
 _MANY: Final = 0.1
-"""Share of frames without a trusted pose from which the whole drive is in question."""
+"""Share of frames without a trusted pose above which the whole drive is in question."""
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON can hold it: dataclasses as mappings, NaN and infinity as null."""
+    """Convert a value for JSON: dataclasses to mappings, NaN and infinity to None."""
     if is_dataclass(value) and not isinstance(value, type):
         return plain(asdict(value))
     if isinstance(value, dict):
@@ -29,7 +29,7 @@ def plain(value: Any) -> Any:
 
 
 def cost(stopwatch: Stopwatch, total_seconds: float) -> dict[str, Any]:
-    """What a run took: seconds per stage (stages overlap in time), in all, and memory."""
+    """Cost of a run: total seconds, seconds per stage (stages overlap), and peak memory."""
     return {
         "seconds": round(total_seconds, 3),
         "stages": {name: round(value, 3) for name, value in stopwatch.seconds.items()},
@@ -38,7 +38,7 @@ def cost(stopwatch: Stopwatch, total_seconds: float) -> dict[str, Any]:
 
 
 def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:
-    """One line for each thing to warn of, and for each stretch of frames that were lost."""
+    """One line per distinct warning, and per stretch of frames without a trusted pose."""
     told = dict.fromkeys(line for record in health for line in record.warnings)
     lines = [f"{_named(health, line)}: {line}" for line in told]
     bad = [index for index, record in enumerate(health) if not record.ok]
@@ -56,7 +56,7 @@ def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:
 
 
 def _named(health: Sequence[OdometryHealth], line: str) -> str:
-    """The frames that a warning is about; their first and last, where they are many."""
+    """The range of frames that a warning is about, first to last."""
     about = [index for index, record in enumerate(health) if line in record.warnings]
     return _frames(about[0], about[-1])
 

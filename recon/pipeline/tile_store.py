@@ -1,4 +1,4 @@
-"""What the surface of a drive is made from, kept on the disk tile by tile."""
+"""Points and voxels from which a drive is meshed, stored on disk tile by tile."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _NUMBERS = frozenset({"xyz", "rgb", "normals"})
 
 
 class TileStore:
-    """Points and voxels in map axes, in tiles whose middles are multiples of the edge.
+    """Points and voxels in map axes, in tiles centred at multiples of the edge length.
 
     Args:
-        folder: Where they are written; the files of one run.
-        tile_m: Edge of a tile.
+        folder: Folder for the files of one run.
+        tile_m: Edge length of a tile.
     """
 
     def __init__(self, folder: Path, tile_m: float) -> None:
@@ -47,12 +47,12 @@ class TileStore:
         return self._points.get(tile, 0)
 
     def bounds_m(self, tile: Tile) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Smallest and largest x and y of a tile. The first one has the map's origin inside."""
+        """Smallest and largest x and y of a tile. Tile (0, 0) is centred at the map's origin."""
         middle = np.array(tile, dtype=np.float64) * self.tile_m
         return middle - self.tile_m / 2, middle + self.tile_m / 2
 
     def put_cloud(self, cloud: PointCloud) -> None:
-        """Put by some points.
+        """Store points.
 
         Raises:
             OutputError: They cannot be written.
@@ -65,7 +65,7 @@ class TileStore:
             self._put("cloud", tile, {k: v for k, v in arrays.items() if v is not None})
 
     def put_voxels(self, voxels: OccupancyVoxels) -> None:
-        """Put by some voxels; all have one resolution.
+        """Store voxels; all must have the same resolution.
 
         Raises:
             OutputError: They cannot be written.
@@ -76,7 +76,7 @@ class TileStore:
             self._put("voxels", tile, arrays)
 
     def cloud_in(self, tile: Tile, margin_m: float) -> PointCloud | None:
-        """The points in a tile and within a margin of it, frame ``map``; None = there are none."""
+        """The points in a tile and within a margin of it, frame ``map``; None = no points."""
         low, high = self.bounds_m(tile)
         parts = []
         for found in self._read("cloud", tile, margin_m):
@@ -86,7 +86,7 @@ class TileStore:
         return join_clouds(parts)
 
     def voxels_in(self, tile: Tile, margin_m: float) -> OccupancyVoxels:
-        """The voxels of a tile and of those that its margin meets."""
+        """The voxels of a tile and of all tiles that its margin touches."""
         keys, log_odds = [np.zeros((0, 3), np.int32)], [np.zeros(0, np.float32)]
         for found in self._read("voxels", tile, margin_m):
             keys.append(found["keys"])
@@ -94,7 +94,7 @@ class TileStore:
         return OccupancyVoxels(np.concatenate(keys), np.concatenate(log_odds), self._resolution_m)
 
     def _split(self, xyz: NDArray[Any]) -> list[tuple[Tile, NDArray[np.intp]]]:
-        """The tiles that points lie in, each with the rows of its points."""
+        """The tiles that contain points, each with the row indices of its points."""
         homes = np.floor(xyz[:, :2] / self.tile_m + 0.5).astype(np.int64)
         tiles, where = np.unique(homes, axis=0, return_inverse=True)
         return [
@@ -110,7 +110,7 @@ class TileStore:
         parts.append(path)
 
     def _read(self, kind: str, tile: Tile, margin_m: float) -> list[dict[str, Any]]:
-        """The parts of a tile and of those within a margin of it."""
+        """The stored parts of a tile and of the tiles within a margin of it."""
         reach = int(np.ceil(margin_m / self.tile_m))
         steps = range(-reach, reach + 1)
         near = [(tile[0] + column, tile[1] + row) for column in steps for row in steps]

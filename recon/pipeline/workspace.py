@@ -1,4 +1,4 @@
-"""Where a run works: what it keeps on the disk while it lasts, and who times it."""
+"""The workspace of a run: its state on disk, threads and stopwatch."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ RAYS: Final = "rays.bin"
 
 @dataclass(frozen=True)
 class Workspace:
-    """What a drive is mapped with, apart from what decides the result.
+    """Resources of a run, none of which affect the result.
 
     Attributes:
-        stopwatch: Told the seconds per stage.
-        folder: Where closed submaps, keyframes and the checkpoint are written, so that memory
-            does not grow with the drive and a killed run can go on; it must stay as long as the
-            result is used. None = all stays in memory.
-        resume: Go on from the checkpoint in the folder, where there is one.
+        stopwatch: Times each stage.
+        folder: Folder for closed submaps, keyframes and the checkpoint, so that memory does not
+            grow with the drive and an interrupted run can be resumed; it must exist as long as the
+            result is used. None = everything stays in memory.
+        resume: Resume from the checkpoint in the folder, if there is one.
         threads: Threads of the matcher; None = all cores.
     """
 
@@ -52,5 +52,5 @@ class Workspace:
 
     @property
     def checkpoint(self) -> Checkpoint | None:
-        """What the run goes on from."""
+        """The checkpoint that the run resumes from."""
         return None if self.folder is None else Checkpoint(self.folder / "checkpoint.zip")
