@@ -81,7 +81,7 @@ class MeshSettings(Settings):
     )
     free_space: bool = Field(
         default=True,
-        description="Cut off what hangs in space that the cameras of a drive looked through.",
+        description="Remove surfaces in space that the cameras of a drive saw to be free.",
     )
 
 

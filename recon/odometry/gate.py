@@ -61,7 +61,8 @@ def judge(
         return _refused(f"overlap {correction.after.overlap:.2f} under {settings.min_overlap:g}")
     fall = 1.0 - correction.after.residual_m / max(correction.before.residual_m, 1e-12)
     if not fall >= settings.min_residual_gain:
-        return _refused(f"residual changes by {-100 * fall:+.1f} %: too little")
+        change = "falls" if fall > 0 else "rises"
+        return _refused(f"residual {change} by {abs(100 * fall):.1f} %")
     news = correction.step - offset
     covariance = icp_covariance(correction.after, settings)
     both = prior_covariance + covariance
