@@ -1,8 +1,8 @@
-"""Where the leaves of an octree are, told by the bits that say which children each node has.
+"""Finds the leaves of an octree from the bits that say which children each node has.
 
-Nodes come depth first, and the children of a node in the order of their numbers (bit 0 is x, bit 1
-y, bit 2 z). A walk may end after any node and go on with the next ones, so that a tree of any
-size can be read in pieces. The twin in plain Python stands in `recon.kernels.octree_reference`.
+Nodes come depth first, the children of a node in the order of their numbers (bit 0 is x, bit 1 y,
+bit 2 z). A walk can stop after any node and continue with the next ones, so a tree of any size can
+be read in pieces. `recon.kernels.octree_reference` is the twin in plain Python.
 """
 
 from __future__ import annotations
