@@ -199,7 +199,7 @@ def _vertices(vertex: Table | None, path: str | PathLike[str]) -> Table:
 
 
 def _check_precision(vertex: Table, path: str | PathLike[str]) -> None:
-    """Refuse places that float32 would move: UTM coordinates become steps of half a metre."""
+    """Reject coordinates that float32 would round too far, such as UTM: by up to half a metre."""
     for name in _XYZ:
         exact = vertex[name]
         if exact.dtype.itemsize <= 4:
