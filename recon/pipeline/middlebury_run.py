@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from recon.errors import SettingsError, SourceError
-from recon.evaluation.middlebury import scene_weight
+from recon.evaluation.middlebury import scene_weight, weighted_mean
 from recon.formats.atomic import write_text
 from recon.formats.pfm import write_pfm
 from recon.matching import MATCHERS
@@ -182,9 +182,13 @@ def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str) -> Figures:
     own = {name: figures[matcher] for name, figures in scenes.items() if figures}
     masked = {name: {mask: figures[mask] for mask in MASKS} for name, figures in own.items()}
     rated = {name: figures["confidence"] for name, figures in own.items()}
-    weighted = {**weighted_figures(masked), "confidence": weighted_confidence(rated)}
-    seconds = sum(figures["seconds"] for figures in own.values())
-    return {"scenes": own, "weighted": weighted, "seconds": round(seconds, 4)}
+    seconds = weighted_mean({name: figures["seconds"] for name, figures in own.items()})
+    weighted = {
+        **weighted_figures(masked),
+        "confidence": weighted_confidence(rated),
+        "seconds": seconds,
+    }
+    return {"scenes": own, "weighted": weighted}
 
 
 def _write(

@@ -45,8 +45,7 @@ def csv_table(summary: Figures) -> str:
     names = [*_HEAD[1:], *depths, *_CONFIDENCE]
     writer.writerow([_HEAD[0], "scene", "mask", "holes", *names, "seconds"])
     for matcher, found in summary["matchers"].items():
-        mean = {**found["weighted"], "seconds": found["seconds"]}
-        for scene, figures in [*found["scenes"].items(), (WEIGHTED, mean)]:
+        for scene, figures in [*found["scenes"].items(), (WEIGHTED, found["weighted"])]:
             for mask, holes in _KINDS:
                 cells = _all_cells(figures, mask, holes)
                 writer.writerow([matcher, scene, mask, holes, *cells, figures["seconds"]])
@@ -79,7 +78,7 @@ def _weighted_rows(matchers: Figures, mask: str, holes: str) -> list[Row]:
         depth = figures.get("depth", {}).get("median_percent")
         cells = [_number(cell) for cell in _cells(found["weighted"], mask, holes)]
         shown = f"{_number(depth)} %" if depth is not None else "–"
-        rows.append((name, *cells, shown, _number(found["seconds"])))
+        rows.append((name, *cells, shown, _number(found["weighted"]["seconds"], 3)))
     return rows
 
 

@@ -21,10 +21,11 @@ def masked(error: float | None, *, depth: bool) -> dict[str, Any]:
 def summary(error: float | None = 3.25, *, depth: bool = True) -> dict[str, Any]:
     figures = {mask: masked(error, depth=depth) for mask in ("nonocc", "all")}
     scenes = {name: {**figures, "seconds": 0.5} for name in ("Piano", "Teddy")}
-    found = {"scenes": scenes, "weighted": figures, "seconds": 1.0}
+    weighted = {**figures, "seconds": 0.5}
+    found = {"scenes": scenes, "weighted": weighted}
     rated = dict.fromkeys(("ece", "ause", "within_1_sigma", "within_2_sigma"), 0.125)
     sure = {name: {**one, "confidence": rated} for name, one in scenes.items()}
-    sad = {"scenes": sure, "weighted": {**figures, "confidence": rated}, "seconds": 1.0}
+    sad = {"scenes": sure, "weighted": {**weighted, "confidence": rated}}
     return {"matchers": {"sad": sad, "opencv-bm": found}}
 
 
@@ -43,6 +44,17 @@ def test_a_table_has_a_row_per_matcher_and_a_column_per_figure() -> None:
         "3.25",
     ]
     assert len({line.rstrip()[-4:] for line in first[2:]}) == 1
+
+
+def test_seconds_in_the_row_of_means_are_their_mean() -> None:
+    given = summary()
+    for scene, seconds in (("Piano", 0.25), ("Teddy", 0.75)):
+        given["matchers"]["sad"]["scenes"][scene]["seconds"] = seconds
+    first = text_tables(given).split("\n\n")[0].splitlines()
+    assert first[1].split()[-1] == "seconds"
+    assert first[2].split()[-1] == "0.500"
+    rows = list(csv.DictReader(io.StringIO(csv_table(given))))
+    assert {row["seconds"] for row in rows if row["scene"] == "weighted"} == {"0.5"}
 
 
 def test_markdown_has_as_many_cells_in_each_row() -> None:
