@@ -5,14 +5,14 @@
     folder/
       left/ right/     images (or cam0 cam1, infra1 infra2, image_left image_right …)
       frames.csv       optional, written by `recon capture`: left file, right file, their times
-      times.txt        optional: seconds, one line per pair
+      times.txt        optional: seconds, one line per pair; wins over times in names
       groundtruth.txt  optional: t tx ty tz qx qy qz qw of the left camera
       calib.txt        or any other supported calibration file
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -25,7 +25,7 @@ from recon.sources.pairing import (
     find_partners,
     pair_stamps,
     partner_names,
-    stamp_of_name,
+    stamps_of_names,
 )
 from recon.sources.pictures import (
     PictureFrame,
@@ -36,11 +36,12 @@ from recon.sources.pictures import (
 )
 from recon.sources.rig import read_rig
 from recon.sources.settings import SourceSettings
-from recon.sources.times import read_times
+from recon.sources.times import read_times_of_pairs
 from recon.sources.truth import read_tum_truth
 from recon.structures.arrays import Float64
 
 DEFAULT_RATE_HZ: Final = 10.0
+_TIMES: Final = "times.txt"
 _INSIDE: Final = ("", "data", "images", "image", "img")
 
 
@@ -121,9 +122,11 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
         )
     left, right = _list_both(*views)
     by = settings.pair_by
+    listed = next((p / _TIMES for p in (folder, views[0]) if (p / _TIMES).is_file()), None)
     stamps = _stamps(left, right) if by in {"auto", "stamp"} else None
     if stamps is not None:
-        return _pair_by_stamp(left, right, stamps, settings, folder)
+        found = _pair_by_stamp(left, right, stamps, settings, folder)
+        return found if listed is None else _with_times(found, listed, left)
     if by == "stamp":
         raise SourceError("names of the images are not timestamps", where=left[0])
     named = _by_name(left, right) if by in {"auto", "name"} else None
@@ -131,8 +134,8 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
     if named is None:
         named, how = _by_index(left, right, by, folder), "by their order"
     label = f"{views[0].name} and {views[1].name}" if views[0] != views[1] else "one folder"
-    stamps_s, texts = _listed_times(folder, len(named))
-    return _Pairing(named, stamps_s, f"{label}, paired {how}", texts)
+    found = _Pairing(named, None, f"{label}, paired {how}")
+    return found if listed is None else _with_times(found, listed, left)
 
 
 def _list_both(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
@@ -155,12 +158,9 @@ def _pair_as_listed(folder: Path) -> _Pairing:
 
 
 def _stamps(left: list[Path], right: list[Path]) -> tuple[Float64, Float64] | None:
-    """The timestamps in the file names, or None unless all names have one."""
-    found = [[stamp_of_name(path.stem) for path in paths] for paths in (left, right)]
-    if any(stamp is None for stamps in found for stamp in stamps):
-        return None
-    first, second = (np.array(stamps, dtype=np.float64) for stamps in found)
-    return first, second
+    """The timestamps in the file names, or None unless all names are timestamps."""
+    first, second = (stamps_of_names([path.stem for path in paths]) for paths in (left, right))
+    return None if first is None or second is None else (first, second)
 
 
 def _pair_by_stamp(
@@ -205,9 +205,12 @@ def _by_index(
     return list(zip(left, right, strict=True))
 
 
-def _listed_times(folder: Path, pairs: int) -> tuple[Float64 | None, tuple[Path, ...]]:
-    path = folder / "times.txt"
-    return (read_times(path, pairs), (path,)) if path.is_file() else (None, ())
+def _with_times(found: _Pairing, path: Path, left: list[Path]) -> _Pairing:
+    """The pairs with the times of a file, which win over those in names."""
+    paired = {pair[0] for pair in found.pairs}
+    kept = [k for k, image in enumerate(left) if image in paired]
+    stamps_s = read_times_of_pairs(path, [image.stem for image in left], kept)
+    return replace(found, stamps_s=stamps_s, how=f"{found.how}, times of {_TIMES}", texts=(path,))
 
 
 def _times(found: _Pairing, settings: SourceSettings) -> tuple[Float64, str]:

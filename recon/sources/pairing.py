@@ -33,6 +33,11 @@ SIDES: Final = (
 _DIGITS: Final = re.compile(r"(\d+)")
 _STAMP: Final = re.compile(r"\d{10}(\.\d+)?|\d{13}|\d{16}|\d{19}|\d+\.\d+")
 
+_SECONDS_DIGITS: Final = 10
+"""Digits of a time in seconds since 1970, from 2001 to 2286."""
+_CLOCK_STEPS: Final = 10
+"""Least step of padded numbers that are a clock: 10 ms, or less in finer units."""
+
 
 @dataclass(frozen=True, eq=False)
 class StampPairs:
@@ -93,9 +98,56 @@ def stamp_of_name(stem: str) -> float | None:
     """
     if _STAMP.fullmatch(stem) is None:
         return None
-    if "." in stem or len(stem) == 10:
+    if "." in stem or len(stem) == _SECONDS_DIGITS:
         return float(stem)
-    return float(int(stem) / 10 ** (len(stem) - 10))
+    return float(int(stem) / 10 ** (len(stem) - _SECONDS_DIGITS))
+
+
+def stamps_of_names(stems: Sequence[str]) -> Float64 | None:
+    """Timestamps in the file names of one camera.
+
+    Returns:
+        float64 (N,), seconds; None unless all names are timestamps, or if they are counters, such
+        as KITTI's ``0000000123``.
+    """
+    stamps = [stamp_of_name(stem) for stem in stems]
+    if any(stamp is None for stamp in stamps) or _are_counters(stems):
+        return None
+    return np.array(stamps, dtype=np.float64)
+
+
+def _are_counters(stems: Sequence[str]) -> bool:
+    """Whether names with as many digits as a timestamp count frames.
+
+    Today's times have no leading zero. Those of a clock that starts at 0 may have one, but are
+    many of their units (ms, µs or ns) apart, and no camera is timed in whole seconds.
+    """
+    if any("." in stem for stem in stems) or not stems[0].startswith("0"):
+        return False
+    steps = np.diff([int(stem) for stem in stems])
+    return len(stems[0]) == _SECONDS_DIGITS or not steps.size or np.median(steps) < _CLOCK_STEPS
+
+
+def lines_of_pairs(frames: Sequence[str], kept: Sequence[int], lines: int) -> list[int] | None:
+    """The line of each pair in a file with one line per frame, such as ``times.txt``.
+
+    One line per pair fits at once. Else names that are counters give the line, so that it stays
+    the right one where images were removed; else the position does, and further lines are ignored.
+
+    Args:
+        frames: Names without suffix of all frames in order, also of those without a partner.
+        kept: Positions of the pairs among them.
+        lines: Number of lines of the file.
+
+    Returns:
+        Indices from 0; None = the file has too few lines.
+    """
+    if lines == len(kept):
+        return list(range(lines))
+    numbers = [int(frames[k]) if frames[k].isdecimal() else lines for k in kept]
+    if max(numbers) < lines:
+        return numbers
+    return list(kept) if len(frames) <= lines else None
 
 
 def check_increasing(stamps_s: Float64, where: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from recon.errors import FormatError, SourceError
 from recon.formats.files import read_table, read_text
+from recon.sources.pairing import lines_of_pairs
 from recon.structures.arrays import Float64
 
 
@@ -22,21 +24,40 @@ def read_times(path: Path, frames: int) -> Float64:
         SourceError: The file is missing or too short.
         FormatError: A line is not a number, or time runs backwards.
     """
+    return read_times_of_pairs(path, [""] * frames, range(frames))
+
+
+def read_times_of_pairs(path: Path, frames: Sequence[str], kept: Sequence[int]) -> Float64:
+    """Read ``times.txt`` for the frames that are pairs; see `lines_of_pairs`.
+
+    Args:
+        path: The file: seconds, one line per frame.
+        frames: Names without suffix of all frames in order, also of those without a partner.
+        kept: Positions of the pairs among them.
+
+    Returns:
+        float64, one time per pair, not decreasing.
+
+    Raises:
+        SourceError: The file is missing or too short.
+        FormatError: A line is not a number, or time runs backwards.
+    """
     if not path.exists():
         raise SourceError("file does not exist", where=path)
     table, lines = read_table(path, (1,))
-    times: Float64 = table[:frames, 0].copy()
-    if len(times) < frames:
+    chosen = lines_of_pairs(frames, kept, len(table))
+    if chosen is None:
         raise SourceError(
             "fewer times than images",
             where=path,
-            got=f"{len(times)} times",
-            expected=f"{frames}",
+            got=f"{len(table)} times",
+            expected=f"{len(frames)}",
         )
+    times: Float64 = table[chosen, 0]
     backwards = np.diff(times) < 0
     if backwards.any():
         raise FormatError(
-            "time runs backwards", where=f"{path}:{lines[int(np.argmax(backwards)) + 1]}"
+            "time runs backwards", where=f"{path}:{lines[chosen[int(np.argmax(backwards)) + 1]]}"
         )
     return times
 
