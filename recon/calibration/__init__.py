@@ -4,7 +4,7 @@ from recon.calibration.board_size import check_charuco, check_chessboard, grown_
 from recon.calibration.bootstrap import DepthError, Spread, measure_depth, measure_spread
 from recon.calibration.bundle import Sighting, View
 from recon.calibration.detect import find_board, orient_like
-from recon.calibration.quality import coverage, shared_pixels, tilt_deg
+from recon.calibration.quality import coverage, distances_m, shared_pixels, tilt_deg
 from recon.calibration.settings import CalibrationSettings, LensKind
 from recon.calibration.stereo import StereoFit, calibrate_stereo
 
@@ -20,6 +20,7 @@ __all__ = [
     "check_charuco",
     "check_chessboard",
     "coverage",
+    "distances_m",
     "find_board",
     "grown_size",
     "measure_depth",

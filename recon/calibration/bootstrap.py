@@ -23,6 +23,8 @@ from recon.structures.arrays import Float64
 # The depth error is evaluated on a 3 by 3 grid in the left image, in fractions of its size.
 _PLACES: Final = (0.2, 0.5, 0.8)
 _MIDDLE: Final = 4
+MATCHED: Final = 0.02
+"""Depth error due to matching at the default working distance, relative to it."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +57,14 @@ class Spread:
         baseline_m: Interval (low, high) of the baseline.
         rotation_deg: Root mean square rotation of the right camera relative to the solution.
         depths: Predicted depth error at each distance.
+        working: The same at the working distance, see `working_distance`.
     """
 
     focal_px: tuple[float, float]
     baseline_m: tuple[float, float]
     rotation_deg: float
     depths: tuple[DepthError, ...]
+    working: DepthError
 
 
 def resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibration]:
@@ -104,7 +108,21 @@ def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
         baseline_m=_interval([rig.baseline_m for rig in rigs], settings),
         rotation_deg=float(np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2)))),
         depths=tuple(_depth_error(fit, rigs, depth, settings) for depth in settings.depths_m),
+        working=_depth_error(fit, rigs, working_distance(fit.calibration, settings), settings),
     )
+
+
+def working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> float:
+    """The distance at which depth matters, in metres.
+
+    It is `CalibrationSettings.working_m`, or else as far as the rig itself allows 2 % of error: an
+    error of calibration and of matching both grow with its square, so it is the same to ask there
+    whether the calibration is as good as the matching.
+    """
+    if settings.working_m is not None:
+        return settings.working_m
+    focal_px = float(rig.left.matrix[0, 0])
+    return MATCHED * focal_px * rig.baseline_m / settings.match_sigma_px
 
 
 def measure_depth(rig: StereoCalibration, left_px: Float64, right_px: Float64) -> Float64:

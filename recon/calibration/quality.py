@@ -40,3 +40,12 @@ def tilt_deg(fit: StereoFit) -> Float64:
     """float64 (V,), angle between the board's normal and the left camera's optical axis."""
     normals = np.array([T[2, 2] for T in fit.state.T_rig_board])
     return np.asarray(np.degrees(np.arccos(np.clip(np.abs(normals), 0.0, 1.0))))
+
+
+def distances_m(fit: StereoFit) -> Float64:
+    """float64 (V,), distance of the middle of the board from the left camera."""
+    middles = [
+        (T @ [*view.seen[0].board_m.mean(axis=0), 1.0])[:3]
+        for T, view in zip(fit.state.T_rig_board, fit.views, strict=True)
+    ]
+    return np.asarray(np.linalg.norm(middles, axis=1))

@@ -42,6 +42,12 @@ class CalibrationSettings(Settings):
         default=(2.0, 5.0, 10.0, 20.0),
         description="Depths at which the depth error is predicted, in metres.",
     )
+    working_m: float | None = Field(
+        default=None,
+        gt=0,
+        description="Distance for which the verdict is made, in metres; unset: where the expected "
+        "error of matching is 2 % of the distance.",
+    )
     match_sigma_px: float = Field(
         default=0.25, gt=0, description="Assumed matching error for that prediction, in pixels."
     )

@@ -17,6 +17,7 @@ from recon.calibration.initial import (
     solve_robustly,
     view_errors,
 )
+from recon.calibration.repeats import group_views
 from recon.calibration.settings import CalibrationSettings
 from recon.errors import CalibrationError
 from recon.structures import StereoCalibration
@@ -36,6 +37,7 @@ class StereoFit:
         state: The rig with the poses of the board.
         information: Information of each view about the shared parameters.
         views: The views that were used.
+        repeated: Names of the views that were left out since they repeat another.
         dropped: Names of the views that were dropped, with their rms errors in pixels.
         errors_px: float64 (V, 2), rms error of each used view in the left and right image.
         alone_px: Rms errors of the left and the right camera, each calibrated alone.
@@ -46,6 +48,7 @@ class StereoFit:
     state: RigState
     information: Information
     views: tuple[View, ...]
+    repeated: tuple[str, ...]
     dropped: dict[str, float]
     errors_px: Float64
     alone_px: tuple[float, float]
@@ -55,8 +58,9 @@ class StereoFit:
 def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSettings) -> StereoFit:
     """Calibrate two cameras.
 
-    Each camera is calibrated alone, then all parameters of both are refined together. Views whose
-    error exceeds `CalibrationSettings.outlier_ratio` times the median are dropped.
+    Each camera is calibrated alone, then all parameters of both are refined together. Of views that
+    repeat each other, one is used. Views whose error exceeds `CalibrationSettings.outlier_ratio`
+    times the median are dropped.
 
     Args:
         views: Each with a sighting of the left and of the right camera.
@@ -68,8 +72,10 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
 
     Ref: Zhang 2000; the lens models are OpenCV's.
     """
-    kept = list(views)
-    _check_count(kept, settings)
+    groups = group_views(views)
+    kept = [group[0] for group in groups]
+    repeated = tuple(view.name for group in groups for view in group[1:])
+    _check_count(kept, settings, repeated=len(repeated))
     left, right = (
         calibrate_one([view.seen[side] for view in kept], size, settings) for side in (0, 1)
     )
@@ -86,11 +92,12 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
         dropped |= {v.name: float(e) for v, e, g in zip(kept, errors, good, strict=True) if not g}
         kept, state = _keep(kept, state, good)
         alone = tuple(each[good] for each in alone)
-        _check_count(kept, settings, dropped)
+        _check_count(kept, settings, dropped, len(repeated))
         state, information = solve(kept, state)
         if good.all():
             break
-    return _finish(kept, state, information, dropped, (_rms(alone[0]), _rms(alone[1])), settings)
+    fit = _finish(kept, state, information, (_rms(alone[0]), _rms(alone[1])), settings)
+    return replace(fit, dropped=dropped, repeated=repeated)
 
 
 def stereo_of(state: RigState) -> StereoCalibration:
@@ -107,7 +114,6 @@ def _finish(
     views: list[View],
     state: RigState,
     information: Information,
-    dropped: dict[str, float],
     alone_px: tuple[float, float],
     settings: CalibrationSettings,
 ) -> StereoFit:
@@ -117,7 +123,7 @@ def _finish(
     if rms_px > settings.max_rms_px:
         raise _no_fit(rms_px, alone_px, settings)
     return StereoFit(
-        stereo_of(state), state, information, tuple(views), dropped, errors, alone_px, rms_px
+        stereo_of(state), state, information, tuple(views), (), {}, errors, alone_px, rms_px
     )
 
 
@@ -136,11 +142,15 @@ def _rms(errors: Float64) -> float:
 
 
 def _check_count(
-    views: Sequence[View], settings: CalibrationSettings, dropped: dict[str, float] | None = None
+    views: Sequence[View],
+    settings: CalibrationSettings,
+    dropped: dict[str, float] | None = None,
+    repeated: int = 0,
 ) -> None:
     if len(views) >= settings.min_views:
         return
     lost = f", after {', '.join(dropped)} did not fit" if dropped else ""
+    lost += f", and {repeated} that repeat them" if repeated else ""
     raise CalibrationError(
         "too few views show the board in both images",
         got=f"{len(views)}{lost}",

@@ -58,6 +58,13 @@ def calibrate(
             show_default="radtan",
         ),
     ] = None,
+    distance: Annotated[
+        float | None,
+        typer.Option(
+            help="Distance in metres for which the verdict is made.",
+            show_default="where matching errs by 2 %",
+        ),
+    ] = None,
     report: Annotated[
         Path | None,
         typer.Option(
@@ -72,10 +79,11 @@ def calibrate(
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
-    """Calibrate a stereo rig from images of a board, and predict its depth error.
+    """Calibrate a stereo rig from images of a board, predict its depth error, and judge it.
 
-    Views that do not fit are dropped and named; intervals come from a bootstrap
-    over the views. How to take good images: docs/calibration.md.
+    The verdict is good, usable or repeat, with what to do about it. Views that
+    do not fit are dropped and named, repeated ones count once; intervals come
+    from a bootstrap over the views. Good images: docs/board-capture.md.
 
     Examples:
       recon calibrate "left*.png" "right*.png" --board chess:9x6:25mm -o rig.yaml
@@ -92,10 +100,15 @@ def calibrate(
         # kalibr's lens model has two radial terms.
         fitting = ["calibration.radial_terms=2"] if form is Form.kalibr else []
         chosen = [] if model is None else [f"calibration.model={model.value}"]
+        if distance is not None:
+            chosen.append(f"calibration.working_m={distance}")
         settings = load_config(config, [*fitting, *(set_ or ()), *chosen])
         options = CalibrateOptions(out, form.value, report, threads, present_calibration)
         run = run_calibration(left, right, parse_board(board), settings, options)
     if json:
         print_json(run.summary)
     else:
-        print_run(run.summary | tell_depths(run.summary), stages=verbose)
+        print_run(run.summary | tell_depths(run.summary) | {"warnings": ()}, stages=verbose)
+        for finding in run.summary["findings"]:
+            typer.echo(f"{finding['severity']}: {finding['text']}")
+        typer.echo(f"verdict: {run.summary['verdict']}")

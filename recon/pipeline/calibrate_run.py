@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -25,7 +25,8 @@ from recon.formats.kalibr import write_kalibr
 from recon.formats.opencv_yaml import write_opencv_calibration
 from recon.formats.recon_yaml import write_recon_calibration
 from recon.pipeline.board_views import BoardViews, find_views
-from recon.pipeline.calibrate_summary import advise, summarise
+from recon.pipeline.calibrate_summary import summarise
+from recon.pipeline.calibrate_verdict import judge_calibration, verdict_of_calibration
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.machine import serial_algebra, use_threads
 from recon.pipeline.record import fingerprint, write_record
@@ -41,7 +42,7 @@ CalibrationForm = Literal["recon", "opencv", "ros", "kalibr"]
 
 # Figures that are also written into the calibration file.
 _KEPT: Final = (
-    "board", "stereo_rms_px", "epipolar_px", "baseline_interval_m", "focal_interval_px",
+    "verdict", "board", "stereo_rms_px", "epipolar_px", "baseline_interval_m", "focal_interval_px",
     "views_used", "views_dropped", "depth_error_cm",
 )  # fmt: skip
 
@@ -122,7 +123,10 @@ def run_calibration(
         with watch.stage("bootstrap"), serial_algebra():
             spread = measure_spread(fit, config.calibration)
         run = _run(config, seen, fit, spread)
-        warnings = advise(seen.board, pictures, run.summary)
+        findings = judge_calibration(seen.board, pictures, run.summary)
+        warnings = [finding.text for finding in findings]
+        run.summary["verdict"] = verdict_of_calibration(findings)
+        run.summary["findings"] = [asdict(finding) for finding in findings]
         run.summary["warnings"] = warnings
         _write(run, options, directory)
         run.summary.update(cost(watch, time.perf_counter() - start))

@@ -22,7 +22,7 @@ from recon.structures import Disparity, RectifiedPair, TrajectoryMetrics
 
 # Key of the summary -> label and format of its figure.
 FigureFormats = Mapping[str, tuple[str, str]]
-_NOT_TABULATED: Final = frozenset({"stages", "warnings"})
+_NOT_TABULATED: Final = frozenset({"stages", "warnings", "findings"})
 _HOW_TO_TURN: Final = (
     "Drag to rotate, scroll to zoom, drag with the right button to pan; click in the legend to "
     "show or hide a part."

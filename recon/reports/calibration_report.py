@@ -113,6 +113,8 @@ def _content(run: CalibrationRun, figures: Mapping[str, bytes]) -> ReportContent
         subtitle=f"{s['board']}, {s['views_used']} of {s['views']} views, lens {s['model']}",
         command=command_line(),
         warnings=s["warnings"],
+        verdict=f"Verdict: {s['verdict']}",
+        sound=s["verdict"] == "good",
         figures=[
             ("Reprojection error (rms)", f"{s['stereo_rms_px']:.3f} px"),
             ("Row error, rectified", f"{s['epipolar_px']:.3f} px"),

@@ -134,6 +134,8 @@ class ReportContent:
         subtitle: One line below it: source, size, time.
         command: The command of the run, or "".
         warnings: Warnings, shown before the figures.
+        verdict: Heading of the warnings, such as "Verdict: usable"; "" counts them.
+        sound: Whether the warnings are shown in green, as remarks on a good result.
         figures: The key figures, as (label, value).
         sections: The body.
         config: The effective configuration, shown collapsed.
@@ -144,6 +146,8 @@ class ReportContent:
     subtitle: str = ""
     command: str = ""
     warnings: Sequence[str] = ()
+    verdict: str = ""
+    sound: bool = False
     figures: Sequence[tuple[str, str]] = ()
     sections: Sequence[Section] = ()
     config: str = ""
@@ -160,7 +164,7 @@ def render_html(content: ReportContent) -> str:
     body = [
         _header(content, sections),
         "<main>",
-        _warnings(content.warnings),
+        _warnings(content),
         _figures(content.figures),
         *(_section(number, section, scene_numbers) for number, section in enumerate(sections)),
         _details(content),
@@ -205,15 +209,15 @@ def _header(content: ReportContent, sections: Sequence[Section]) -> str:
     )
 
 
-def _warnings(warnings: Sequence[str]) -> str:
-    if not warnings:
-        return '<div class="notice good"><h2>No warnings</h2></div>'
-    items = "".join(f"<li>{escape(text)}</li>" for text in warnings)
-    plural = "s" if len(warnings) > 1 else ""
-    return (
-        f'<div class="notice warn" role="alert"><h2>{len(warnings)} warning{plural}</h2>'
-        f"<ul>{items}</ul></div>"
-    )
+def _warnings(content: ReportContent) -> str:
+    count = len(content.warnings)
+    counted = f"{count} warning{'s' if count > 1 else ''}" if count else "No warnings"
+    heading = f"<h2>{escape(content.verdict or counted)}</h2>"
+    items = "".join(f"<li>{escape(text)}</li>" for text in content.warnings)
+    listed = f"<ul>{items}</ul>" if items else ""
+    if content.sound or not (count or content.verdict):
+        return f'<div class="notice good">{heading}{listed}</div>'
+    return f'<div class="notice warn" role="alert">{heading}{listed}</div>'
 
 
 def _figures(figures: Sequence[tuple[str, str]]) -> str:

@@ -217,3 +217,74 @@ def test_the_intervals_hold_the_truth_in_most_repeats(make_views, lens: str) -> 
     shares = {name: float(np.mean(each)) for name, each in held.items()}
     sys.stdout.write(f"{lens}: share of intervals that hold the truth: {shares}\n")
     assert min(shares.values()) >= 0.85, shares
+
+
+def again(views: list[View], times: int, sigma_px: float, seed: int = 9) -> list[View]:
+    """Each view captured several times, with noise of the corners that is new each time."""
+    rng = np.random.default_rng(seed)
+    return [
+        View(
+            f"{view.name}-{number}",
+            tuple(
+                replace(seen, pixels=seen.pixels + rng.normal(0, sigma_px, seen.pixels.shape))
+                for seen in view.seen
+            ),
+        )
+        for view in views
+        for number in range(times)
+    ]
+
+
+@pytest.mark.parametrize("fresh_px", [0.0, 0.05, 0.5])
+def test_views_captured_five_times_do_not_make_the_forecast_better(
+    make_views, fresh_px: float
+) -> None:
+    """Noise of a still board that repeats (0.1 px) and, on top of it, noise that does not."""
+    settings = CalibrationSettings(bootstrap=200)
+    _, views = make_views(count=13)
+    single = again(views, 1, fresh_px)
+    once = measure_spread(calibrate_stereo(single, SIZE, settings), settings)
+    fit = calibrate_stereo(again(views, 5, fresh_px), SIZE, settings)
+    five = measure_spread(fit, settings)
+    assert (len(fit.views), len(fit.repeated)) == (13, 52)
+    # Another draw of the fresh noise; a spread from 13 views is itself known to a quarter or so.
+    tolerance = 0.5 if fresh_px else 1e-6
+    assert five.rotation_deg == pytest.approx(once.rotation_deg, rel=tolerance)
+    for one, other in zip(once.depths, five.depths, strict=True):
+        assert other.calibration_m == pytest.approx(one.calibration_m, rel=tolerance)
+
+
+def test_views_that_only_resemble_each_other_are_kept(make_views) -> None:
+    _, views = make_views(count=40)
+    assert calibrate_stereo(views, SIZE, CalibrationSettings()).repeated == ()
+
+
+def test_a_board_whose_corners_begin_at_the_other_end_repeats_the_view(make_views) -> None:
+    _, views = make_views(count=6)
+    turned = replace(
+        views[2],
+        name="turned",
+        seen=tuple(replace(seen, pixels=seen.pixels[::-1]) for seen in views[2].seen),
+    )
+    fit = calibrate_stereo([*views, turned], SIZE, CalibrationSettings())
+    assert fit.repeated == ("turned",)
+
+
+def test_one_pose_captured_often_is_too_few_views(make_views) -> None:
+    _, views = make_views(count=3)
+    with pytest.raises(CalibrationError, match=r"got 3, and 12 that repeat them"):
+        calibrate_stereo(again(views, 5, 0.1), SIZE, CalibrationSettings())
+
+
+def test_depth_is_judged_where_matching_errs_by_two_percent_or_where_the_user_works(
+    make_views,
+) -> None:
+    rig, views = make_views(count=10)
+    fit = calibrate_stereo(views, SIZE, CalibrationSettings())
+    own = measure_spread(fit, CalibrationSettings(bootstrap=60)).working
+    assert own.matching_m == pytest.approx(0.02 * own.depth_m)
+    assert own.depth_m == pytest.approx(
+        0.02 * rig.left.matrix[0, 0] * rig.baseline_m / 0.25, rel=0.01
+    )
+    asked = measure_spread(fit, CalibrationSettings(bootstrap=60, working_m=1.5)).working
+    assert asked.depth_m == 1.5

@@ -8,7 +8,7 @@ import pytest
 
 from recon.errors import CalibrationError, OutputError, ReconError, SourceError
 from recon.formats.calibration import read_calibration
-from recon.formats.image import write_image
+from recon.formats.image import read_image, write_image
 from recon.pipeline.board_views import find_views
 from recon.pipeline.calibrate_run import CalibrateOptions, run_calibration
 from recon.pipeline.calibrate_summary import tell_depths
@@ -73,6 +73,11 @@ def test_report_and_pictures_are_written(drawn: Path, tmp_path: Path) -> None:
     assert {"coverage.png", "epipolar_raw.png", "epipolar_rectified.png"} <= names
     html = (tmp_path / "out" / "report.html").read_text()
     assert "Stereo calibration" in html
+    # Eight views are too few to be sure of the forecast, however small it is.
+    assert run.summary["verdict"] in ("usable", "repeat")
+    assert f"Verdict: {run.summary['verdict']}" in html
+    assert "No warnings" not in html
+    assert run.summary["findings"][0]["text"] in html
     assert f"{run.summary['stereo_rms_px']:.3f} px" in html
     assert (tmp_path / "out" / "calibration.yaml").is_file()
 
@@ -143,8 +148,10 @@ def test_a_charuco_board_of_the_older_pattern_is_found_out(tmp_path: Path) -> No
 def test_depth_errors_are_told_in_words() -> None:
     known = {"calibration": 110.4, "low": -3.24, "high": 4.56, "matching": 2.251}
     unknown = dict.fromkeys(known) | {"matching": 0.01}
-    told = tell_depths({"depth_error_cm": {"2": known, "0.1": unknown}})
+    working = {"distance_m": 3.548, "calibration_share": 0.0551}
+    told = tell_depths({"depth_error_cm": {"2": known, "0.1": unknown}, "working_error": working})
     assert told == {
+        "depth error at the working distance of 3.55 m": "5.5 %",
         "depth error at 2 m": "110 cm, in the middle -3.2 to 4.6; of matching 2.3 cm",
         "depth error at 0.1 m": "no common view; of matching 0.01 cm",
     }
@@ -154,6 +161,26 @@ def test_a_folder_for_a_calibration_file_is_refused(drawn: Path, tmp_path: Path)
     (tmp_path / "rig.yaml").mkdir()
     with pytest.raises(OutputError, match="calibration file is a folder"):
         calibrate(drawn, tmp_path)
+
+
+def test_a_still_board_on_video_gives_the_forecast_of_one_image_each(
+    drawn: Path, tmp_path: Path
+) -> None:
+    often = tmp_path / "often"
+    often.mkdir()
+    rng = np.random.default_rng(3)
+    for path in drawn.iterdir():
+        for number in range(3):
+            fresh = read_image(path) + rng.normal(0, 1.0, (480, 640)) * (number > 0)
+            copy = often / f"{path.stem}_{number}.png"
+            write_image(copy, np.clip(np.rint(fresh), 0, 255).astype(np.uint8))
+    once = calibrate(drawn, tmp_path / "a").summary
+    thrice = calibrate(often, tmp_path / "b").summary
+    assert (thrice["views_used"], len(thrice["views_repeated"])) == (8, 16)
+    # Another draw of the sensor's noise in the corners: a spread from 8 views varies by a third.
+    spread = "rotation_spread_deg"
+    assert thrice[spread] == pytest.approx(once[spread], rel=0.35)
+    assert any(finding["code"] == "repeats" for finding in thrice["findings"])
 
 
 @pytest.mark.real
@@ -167,4 +194,23 @@ def test_the_published_chessboard_pairs_calibrate_as_they_should(
     assert summary["stereo_rms_px"] <= 0.45
     assert summary["baseline_squares"] == pytest.approx(3.34, abs=0.02)
     assert summary["epipolar_px"] <= 0.3
-    assert summary["views_used"] == 13
+    assert (summary["views_used"], summary["views_repeated"]) == (13, [])
+
+
+@pytest.mark.real
+def test_the_published_views_captured_five_times_have_the_same_forecast(
+    recon_data: Path, tmp_path: Path
+) -> None:
+    folder = recon_data / "calibration" / "opencv_chessboard"
+    for path in folder.glob("*.jpg"):
+        for number in range(5):
+            (tmp_path / f"{path.stem}_{number}.jpg").symlink_to(path)
+    summaries = []
+    for name, source in (("once", folder), ("five", tmp_path)):
+        options = CalibrateOptions(None, "recon", tmp_path / name, 1, None)
+        sides = (str(source / "left*.jpg"), str(source / "right*.jpg"))
+        summaries.append(run_calibration(*sides, BOARD, load_config(None, QUICK), options).summary)
+    once, five = summaries
+    assert five["rotation_spread_deg"] == pytest.approx(once["rotation_spread_deg"], rel=1e-6)
+    # 0.12 degrees between the cameras, which is 5 % of the depth at 3.5 m.
+    assert once["verdict"] == five["verdict"] != "good"
