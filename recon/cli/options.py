@@ -34,7 +34,7 @@ Matcher = Annotated[
     str | None,
     typer.Option(
         "--matcher",
-        help="Matcher: sad, sgm, opencv-bm, opencv-sgbm or onnx.",
+        help="Matcher: sad, sgm, opencv-bm, opencv-sgbm, onnx, or one of an installed plug-in.",
         show_default="matching.matcher, sad unless changed",
     ),
 ]

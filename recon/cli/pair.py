@@ -55,7 +55,12 @@ def pair(
       recon pair im0.png im1.png --calib calib.txt --truth disp0GT.pfm
     """
     with session():
-        from recon.pipeline.config import PAIR_DEFAULTS, load_config, matching_overrides
+        from recon.pipeline.config import (
+            PAIR_DEFAULTS,
+            check_ndisp,
+            load_config,
+            matching_overrides,
+        )
         from recon.pipeline.pair_input import read_pair_input
         from recon.pipeline.pair_run import PairOptions, run_pair
         from recon.reports import present_pair
@@ -63,6 +68,7 @@ def pair(
 
         overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
         settings = load_config(config, overrides, PAIR_DEFAULTS)
+        check_ndisp(settings, ndisp)
         unit = settings.source.metres_per_unit if unit_m is None else unit_m
         given = read_pair_input(left, right, calib, truth, metres_per_unit=unit)
         options = PairOptions(
@@ -98,7 +104,12 @@ def disparity(
       recon disparity raw_left.png raw_right.png --calib rig.yaml --matcher sgm
     """
     with session():
-        from recon.pipeline.config import PAIR_DEFAULTS, load_config, matching_overrides
+        from recon.pipeline.config import (
+            PAIR_DEFAULTS,
+            check_ndisp,
+            load_config,
+            matching_overrides,
+        )
         from recon.pipeline.pair_input import read_pair_input
         from recon.pipeline.pair_run import PairOptions, run_pair
         from recon.reports import present_disparity
@@ -106,6 +117,7 @@ def disparity(
 
         overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
         settings = load_config(config, overrides, PAIR_DEFAULTS)
+        check_ndisp(settings, ndisp)
         unit = settings.source.metres_per_unit
         given = read_pair_input(left, right, calib, metres_per_unit=unit)
         options = PairOptions(

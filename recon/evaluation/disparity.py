@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from recon.errors import EvaluationError
 from recon.geometry.triangulation import depth_from_disparity
@@ -16,7 +17,7 @@ from recon.structures import (
     DisparityTruth,
     RectifiedCamera,
 )
-from recon.structures.arrays import Bool, Float32, Float64
+from recon.structures.arrays import Bool, Float32, Float64, float_map
 
 THRESHOLDS_PX: Final = (0.5, 1.0, 2.0, 4.0)
 _QUANTILES: Final = (50, 90, 95, 99)
@@ -26,8 +27,8 @@ _DEPTH_SHARE: Final = 0.05
 
 
 def evaluate_disparity(
-    estimate: Disparity | Float32,
-    truth: DisparityTruth,
+    estimate: Disparity | ArrayLike,
+    truth: DisparityTruth | ArrayLike,
     thresholds_px: Sequence[float] = THRESHOLDS_PX,
     *,
     occluded: bool = False,
@@ -39,8 +40,9 @@ def evaluate_disparity(
     value count as invalid and not as bad, so ``bad + invalid`` is the share of all failures.
 
     Args:
-        estimate: A disparity, or its values: float32 (H, W), pixels, NaN = none.
-        truth: Ground truth at the same size.
+        estimate: A disparity, or its values: (H, W), pixels, not finite = none.
+        truth: Ground truth at the same size, or its values as `DisparityTruth.from_values` takes
+            them.
         thresholds_px: Thresholds of ``bad``, in pixels at the scale of the results.
         occluded: Whether to include pixels that only the left camera sees.
         scale: Factor from pixels of the map to pixels of the results: 4 reports a quarter-size
@@ -68,8 +70,8 @@ def evaluate_disparity(
 
 
 def evaluate_depth(
-    estimate: Disparity | Float32,
-    truth: DisparityTruth,
+    estimate: Disparity | ArrayLike,
+    truth: DisparityTruth | ArrayLike,
     camera: RectifiedCamera,
     *,
     occluded: bool = False,
@@ -77,8 +79,9 @@ def evaluate_depth(
     """Compare the depth of a disparity map with the true depth.
 
     Args:
-        estimate: A disparity, or its values: float32 (H, W), pixels, NaN = none.
-        truth: Ground truth at the same size.
+        estimate: A disparity, or its values: (H, W), pixels, not finite = none.
+        truth: Ground truth at the same size, or its values as `DisparityTruth.from_values` takes
+            them.
         camera: The camera at that size.
         occluded: Whether to include pixels that only the left camera sees.
 
@@ -101,13 +104,31 @@ def evaluate_depth(
     )
 
 
+def values_of(estimate: Disparity | ArrayLike) -> Float32:
+    """The values of an estimate: float32 (H, W), pixels.
+
+    Raises:
+        ShapeError: It is no map of real numbers.
+    """
+    return estimate.values if isinstance(estimate, Disparity) else float_map("estimate", estimate)
+
+
+def truth_of(truth: DisparityTruth | ArrayLike) -> DisparityTruth:
+    """A ground truth, made from its values if need be.
+
+    Raises:
+        ShapeError: It is no map of real numbers.
+    """
+    return truth if isinstance(truth, DisparityTruth) else DisparityTruth.from_values(truth)
+
+
 def _compared(
-    estimate: Disparity | Float32, truth: DisparityTruth, *, occluded: bool
+    estimate: Disparity | ArrayLike, truth: DisparityTruth | ArrayLike, *, occluded: bool
 ) -> tuple[Float64, Float64]:
     """float64 (N,) twice, values and truth of the compared pixels."""
-    values = estimate.values if isinstance(estimate, Disparity) else estimate
-    counted = _counted(values, truth, occluded=occluded)
-    return values[counted].astype(np.float64), truth.values[counted].astype(np.float64)
+    values, known = values_of(estimate), truth_of(truth)
+    counted = _counted(values, known, occluded=occluded)
+    return values[counted].astype(np.float64), known.values[counted].astype(np.float64)
 
 
 def _counted(values: Float32, truth: DisparityTruth, *, occluded: bool) -> Bool:

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from recon.errors import EvaluationError
-from recon.evaluation.disparity import evaluate_disparity
+from recon.evaluation.disparity import evaluate_disparity, truth_of, values_of
 from recon.structures import Disparity, DisparityMetrics, DisparityTruth
 from recon.structures.arrays import Float32
 
@@ -106,21 +106,29 @@ def by_the_rules(values: Float32, shape: tuple[int, ...], rules: MiddleburyRules
 
 
 def evaluate_middlebury(
-    values: Float32, truth: DisparityTruth, rules: MiddleburyRules, *, occluded: bool = False
+    estimate: Disparity | ArrayLike,
+    truth: DisparityTruth | ArrayLike,
+    rules: MiddleburyRules | None = None,
+    *,
+    occluded: bool = False,
 ) -> DisparityMetrics:
     """Compare a result with the truth as the benchmark does; errors are in full-size pixels.
 
     Args:
-        values: float32 (h, w), pixels; NaN = none. Sparse as matched, or dense (holes filled).
-        truth: Ground truth, at the size of the result or 2 or 4 times larger or smaller.
-        rules: Rules of the scene.
+        estimate: A disparity, or its values: (h, w), pixels of its own size, not finite = none.
+            Sparse as matched, or dense (holes filled).
+        truth: Ground truth, at the size of the result or 2 or 4 times larger or smaller; or its
+            values as `DisparityTruth.from_values` takes them.
+        rules: Rules of the scene; None = errors in pixels of the truth, nothing clipped or
+            rounded.
         occluded: Whether to include pixels that only the left camera sees ("all").
 
     Raises:
         EvaluationError: The sizes do not fit, or no pixel has a known truth.
     """
-    compared = by_the_rules(values, truth.values.shape, rules)
-    return evaluate_disparity(compared, truth, occluded=occluded, scale=rules.full_size_factor)
+    known, rules = truth_of(truth), rules or MiddleburyRules()
+    compared = by_the_rules(values_of(estimate), known.values.shape, rules)
+    return evaluate_disparity(compared, known, occluded=occluded, scale=rules.full_size_factor)
 
 
 def weighted_mean(figures: Mapping[str, float]) -> float:

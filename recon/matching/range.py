@@ -35,11 +35,13 @@ class AutoRangeMatcher:
     Args:
         matcher: The matcher; it must take its range from the camera.
         minimum_px: The first disparity that it searches.
+        usual: Whether the range is just `usual_ndisp`, for a matcher that cannot choose it.
     """
 
-    def __init__(self, matcher: Matcher, minimum_px: int = 0) -> None:
+    def __init__(self, matcher: Matcher, minimum_px: int = 0, *, usual: bool = False) -> None:
         self._matcher = matcher
         self._minimum_px = minimum_px
+        self._usual = usual
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair.
@@ -48,7 +50,8 @@ class AutoRangeMatcher:
             MatchingError: As of the matcher inside.
         """
         if pair.camera.ndisp is None:
-            ndisp = estimate_ndisp(pair, self._minimum_px)
+            width = pair.camera.width_px
+            ndisp = usual_ndisp(width) if self._usual else estimate_ndisp(pair, self._minimum_px)
             pair = replace(pair, camera=replace(pair.camera, ndisp=ndisp))
         return self._matcher.match(pair)
 

@@ -1,13 +1,20 @@
-"""The matchers by name."""
+"""The matchers by name: ours, and those that installed packages register."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any, Final, Literal
 
-from pydantic import Field
+from pydantic import Field, InstanceOf, field_serializer
 
 from recon.errors import SettingsError
+from recon.matching.foreign import (
+    CheckedMatcher,
+    check_object,
+    load_registered,
+    name_of,
+    registered_names,
+)
 from recon.matching.onnx import OnnxMatcher, OnnxSettings
 from recon.matching.opencv import (
     OpencvBmMatcher,
@@ -20,7 +27,6 @@ from recon.matching.range import AutoRangeMatcher, estimate_ndisp
 from recon.matching.sad import SadMatcher, SadSettings
 from recon.matching.search import SearchSettings
 from recon.matching.sgm import SgmMatcher, SgmSettings
-from recon.matching.unrated import UnratedSettings
 from recon.settings import Settings
 from recon.structures import RectifiedPair
 
@@ -36,8 +42,10 @@ MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
 class MatchingSettings(Settings):
     """Which matcher, and the settings of each."""
 
-    matcher: str = Field(
-        default="sad", description="Name of the matcher: sad, sgm, opencv-bm, opencv-sgbm or onnx."
+    matcher: str | InstanceOf[Matcher] = Field(
+        default="sad",
+        description="Name of the matcher: sad, sgm, opencv-bm, opencv-sgbm, onnx, or one that an "
+        "installed package registers; in Python also a matcher of your own.",
     )
     range: Literal["auto", "usual"] = Field(
         default="auto",
@@ -55,54 +63,74 @@ class MatchingSettings(Settings):
     )
     onnx: OnnxSettings = Field(default_factory=OnnxSettings, description="Of the matcher `onnx`.")
 
+    @field_serializer("matcher")
+    def _written(self, matcher: str | Matcher) -> str:
+        return name_of(matcher)
+
 
 def make_matcher(
-    name: str, settings: MatchingSettings | None = None, threads: int | None = None
+    matcher: str | Matcher, settings: MatchingSettings | None = None, threads: int | None = None
 ) -> Matcher:
-    """Make the matcher of a name.
+    """Make the matcher of a name, or make sure that an object can be used as one.
 
     Args:
-        name: A key of `MATCHERS`.
+        matcher: A key of `MATCHERS`, a name that an installed package registers, or an object
+            with the methods of `Matcher`. What a matcher returns that is not ours is checked.
         settings: The settings of all matchers; it takes its own part.
-        threads: Threads that it may use; all cores by default.
+        threads: Threads that a matcher of ours may use; all cores by default.
 
     Raises:
-        SettingsError: There is no such matcher.
+        SettingsError: There is no such matcher, or it is not one.
     """
-    if name not in MATCHERS:
-        choices = ", ".join(sorted(MATCHERS))
-        raise SettingsError("unknown matcher", got=repr(name), expected=f"one of: {choices}")
     settings = settings or MatchingSettings()
-    own = getattr(settings, field_of(name))
-    matcher = MATCHERS[name](own, threads)
+    if not isinstance(matcher, str) or matcher not in MATCHERS:
+        check_matcher(matcher)
+        made = load_registered(matcher) if isinstance(matcher, str) else matcher
+        checked = CheckedMatcher(made, name_of(matcher))
+        return AutoRangeMatcher(checked, usual=settings.range == "usual")
+    own = getattr(settings, field_of(matcher))
+    made = MATCHERS[matcher](own, threads)
     # A matcher without the setting searches no range; one that is set needs no guess.
     if settings.range == "usual" or getattr(own, "ndisp", 0) is not None:
-        return matcher
-    return AutoRangeMatcher(matcher, own.min_disparity_px)
+        return made
+    return AutoRangeMatcher(made, own.min_disparity_px)
 
 
-def rates_matches(name: str) -> bool:
-    """Whether the matcher of a name tells how sure it is of each match.
+def check_matcher(matcher: str | Matcher) -> None:
+    """Check that a matcher exists, without making it.
 
-    Args:
-        name: A key of `MATCHERS`.
+    Raises:
+        SettingsError: There is no matcher of this name, or the object is none.
     """
-    settings = MatchingSettings.model_fields[field_of(name)].annotation
-    return not (isinstance(settings, type) and issubclass(settings, UnratedSettings))
+    if not isinstance(matcher, str):
+        check_object(matcher)
+    elif matcher not in MATCHERS and matcher not in (others := registered_names()):
+        choices = ", ".join(sorted({*MATCHERS, *others}))
+        raise SettingsError("unknown matcher", got=repr(matcher), expected=f"one of: {choices}")
 
 
-def searched_ndisp(name: str, settings: MatchingSettings, pair: RectifiedPair) -> int | None:
-    """How many disparities the matcher of a name searches in a pair, before it rounds them.
+def settings_of(matcher: str | Matcher, settings: MatchingSettings) -> Settings | None:
+    """The settings of one matcher; None of a matcher that is not ours."""
+    if not isinstance(matcher, str) or matcher not in MATCHERS:
+        return None
+    own: Settings = getattr(settings, field_of(matcher))
+    return own
+
+
+def searched_ndisp(
+    matcher: str | Matcher, settings: MatchingSettings, pair: RectifiedPair
+) -> int | None:
+    """How many disparities a matcher searches in a pair, before it rounds them.
 
     Args:
-        name: A key of `MATCHERS`.
+        matcher: The matcher, or its name.
         settings: The settings of all matchers.
         pair: The pair.
 
     Returns:
-        Their number, or None of a matcher that searches no range.
+        Their number, or None of a matcher that searches no range, or is not ours.
     """
-    own = getattr(settings, field_of(name))
+    own = settings_of(matcher, settings)
     if not isinstance(own, SearchSettings):
         return None
     if settings.range == "auto" and own.ndisp is None and pair.camera.ndisp is None:

@@ -8,23 +8,23 @@ from pydantic import Field
 from recon.settings import Settings
 from recon.structures import Disparity, Reason, RectifiedPair
 from recon.structures.arrays import Float32, UInt8
+from recon.structures.disparity import ASSUMED_CONFIDENCE, ASSUMED_SIGMA_PX
 
 
 class UnratedSettings(Settings):
     """Confidence and uncertainty that are assumed for every match.
 
-    The defaults are measured with OpenCV's matchers on MiddEval3 at quarter size: 90 to 92 % of
-    the disparities they keep are within a pixel, and 68 % within a quarter.
+    The defaults are those of `Disparity.from_values`, which says where they come from.
     """
 
     assumed_confidence: float = Field(
-        default=0.9,
+        default=ASSUMED_CONFIDENCE,
         ge=0.0,
         le=1.0,
         description="Confidence of every match: the matcher gives none.",
     )
     assumed_sigma_px: float = Field(
-        default=0.25,
+        default=ASSUMED_SIGMA_PX,
         gt=0.0,
         description="Standard deviation of every match: the matcher gives none.",
     )

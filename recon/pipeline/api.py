@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
+from recon.errors import SettingsError
 from recon.formats.middlebury import stand_in_camera
-from recon.matching import MATCHERS, field_of
+from recon.matching import MATCHERS, Matcher, check_matcher, field_of, name_of
 from recon.pipeline.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
 from recon.structures import Disparity, RectifiedCamera, StereoCalibration, StereoPair
@@ -19,7 +21,7 @@ def match(
     right: UInt8,
     calibration: Calibration | None = None,
     *,
-    matcher: str = "sad",
+    matcher: str | Matcher = "sad",
     **settings: Any,
 ) -> Disparity:
     """Disparity of two images.
@@ -28,22 +30,28 @@ def match(
         left: uint8 (H, W) grey or (H, W, 3) RGB.
         right: The same shape as ``left``.
         calibration: Needed if the images are not rectified; it also gives the disparity range.
-        matcher: Name of the matcher: a key of `recon.matching.MATCHERS`.
-        **settings: Settings of that matcher, such as ``ndisp=64`` or ``window_px=9``.
+        matcher: Name of the matcher, one of recon's or one that an installed package registers;
+            or any object with the methods of `Matcher`.
+        **settings: Settings of a matcher of recon's, such as ``ndisp=64`` or ``window_px=9``.
 
     Raises:
         ShapeError: The images differ in size.
         SettingsError: There is no such matcher, or a setting is unknown or out of its range.
+        MatchingError: A matcher that is not recon's fails, or returns no disparity of the pair.
     """
     height_px, width_px = left.shape[:2]
-    own = {field_of(matcher): settings} if matcher in MATCHERS else {}
-    config = ReconConfig.parse({"matching": {"matcher": matcher, **own}})
+    config = ReconConfig.parse({"matching": _own_settings(matcher, settings)}).with_matcher(matcher)
     camera = calibration or stand_in_camera(width_px, height_px)
     return FrameReconstructor(camera, config).match(StereoPair(left, right))[1]
 
 
 def reconstruct(
-    left: UInt8, right: UInt8, calibration: Calibration, config: ReconConfig | None = None
+    left: UInt8,
+    right: UInt8,
+    calibration: Calibration,
+    config: ReconConfig | None = None,
+    *,
+    matcher: str | Matcher | None = None,
 ) -> ReconstructedFrame:
     """Rectified pair, disparity and cloud (camera axes, metres) of two images.
 
@@ -52,9 +60,25 @@ def reconstruct(
         right: The same shape as ``left``.
         calibration: Of the two cameras.
         config: Settings of the stages; None = those of ``recon pair``.
+        matcher: As for `match`; None = that of the settings.
 
     Raises:
         ReconError: The images, the calibration and the settings do not fit together.
     """
-    settings = config or load_config(defaults=PAIR_DEFAULTS)
+    settings = (config or load_config(defaults=PAIR_DEFAULTS)).with_matcher(matcher)
     return FrameReconstructor(calibration, settings).reconstruct(StereoPair(left, right))
+
+
+def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of one matcher as a part of those of all."""
+    if isinstance(matcher, str) and matcher in MATCHERS:
+        return {field_of(matcher): settings}
+    if settings:
+        check_matcher(matcher)
+        raise SettingsError(
+            "only recon's own matchers take settings",
+            where=f"matcher {name_of(matcher)!r}",
+            got=", ".join(settings),
+            hint="make the object with them",
+        )
+    return {}

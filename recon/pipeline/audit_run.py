@@ -11,7 +11,7 @@ import numpy as np
 from recon.audit import Finding, RowAlignment, Verdict, mend_rig, verdict_of
 from recon.errors import CalibrationError
 from recon.formats.recon_yaml import write_recon_calibration
-from recon.matching import MatchingSettings, field_of
+from recon.matching import MatchingSettings, settings_of
 from recon.matching.search import SearchSettings
 from recon.pipeline.audit_figures import audit_figures
 from recon.pipeline.audit_findings import (
@@ -135,7 +135,7 @@ def mend_calibration(
 
 def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None:
     """The largest disparity that is searched; None if the range adapts to each pair."""
-    own = getattr(matching, field_of(matching.matcher), None)
+    own = settings_of(matching.matcher, matching)
     if not isinstance(own, SearchSettings):
         return None
     if matching.range == "auto" and own.ndisp is None and camera.ndisp is None:

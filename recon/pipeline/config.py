@@ -23,7 +23,7 @@ from recon.mapping import (
     OccupancySettings,
     SubmapSettings,
 )
-from recon.matching import MatchingSettings
+from recon.matching import Matcher, MatchingSettings, check_matcher, name_of, settings_of
 from recon.meshing import MeshSettings
 from recon.odometry import OdometrySettings
 from recon.pipeline.checkpoint import CheckpointSettings
@@ -72,6 +72,21 @@ class ReconConfig(Settings):
     mesh: MeshSettings = MeshSettings()
     street: StreetSettings = StreetSettings()
     paper: PaperSettings = PaperSettings()
+
+    def with_matcher(self, matcher: str | Matcher | None) -> ReconConfig:
+        """The configuration with another matcher, by name or as an object; None = unchanged.
+
+        ``config.yaml`` has the name of an object only, so such a run is repeated from Python.
+        `map_sequence` and `run_map` call it from one thread, one pair after the other.
+
+        Raises:
+            SettingsError: There is no matcher of this name, or the object is none.
+        """
+        if matcher is None:
+            return self
+        check_matcher(matcher)
+        matching = self.matching.model_copy(update={"matcher": matcher})
+        return self.model_copy(update={"matching": matching})
 
 
 PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
@@ -122,6 +137,19 @@ def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> 
         if "ndisp" in getattr(field.annotation, "model_fields", ())
     ]
     return chosen + ([] if ndisp is None else [f"matching.{name}.ndisp={ndisp}" for name in ranged])
+
+
+def check_ndisp(config: ReconConfig, ndisp: int | None) -> None:
+    """Check that the matcher obeys a number of disparities given by itself; None = none given.
+
+    Raises:
+        SettingsError: The matcher has no such setting.
+    """
+    matcher = config.matching.matcher
+    if ndisp is not None and not hasattr(settings_of(matcher, config.matching), "ndisp"):
+        raise SettingsError(
+            "the matcher has no such setting", where="--ndisp", got=f"matcher {name_of(matcher)!r}"
+        )
 
 
 def source_overrides(

@@ -12,7 +12,7 @@ import numpy as np
 
 from recon.evaluation.middlebury import by_the_rules
 from recon.formats.files import naming
-from recon.matching import Matcher, make_matcher, rates_matches, searched_ndisp
+from recon.matching import Matcher, make_matcher, name_of, searched_ndisp
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.middlebury_confidence import confidence_figures
 from recon.pipeline.middlebury_scenes import ScoredScene
@@ -32,9 +32,9 @@ class SceneResult:
         scene: The scene.
         matcher: Name of the matcher.
         disparity: Its disparity, at the size of the images.
-        figures: As `score_result` gives them; ``ndisp``, the number of disparities searched; and
-            ``confidence`` as `confidence_figures` gives it, None for a matcher that does not
-            estimate confidence.
+        figures: As `score_result` gives them; ``ndisp``, the number of disparities searched, None
+            of a matcher that is not ours; and ``confidence`` as `confidence_figures` gives it,
+            None of a matcher with the same confidence everywhere.
         seconds: Time of matching alone.
     """
 
@@ -54,10 +54,11 @@ class SceneResult:
 class Bench:
     """Matches and scores scenes; each thread has its own matchers, warmed up once.
 
-    The warm-up keeps kernel compilation and network loading out of the timings.
+    The warm-up keeps kernel compilation and network loading out of the timings. A matcher given as
+    an object is shared by the threads.
 
     Args:
-        names: The matchers.
+        matchers: The matchers, by name or as objects.
         config: Their settings, and the conversion of images to grey.
         threads: Threads of each matcher.
         auto_range: Whether the disparity range is estimated from each pair, as if unknown,
@@ -65,9 +66,14 @@ class Bench:
     """
 
     def __init__(
-        self, names: Sequence[str], config: ReconConfig, threads: int, *, auto_range: bool = False
+        self,
+        matchers: Sequence[str | Matcher],
+        config: ReconConfig,
+        threads: int,
+        *,
+        auto_range: bool = False,
     ) -> None:
-        self._names = names
+        self._given = matchers
         self._config = config
         self._threads = threads
         self._auto_range = auto_range
@@ -82,24 +88,30 @@ class Bench:
         camera = replace(scene.camera, ndisp=None) if self._auto_range else scene.camera
         pair = Rectifier(camera, self._config.rectification).rectify(scene.pair)
         with naming(scene.name):
-            for name, matcher in self._matchers(pair).items():
+            for given, matcher in zip(self._given, self._matchers(pair), strict=True):
                 start = time.perf_counter()
                 disparity = matcher.match(pair)
                 seconds = time.perf_counter() - start
                 figures = score_result(scene, disparity.values)
-                figures["ndisp"] = searched_ndisp(name, self._config.matching, pair)
-                rated = confidence_figures(disparity, scene.truth) if rates_matches(name) else None
+                figures["ndisp"] = searched_ndisp(given, self._config.matching, pair)
+                rated = confidence_figures(disparity, scene.truth) if _rates(disparity) else None
                 figures["confidence"] = rated
-                yield SceneResult(scene, name, disparity, figures, seconds)
+                yield SceneResult(scene, name_of(given), disparity, figures, seconds)
 
-    def _matchers(self, pair: RectifiedPair) -> dict[str, Matcher]:
-        made: dict[str, Matcher] | None = getattr(self._own, "matchers", None)
+    def _matchers(self, pair: RectifiedPair) -> list[Matcher]:
+        made: list[Matcher] | None = getattr(self._own, "matchers", None)
         if made is None:
-            made = {n: make_matcher(n, self._config.matching, self._threads) for n in self._names}
-            for matcher in made.values():
+            made = [make_matcher(n, self._config.matching, self._threads) for n in self._given]
+            for matcher in made:
                 matcher.match(_upper_rows(pair))
             self._own.matchers = made
         return made
+
+
+def _rates(disparity: Disparity) -> bool:
+    """Whether the matcher tells how sure it is of each match, and not the same of all."""
+    sure = disparity.confidence[disparity.valid]
+    return bool(sure.size) and bool(sure.min() < sure.max())
 
 
 def _upper_rows(pair: RectifiedPair) -> RectifiedPair:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +14,7 @@ from recon.errors import SettingsError, SourceError
 from recon.evaluation.middlebury import scene_weight, weighted_mean
 from recon.formats.atomic import write_text
 from recon.formats.pfm import write_pfm
-from recon.matching import MATCHERS
+from recon.matching import Matcher, check_matcher, name_of
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.machine import peak_memory_mb, use_threads
 from recon.pipeline.middlebury_bench import Bench, SceneResult
@@ -25,6 +26,9 @@ from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.summary import plain
 
 COMMAND: Final = "evaluate-middlebury"
+
+_FOLDER_NAME: Final = re.compile(r"\w[\w.+ ()-]*")
+_NAMING: Final = "give each object an attribute `name`"
 
 SceneFigures = dict[str, Figures]
 """Figures of one scene, by matcher."""
@@ -51,7 +55,7 @@ class MiddleburyOptions:
     """Options of an evaluation that are not part of the configuration.
 
     Attributes:
-        matchers: Names of the matchers; () = the configured one.
+        matchers: The matchers, by name or as objects; () = the configured one.
         truth: Folder of scenes that supply ground truth for scenes without their own.
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores. Changes no result.
@@ -63,7 +67,7 @@ class MiddleburyOptions:
         present: Writes the tables.
     """
 
-    matchers: Sequence[str] = ()
+    matchers: Sequence[str | Matcher] = ()
     truth: Path | None = None
     out: Path | None = None
     threads: int | None = None
@@ -87,13 +91,14 @@ def run_middlebury(folder: Path, config: ReconConfig, options: MiddleburyOptions
             left behind.
     """
     start = time.perf_counter()
-    names = _checked(options.matchers or (config.matching.matcher,))
+    matchers = options.matchers or (config.matching.matcher,)
+    names = _checked(matchers)
     if options.truth is not None:
         check_folder(options.truth)
     paths, threads = find_scenes(folder), use_threads(options.threads)
     with RunDirectory.for_command(COMMAND, options.out) as directory:
         own_threads = max(1, threads // options.parallel)
-        bench = Bench(names, config, own_threads, auto_range=options.auto_range)
+        bench = Bench(matchers, config, own_threads, auto_range=options.auto_range)
         scenes = dict(_scenes(bench, folder, paths, options, directory))
         skipped = [name for name, figures in scenes.items() if not figures]
         if len(skipped) == len(scenes):
@@ -120,13 +125,17 @@ def run_middlebury(folder: Path, config: ReconConfig, options: MiddleburyOptions
     return summary
 
 
-def _checked(names: Sequence[str]) -> Sequence[str]:
-    expected = f"one of: {', '.join(sorted(MATCHERS))}"
-    for name in names:
-        if name not in MATCHERS:
-            raise SettingsError("unknown matcher", got=repr(name), expected=expected)
+def _checked(matchers: Sequence[str | Matcher]) -> list[str]:
+    """The names of the matchers, which are also those of their folders."""
+    for matcher in matchers:
+        check_matcher(matcher)
+    names = [name_of(matcher) for matcher in matchers]
     if len(set(names)) < len(names):
-        raise SettingsError("a matcher is named twice", got=", ".join(names))
+        hint = None if all(isinstance(one, str) for one in matchers) else _NAMING
+        raise SettingsError("a matcher is named twice", got=", ".join(names), hint=hint)
+    for name in names:
+        if not _FOLDER_NAME.fullmatch(name):
+            raise SettingsError("the matcher's name cannot name a folder", got=repr(name))
     return names
 
 

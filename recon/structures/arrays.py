@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from recon.errors import ShapeError
 
@@ -53,6 +53,50 @@ def freeze(instance: object, name: str, dtype: DTypeLike, shape: tuple[int | Non
     if value is not None:
         label = f"{type(instance).__name__}.{name}"
         object.__setattr__(instance, name, frozen_array(label, value, dtype, shape))
+
+
+def float_map(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None) -> Float32:
+    """Convert what a caller gives to a map of floats.
+
+    Args:
+        name: Name used in the error message.
+        values: Anything that numpy takes for an array of real numbers. Masked elements of a
+            masked array become NaN.
+        shape: (H, W) that it must have unless it is a single number; None = any (H, W).
+
+    Returns:
+        float32 (H, W), or () for a single number where ``shape`` is given.
+
+    Raises:
+        ShapeError: It is not an array of real numbers, or has another shape.
+    """
+    try:
+        given = values if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
+    except ValueError as error:  # rows of different lengths
+        raise ShapeError(f"{name} is not an array", got=error) from error
+    if given.dtype.kind not in "fiu":
+        raise ShapeError(f"{name} is not an array of real numbers", got=f"dtype {given.dtype}")
+    fits = given.ndim == 2 if shape is None else given.shape in ((), shape)
+    if not fits or given.size == 0:
+        expected = "(H, W)" if shape is None else f"{shape}, or one number"
+        raise ShapeError(f"{name} has the wrong shape", got=given.shape, expected=expected)
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite
+        floats = given.astype(np.float32)
+    return np.asarray(np.ma.filled(floats, np.nan) if np.ma.isMaskedArray(floats) else floats)
+
+
+def size_text(image: NDArray[Any]) -> str:
+    """The size of an image or map as it is read aloud: width x height."""
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+def map_text(values: Float32, unit: str = "px") -> str:
+    """Range and share of the finite values of a map, for a ``repr``."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return "0 %"
+    share = 100 * finite.size / values.size
+    return f"{finite.min():.4g} to {finite.max():.4g} {unit}, {share:.1f} %"
 
 
 def _shape_text(shape: tuple[int | None, ...]) -> str:

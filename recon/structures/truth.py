@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
+from typing_extensions import Self
 
-from recon.structures.arrays import Bool, Float32, Float64, Int32, freeze
+from recon.errors import ShapeError
+from recon.structures.arrays import (
+    Bool,
+    Float32,
+    Float64,
+    Int32,
+    float_map,
+    freeze,
+    map_text,
+    size_text,
+)
 from recon.structures.camera import RectifiedCamera
 from recon.structures.cloud import PointCloud
 from recon.structures.grid import OccupancyGrid
 from recon.structures.trajectory import Trajectory
+
+_SEEN_BY_BOTH: Final = 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +43,41 @@ class DisparityTruth:
     def __post_init__(self) -> None:
         freeze(self, "values", np.float32, (None, None))
         freeze(self, "nonocc", np.bool_, self.values.shape)
+
+    @classmethod
+    def from_values(cls, values: ArrayLike, nonocc: ArrayLike | None = None) -> Self:
+        """Build a ground truth from a bare array.
+
+        Args:
+            values: (H, W) of any real dtype, pixels; NaN, infinite, zero and negative values are
+                unknown.
+            nonocc: bool (H, W), True where both cameras see the point, or the levels of a mask of
+                Middlebury, 255 there; None = both see everything.
+
+        Raises:
+            ShapeError: An array has the wrong shape or dtype.
+        """
+        found = float_map("truth", values)
+        known = np.isfinite(found) & (found > 0)
+        seen = known if nonocc is None else known & _seen_by_both(nonocc, found.shape)
+        return cls(np.where(known, found, np.float32(np.nan)), seen)
+
+    def __repr__(self) -> str:
+        size, seen = size_text(self.values), 100 * float(np.mean(self.nonocc))
+        return f"DisparityTruth({size}, {map_text(self.values)} known, {seen:.1f} % not occluded)"
+
+
+def _seen_by_both(mask: ArrayLike, shape: tuple[int, ...]) -> Bool:
+    """bool (H, W), from truth values or from Middlebury's levels (128 = occluded)."""
+    levels = np.asarray(mask)
+    seen = levels if levels.dtype == np.bool_ else levels == _SEEN_BY_BOTH
+    if levels.shape != shape or (levels.dtype != np.bool_ and not seen.any()):
+        raise ShapeError(
+            "nonocc is no mask of the truth",
+            got=f"{levels.dtype} {levels.shape}",
+            expected=f"bool {shape}, or levels with {_SEEN_BY_BOTH} where both cameras see",
+        )
+    return np.asarray(seen)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from recon.errors import EvaluationError
 from recon.evaluation.disparity import evaluate_disparity
-from recon.structures import DisparityTruth
+from recon.evaluation.middlebury import evaluate_middlebury
+from recon.structures import Disparity, DisparityTruth
 
 NAN = float("nan")
 
@@ -91,3 +92,18 @@ def test_figures_of_the_full_size_are_those_of_maps_enlarged() -> None:
     small = evaluate_disparity(estimate([10.25, 12, 9]), truth([10, 10, 10]), scale=4)
     large = evaluate_disparity(estimate([41, 48, 36]), truth([40, 40, 40]))
     assert small == large
+
+
+def test_plain_arrays_are_evaluated_like_values() -> None:
+    true = np.array([[8.0, np.inf, 0.0, 6.0], [4.0, 5.0, np.nan, 7.0]])
+    found = np.array([[8.5, 3.0, 3.0, np.inf], [9.0, 5.0, 1.0, np.nan]])
+    expected = evaluate_disparity(
+        found.astype(np.float32), DisparityTruth.from_values(true.astype(np.float32))
+    )
+    for estimate in (found, found.tolist(), Disparity.from_values(found)):
+        got = evaluate_disparity(estimate, true)
+        assert got == expected
+    # Of five known pixels two have no value, and one is off by 5.
+    assert (got.pixels, got.invalid, got.bad[2.0]) == (5, 40, 20)
+    assert evaluate_middlebury(found, true) == expected
+    assert evaluate_middlebury(Disparity.from_values(found), true.tolist()) == expected

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from recon.evaluation import share_within_sigma
-from recon.matching import MATCHERS, rates_matches
 from recon.pipeline.middlebury_confidence import confidence_figures, weighted_confidence
 from recon.structures import Disparity, DisparityTruth, Reason
 
@@ -80,7 +79,3 @@ def test_the_mean_counts_scenes_by_weight_and_leaves_out_those_without() -> None
     # 1e-5: the lists have six digits.
     assert mean["reliability"]["right"][8] == pytest.approx(2 / 3, abs=1e-5)
     assert mean["sparsification"]["wrong"][0] == pytest.approx(1 / 3, abs=1e-5)
-
-
-def test_matchers_that_assume_their_confidence_do_not_rate() -> None:
-    assert {name for name in MATCHERS if rates_matches(name)} == {"sad", "sgm"}
