@@ -7,7 +7,7 @@ READY := .venv/.ready
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: help setup demo test test-all check lint bench format clean
+.PHONY: help setup demo test test-all fuzz check lint bench format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -27,6 +27,9 @@ test: $(READY) ## fast tests, with style, types and import contracts; real data 
 
 test-all: $(READY) ## every test
 	$(PYTEST)
+
+fuzz: $(READY) ## search at random for failing examples; MINUTES=30, SEED=… repeats a round
+	@scripts/fuzz.sh
 
 check: lint test ## what CI runs, with the quick answers first
 

@@ -31,7 +31,16 @@ def linearise_reference(
 
 
 def solve_step_reference(normal: NormalEquations, damping: float) -> tuple[Float64, Float64]:
-    """The twin of `recon.kernels.bundle.solve_step`: the whole system, not reduced."""
+    """The reference of `recon.kernels.bundle.solve_step`: the whole system, not reduced."""
+    H, g = whole_system(normal, damping)
+    step = np.zeros(len(g))
+    step[6:] = np.linalg.solve(H[6:, 6:], g[6:])
+    size = 6 * len(normal.H_pose)
+    return step[:size].reshape(-1, 6), step[size:].reshape(-1, 3)
+
+
+def whole_system(normal: NormalEquations, damping: float) -> tuple[Float64, Float64]:
+    """The damped equations of all poses, then all points: a matrix and its right-hand side."""
     frames, points = len(normal.H_pose), len(normal.H_point)
     size = 6 * frames
     H = np.zeros((size + 3 * points, size + 3 * points))
@@ -45,10 +54,7 @@ def solve_step_reference(normal: NormalEquations, damping: float) -> tuple[Float
             H[6 * w : 6 * w + 6, at : at + 3] = cross
             H[at : at + 3, 6 * w : 6 * w + 6] = cross.T
     H[np.diag_indices_from(H)] += damping * np.diag(H) + RIDGE
-    g = np.concatenate([normal.g_pose.ravel(), normal.g_point.ravel()])
-    step = np.zeros(len(g))
-    step[6:] = np.linalg.solve(H[6:, 6:], g[6:])
-    return step[:size].reshape(-1, 6), step[size:].reshape(-1, 3)
+    return H, np.concatenate([normal.g_pose.ravel(), normal.g_point.ravel()])
 
 
 def cost_reference(

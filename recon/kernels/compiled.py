@@ -1,17 +1,56 @@
-"""How kernels are compiled."""
+"""How kernels are compiled, and who is told."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, Final, Literal, TypeVar, overload
 
 from numba import config, njit
+from numba.core.caching import FunctionCache
 
 from recon.kernels.cache import cache_folder, cache_parent
 
 KernelT = TypeVar("KernelT", bound=Callable[..., Any])
 
 _CACHE: Final = str(cache_folder(cache_parent()))
+_LISTENERS: Final[list[Callable[[str], None]]] = []
+
+
+@contextmanager
+def when_compiling(tell: Callable[[str], None]) -> Iterator[None]:
+    """Call ``tell`` with the name of each kernel that is about to be compiled, in any thread."""
+    _LISTENERS.append(tell)
+    try:
+        yield
+    finally:
+        _LISTENERS.remove(tell)
+
+
+class _KernelCache(FunctionCache):  # type: ignore[misc]
+    """numba's cache of one kernel, which one process at a time writes.
+
+    Two that add machine code for different types at once would choose the same file, and the index
+    of one would name the code of the other: a later run would call code for the wrong types.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = super().load_overload(sig, target_context)
+        if found is None:
+            for tell in tuple(_LISTENERS):
+                tell(self._py_func.__name__)
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        self._impl.locator.ensure_cache_path()
+        folder = os.open(self.cache_path, os.O_RDONLY)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX)
+            super().save_overload(sig, data)
+        finally:
+            os.close(folder)
 
 
 @overload
@@ -37,6 +76,9 @@ def kernel(function: Any = None, **options: str) -> Any:
     # numba takes the folder while it decorates; functions of other packages keep theirs.
     config.CACHE_DIR = _CACHE
     try:
-        return njit(cache=True, nogil=True, **options)(function)
+        compiled = njit(nogil=True, **options)(function)
+        if compiled is not function:  # it is where NUMBA_DISABLE_JIT is set
+            compiled._cache = _KernelCache(function)  # as `enable_caching` does
+        return compiled
     finally:
         config.CACHE_DIR = kept

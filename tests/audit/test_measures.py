@@ -47,7 +47,7 @@ def features(
     return left.astype(np.float32), right.astype(np.float32)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     pitch_deg=st.floats(-1.5, 1.5),
     roll_deg=st.floats(-2, 2),

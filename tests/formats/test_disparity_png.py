@@ -20,7 +20,7 @@ from recon.formats.image import write_image
 NAN = float("nan")
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     values=arrays(
         np.float32,

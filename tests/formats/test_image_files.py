@@ -23,7 +23,7 @@ def picture(*shape: int, dtype: str = "u1") -> np.ndarray:
     return np.random.default_rng(7).integers(0, top, shape, dtype=dtype, endpoint=True)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     image=st.sampled_from(["u1", "u2"]).flatmap(lambda t: arrays(t, SHAPES)),
     suffix=st.sampled_from([".png", ".tif"]),
@@ -111,7 +111,7 @@ def test_a_bmp_is_read_whole_or_not_at_all(tmp_path: Path, shape: tuple[int, ...
             read_image(path)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(cut=st.integers(1, 400), suffix=st.sampled_from([".png", ".jpg"]))
 def test_no_cut_passes_unseen(
     cut: int, suffix: str, tmp_path_factory: pytest.TempPathFactory

@@ -18,7 +18,7 @@ DISPARITIES = arrays(
 )
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(values=DISPARITIES)
 def test_pfm_gives_back_every_bit(
     values: np.ndarray, tmp_path_factory: pytest.TempPathFactory

@@ -56,7 +56,7 @@ def example_cloud(n: int = 20) -> PointCloud:
 
 
 @pytest.mark.parametrize("ascii", [False, True])
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cloud=clouds())
 def test_a_cloud_comes_back_bit_by_bit(tmp_path: Path, ascii: bool, cloud: PointCloud) -> None:  # noqa: A002
     path = tmp_path / "cloud.ply"

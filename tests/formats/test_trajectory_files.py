@@ -35,7 +35,7 @@ def random_trajectory(seed: int, length: int) -> Trajectory:
 TRAJECTORIES = st.builds(random_trajectory, st.integers(0, 2**31), st.integers(1, 8))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(trajectory=TRAJECTORIES)
 def test_kitti_poses_lose_nothing_that_matters(
     trajectory: Trajectory, tmp_path_factory: pytest.TempPathFactory
@@ -48,7 +48,7 @@ def test_kitti_poses_lose_nothing_that_matters(
     np.testing.assert_array_equal(read.timestamps_s, trajectory.timestamps_s)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(trajectory=TRAJECTORIES)
 def test_tum_poses_lose_nothing_that_matters(
     trajectory: Trajectory, tmp_path_factory: pytest.TempPathFactory

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
@@ -24,13 +24,11 @@ def planes_of(
     return planes.transpose(1, 0, 2)
 
 
-@settings(deadline=None)  # the first call compiles
 @given(greys, st.builds(Descriptor, st.integers(1, 127), st.integers(0, 4), st.integers(0, 4)))
 def test_planes_equal_their_twin(grey: Image, descriptor: Descriptor) -> None:
     np.testing.assert_array_equal(planes_of(grey, descriptor), planes_reference(grey, descriptor))
 
 
-@settings(deadline=None)  # the first call compiles
 @given(greys, st.integers(-30, 40), st.integers(1, 30))
 def test_a_placed_row_is_continued_by_its_border(grey: Image, place: int, size: int) -> None:
     descriptor = Descriptor(127, 1, 1)
@@ -39,7 +37,6 @@ def test_a_placed_row_is_continued_by_its_border(grey: Image, place: int, size: 
     np.testing.assert_array_equal(planes_of(grey, descriptor, place, size), expected)
 
 
-@settings(deadline=None)  # the first call compiles
 @given(greys, st.integers(1, 127))
 def test_gradients_are_those_of_opencv(grey: Image, cap: int) -> None:
     sobel = cv2.Sobel(grey, cv2.CV_16S, 1, 0, borderType=cv2.BORDER_REPLICATE)

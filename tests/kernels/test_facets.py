@@ -28,7 +28,7 @@ def _block(edge: int) -> np.ndarray:
     return np.stack(np.meshgrid(*[np.arange(-edge, edge)] * 3, indexing="ij"), -1).reshape(-1, 3)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60))
 def test_the_kernel_finds_what_the_twin_finds(seed: int, number: int) -> None:
     rng = np.random.default_rng(seed)

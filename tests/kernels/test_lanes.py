@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numba import njit
@@ -101,7 +101,6 @@ def arrays(kind: Any) -> st.SearchStrategy[Any]:
     return hnp.arrays(kind, LANES + 5, elements=values)
 
 
-@settings(deadline=None)  # the first call compiles
 @given(st.data())
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("function", [add, subtract, compare, look_beside])
@@ -111,19 +110,16 @@ def test_vectors_of_one_kind_do_as_numpy_does(
     assert_same(function, data.draw(arrays(kind)), data.draw(arrays(kind)), kind)
 
 
-@settings(deadline=None)  # the first call compiles
 @given(arrays(np.uint8))
 def test_bytes_are_widened_as_numpy_does(a: Any) -> None:
     assert_same(resize, a, a, np.uint16)
 
 
-@settings(deadline=None)  # the first call compiles
 @given(arrays(np.uint8), arrays(np.uint8))
 def test_bytes_are_compared_as_numpy_does(a: Any, b: Any) -> None:
     assert_same(compare_bytes, a, b, np.uint8)
 
 
-@settings(deadline=None)  # the first call compiles
 @given(arrays(np.uint16), arrays(np.uint16))
 def test_values_are_scaled_and_narrowed_as_numpy_does(a: Any, b: Any) -> None:
     assert_same(scale, a, b, np.uint16)
@@ -166,7 +162,6 @@ def test_rows_that_are_not_contiguous_are_refused_by_the_compiler() -> None:
         move_rows(a[:, ::2], a, out)
 
 
-@settings(deadline=None)  # the first call compiles
 @given(arrays(np.uint16))
 def test_numbers_follow_each_other_as_in_numpy(a: Any) -> None:
     assert_same(number, a, a, np.uint16)

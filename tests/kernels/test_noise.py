@@ -21,7 +21,7 @@ def _points(n: int, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-50.0, 50.0, (n, 3))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     xyz=st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=1, max_size=4),
     smear=st.tuples(*[st.floats(-3.0, 3.0)] * 3),

@@ -33,7 +33,7 @@ def _listed(leaves: Leaves, first: int = 0) -> list[Leaf]:
     ]
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(trees(), st.integers(1, 7))
 def test_the_kernel_finds_what_the_twin_finds_in_pieces_of_any_size(
     tree: list[int], size: int
@@ -48,7 +48,7 @@ def test_the_kernel_finds_what_the_twin_finds_in_pieces_of_any_size(
     assert walk.level[0] == -1  # the tree is whole
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(trees(), st.integers(0, 255))
 def test_nodes_behind_the_end_of_the_tree_are_not_walked_over(tree: list[int], more: int) -> None:
     seen, leaves = find_leaves(np.array([*tree, more], np.uint8), begin_walk(DEPTH))

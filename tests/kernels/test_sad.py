@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
@@ -66,7 +66,6 @@ searches = st.builds(
 )
 
 
-@settings(deadline=None)  # the first call compiles
 @given(pairs(), searches)
 def test_search_equals_its_twin(pair: tuple[Image, Image], search: Search) -> None:
     tiles = everything(pair[0].shape, search)
@@ -81,7 +80,6 @@ def tilings(draw: st.DrawFn, shape: tuple[int, int], search: Search) -> Tiles:
     return tiles._replace(offered=draw(hnp.arrays(np.bool_, tiles.offered.shape)))
 
 
-@settings(deadline=None)  # the first call compiles
 @given(st.data(), pairs((1, 14), (1, 40)), searches, st.integers(1, 3))
 def test_what_is_not_offered_is_as_if_it_did_not_exist(
     data: st.DataObject, pair: tuple[Image, Image], search: Search, strips: int
@@ -92,7 +90,6 @@ def test_what_is_not_offered_is_as_if_it_did_not_exist(
     assert_equal(found, sad_minima_reference(*pair, search, tiles))
 
 
-@settings(deadline=None)  # the first call compiles
 @given(pairs(), searches, st.integers(2, 4))
 def test_strips_do_not_change_the_result(
     pair: tuple[Image, Image], search: Search, strips: int
@@ -113,7 +110,6 @@ def test_wide_pictures_are_searched_in_vectors(ndisp: int, minimum: int, lean: i
     assert_equal(search_all(left, right, search), expected)
 
 
-@settings(deadline=None)  # the first call compiles
 @given(pairs(), searches, st.integers(1, 12))
 def test_blocks_do_not_change_the_result(
     pair: tuple[Image, Image], search: Search, block: int

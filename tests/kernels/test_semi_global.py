@@ -92,7 +92,7 @@ def windows(draw: st.DrawFn) -> tuple[Window, Paths]:
     return window, paths
 
 
-@settings(deadline=None, max_examples=60)  # the first call compiles
+@settings(max_examples=60)
 @given(pairs(), windows())
 def test_search_equals_its_twin(pair: tuple[Image, Image], rules: tuple[Window, Paths]) -> None:
     window, paths = rules
@@ -101,7 +101,7 @@ def test_search_equals_its_twin(pair: tuple[Image, Image], rules: tuple[Window, 
     assert_equal(search(views, window, paths), expected)
 
 
-@settings(deadline=None, max_examples=30)  # the first call compiles
+@settings(max_examples=30)
 @given(pairs(), windows(), st.integers(2, 4))
 def test_strips_that_overlap_wholly_do_not_change_the_result(
     pair: tuple[Image, Image], rules: tuple[Window, Paths], strips: int

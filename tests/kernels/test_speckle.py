@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -19,7 +19,6 @@ maps = hnp.arrays(
 )
 
 
-@settings(deadline=None)  # the first call compiles
 @given(maps, st.sampled_from([0.5, 1.0, 2.0]), st.integers(0, 20))
 def test_speckles_equal_those_of_the_twin(values: np.ndarray, step: float, size: int) -> None:
     found = find_speckles(values, step, size)

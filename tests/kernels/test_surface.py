@@ -1,4 +1,4 @@
-"""The hit kernel equals its numpy twin, and describes hits as geometry says."""
+"""The hit kernel equals its numpy reference, and describes hits as geometry says."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from recon.kernels.surface import (
     MAX_STRETCH,
+    SurfaceHits,
     SurfaceTable,
     describe_hits,
     describe_hits_reference,
@@ -34,7 +35,36 @@ def _wall(z: float) -> SurfaceTable:
     return SurfaceTable(anchor, normal, to_uv, np.zeros((1, 2)), np.zeros((1, 3, 3)), normal)
 
 
-@settings(max_examples=40, deadline=None)
+def _rounding(table: SurfaceTable, faces, origin, rays, xyz) -> SurfaceHits:
+    """How far two ways to compute the hits may differ, hit by hit.
+
+    A depth is (anchor - origin)·normal over ray·normal: 12 operations on products of the size of
+    anchor and origin, divided by the cosine once for the depth and once for the rounding of the
+    cosine itself. A smear is divided by the sine in the same way. The point, and what is computed
+    from it, take at most 20 more. Each way may err.
+    """
+    anchor, normal = table.anchor[faces], table.normal[faces]
+    view = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    cosine = np.abs((view * normal).sum(axis=1))
+    sine = np.linalg.norm(view - (view * normal).sum(axis=1, keepdims=True) * normal, axis=1)
+    reach = 1 + np.linalg.norm(anchor, axis=1) + np.linalg.norm(origin)
+    place = 2 * 32 * 2.0**-53 * reach / np.minimum(cosine, sine) ** 2
+    shading = table.shading[faces] + np.einsum("nij,nj->ni", table.to_shading[faces], xyz - anchor)
+    terms = np.abs(table.shading[faces]).max(axis=1, initial=0.0)
+    terms = 1 + terms + np.abs(table.to_shading[faces]).sum(axis=(1, 2))
+    by_uv = place * (1 + np.abs(table.uv[faces]).sum(axis=1))
+    by_uv *= 1 + np.abs(table.to_uv[faces]).sum(axis=(1, 2))
+    return SurfaceHits(
+        xyz=place[:, None],
+        normal=(place * terms / np.linalg.norm(shading, axis=1))[:, None],
+        uv=by_uv[:, None],
+        width=place,
+        smear=place[:, None],
+        spread=by_uv[:, None],
+    )
+
+
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(0, 30), pixel=st.floats(1e-4, 1e-2))
 def test_kernel_equals_reference(seed, n, pixel):
     rng = np.random.default_rng(seed)
@@ -42,13 +72,12 @@ def test_kernel_equals_reference(seed, n, pixel):
     faces = rng.integers(0, 8, n).astype(np.int32)
     rays = np.column_stack([rng.normal(size=(n, 2)), np.ones(n)])
     origin = rng.normal(size=3)
-    for got, expected in zip(
-        describe_hits(table, faces, origin, rays, pixel),
-        describe_hits_reference(table, faces, origin, rays, pixel),
-        strict=True,
-    ):
-        # Both sum the same few products in another order; a grazing ray magnifies the rounding.
-        np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6)
+    found = describe_hits(table, faces, origin, rays, pixel)
+    expected = describe_hits_reference(table, faces, origin, rays, pixel)
+    bounds = _rounding(table, faces, origin, rays, expected.xyz)
+    for name in SurfaceHits._fields:
+        difference = np.abs(getattr(found, name) - getattr(expected, name))
+        assert (difference <= getattr(bounds, name)).all(), name
 
 
 def test_a_wall_seen_straight_on_has_a_square_footprint():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -35,7 +35,6 @@ supports = st.builds(
 disparities = st.one_of(st.just(np.nan), st.integers(-4, 30))
 
 
-@settings(deadline=None)  # the first call compiles
 @given(
     hnp.arrays(np.float32, st.tuples(st.integers(1, 20), st.integers(1, 30)), elements=disparities),
     st.integers(-9, 9),

@@ -84,7 +84,7 @@ def test_an_even_patch_is_refused() -> None:
         PrintedSettings.parse({"patch_px": 4})
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     data=st.data(),
     shape=st.tuples(st.integers(3, 8), st.integers(3, 14)),

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.odometry.covariance import step_covariance
@@ -92,7 +92,6 @@ def test_a_correction_that_does_not_fit_better_is_refused(
     assert told in verdict.note
 
 
-@settings(deadline=None)
 @given(seed=st.integers(0, 10_000), scale=st.floats(1e-4, 0.3))
 def test_no_more_is_taken_than_is_offered(seed: int, scale: float) -> None:
     """In the metric of both uncertainties the step taken is shorter than the one offered."""

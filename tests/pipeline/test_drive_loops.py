@@ -6,7 +6,6 @@ Each place is a wall of its own, 10 m ahead, and the drive is one lap and a bit 
 from __future__ import annotations
 
 import math
-import threading
 import time
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from recon.geometry import se3
 from recon.loops import LoopSettings
 from recon.loops.detector import CONTRADICTED, LoopDetector, StoredKeyframe
 from recon.loops.graph import close_loops
+from recon.pipeline import drive_loops
 from recon.pipeline.drive_loops import DriveLoops, KeyframeFiles, LoopWatch
 from recon.pipeline.frame import ReconstructedFrame
 from recon.pipeline.submap_store import SubmapEntry
@@ -29,6 +29,7 @@ from recon.structures import (
     RectifiedPair,
     Trajectory,
 )
+from tests.pipeline.pools import observed_pool
 
 CAMERA = RectifiedCamera(200.0, 159.5, 59.5, 159.5, 0.5, 320, 120)
 LAP = 60
@@ -167,19 +168,20 @@ def test_a_full_disk_is_told_although_another_thread_met_it(frames, tmp_path, mo
 
 
 def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):
-    looked, go_on = [], threading.Event()
+    looked: list[int] = []
+    pool, dropped = observed_pool()
 
     def slow(self: LoopDetector, frame: int, *_: object, **__: object) -> None:
         looked.append(frame)
-        go_on.wait(10)
+        dropped.wait(30)
 
     monkeypatch.setattr(LoopDetector, "add", slow)
+    monkeypatch.setattr(drive_loops, "ThreadPoolExecutor", pool)
     watch = LoopWatch(LoopSettings())
     for frame in frames[:4]:
         watch.add(frame, np.eye(4), measured=True)
     while not looked:
         time.sleep(0.001)
-    threading.Timer(0.05, go_on.set).start()
     watch.stop()
     assert looked == [0]
 

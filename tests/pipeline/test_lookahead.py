@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 from collections.abc import Iterator
 from functools import partial
 
@@ -12,7 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from recon.pipeline import lookahead
 from recon.pipeline.lookahead import OneBehind, look_ahead, side_by_side
+from tests.pipeline.pools import observed_pool
 
 
 @given(st.lists(st.integers()), st.integers(min_value=1, max_value=5))
@@ -49,17 +50,34 @@ def test_no_more_items_are_begun_than_can_be_held() -> None:
     assert len(begun) <= 3
 
 
-def test_nothing_is_begun_after_an_interruption() -> None:
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """SIGINT raises `KeyboardInterrupt`, also where a shell in whose background we run hides it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
+def test_nothing_is_begun_after_an_interruption(monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[int] = []
+    next_drawn = threading.Event()
+    pool, dropped = observed_pool()
+    monkeypatch.setattr(lookahead, "ThreadPoolExecutor", pool)
+
+    def items() -> Iterator[int]:
+        yield 0
+        next_drawn.set()
+        yield from range(1, 100)
 
     def work(item: int) -> None:
         begun.append(item)
-        time.sleep(0.2)  # the caller waits for this result by now, and the next item waits too
+        next_drawn.wait(30)
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-        time.sleep(0.2)
+        dropped.wait(30)
 
     with pytest.raises(KeyboardInterrupt):
-        list(side_by_side(work, range(100), threads=1))
+        list(side_by_side(work, items(), threads=1))
     assert begun == [0]
 
 
