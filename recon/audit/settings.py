@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from recon.settings import Settings
+from recon.structures import LARGEST_CENTRE_OFFSET
 
 
 class AuditSettings(Settings):
@@ -98,7 +99,7 @@ class AuditSettings(Settings):
         default=70.0, gt=0, description="A higher apparent speed means that the baseline is wrong."
     )
     centre_share: float = Field(
-        default=0.25,
+        default=LARGEST_CENTRE_OFFSET,
         gt=0,
         lt=0.5,
         description="Offset of the principal point from the image centre, relative to the image "

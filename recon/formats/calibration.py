@@ -9,11 +9,12 @@ from recon.errors import CalibrationError, FormatError
 from recon.formats.camera_info import read_camera_info
 from recon.formats.files import StrPath, read_text
 from recon.formats.kalibr import read_kalibr
-from recon.formats.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_calib
+from recon.formats.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras
+from recon.formats.kitti_raw import read_kitti_rig
 from recon.formats.middlebury_calib import read_middlebury_calib
 from recon.formats.opencv_yaml import read_opencv_calibration
 from recon.formats.recon_yaml import MARK, read_recon_calibration
-from recon.structures import RectifiedCamera, StereoCalibration
+from recon.structures import RectifiedCamera, StereoCalibration, check_size
 
 _KITTI: Final = re.compile(r"^P(?:_rect_0)?\d:", re.MULTILINE)
 _MIDDLEBURY: Final = re.compile(r"^\s*cam[01]\s*=", re.MULTILINE)
@@ -25,35 +26,53 @@ _OPENCV: Final = re.compile(r"^%YAML|<opencv_storage>|opencv-matrix")
 
 
 def read_calibration(
-    path: StrPath, width_px: int, height_px: int, *, metres_per_unit: float = 1.0
+    path: StrPath,
+    width_px: int,
+    height_px: int,
+    *,
+    metres_per_unit: float = 1.0,
+    cameras: tuple[int, int] | None = None,
 ) -> RectifiedCamera | StereoCalibration:
-    """Read a calibration file of any supported format.
+    """Read the calibration of images of one size from a file of any supported format.
 
-    Supported are our own YAML, KITTI's ``calib.txt`` (the grey pair if it has one, else the colour
-    pair), Middlebury's ``calib.txt``, OpenCV's ``FileStorage`` files, ROS CameraInfo (either of the
-    two files; the other is expected in the same folder), and kalibr's camera chain.
+    Supported are our own YAML, KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt`` (its rectified or
+    raw cameras, according to the image size), Middlebury's ``calib.txt``, OpenCV's ``FileStorage``
+    files, ROS CameraInfo (either of the two files; the other is expected in the same folder), and
+    kalibr's camera chain.
 
     Args:
         path: The file.
-        width_px: Image width, for formats that do not store it.
+        width_px: Image width.
         height_px: Image height.
         metres_per_unit: Unit of the translation in an OpenCV file; other formats define theirs.
+        cameras: Left and right camera of a KITTI file; None = the grey pair if it has one.
 
     Returns:
         A `RectifiedCamera` if the images are already rectified.
 
     Raises:
         FormatError: The file is missing, damaged or of an unknown format.
-        CalibrationError: The calibration cannot give depth.
+        CalibrationError: The calibration cannot give depth, or is of another image size.
     """
+    size = (width_px, height_px)
+    rig = _read(path, size, metres_per_unit, cameras)
+    check_size(rig, *size, path)
+    return rig
+
+
+def _read(
+    path: StrPath,
+    size: tuple[int, int],
+    metres_per_unit: float,
+    cameras: tuple[int, int] | None,
+) -> RectifiedCamera | StereoCalibration:
+    """Recognise the format; ``size`` is for files that do not state one, or more than one."""
     text = read_text(path)
     if _OURS.search(text):
         return read_recon_calibration(path)
     # OpenCV before KITTI: its extrinsics contain a ``P1:`` as well.
     if _OPENCV.search(text):
-        return read_opencv_calibration(
-            path, size_px=(width_px, height_px), metres_per_unit=metres_per_unit
-        )
+        return read_opencv_calibration(path, size_px=size, metres_per_unit=metres_per_unit)
     if _CAMERA_INFO.search(text):
         return read_camera_info(path)
     if _KALIBR.search(text):
@@ -61,9 +80,7 @@ def read_calibration(
     if _MIDDLEBURY.search(text):
         return read_middlebury_calib(path).camera
     if _KITTI.search(text):
-        known = list_kitti_cameras(path)
-        grey = known.issuperset(GREY_CAMERAS) or not known.issuperset(COLOUR_CAMERAS)
-        return read_kitti_calib(path, width_px, height_px, GREY_CAMERAS if grey else COLOUR_CAMERAS)
+        return read_kitti_rig(path, *size, cameras or _kitti_cameras(path))
     if _HOMOGRAPHIES.search(text):
         raise CalibrationError(
             "homographies know no focal length and no baseline: there is no depth in them",
@@ -77,3 +94,9 @@ def read_calibration(
         expected="our YAML, KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…), "
         "OpenCV YAML/XML (M1 …), ROS CameraInfo or a kalibr camchain (cam0: …)",
     )
+
+
+def _kitti_cameras(path: StrPath) -> tuple[int, int]:
+    known = list_kitti_cameras(path)
+    grey = known.issuperset(GREY_CAMERAS) or not known.issuperset(COLOUR_CAMERAS)
+    return GREY_CAMERAS if grey else COLOUR_CAMERAS

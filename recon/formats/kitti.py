@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from recon.errors import CalibrationError, FormatError
 from recon.formats.files import StrPath, read_text
-from recon.structures import RectifiedCamera
+from recon.structures import RectifiedCamera, check_unsized
 from recon.structures.arrays import Float64
 
 GREY_CAMERAS: Final = (0, 1)
 COLOUR_CAMERAS: Final = (2, 3)
+_FOLDER: Final = re.compile(r"image_0?([0-3])")
 _LINE: Final = re.compile(r"^P(?:_rect_0)?(\d):(.*)$", re.MULTILINE)
 
 
@@ -28,14 +30,14 @@ def read_kitti_calib(
     Args:
         path: ``calib.txt`` of a KITTI odometry sequence (``P0:`` …), or ``calib_cam_to_cam.txt``
             of a raw drive (``P_rect_00:`` …).
-        width_px: Image width; the file does not contain it.
+        width_px: Image width; the first kind of file does not contain it.
         height_px: Image height.
         cameras: Left and right camera: (0, 1) grey, (2, 3) colour.
 
     Raises:
         FormatError: The file is missing or lacks a camera, or a matrix is not 12 numbers.
-        CalibrationError: The cameras differ in focal length or principal row, or the baseline is
-            not positive.
+        CalibrationError: The cameras differ in focal length or principal row, the baseline is
+            not positive, or the principal point cannot be that of images of this size.
     """
     left, right = (_projection(path, camera) for camera in cameras)
     if not np.allclose(left[:, :3][[0, 1, 1], [0, 1, 2]], right[:, :3][[0, 1, 1], [0, 1, 2]]):
@@ -44,6 +46,7 @@ def read_kitti_calib(
             where=path,
             hint="a rectified pair shares them; rectify the images first",
         )
+    check_unsized((float(left[0, 2]), float(left[1, 2])), width_px, height_px, path)
     baseline_m = float(_centre_m(left)[0] - _centre_m(right)[0])
     if baseline_m <= 0:
         raise CalibrationError(
@@ -75,6 +78,15 @@ def read_kitti_offset(path: StrPath, camera: int) -> Float64:
     T = np.eye(4)
     T[:3, 3] = _centre_m(_projection(path, camera))
     return T
+
+
+def kitti_cameras_of(left: Path) -> tuple[int, int] | None:
+    """Left and right camera, if the path of a left image names KITTI's folder of one of them."""
+    for part in reversed(left.parts):
+        found = _FOLDER.fullmatch(part)
+        if found:
+            return COLOUR_CAMERAS if int(found[1]) in COLOUR_CAMERAS else GREY_CAMERAS
+    return None
 
 
 def list_kitti_cameras(path: StrPath) -> frozenset[int]:

@@ -1,4 +1,4 @@
-"""KITTI raw calibration, ``calib_cam_to_cam.txt``: four cameras, raw and rectified."""
+"""KITTI's calibrations; ``calib_cam_to_cam.txt`` has four cameras, each raw and rectified."""
 
 from __future__ import annotations
 
@@ -11,45 +11,45 @@ from recon.errors import FormatError
 from recon.formats.files import StrPath, naming, read_text
 from recon.formats.kitti import read_kitti_calib
 from recon.geometry.se3 import invert, make_transform
-from recon.structures import CameraIntrinsics, RectifiedCamera, StereoCalibration
+from recon.structures import CameraIntrinsics, RectifiedCamera, StereoCalibration, other_size
 from recon.structures.arrays import Float64
 
 _LINE: Final = re.compile(r"^([A-Z](?:_rect)?_\d\d):(.*)$", re.MULTILINE)
 _SIZES: Final = {"S": 2, "K": 9, "D": 5, "R": 9, "T": 3, "S_rect": 2}
 
 
-def read_kitti_raw_calib(
+def read_kitti_rig(
     path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int]
 ) -> RectifiedCamera | StereoCalibration:
     """Read the cameras of one stereo pair, rectified or raw according to the image size.
 
-    Rectified images (``_sync`` drives) are smaller than raw ones (``_extract`` drives).
+    Rectified images (``_sync`` drives) are smaller than raw ones (``_extract`` drives). A file
+    without sizes is of rectified images.
 
     Args:
-        path: ``calib_cam_to_cam.txt``.
+        path: ``calib_cam_to_cam.txt`` of a raw drive, or ``calib.txt`` of an odometry sequence.
         width_px: Image width.
         height_px: Image height.
         cameras: Left and right camera: (0, 1) grey, (2, 3) colour.
 
     Raises:
-        FormatError: The file is missing or lacks a line, or the image size is neither of the two.
-        CalibrationError: The calibration cannot give depth.
+        FormatError: The file is missing or lacks a line.
+        CalibrationError: The calibration cannot give depth, or the image size is neither of the
+            two.
 
     Ref: Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013, section 4.
     """
     rows = dict(_LINE.findall(read_text(path)))
+    if f"S_rect_{cameras[0]:02d}" not in rows:
+        return read_kitti_calib(path, width_px, height_px, cameras)
     recorded, rectified = (
         tuple(int(n) for n in _numbers(rows, key, cameras[0], path)) for key in ("S", "S_rect")
     )
     if (width_px, height_px) == rectified:
         return read_kitti_calib(path, width_px, height_px, cameras)
     if (width_px, height_px) != recorded:
-        raise FormatError(
-            "image size differs from the calibration",
-            where=path,
-            got=f"{width_px}x{height_px}",
-            expected=f"{rectified[0]}x{rectified[1]} rectified, {recorded[0]}x{recorded[1]} raw",
-        )
+        expected = f"{rectified[0]}x{rectified[1]} rectified, or {recorded[0]}x{recorded[1]} raw"
+        raise other_size(width_px, height_px, expected, path)
     T_left_0, T_right_0 = (_pose(rows, camera, path) for camera in cameras)
     with naming(path):
         left, right = (_camera(rows, camera, recorded, path) for camera in cameras)

@@ -24,7 +24,7 @@ from recon.formats.middlebury_layout import (
     scene_root,
 )
 from recon.formats.middlebury_truth import read_middlebury_truth
-from recon.structures import DisparityTruth, RectifiedCamera, StereoPair
+from recon.structures import DisparityTruth, RectifiedCamera, StereoPair, check_size
 from recon.structures.arrays import UInt8
 
 
@@ -136,13 +136,7 @@ def _read_calib(
     if generation != "2014" or not (path / "calib.txt").is_file():
         return None
     calib = read_middlebury_calib(path / "calib.txt")
-    if (calib.camera.width_px, calib.camera.height_px) != (width_px, height_px):
-        raise FormatError(
-            "image size in the calibration differs from the images",
-            where=path / "calib.txt",
-            got=f"{calib.camera.width_px}x{calib.camera.height_px}",
-            expected=_size(left),
-        )
+    check_size(calib.camera, width_px, height_px, path / "calib.txt")
     return calib
 
 

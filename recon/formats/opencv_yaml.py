@@ -13,7 +13,7 @@ from recon.errors import CalibrationError, FormatError
 from recon.formats.atomic import write_text
 from recon.formats.files import StrPath, naming, read_text
 from recon.geometry.se3 import make_transform
-from recon.structures import CameraIntrinsics, LensModel, StereoCalibration
+from recon.structures import CameraIntrinsics, LensModel, StereoCalibration, check_unsized
 from recon.structures.arrays import Float64
 
 # Accepted names: those of OpenCV's samples first, then those of calibration tools and tutorials.
@@ -58,14 +58,23 @@ def read_opencv_calibration(
 
     Raises:
         FormatError: A file or matrix is missing, or the image size is unknown.
-        CalibrationError: The calibration cannot give depth.
+        CalibrationError: The calibration cannot give depth, or cannot be of images of ``size_px``.
     """
     nodes = _read_nodes(intrinsics)
     outer = _find_extrinsics(intrinsics, extrinsics, nodes)
-    size = _size(nodes, size_px, intrinsics)
+    stated = _size(nodes)
+    size = stated or size_px
+    if size is None:
+        raise FormatError(
+            "calibration does not contain the image size",
+            where=intrinsics,
+            expected="image_width and image_height",
+        )
     model = _model(intrinsics)
     left = _camera(nodes, (_LEFT_MATRIX, _LEFT_DISTORTION), size, model, intrinsics)
     right = _camera(nodes, (_RIGHT_MATRIX, _RIGHT_DISTORTION), size, model, intrinsics)
+    if stated is None:
+        check_unsized((left.matrix[0, 2], left.matrix[1, 2]), *size, intrinsics)
     outer_nodes = _read_nodes(outer)
     rotation = _matrix(outer_nodes, _ROTATION, (3, 3), outer)
     translation = _matrix(outer_nodes, _TRANSLATION, (3,), outer)
@@ -179,19 +188,14 @@ def _camera(
         return CameraIntrinsics(matrix, distortion, *size_px, model)
 
 
-def _size(nodes: Nodes, given: tuple[int, int] | None, path: StrPath) -> tuple[int, int]:
+def _size(nodes: Nodes) -> tuple[int, int] | None:
+    """Image width and height, if the file states them."""
     width, height, both = (_find(nodes, names) for names in (_WIDTH, _HEIGHT, _SIZE))
     if width is not None and height is not None:
         return int(width), int(height)
     if both is not None and both.size == 2:
         return int(both.ravel()[0]), int(both.ravel()[1])
-    if given is None:
-        raise FormatError(
-            "calibration does not contain the image size",
-            where=path,
-            expected="image_width and image_height",
-        )
-    return given
+    return None
 
 
 def _find_extrinsics(intrinsics: StrPath, extrinsics: StrPath | None, nodes: Nodes) -> StrPath:

@@ -15,6 +15,7 @@ from recon.errors import CalibrationError
 from recon.formats.atomic import write_text
 from recon.formats.calibration import read_calibration
 from recon.formats.image import write_image
+from recon.formats.kitti import kitti_cameras_of
 from recon.formats.recon_yaml import write_recon_calibration
 from recon.formats.yaml_file import write_yaml
 from recon.pipeline.config import ReconConfig, dump_config
@@ -108,7 +109,8 @@ def run_rectify(left: str, right: str, config: ReconConfig, options: RectifyOpti
     with RunDirectory.for_command("rectify", options.out) as directory, serial_algebra():
         with watch.stage("plan"):
             first = read_pair(*pictures.pairs[0])
-            plan = _by_file(options, config, first) if options.calibration else None
+            cameras = kitti_cameras_of(pictures.pairs[0][0])
+            plan = _by_file(options, config, first, cameras) if options.calibration else None
             plan = plan or _by_features(pictures, config, first)
         with watch.stage("rectify"):
             for pair, (left_path, right_path) in _pairs(pictures):
@@ -150,11 +152,22 @@ class _Plan:
     figures: dict[str, Any]
 
 
-def _by_file(options: RectifyOptions, config: ReconConfig, first: StereoPair) -> _Plan:
+def _by_file(
+    options: RectifyOptions,
+    config: ReconConfig,
+    first: StereoPair,
+    cameras: tuple[int, int] | None,
+) -> _Plan:
     """Rectification by a calibration file; depth is metric."""
     path = options.calibration
     height, width = first.left.shape[:2]
-    rig = read_calibration(path or "", width, height, metres_per_unit=options.metres_per_unit)
+    rig = read_calibration(
+        path or "",
+        width,
+        height,
+        metres_per_unit=options.metres_per_unit,
+        cameras=cameras,
+    )
     if not isinstance(rig, StereoCalibration):
         raise CalibrationError(
             "the calibration is of images that are already rectified",

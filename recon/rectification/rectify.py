@@ -21,6 +21,7 @@ from recon.structures import (
     RectifiedPair,
     StereoCalibration,
     StereoPair,
+    check_size,
 )
 from recon.structures.arrays import Bool, Float32, Float64, UInt8
 
@@ -147,24 +148,13 @@ class Rectifier:
         Raises:
             CalibrationError: The image size differs from that of the calibration.
         """
-        self._check_size(pair)
+        height_px, width_px = pair.left.shape[:2]
+        check_size(self.camera, width_px, height_px, pair.name or f"frame {pair.index}")
         if self._views is None:
             return pair.left, pair.right
         how = _INTERPOLATIONS[self.settings.interpolation]
         left, right = self._views
         return left.warp(pair.left, how), right.warp(pair.right, how)
-
-    def _check_size(self, pair: StereoPair) -> None:
-        height_px, width_px = pair.left.shape[:2]
-        if (width_px, height_px) != (self.camera.width_px, self.camera.height_px):
-            raise CalibrationError(
-                "images have another size than the calibration",
-                where=pair.name or f"frame {pair.index}",
-                got=f"{width_px}x{height_px}",
-                expected=f"{self.camera.width_px}x{self.camera.height_px}",
-                hint="use images as they were calibrated (not resized, cropped or rotated), or a "
-                "calibration of these images",
-            )
 
 
 @dataclass(frozen=True, eq=False)

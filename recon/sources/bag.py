@@ -19,10 +19,9 @@ from recon.sources.bag_rig import rig_of_messages
 from recon.sources.bag_topics import camera_info_topic, choose_topics, list_topics, names_rectified
 from recon.sources.files import join_pair
 from recon.sources.pairing import StampPairs, check_increasing, pair_stamps
-from recon.sources.pictures import check_size
 from recon.sources.rig import Rig, as_rectified, read_rig
 from recon.sources.settings import SourceSettings
-from recon.structures import SequenceTruth, StereoPair
+from recon.structures import SequenceTruth, StereoPair, check_size
 from recon.structures.arrays import Float64, UInt8
 
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
@@ -84,8 +83,8 @@ class BagSource:
         """Read the pairs from number ``start`` on, without reading the messages before.
 
         Raises:
-            FormatError: A message is damaged, has another size than the calibration, or an
-                unsupported encoding.
+            FormatError: A message is damaged or has an unsupported encoding.
+            CalibrationError: An image has another size than the calibration.
         """
         if start >= len(self):
             return
@@ -112,8 +111,9 @@ class BagSource:
                     "recording ends early", where=self.bag.paths[0], got=f"{target} of {topic}"
                 )
             position = target + 1
-            image = decode_message(message, f"{self.bag.paths[0]}: {topic}, message {target}")
-            check_size(image, self.calibration, f"{self.bag.paths[0]}: {topic}, message {target}")
+            where = f"{self.bag.paths[0]}: {topic}, message {target}"
+            image = decode_message(message, where)
+            check_size(self.calibration, image.shape[1], image.shape[0], where)
             yield image
 
 

@@ -28,7 +28,7 @@ from recon.sources.rig import Rig, as_rectified, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_stamped_names
 from recon.sources.truth import truth_at
-from recon.structures import SequenceTruth, StereoCalibration
+from recon.structures import SequenceTruth, StereoCalibration, check_size
 from recon.structures.arrays import Float64
 
 _TRUTH: Final = "state_groundtruth_estimate0"
@@ -86,6 +86,7 @@ def _read_rig(
     paths = [view / "sensor.yaml" for view in views]
     (left, T_body_left), (right, T_body_right) = (read_euroc_camera(path) for path in paths)
     rig = StereoCalibration(left, right, invert(T_body_right) @ T_body_left)
+    check_size(rig, *size, paths[0])
     return as_rectified(rig), tuple(paths)
 
 

@@ -9,6 +9,7 @@ from recon.errors import SourceError
 from recon.formats.calibration import read_calibration
 from recon.formats.files import StrPath
 from recon.formats.image import read_image
+from recon.formats.kitti import kitti_cameras_of
 from recon.formats.middlebury import stand_in_camera
 from recon.structures import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
 from recon.structures.arrays import UInt8
@@ -27,7 +28,7 @@ class FilesSource:
     Raises:
         SourceError: The images differ in size.
         FormatError: A file is missing, damaged or of another format.
-        CalibrationError: The calibration cannot give depth.
+        CalibrationError: The calibration cannot give depth, or is of another image size.
     """
 
     def __init__(
@@ -45,7 +46,13 @@ class FilesSource:
         self._calibration = (
             stand_in_camera(width_px, height_px)
             if calibration is None
-            else read_calibration(calibration, width_px, height_px, metres_per_unit=metres_per_unit)
+            else read_calibration(
+                calibration,
+                width_px,
+                height_px,
+                metres_per_unit=metres_per_unit,
+                cameras=kitti_cameras_of(self._files[0]),
+            )
         )
 
     @property

@@ -20,6 +20,7 @@ import numpy as np
 
 from recon.errors import SourceError
 from recon.formats.frames_csv import FRAMES, read_frames
+from recon.formats.kitti import kitti_cameras_of
 from recon.sources.pairing import (
     check_increasing,
     find_partners,
@@ -66,7 +67,8 @@ def open_folders(folder: Path, settings: SourceSettings) -> PictureSource:
     """
     found = _pair(folder, settings)
     stamps_s, clock = _times(found, settings)
-    rig, texts = read_rig(settings, folder, picture_size(found.pairs[0][0]))
+    first = found.pairs[0][0]
+    rig, texts = read_rig(settings, folder, picture_size(first), kitti_cameras_of(first))
     truth, note = read_tum_truth(folder, stamps_s)
     return PictureSource(
         name=folder.resolve().name,

@@ -20,7 +20,8 @@ import numpy as np
 
 from recon.errors import SourceError
 from recon.formats.files import StrPath
-from recon.formats.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_calib, read_kitti_offset
+from recon.formats.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset
+from recon.formats.kitti_raw import read_kitti_rig
 from recon.formats.trajectory import read_kitti_poses
 from recon.geometry.se3 import invert
 from recon.sources.pictures import (
@@ -30,7 +31,7 @@ from recon.sources.pictures import (
     list_pictures,
     picture_size,
 )
-from recon.sources.rig import Rig, read_rig
+from recon.sources.rig import Rig, as_rectified, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_times
 from recon.structures import SequenceTruth, Trajectory
@@ -154,15 +155,15 @@ def _read_times(
 def _read_rig(
     folder: Path, settings: SourceSettings, cameras: tuple[int, int], picture: Path
 ) -> tuple[Rig, tuple[Path, ...]]:
-    """Read the calibration; the file does not contain the image size."""
+    """Read the calibration; its file need not contain the image size."""
     path, size = folder / "calib.txt", picture_size(picture)
     if settings.calibration is not None:
-        return read_rig(settings, folder, size)
+        return read_rig(settings, folder, size, cameras)
     if not path.exists():
         raise SourceError(
             "calibration is missing", where=path, hint="name a file with --calib FILE"
         )
-    return read_kitti_calib(path, *size, cameras), (path,)
+    return as_rectified(read_kitti_rig(path, *size, cameras)), (path,)
 
 
 def _read_truth(folder: Path, times: Float64, camera: int) -> SequenceTruth | None:

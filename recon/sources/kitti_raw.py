@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from recon.errors import SourceError
-from recon.formats.kitti_raw import read_kitti_raw_calib
+from recon.formats.kitti_raw import read_kitti_rig
 from recon.sources.kitti import choose_cameras
 from recon.sources.pairing import check_increasing, pair_stamps
 from recon.sources.pictures import PictureFrame, PictureSource, list_pictures, picture_size
@@ -77,7 +77,7 @@ def _read_rig(
     folder: Path, settings: SourceSettings, cameras: tuple[int, int], size: tuple[int, int]
 ) -> tuple[Rig, tuple[Path, ...]]:
     if settings.calibration is not None:
-        return read_rig(settings, folder, size)
+        return read_rig(settings, folder, size, cameras)
     candidates = [place / _CALIBRATION for place in (folder, folder.resolve().parent)]
     path = next((candidate for candidate in candidates if candidate.is_file()), None)
     if path is None:
@@ -87,4 +87,4 @@ def _read_rig(
             expected=f"{_CALIBRATION} in the folder of the drive or of its day",
             hint="download the calibration of the day, or name a file with --calib",
         )
-    return as_rectified(read_kitti_raw_calib(path, *size, cameras)), (path,)
+    return as_rectified(read_kitti_rig(path, *size, cameras)), (path,)

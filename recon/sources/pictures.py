@@ -9,11 +9,17 @@ from typing import Final
 
 import numpy as np
 
-from recon.errors import FormatError, SourceError
+from recon.errors import SourceError
 from recon.formats.image import read_image
 from recon.sources.files import join_pair
 from recon.sources.pairing import natural_key
-from recon.structures import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
+from recon.structures import (
+    RectifiedCamera,
+    SequenceTruth,
+    StereoCalibration,
+    StereoPair,
+    check_size,
+)
 from recon.structures.arrays import Float64, UInt8
 
 PICTURES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
@@ -75,7 +81,8 @@ class PictureSource:
         """Read the pairs from number ``start`` on.
 
         Raises:
-            FormatError: An image is missing, damaged or of another size than the calibration.
+            FormatError: An image is missing or damaged.
+            CalibrationError: An image has another size than the calibration.
         """
         for index in range(start, len(self.pictures)):
             frame = self.pictures[index]
@@ -84,33 +91,8 @@ class PictureSource:
 
     def _read(self, path: Path) -> UInt8:
         image = read_image(path)
-        check_size(image, self.calibration, path)
+        check_size(self.calibration, image.shape[1], image.shape[0], path)
         return image
-
-
-def size_of(calibration: RectifiedCamera | StereoCalibration) -> tuple[int, int]:
-    """Image width and height of a calibration."""
-    camera = calibration if isinstance(calibration, RectifiedCamera) else calibration.left
-    return camera.width_px, camera.height_px
-
-
-def check_size(
-    image: UInt8, calibration: RectifiedCamera | StereoCalibration, where: Path | str
-) -> None:
-    """Check that an image has the size of the calibration.
-
-    Raises:
-        FormatError: It has another size.
-    """
-    size = (image.shape[1], image.shape[0])
-    expected = size_of(calibration)
-    if size != expected:
-        raise FormatError(
-            "image size differs from the calibration, or from the first image of the drive",
-            where=where,
-            got=f"{size[0]}x{size[1]}",
-            expected=f"{expected[0]}x{expected[1]}",
-        )
 
 
 def picture_size(path: Path) -> tuple[int, int]:

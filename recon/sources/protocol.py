@@ -60,7 +60,8 @@ class StereoSource(Protocol):
         is entered by its index, a video is decoded up to there.
 
         Raises:
-            FormatError: An image is missing, truncated or of another size.
+            FormatError: An image is missing or truncated.
+            CalibrationError: An image has another size than the calibration.
         """
         ...
 

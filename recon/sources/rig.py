@@ -25,14 +25,18 @@ _DIGITS_TOLERANCE: Final = 1e-9
 
 
 def read_rig(
-    settings: SourceSettings, folder: Path, size: tuple[int, int]
+    settings: SourceSettings,
+    folder: Path,
+    size: tuple[int, int],
+    cameras: tuple[int, int] | None = None,
 ) -> tuple[Rig, tuple[Path, ...]]:
     """Read the calibration named in the settings, else the one in a folder.
 
     Args:
         settings: May name a file.
         folder: The folder to search otherwise.
-        size: Image width and height, for files that do not contain them.
+        size: Image width and height.
+        cameras: Left and right camera of a KITTI file; None = grey if it has that pair.
 
     Returns:
         The calibration, and the files it was read from.
@@ -40,7 +44,7 @@ def read_rig(
     Raises:
         SourceError: No file is named and none is found.
         FormatError: The file is damaged.
-        CalibrationError: The calibration cannot give depth.
+        CalibrationError: The calibration cannot give depth, or is of another image size.
     """
     path = find_calibration(folder) if settings.calibration is None else Path(settings.calibration)
     if path is None:
@@ -50,7 +54,7 @@ def read_rig(
             expected="calib.txt, calibration.yaml, … in the folder",
             hint="name one with --calib FILE",
         )
-    rig = read_calibration(path, *size, metres_per_unit=settings.metres_per_unit)
+    rig = read_calibration(path, *size, metres_per_unit=settings.metres_per_unit, cameras=cameras)
     return as_rectified(rig), (path,)
 
 

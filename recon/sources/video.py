@@ -12,10 +12,9 @@ import numpy as np
 from recon.errors import FormatError, SourceError
 from recon.formats.video import VIDEOS, VideoFile, open_video
 from recon.sources.pairing import find_partners
-from recon.sources.pictures import check_size
 from recon.sources.rig import Rig, read_rig
 from recon.sources.settings import SourceSettings
-from recon.structures import SequenceTruth, StereoPair
+from recon.structures import SequenceTruth, StereoPair, check_size
 from recon.structures.arrays import UInt8
 
 _STACKED: Final = frozenset({"top-bottom", "bottom-top"})
@@ -67,7 +66,7 @@ class VideoSource:
         last_s = -np.inf
         for index, (stamp_s, left, right) in enumerate(self._views(start), start=start):
             for view in (left, right):
-                check_size(view, self.calibration, self.videos[0].path)
+                check_size(self.calibration, view.shape[1], view.shape[0], self.videos[0].path)
             time_s = index / self.settings.rate_hz if self.settings.rate_hz else stamp_s
             if time_s <= last_s:
                 raise FormatError(

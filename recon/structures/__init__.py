@@ -1,6 +1,15 @@
 """Immutable data types: validated on construction, numpy only; no file access, no drawing."""
 
-from recon.structures.camera import CameraIntrinsics, LensModel, RectifiedCamera, StereoCalibration
+from recon.structures.camera import (
+    LARGEST_CENTRE_OFFSET,
+    CameraIntrinsics,
+    LensModel,
+    RectifiedCamera,
+    StereoCalibration,
+    check_size,
+    check_unsized,
+    other_size,
+)
 from recon.structures.cloud import Frame, PointCloud
 from recon.structures.disparity import Disparity, Reason
 from recon.structures.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
@@ -22,6 +31,7 @@ from recon.structures.truth import DisparityTruth, OccupancyTruth, SequenceTruth
 
 __all__ = [
     "FREE",
+    "LARGEST_CENTRE_OFFSET",
     "OCCUPIED",
     "UNKNOWN",
     "CameraIntrinsics",
@@ -51,4 +61,7 @@ __all__ = [
     "TrajectoryMetrics",
     "TriangleMesh",
     "VoxelMetrics",
+    "check_size",
+    "check_unsized",
+    "other_size",
 ]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from os import PathLike
+from typing import Final, Literal
 
 import numpy as np
 
@@ -12,6 +13,10 @@ from recon.errors import CalibrationError
 from recon.structures.arrays import Float64, freeze
 
 LensModel = Literal["pinhole", "fisheye"]
+
+LARGEST_CENTRE_OFFSET: Final = 0.25
+"""Offset of a principal point from the image centre, relative to the image size, above which the
+calibration is hardly of these images: at half the calibrated size it is 0.5."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,4 +152,62 @@ class RectifiedCamera:
             width_px=width_px,
             height_px=height_px,
             ndisp=None if self.ndisp is None else math.ceil(self.ndisp * s),
+        )
+
+
+def check_size(
+    calibration: RectifiedCamera | StereoCalibration,
+    width_px: int,
+    height_px: int,
+    where: str | PathLike[str] | None,
+) -> None:
+    """Check that images have the size of their calibration; every use of a calibration does.
+
+    Args:
+        calibration: The calibration.
+        width_px: Width of the images.
+        height_px: Height of the images.
+        where: Calibration file or image, for the error message.
+
+    Raises:
+        CalibrationError: They have another size.
+    """
+    camera = calibration if isinstance(calibration, RectifiedCamera) else calibration.left
+    if (width_px, height_px) != (camera.width_px, camera.height_px):
+        raise other_size(width_px, height_px, f"{camera.width_px}x{camera.height_px}", where)
+
+
+def other_size(
+    width_px: int, height_px: int, expected: str, where: str | PathLike[str] | None
+) -> CalibrationError:
+    """The error for images that have another size than their calibration."""
+    return CalibrationError(
+        "images have another size than the calibration",
+        where=where,
+        got=f"{width_px}x{height_px}",
+        expected=expected,
+        hint="use images as they were calibrated (not resized, cropped or rotated), or a "
+        "calibration of these images",
+    )
+
+
+def check_unsized(
+    centre_px: tuple[float, float], width_px: int, height_px: int, where: str | PathLike[str]
+) -> None:
+    """Check a calibration from a file that does not state its image size against the images.
+
+    Raises:
+        CalibrationError: The principal point is so far off their centre that the calibration must
+            be of another size.
+    """
+    offsets = (centre_px[0] / width_px - 0.5, centre_px[1] / height_px - 0.5)
+    if max(map(abs, offsets)) > LARGEST_CENTRE_OFFSET:
+        raise CalibrationError(
+            "the calibration is of another size",
+            where=where,
+            got=f"principal point at ({centre_px[0]:g}, {centre_px[1]:g}) of "
+            f"{width_px}x{height_px} pixels",
+            expected="near the centre",
+            hint="use images as they were calibrated; a cropped image needs a calibration file "
+            "that stores the size",
         )

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from recon.errors import FormatError
+from recon.errors import CalibrationError
 from recon.geometry.se3 import exp_so3, make_transform
 from recon.sources import StereoSource
 from recon.structures import (
@@ -136,8 +136,8 @@ def wrong_size(source: StereoSource) -> Spoiled:
 
     def take(index: int) -> StereoPair:
         pair = half.take(index)
-        raise FormatError(
-            "image size differs from the calibration",
+        raise CalibrationError(
+            "images have another size than the calibration",
             where=pair.name,
             got=f"{pair.left.shape[1]}x{pair.left.shape[0]}",
         )

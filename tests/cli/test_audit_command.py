@@ -109,14 +109,14 @@ def test_mapping_warns_of_rows_first_and_takes_the_mended_file(
     assert summary["points"] > json.loads(done.stdout)["points"]
 
 
-def test_a_picture_of_another_size_is_a_finding(drive: Drive, tmp_path: Path) -> None:
+def test_images_of_another_size_are_refused_in_one_line(drive: Drive, tmp_path: Path) -> None:
     pairs, camera = drive
     half = [replace(p, left=p.left[::2, ::2].copy(), right=p.right[::2, ::2].copy()) for p in pairs]
     done = recon("audit", drives.write_euroc(half, camera, tmp_path))
-    assert done.exit_code == 0
-    assert "fatal: " in done.stdout
-    assert "size differs" in done.stdout
-    assert done.stdout.rstrip().endswith("verdict: not usable")
+    assert done.exit_code == 1
+    assert "images have another size than the calibration" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stdout == ""
 
 
 def cut_off(path: Path) -> Path:

@@ -79,7 +79,7 @@ def test_every_format_gives_the_rig_back_whatever_its_name(
 def test_our_file_gives_a_rectified_camera_back_to_the_last_bit(tmp_path: Path) -> None:
     camera = RectifiedCamera(1 / 3 + 700, 600.1, 180.7, 610.3, 0.54, 1242, 375, ndisp=96)
     write_recon_calibration(tmp_path / "c.yaml", camera)
-    assert read_calibration(tmp_path / "c.yaml", 1, 1) == camera
+    assert read_calibration(tmp_path / "c.yaml", camera.width_px, camera.height_px) == camera
 
 
 def test_our_file_names_every_unit_and_keeps_figures_aside(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_calib_txt_gives_metres_and_doffs(tmp_path: Path) -> None:
         ({"cam0": "[nan 0 1; 0 1 1; 0 0 1]"}, FormatError, "'cam0' has a value .* not finite"),
         ({"doffs": "31"}, CalibrationError, r"doffs is not .* \(got 31, expected 32\.778"),
         ({"cam1": "[500 0 1; 0 500 1; 0 0 1]"}, CalibrationError, "different focal lengths"),
-        ({"width": "25"}, FormatError, r"size in the calibration.*got 25x12, expected 24x12"),
+        ({"width": "25"}, CalibrationError, r"another size .*got 24x12, expected 25x12"),
     ],
 )
 def test_a_bad_calib_txt_is_one_clear_line_with_the_file(

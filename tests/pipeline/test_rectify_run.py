@@ -78,7 +78,7 @@ def test_a_calibration_gives_metric_pictures_that_other_commands_take(
 
 
 def test_a_calibration_of_rectified_pictures_is_refused(street: Path, tmp_path: Path) -> None:
-    camera = RectifiedCamera(700, 600, 180, 600, 0.5, 1242, 375)
+    camera = RectifiedCamera(270, 240, 120, 240, 0.5, 480, 240)
     write_recon_calibration(tmp_path / "c.yaml", camera)
     options = RectifyOptions(tmp_path / "c.yaml", out=tmp_path / "out")
     with pytest.raises(CalibrationError, match=r"c\.yaml: .*already rectified"):

@@ -196,7 +196,7 @@ def test_a_picture_of_another_size_is_named_when_its_turn_comes(tmp_path: Path, 
     write_image(folder / name, np.zeros((16, 31), dtype=np.uint8))
     source = open_kitti(folder)
     with pytest.raises(
-        FormatError, match=rf"{name}: .*image size differs.*got 31x16, expected 32x16"
+        CalibrationError, match=rf"{name}: .*another size.*got 31x16, expected 32x16"
     ):
         list(source)
 
