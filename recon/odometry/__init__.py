@@ -2,12 +2,14 @@
 
 from recon.odometry.known import KnownPoses
 from recon.odometry.prior import MotionPrior
+from recon.odometry.prior_axes import FoundAxes, find_axes, first_moving
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
 from recon.odometry.registry import ODOMETRIES, make_odometry
 from recon.odometry.settings import OdometrySettings
 
 __all__ = [
     "ODOMETRIES",
+    "FoundAxes",
     "KnownPoses",
     "MotionPrior",
     "Odometry",
@@ -15,5 +17,7 @@ __all__ = [
     "OdometryHealth",
     "OdometryResult",
     "OdometrySettings",
+    "find_axes",
+    "first_moving",
     "make_odometry",
 ]

@@ -45,7 +45,7 @@ class MotionPrior:
         Raises:
             RegistrationError: No two frames that follow one another lie within the path.
         """
-        known = np.array([self._pose_at(float(t)) is not None for t in stamps_s])
+        known = np.array([self.knows(float(t)) for t in stamps_s])
         if len(stamps_s) < 2 or (known[1:] & known[:-1]).any():
             return
         spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" for t in (self.path.timestamps_s, stamps_s)]
@@ -55,6 +55,10 @@ class MotionPrior:
             expected=f"frames from {spans[1]}, poses at most {self.settings.max_gap_s:g} s apart",
             hint="both must use the same clock, in seconds",
         )
+
+    def knows(self, time_s: float) -> bool:
+        """Whether the path has a pose at a time."""
+        return self._pose_at(time_s) is not None
 
     def motion(self, from_s: float, to_s: float) -> Float64 | None:
         """T_from_to (4, 4) of the camera between two times; None = the path has a gap there."""

@@ -152,10 +152,11 @@ class TrustSettings(Settings):
 class PriorSettings(Settings):
     """How a path from other sensors is used."""
 
-    axes: Literal["camera", "body"] = Field(
-        "camera",
+    axes: Literal["auto", "camera", "body"] = Field(
+        "auto",
         description="Axes of its poses: of the left camera (x right, y down, z forward), or of a "
-        "body (x forward, y left, z up) that turns with it and is near to it.",
+        "body (x forward, y left, z up) that turns with it and is near to it. auto = those in "
+        "which it explains what the cameras see on the first metres.",
     )
     max_gap_s: float = Field(
         1.0, gt=0.0, description="Poses farther apart in time are not interpolated."

@@ -14,6 +14,7 @@ from recon.formats.atomic import write_text
 from recon.formats.trajectory import write_kitti_poses, write_tum
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.drive_mesh import mesh_to_show, store_map, write_drive_mesh
+from recon.pipeline.empty_map import check_map
 from recon.pipeline.finished_run import RAYS_FILE
 from recon.pipeline.machine import use_threads
 from recon.pipeline.map_files import write_map
@@ -86,6 +87,7 @@ class MapOptions:
         threads: Threads to use; None = all cores. Changes no result.
         known_poses: Poses to use instead of odometry, one per frame.
         prior: Motion of the left camera from another sensor, in the time base of the source.
+        prior_origin: Where it is from, for the summary.
         mesh: Whether to reconstruct a surface.
         observers: Notified of progress.
         present: Writes figures and the report into the result folder.
@@ -99,6 +101,7 @@ class MapOptions:
     threads: int | None = None
     known_poses: Trajectory | None = None
     prior: Trajectory | None = None
+    prior_origin: str = ""
     mesh: bool = True
     observers: tuple[Observer, ...] = ()
     present: Callable[[MapRun, RunDirectory], None] | None = None
@@ -169,9 +172,12 @@ def _finish(
     """Make the products that need the whole drive; map files are written immediately."""
     config = mapped.config
     warnings = [*options.warnings, *health_warnings(mapped.health)]
+    if mapped.prior is not None:
+        warnings += mapped.prior.warnings()
     if mapped.loops is not None:
         warnings += mapped.loops.warnings()
     _tell(options.observers, "map")
+    check_map(mapped, source.name)
     written = write_map(mapped, directory, watch)
     warnings += written.warnings
     mesh, faces = None, 0
@@ -204,6 +210,8 @@ def _finish(
     odometry = "known poses" if given else config.odometry.method
     sizes = {"points": written.points, "voxels": written.voxels, "faces": faces}
     run.summary.update(odometry=odometry, **_summary(run), **sizes)
+    if mapped.prior is not None:
+        run.summary["prior"] = {"from": options.prior_origin, **plain(mapped.prior)}
     return run
 
 

@@ -23,6 +23,7 @@ from recon.formats.ply import write_ply
 from recon.geometry.triangulation import depth_from_disparity
 from recon.meshing import reconstruct_mesh
 from recon.pipeline.config import ReconConfig, dump_config
+from recon.pipeline.empty_map import check_cloud
 from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
 from recon.pipeline.machine import use_threads
 from recon.pipeline.pair_checks import OnePair, check_found, find_pair_faults
@@ -137,6 +138,9 @@ def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> Pai
         else:
             run = _reconstruct(given, config, reconstructor, options, watch)
         few = check_found(run.disparity, given.pair, faults)
+        if run.cloud is not None:
+            camera = run.pair.camera
+            check_cloud(len(run.cloud), run.disparity, camera, config.cloud, run.name)
         run = replace(run, warnings=(*(fault.text for fault in faults), *few, *run.warnings))
         with watch.stage("write"):
             _write(run, directory)

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from recon.errors import RegistrationError
-from recon.odometry import KnownPoses, MotionPrior, Odometry, OdometryHealth, make_odometry
+from recon.odometry import (
+    KnownPoses,
+    MotionPrior,
+    Odometry,
+    OdometryFrame,
+    OdometryHealth,
+    OdometrySettings,
+    find_axes,
+    first_moving,
+    make_odometry,
+)
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.drive_loops import DriveLoops, LoopWatch
 from recon.pipeline.drive_map import DriveMap
@@ -25,6 +35,28 @@ from recon.pipeline.workspace import Workspace
 from recon.sources import StampedSource, StereoSource
 from recon.structures import OccupancyVoxels, PointCloud, RectifiedCamera, Trajectory
 from recon.structures.arrays import Float64
+
+
+@dataclass(frozen=True)
+class UsedPrior:
+    """How an external trajectory was used.
+
+    Attributes:
+        axes: The axes of its poses.
+        known_from: ``images``, ``settings``, or ``assumed``.
+        sigmas: Median distance from the visual motion in each set of axes, standard deviations.
+    """
+
+    axes: str
+    known_from: str
+    sigmas: Mapping[str, float] = field(default_factory=dict)
+
+    def warnings(self) -> list[str]:
+        """What the user should know about it."""
+        if self.known_from != "assumed":
+            return []
+        what = "too little motion was seen to tell the axes of the prior"
+        return [f"{what}; taken as those of the camera (odometry.prior.axes)"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +75,7 @@ class MappedSequence:
         T_corrected_world: float64 (S, 4, 4), correction still to be applied to each submap; the
             trajectory already includes it. None = none.
         loops: Result of loop closure; None = it was not run.
+        prior: How the external trajectory was used; None = there was none.
     """
 
     trajectory: Trajectory
@@ -55,6 +88,7 @@ class MappedSequence:
     seconds: float
     T_corrected_world: Float64 | None = None
     loops: DriveLoops | None = None
+    prior: UsedPrior | None = None
 
     @cached_property
     def map(self) -> DriveMap:
@@ -129,7 +163,10 @@ def map_sequence(
     reconstructor = FrameReconstructor(
         source.calibration, config, threads=work.threads, stopwatch=work.stopwatch
     )
-    odometry = _odometry(config, source, known_poses, prior)
+    used = None
+    if prior is not None and known_poses is None:
+        used = _axes_of(prior, source, reconstructor, config.odometry)
+    odometry = _odometry(config, source, known_poses, prior, used)
     looking = config.loops.enabled and known_poses is None
     loops = LoopWatch(config.loops, work.loops, work.stopwatch) if looking else None
     mapper = Mapper(config, reconstructor.camera, odometry, work)
@@ -148,7 +185,7 @@ def map_sequence(
         drive.stop()
         for observer in audience:
             observer.on_finish()
-    return drive.finish(source, reconstructor)
+    return replace(drive.finish(source, reconstructor), prior=used)
 
 
 class _Drive:
@@ -244,16 +281,39 @@ class _Drive:
         return reconstructor.reconstruct(next(source.frames(index)))
 
 
+def _axes_of(
+    prior: Trajectory,
+    source: StereoSource,
+    reconstructor: FrameReconstructor,
+    settings: OdometrySettings,
+) -> UsedPrior:
+    """The axes of a prior: those set, else those that explain the first motions in the images."""
+    start = 0
+    if isinstance(source, StampedSource):
+        MotionPrior(prior, settings.prior).check_covers(source.stamps_s)
+        start = first_moving(prior, source.stamps_s, settings.prior)
+    if settings.prior.axes != "auto":
+        return UsedPrior(settings.prior.axes, "settings")
+    frames = (OdometryFrame(*reconstructor.match(pair)) for pair in source.frames(start))
+    found = find_axes(prior, frames, settings)
+    if found is None:
+        return UsedPrior("camera", "assumed")
+    return UsedPrior(found.axes, "images", found.sigmas)
+
+
 def _odometry(
     config: ReconConfig,
     source: StereoSource,
     known_poses: Trajectory | None,
     prior: Trajectory | None,
+    used: UsedPrior | None,
 ) -> Odometry:
     if known_poses is None:
-        if prior is not None and isinstance(source, StampedSource):
-            MotionPrior(prior, config.odometry.prior).check_covers(source.stamps_s)
-        return make_odometry(config.odometry.method, config.odometry, prior)
+        settings = config.odometry
+        if used is not None:
+            axes = settings.prior.model_copy(update={"axes": used.axes})
+            settings = settings.model_copy(update={"prior": axes})
+        return make_odometry(settings.method, settings, prior)
     if len(known_poses) < len(source):
         raise RegistrationError(
             "fewer known poses than frames",

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.errors import CalibrationError
+from recon.errors import CalibrationError, MappingError
 from recon.geometry.se3 import exp_so3, make_transform
 from recon.matching import make_matcher
 from recon.odometry import OdometryFrame, OdometryResult, make_odometry
@@ -23,7 +23,7 @@ from recon.pipeline.config import load_config
 from recon.pipeline.map_run import MapOptions, MapRun, run_map
 from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource, write_kitti
-from recon.structures import RectifiedCamera, RectifiedPair
+from recon.structures import RectifiedCamera, RectifiedPair, Trajectory
 from recon.synthetic import StreetSettings
 
 CAMERA = RectifiedCamera(
@@ -163,16 +163,64 @@ def off_m(run: MapRun, road: Road, index: int) -> float:
     return float(np.linalg.norm(run.mapped.trajectory.positions_m[-1] - truth))
 
 
-def test_a_bare_motorway_ends_with_a_loud_warning_and_no_map_of_it(tmp_path: Path) -> None:
-    run = map_drive(Road(grain=1.0, step_m=2.8).pairs(range(8)), tmp_path)
-    assert [record.ok for record in run.mapped.health] == [True] + [False] * 7
-    assert run.warnings[0].startswith("PATH AND MAP ARE NOT TO BE TRUSTED: the poses of 7 of 8")
-    assert run.warnings[1].startswith("frames 1-7: the pose is not to be trusted")
-    # Three frames must have seen a voxel; only one is believed.
-    assert len(run.cloud) == 0
+def test_a_drive_without_a_trusted_pose_fails_and_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(MappingError, match=r"the map is empty \(got 7 of 8 poses are not to be"):
+        map_drive(Road(grain=1.0, step_m=2.8).pairs(range(8)), tmp_path)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_bare_stretch_of_motorway_ends_with_a_loud_warning(
+    seen: list[RectifiedPair], tmp_path: Path
+) -> None:
+    bare = [Road(grain=1.0, step_m=2.8).pair(index) for index in range(10, 18)]
+    run = map_drive([*seen[:4], *bare], tmp_path)
+    assert [record.ok for record in run.mapped.health] == [True] * 4 + [False] * 8
+    assert run.warnings[0].startswith("PATH AND MAP ARE NOT TO BE TRUSTED: the poses of 8 of 12")
+    assert run.warnings[1].startswith("frames 4-11: the pose is not to be trusted")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["frames_not_trusted"] == 7
+    assert summary["frames_not_trusted"] == 8
     assert summary["warnings"] == list(run.warnings)
+
+
+def body_path(count: int, T_camera_body: np.ndarray) -> Trajectory:
+    """The path of `ROAD`, as wheels would give it."""
+    poses = np.stack([ROAD.pose(index) @ T_camera_body for index in range(count)])
+    return Trajectory(np.linalg.inv(poses[0]) @ poses, 0.1 * np.arange(count))
+
+
+BODY = make_transform(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.zeros(3))
+
+
+def test_a_prior_in_body_axes_is_recognised(seen: list[RectifiedPair], tmp_path: Path) -> None:
+    write_drive(seen, tmp_path / "drive")
+    options = MapOptions(out=tmp_path / "out", mesh=False, prior=body_path(10, BODY))
+    run = run_map(open_source(tmp_path / "drive"), load_config(), options)
+    assert not doubted(run)
+    assert run.summary["prior"]["axes"] == "body"
+    assert run.summary["prior"]["known_from"] == "images"
+    assert run.summary["prior"]["sigmas"]["camera"] > 5
+    assert off_m(run, ROAD, 9) < ALLOWED_M
+
+
+def test_a_prior_said_to_be_in_the_wrong_axes_fails_with_the_reason(
+    seen: list[RectifiedPair], tmp_path: Path
+) -> None:
+    write_drive(seen, tmp_path / "drive")
+    config = load_config(None, ["odometry.prior.axes=camera"])
+    options = MapOptions(out=tmp_path / "out", mesh=False, prior=body_path(10, BODY))
+    with pytest.raises(MappingError, match=r"the map is empty .*check the prior: its axes"):
+        run_map(open_source(tmp_path / "drive"), config, options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_drive_out_of_range_fails_with_the_reason(
+    seen: list[RectifiedPair], tmp_path: Path
+) -> None:
+    write_drive(seen[:4], tmp_path / "drive")
+    config = load_config(None, ["cloud.max_range_m=0.5"])
+    with pytest.raises(MappingError, match=r"no point in the middle of the drive: .* at .* m"):
+        run_map(open_source(tmp_path / "drive"), config, MapOptions(out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("grain", [1.0, 25.0])

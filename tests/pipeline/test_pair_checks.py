@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.errors import MatchingError
+from recon.errors import MappingError, MatchingError
 from recon.pipeline.config import PAIR_DEFAULTS, load_config
 from recon.pipeline.pair_run import PairInput, PairOptions, PairRun, run_pair
 from recon.structures import RectifiedCamera, StereoPair
@@ -50,6 +50,17 @@ def test_pictures_that_show_nothing_are_refused_and_leave_nothing(
     dark = replace(pair, right=np.zeros_like(pair.right))
     with pytest.raises(MatchingError, match=r"^left\.png: no pixel .* right camera shows nothing"):
         run(dark, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_pair_without_a_point_is_refused_with_its_depths(
+    pair: StereoPair, tmp_path: Path
+) -> None:
+    settings = load_config(None, ["cloud.max_range_m=1"], PAIR_DEFAULTS)
+    options = PairOptions("pair", tmp_path / "out")
+    # 300 px and 0.1 m at 12 px: 2.5 m.
+    with pytest.raises(MappingError, match=r"the cloud is empty .* at 2\.\d+ to 2\.5 m.* to 1 m"):
+        run_pair(PairInput(pair, CAMERA), settings, options)
     assert not (tmp_path / "out").exists()
 
 

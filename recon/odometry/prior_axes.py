@@ -1,0 +1,157 @@
+"""Finds the axes of an external trajectory: whose turn of it explains what the cameras see."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from typing import Final, Literal, get_args
+
+import numpy as np
+
+from recon.errors import RegistrationError
+from recon.geometry.se3 import as_step, invert
+from recon.odometry.covariance import covariance_of, step_covariance
+from recon.odometry.prior import MotionPrior
+from recon.odometry.protocol import OdometryFrame
+from recon.odometry.settings import OdometrySettings, PriorSettings
+from recon.odometry.visual import VisualOdometry
+from recon.structures import Trajectory
+from recon.structures.arrays import Float64
+
+Axes = Literal["camera", "body"]
+
+_CLEAR: Final = 10.0
+"""Standard deviations of a prior that a motion must exceed to tell one set of axes from another."""
+_ENOUGH: Final = 5
+"""Motions compared; their median is not spoiled by two that are wrong."""
+_MOST_FRAMES: Final = 100
+"""Frames looked at; matching them takes about ten seconds."""
+
+
+@dataclass(frozen=True)
+class FoundAxes:
+    """The axes of a prior.
+
+    Attributes:
+        axes: Those that explain the visual motion best.
+        sigmas: Median distance from the visual motion, standard deviations, for each set of axes.
+        motions: Number of motions compared.
+    """
+
+    axes: Axes
+    sigmas: Mapping[str, float]
+    motions: int
+
+
+def find_axes(
+    prior: Trajectory, frames: Iterable[OdometryFrame], settings: OdometrySettings
+) -> FoundAxes | None:
+    """Compare a prior in all supported axes with the visual motion of some frames.
+
+    Args:
+        prior: Path of the rig by other sensors.
+        frames: Frames in order; as many are read as are needed.
+        settings: Visual odometry, and the accuracy of the prior.
+
+    Returns:
+        The axes; None if the cameras do not see enough motion to tell.
+
+    Raises:
+        RegistrationError: The prior contradicts the visual motion in all axes.
+    """
+    priors = {axes: MotionPrior(prior, _in_axes(settings.prior, axes)) for axes in get_args(Axes)}
+    off = [
+        _distances(priors, motion) for motion in _visual_motions(priors["camera"], frames, settings)
+    ]
+    if not off:
+        return None
+    sigmas = {axes: float(np.median([one[axes] for one in off])) for axes in priors}
+    best = min(priors, key=lambda axes: sigmas[axes])
+    if sigmas[best] > settings.prior.max_sigmas:
+        told = ", ".join(f"{axes} axes {sigmas[axes]:.1f}" for axes in priors)
+        raise RegistrationError(
+            "the prior fits what the cameras see in no axes",
+            got=f"{told} standard deviations off in {len(off)} motions",
+            expected=f"at most {settings.prior.max_sigmas:g}",
+            hint="it must be the path of this rig, in metres and on its clock; name its axes with "
+            "--set odometry.prior.axes= to use it nevertheless",
+        )
+    return FoundAxes(best, sigmas, len(off))
+
+
+def first_moving(prior: Trajectory, stamps_s: Float64, settings: PriorSettings) -> int:
+    """The last frame before a prior moves; 0 if it never does."""
+    path = MotionPrior(prior, _in_axes(settings, "camera"))
+    start: float | None = None
+    for index, stamp_s in enumerate(stamps_s.tolist()):
+        if start is None:
+            start = stamp_s if path.knows(stamp_s) else None
+            continue
+        motion = path.motion(start, stamp_s)
+        if motion is not None and _in_sigmas(motion, settings) > 1:
+            return index - 1
+    return 0
+
+
+@dataclass(frozen=True, eq=False)
+class _VisualMotion:
+    """A motion between two frames: ``T_from_to`` and its covariance (6, 6)."""
+
+    from_s: float
+    to_s: float
+    frames: int
+    T_from_to: Float64
+    covariance: Float64
+
+
+def _in_axes(settings: PriorSettings, axes: Axes) -> PriorSettings:
+    return settings.model_copy(update={"axes": axes})
+
+
+def _in_sigmas(T: Float64, settings: PriorSettings) -> float:
+    """Size of a motion in standard deviations of a short one."""
+    step = as_step(T)
+    turned_deg = float(np.rad2deg(np.linalg.norm(step[3:])))
+    return max(float(np.linalg.norm(step[:3])) / settings.sigma_m, turned_deg / settings.sigma_deg)
+
+
+def _visual_motions(
+    prior: MotionPrior, frames: Iterable[OdometryFrame], settings: OdometrySettings
+) -> list[_VisualMotion]:
+    """Visual motions that are long enough, one after the other, where the prior is known."""
+    odometry, motions = VisualOdometry(settings.visual), []
+    start: tuple[int, float, Float64] | None = None
+    covariance = np.zeros((6, 6))
+    for index, frame in enumerate(islice(frames, _MOST_FRAMES)):
+        seen, time_s = odometry.track(frame), frame.pair.timestamp_s
+        now = (index, time_s, seen.result.T_world_camera)
+        if start is None or seen.information is None:
+            start, covariance = now, np.zeros((6, 6))
+            continue
+        covariance = covariance + covariance_of(seen.information)
+        expected = prior.motion(start[1], time_s)
+        if expected is not None and _in_sigmas(expected, prior.settings) < _CLEAR:
+            continue
+        if expected is not None:
+            T = invert(start[2]) @ now[2]
+            motions.append(_VisualMotion(start[1], time_s, index - start[0], T, covariance))
+        start, covariance = now, np.zeros((6, 6))
+        if len(motions) == _ENOUGH:
+            break
+    return motions
+
+
+def _distances(priors: Mapping[Axes, MotionPrior], seen: _VisualMotion) -> dict[Axes, float]:
+    """Distance of each prior from a visual motion, in standard deviations of their difference."""
+    return {axes: _distance(prior, seen) for axes, prior in priors.items()}
+
+
+def _distance(prior: MotionPrior, seen: _VisualMotion) -> float:
+    expected = prior.motion(seen.from_s, seen.to_s)
+    if expected is None:
+        return float("inf")
+    off = as_step(invert(expected) @ seen.T_from_to)
+    # The standard deviations are those from frame to frame; independent ones add in squares.
+    own = seen.frames * step_covariance(*prior.sigmas(expected))
+    return float(np.sqrt(off @ np.linalg.solve(own + seen.covariance, off)))
