@@ -1,7 +1,7 @@
 """Bags of ROS 1 (.bag), ROS 2 (a folder, .db3) and MCAP, read with rosbags, without ROS.
 
-Only the three message types that a stereo source needs are read; a bag may contain any others,
-known or not. Exceptions of rosbags and its dependencies become a `FormatError`.
+Only message types that a stereo source or a motion prior needs are read; a bag may contain any
+others, known or not. Exceptions of rosbags and its dependencies become a `FormatError`.
 """
 
 from __future__ import annotations
@@ -24,17 +24,25 @@ from recon.structures.arrays import Float64
 IMAGE: Final = "sensor_msgs/msg/Image"
 COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
+TRANSFORMS: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+POSES: Final = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+    *TRANSFORMS,
+)
 _EXTRA: Final = "ros"
 _NS_PER_S: Final = 1_000_000_000
 
 
 @dataclass(frozen=True)
 class BagTopic:
-    """One topic of a supported message type.
+    """One topic.
 
     Attributes:
         name: Name of the topic.
-        kind: `IMAGE`, `COMPRESSED` or `CAMERA_INFO`.
+        kind: Message type, such as `IMAGE`, `COMPRESSED`, `CAMERA_INFO` or one of `POSES`.
         messages: Number of messages.
     """
 
@@ -87,6 +95,27 @@ class BagCameraInfo:
     P: Float64
 
 
+@dataclass(frozen=True, eq=False)
+class BagPose:
+    """The pose of one frame in another, from any of the `POSES`.
+
+    Attributes:
+        recorded_ns: Time of recording.
+        stamp_ns: Header stamp; 0 = none.
+        parent: The frame the pose is given in.
+        child: The frame whose pose it is; empty if the message does not say.
+        xyz_m: float64 (3,), position.
+        xyzw: float64 (4,), quaternion.
+    """
+
+    recorded_ns: int
+    stamp_ns: int
+    parent: str
+    child: str
+    xyz_m: Float64
+    xyzw: Float64
+
+
 class Bag:
     """A recording in one or more files.
 
@@ -94,7 +123,7 @@ class Bag:
         paths: ROS 1 files that belong together, or one folder or file of ROS 2.
 
     Attributes:
-        topics: The topics of supported types, by name.
+        topics: All topics, by name.
 
     Raises:
         MissingDependencyError: rosbags is not installed.
@@ -109,6 +138,10 @@ class Bag:
         typesys = require("rosbags.typesys", extra=_EXTRA)
         store = typesys.Stores.ROS1_NOETIC if self._ros1 else typesys.Stores.ROS2_HUMBLE
         self._store = typesys.get_typestore(store)
+        for kind in TRANSFORMS:
+            if kind not in self._store.types:
+                fields = "geometry_msgs/TransformStamped[] transforms\n"
+                self._store.register(typesys.get_types_from_msg(fields, kind))
         self.topics = self._list_topics()
 
     def scan(self, topics: Sequence[str]) -> dict[str, NDArray[np.int64]]:
@@ -177,14 +210,30 @@ class Bag:
             )
         raise FormatError("topic has no message", where=self.paths[0], got=topic)
 
+    def frame_id(self, topic: str) -> str:
+        """The coordinate frame that the first message of an image topic names; empty if none."""
+        for _, _, content in self._messages([topic]):
+            return str(self._parse(content, topic).header.frame_id).lstrip("/")
+        return ""
+
+    def poses(self, topic: str) -> Iterator[BagPose]:
+        """Yield the poses of a topic of one of the `POSES`, in the order of recording.
+
+        Raises:
+            FormatError: The recording is truncated or damaged.
+        """
+        for _, recorded_ns, content in self._messages([topic]):
+            message = self._parse(content, topic)
+            for part in getattr(message, "transforms", [message]):
+                yield _pose_of(part, recorded_ns)
+
     def _list_topics(self) -> dict[str, BagTopic]:
         found: dict[str, BagTopic] = {}
         with self._our_errors(), self._opened() as readers:
             for connection in (c for reader in readers for c in reader.connections):
                 name, kind = connection.topic, connection.msgtype
-                if kind in {IMAGE, COMPRESSED, CAMERA_INFO}:
-                    before = found[name].messages if name in found else 0
-                    found[name] = BagTopic(name, kind, before + connection.msgcount)
+                before = found[name].messages if name in found else 0
+                found[name] = BagTopic(name, kind, before + connection.msgcount)
         return found
 
     def _messages(
@@ -242,3 +291,22 @@ class Bag:
                 hint="it may be truncated; copy it again, or repair it with rosbag reindex, "
                 "ros2 bag reindex or mcap recover",
             ) from error
+
+
+def _pose_of(message: Any, recorded_ns: int) -> BagPose:
+    """The pose in a message; one with a covariance is wrapped once more."""
+    if hasattr(message, "transform"):
+        place, turn = message.transform.translation, message.transform.rotation
+    else:
+        pose = getattr(message.pose, "pose", message.pose)
+        place, turn = pose.position, pose.orientation
+    stamp = message.header.stamp
+    return BagPose(
+        recorded_ns,
+        int(stamp.sec) * _NS_PER_S + int(stamp.nanosec),
+        # Old recordings write frames with a leading slash.
+        str(message.header.frame_id).lstrip("/"),
+        str(getattr(message, "child_frame_id", "")).lstrip("/"),
+        np.array([place.x, place.y, place.z], dtype=np.float64),
+        np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64),
+    )

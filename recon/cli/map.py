@@ -57,10 +57,11 @@ def map_(
         Path | None, typer.Option(help="Known poses (KITTI or TUM), used instead of odometry.")
     ] = None,
     prior: Annotated[
-        Path | None,
+        str | None,
         typer.Option(
-            help="Trajectory from wheel odometry, an IMU or GNSS that guides the odometry (TUM "
-            "format, same clock as the images)."
+            metavar="FILE|TOPIC",
+            help="Trajectory from wheel odometry, an IMU or GNSS that guides the odometry: a TUM "
+            "file on the clock of the images, or a topic of the bag, such as /odom.",
         ),
     ] = None,
     matcher: Matcher = None,
@@ -86,7 +87,8 @@ def map_(
       recon map ~/kitti/sequences/06 --out outputs/kitti06
       recon map drive.bag --calib camchain.yaml --left /cam0 --right /cam1
       recon map left.mp4 --right right.mp4 --calib stereo.yaml
-      recon map rides/today --prior wheels.txt --set odometry.prior.axes=body
+      recon map rides/today --prior wheels.txt
+      recon map drive.bag --prior /odom
       recon map --resume outputs/kitti06
     """
     if source is None and resume is None:
@@ -94,12 +96,13 @@ def map_(
     if poses is not None and prior is not None:
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
     with session():
-        from recon.formats.trajectory import read_trajectory, read_tum
+        from recon.formats.trajectory import read_trajectory
         from recon.pipeline.audit_run import quick_warnings
         from recon.pipeline.config import matching_overrides, source_overrides
         from recon.pipeline.map_run import MapOptions, run_map
         from recon.pipeline.resume import MapRequest, open_requested, plan_map
         from recon.reports import present_map
+        from recon.sources import read_prior
         from recon.viewers import announce, choose_viewer, warn
 
         method = [] if odometry is None else [f"odometry.method={odometry.value}"]
@@ -111,11 +114,13 @@ def map_(
         announce(drive, quiet=quiet)
         found = quick_warnings(drive, settings)
         warn(found, quiet=quiet)
+        guide = None if request.prior is None else read_prior(drive, request.prior)
         options = MapOptions(
             out=request.out,
             threads=threads,
             known_poses=None if request.poses is None else read_trajectory(request.poses),
-            prior=None if request.prior is None else read_tum(request.prior),
+            prior=None if guide is None else guide.path,
+            prior_origin="" if guide is None else guide.origin,
             mesh=request.mesh,
             resume=resume is not None,
             arguments=request.arguments(),

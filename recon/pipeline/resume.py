@@ -43,7 +43,7 @@ class MapRequest:
         source: Path of the source; None = that of the run that is resumed.
         kind: Kind of the source; None = inferred from its files.
         poses: File of known poses.
-        prior: File of the camera's motion from another sensor.
+        prior: File of the camera's motion from another sensor, or a topic of the source.
         mesh: Whether to reconstruct a surface.
         out: Result folder; None = a new one.
         resume: Folder of an unfinished run to resume.
@@ -53,7 +53,7 @@ class MapRequest:
     source: Path | None
     kind: str | None = None
     poses: Path | None = None
-    prior: Path | None = None
+    prior: str | None = None
     mesh: bool = True
     out: Path | None = None
     resume: Path | None = None
@@ -65,7 +65,7 @@ class MapRequest:
             "source": None if self.source is None else str(self.source.resolve()),
             "kind": self.kind,
             "poses": None if self.poses is None else str(self.poses.resolve()),
-            "prior": None if self.prior is None else str(self.prior.resolve()),
+            "prior": _place(self.prior),
             "mesh": self.mesh,
         }
 
@@ -107,11 +107,16 @@ def _plan_resumed(
         source=request.source or _path(known.get("source")),
         kind=request.kind or known.get("kind"),
         poses=request.poses or _path(known.get("poses")),
-        prior=request.prior or _path(known.get("prior")),
+        prior=request.prior or known.get("prior"),
         mesh=bool(known.get("mesh")),
         out=folder,
     )
     return request, settings
+
+
+def _place(name: str | None) -> str | None:
+    """The absolute path of a file; other names, such as topics, unchanged."""
+    return str(Path(name).resolve()) if name is not None and Path(name).is_file() else name
 
 
 def _path(text: str | None) -> Path | None:

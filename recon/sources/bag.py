@@ -16,7 +16,13 @@ from recon.errors import FormatError, SourceError
 from recon.formats.image import decode_image
 from recon.formats.ros_image import pixels_of_ros_image
 from recon.sources.bag_rig import rig_of_messages
-from recon.sources.bag_topics import camera_info_topic, choose_topics, list_topics, names_rectified
+from recon.sources.bag_topics import (
+    camera_info_topic,
+    choose_topics,
+    list_others,
+    list_topics,
+    names_rectified,
+)
 from recon.sources.files import join_pair
 from recon.sources.pairing import StampPairs, check_increasing, pair_stamps
 from recon.sources.rig import Rig, as_rectified, read_rig
@@ -42,6 +48,7 @@ class BagSource:
         left_s: float64 (M,), timestamps of all left messages.
         recorded_ns: int64 (M,) and (K,), recording times of the left and right messages.
         texts: The calibration file, if one was given.
+        stamped: Whether timestamps are those of the headers, not of the recording.
     """
 
     name: str
@@ -53,6 +60,7 @@ class BagSource:
     left_s: Float64
     recorded_ns: tuple[NDArray[np.int64], NDArray[np.int64]]
     texts: tuple[Path, ...]
+    stamped: bool = True
 
     @property
     def truth(self) -> SequenceTruth | None:
@@ -133,6 +141,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
     stamps, clock = _stamps(times, topics, path)
     pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(path))
     rig, texts, source = _read_rig(bag, topics, pairs, settings, path)
+    also += list_others(bag, topics)
     kind = {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(bag.paths[0].suffix, "ROS 2 bag")
     return BagSource(
         name=path.resolve().name,
@@ -144,6 +153,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
         left_s=stamps[0],
         recorded_ns=(times[topics[0]][:, 0], times[topics[1]][:, 0]),
         texts=texts,
+        stamped=not clock,
     )
 
 

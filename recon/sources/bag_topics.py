@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import PurePosixPath
 
-from recon.adapters.rosbags import CAMERA_INFO, COMPRESSED, IMAGE, Bag
+from recon.adapters.rosbags import CAMERA_INFO, COMPRESSED, IMAGE, POSES, Bag
 from recon.errors import SourceError
 from recon.sources.pairing import find_partners, partner_names
 from recon.sources.settings import SourceSettings
 
 _PICTURES = (IMAGE, COMPRESSED)
+_LISTED = 20
 
 
 def choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], str]:
@@ -55,6 +56,23 @@ def list_topics(bag: Bag, kinds: Sequence[str]) -> str:
         for topic in sorted(bag.topics.values(), key=lambda topic: topic.name)
         if topic.kind in kinds
     )
+
+
+def list_others(bag: Bag, used: Sequence[str]) -> str:
+    """A note on the topics that are not used, and on those that `--prior` takes; empty if none.
+
+    Other pairs of image topics are not among them; see `choose_topics`.
+    """
+    images = [topic.name for topic in bag.topics.values() if topic.kind in _PICTURES]
+    told = {*used, *(name for pair in find_partners(images) for name in pair)}
+    others = sorted(
+        t.name for t in bag.topics.values() if t.kind != CAMERA_INFO and t.name not in told
+    )
+    if not others:
+        return ""
+    poses = [name for name in others if bag.topics[name].kind in POSES and "static" not in name]
+    listed = ", ".join(others[:_LISTED]) + (" …" if len(others) > _LISTED else "")
+    return f", not used: {listed}" + (f" (for --prior: {', '.join(poses)})" if poses else "")
 
 
 def camera_info_topic(bag: Bag, image_topic: str) -> str | None:

@@ -13,8 +13,9 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from recon.geometry.quaternion import quaternion_from_rotation
 from recon.structures import RectifiedCamera, StereoPair
 from tests.sources.drives import EPOCH_S, projections
 
@@ -47,6 +48,9 @@ class Recorder:
         self.writer, self.how = writer, how
         self.ros1 = how.kind == "ros1"
         self.store = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
+        if self.ros1:
+            text = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
         self.connections: dict[str, Any] = {}
 
     def write(self, topic: str, recorded_ns: int, message: Any) -> None:
@@ -56,11 +60,11 @@ class Recorder:
         pack = self.store.serialize_ros1 if self.ros1 else self.store.serialize_cdr
         self.writer.write(self.connections[topic], recorded_ns, pack(message, kind))
 
-    def header(self, stamp_ns: int) -> Any:
+    def header(self, stamp_ns: int, frame_id: str = "cam") -> Any:
         types = self.store.types
         time = types["builtin_interfaces/msg/Time"](sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
         extra = {"seq": 0} if self.ros1 else {}
-        return types["std_msgs/msg/Header"](stamp=time, frame_id="cam", **extra)
+        return types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id, **extra)
 
     def image(self, stamp_ns: int, image: np.ndarray) -> Any:
         types, header = self.store.types, self.header(stamp_ns if self.how.stamped else 0)
@@ -76,6 +80,37 @@ class Recorder:
             header=header, height=height, width=width, encoding=self.how.encoding,
             is_bigendian=0, step=padded.shape[1], data=padded.ravel(),
         )  # fmt: skip
+
+    def odometry(self, stamp_ns: int, T: np.ndarray) -> Any:
+        """Pose of ``base_link`` in ``odom``."""
+        types = self.store.types
+        x, y, z, w = quaternion_from_rotation(T[:3, :3])
+        zero = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+        twist = types["geometry_msgs/msg/Twist"](linear=zero, angular=zero)
+        place = types["geometry_msgs/msg/Point"](*T[:3, 3].tolist())
+        turn = types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w)
+        pose = types["geometry_msgs/msg/Pose"](position=place, orientation=turn)
+        return types["nav_msgs/msg/Odometry"](
+            header=self.header(stamp_ns, "odom"), child_frame_id="base_link",
+            pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
+            twist=types["geometry_msgs/msg/TwistWithCovariance"](
+                twist=twist, covariance=np.zeros(36)
+            ),
+        )  # fmt: skip
+
+    def transform(self, stamp_ns: int, parent: str, child: str, T: np.ndarray) -> Any:
+        types = self.store.types
+        x, y, z, w = quaternion_from_rotation(T[:3, :3])
+        moved = types["geometry_msgs/msg/Transform"](
+            translation=types["geometry_msgs/msg/Vector3"](*T[:3, 3].tolist()),
+            rotation=types["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w),
+        )
+        return types["geometry_msgs/msg/TransformStamped"](
+            header=self.header(stamp_ns, parent), child_frame_id=child, transform=moved
+        )
+
+    def transforms(self, *parts: Any) -> Any:
+        return self.store.types["tf2_msgs/msg/TFMessage"](transforms=list(parts))
 
     def camera_info(self, stamp_ns: int, camera: RectifiedCamera, P: np.ndarray) -> Any:
         types = self.store.types

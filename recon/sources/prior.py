@@ -1,0 +1,130 @@
+"""Reads the motion of the rig by other sensors: from a file, or from a topic of the recording."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.adapters.rosbags import POSES, TRANSFORMS, Bag, BagPose
+from recon.errors import FormatError, SourceError
+from recon.formats.trajectory import read_tum
+from recon.geometry.quaternion import rotation_from_quaternion
+from recon.geometry.se3 import invert, make_transform
+from recon.sources.bag import BagSource
+from recon.sources.bag_topics import list_topics
+from recon.sources.protocol import StereoSource
+from recon.structures import Trajectory
+from recon.structures.arrays import Float64
+
+_STATIC: Final = "tf_static"
+_ODOMETRY: Final = "odom"
+"""The frame in which wheels and inertial units measure, by REP 105."""
+_S: Final = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class ReadPrior:
+    """A path by other sensors.
+
+    Attributes:
+        path: The poses on the clock of the images.
+        origin: Where they are from and whose they are, in one line.
+    """
+
+    path: Trajectory
+    origin: str
+
+
+def read_prior(source: StereoSource, name: str) -> ReadPrior:
+    """Read a prior of the motion.
+
+    Args:
+        source: The drive.
+        name: A TUM file, or, if the source is a recording, one of its topics with odometry, poses
+            or transforms. Its static transforms, if they connect the two, turn the poses into
+            those of the left camera.
+
+    Raises:
+        SourceError: The recording has no such topic, or one with several moving frames.
+        FormatError: The file or a message is damaged.
+    """
+    if isinstance(source, BagSource) and not Path(name).is_file():
+        return _read_topic(source, name)
+    return ReadPrior(read_tum(name), name)
+
+
+def _read_topic(source: BagSource, name: str) -> ReadPrior:
+    bag, where = source.bag, f"{source.bag.paths[0]}: {name}"
+    if name not in bag.topics or bag.topics[name].kind not in POSES:
+        raise SourceError(
+            "recording has no such topic of poses, and there is no such file",
+            where=bag.paths[0],
+            got=name,
+            expected=list_topics(bag, POSES) or "a file; the recording has no poses",
+        )
+    (parent, child), poses = _choose_frames(list(bag.poses(name)), where)
+    path = _path_of(poses, where, stamped=source.stamped)
+    camera = bag.frame_id(source.topics[0])
+    T_child_camera = _static_transform(bag, child, camera)
+    origin = f"{name}, {len(path)} poses of {child or 'an unnamed frame'} in {parent}"
+    if T_child_camera is None:
+        return ReadPrior(path, f"{origin}, no static transform to {camera or 'the camera'}")
+    moved = Trajectory(path.T_world_camera @ T_child_camera, path.timestamps_s)
+    return ReadPrior(moved, f"{origin}, moved to {camera} by the static transforms")
+
+
+def _choose_frames(poses: list[BagPose], where: str) -> tuple[tuple[str, str], list[BagPose]]:
+    """The poses of one frame in another: the only ones, or those in the odometry frame."""
+    found: dict[tuple[str, str], list[BagPose]] = defaultdict(list)
+    for pose in poses:
+        found[pose.parent, pose.child].append(pose)
+    if not found:
+        raise SourceError("topic has no message", where=where)
+    chosen = list(found) if len(found) == 1 else [names for names in found if names[0] == _ODOMETRY]
+    if len(chosen) != 1:
+        raise SourceError(
+            "topic has poses of several frames",
+            where=where,
+            got=", ".join(f"{child} in {parent}" for parent, child in list(found)[:8]),
+            expected="one, or one in the frame odom",
+            hint="name a topic of odometry or poses",
+        )
+    return chosen[0], found[chosen[0]]
+
+
+def _path_of(poses: list[BagPose], where: str, *, stamped: bool) -> Trajectory:
+    """The poses in order of time, each time once."""
+    stamps = [pose.stamp_ns if stamped else pose.recorded_ns for pose in poses]
+    times_ns, first = np.unique(stamps, return_index=True)
+    for pose in poses:
+        norm = float(np.linalg.norm(pose.xyzw))
+        if not (np.isfinite(pose.xyz_m).all() and np.isfinite(norm) and norm > 0):
+            raise FormatError("pose is not finite, or has no rotation", where=where)
+    transforms = [_transform(poses[index]) for index in first]
+    return Trajectory(np.stack(transforms), times_ns * _S)
+
+
+def _transform(pose: BagPose) -> Float64:
+    return make_transform(rotation_from_quaternion(pose.xyzw), pose.xyz_m)
+
+
+def _static_transform(bag: Bag, start: str, goal: str) -> Float64 | None:
+    """T_start_goal by the static transforms of a recording; None = they do not connect them."""
+    topics = [t.name for t in bag.topics.values() if t.kind in TRANSFORMS and _STATIC in t.name]
+    steps: dict[str, dict[str, Float64]] = defaultdict(dict)
+    for pose in (pose for topic in topics for pose in bag.poses(topic)):
+        T_parent_child = _transform(pose)
+        steps[pose.parent][pose.child] = T_parent_child
+        steps[pose.child][pose.parent] = invert(T_parent_child)
+    reached, waiting = {start: np.eye(4)}, [start]
+    while waiting:
+        here = waiting.pop()
+        for there, T_here_there in steps[here].items():
+            if there not in reached:
+                reached[there] = reached[here] @ T_here_there
+                waiting.append(there)
+    return reached.get(goal) if start and goal else None
