@@ -8,8 +8,19 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Matcher, Out, Quiet, Set, Threads
+from recon.cli.options import Config, Json, Out, Quiet, Set, Threads
 from recon.cli.session import print_json, session
+
+_NONE = "none"
+Matchers = Annotated[
+    str | None,
+    typer.Option(
+        "--matcher",
+        help="Matchers, separated by commas: sad, sgm, opencv-bm, opencv-sgbm, onnx, or those of "
+        "installed plug-ins; none for --results alone.",
+        show_default="matching.matcher, sad unless changed",
+    ),
+]
 
 
 class Range(str, Enum):
@@ -26,7 +37,14 @@ def middlebury(
             help="A Middlebury scene, or a folder with scenes of any year at any depth."
         ),
     ],
-    matcher: Matcher = None,
+    matcher: Matchers = None,
+    results: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder with results of another program: SCENE.pfm or SCENE/disp0*.pfm, for a "
+            "column of its own. May be repeated."
+        ),
+    ] = None,
     truth: Annotated[
         Path | None,
         typer.Option(
@@ -48,26 +66,34 @@ def middlebury(
     config: Config = None,
     set_: Set = None,
     json: Json = False,
+    latex: Annotated[
+        bool, typer.Option("--latex", help="Print the tables in LaTeX, the best value in bold.")
+    ] = False,
     quiet: Quiet = False,
     threads: Threads = None,
 ) -> None:
     """Score matchers on Middlebury scenes with the measures of the benchmark.
 
-    Several matchers, separated by commas, are compared in one run.
+    Several matchers, separated by commas, are compared in one run, and with
+    --results those of other programs beside them.
 
     Examples:
       recon evaluate middlebury MiddEval3/trainingQ --matcher sad,sgm,opencv-sgbm
       recon evaluate middlebury MiddEval3/trainingH --truth MiddEval3/trainingQ
+      recon evaluate middlebury MiddEval3/trainingQ --results results/mine --latex
     """
+    if json and latex:
+        raise typer.BadParameter("--json and --latex exclude each other")
     with session():
         from recon.pipeline.config import load_config
         from recon.pipeline.middlebury_run import MiddleburyOptions, run_middlebury
         from recon.reports.middlebury_pictures import draw_result, present_middlebury
-        from recon.reports.middlebury_tables import text_tables
+        from recon.reports.middlebury_tables import latex_tables, text_tables
         from recon.viewers.scenes import choose_scene_viewer
 
         options = MiddleburyOptions(
-            matchers=[] if matcher is None else [name.strip() for name in matcher.split(",")],
+            matchers=_names(matcher),
+            results=results or (),
             truth=truth,
             out=out,
             threads=threads,
@@ -78,11 +104,18 @@ def middlebury(
             present=present_middlebury,
         )
         summary = run_middlebury(folder, load_config(config, set_ or ()), options)
-        tables = text_tables(summary)
+        tables = latex_tables(summary) if latex else text_tables(summary)
     for warning in summary["warnings"]:
         typer.echo(f"warning: {warning}", err=True)
     if json:
         print_json(summary)
         return
     typer.echo(tables)
-    typer.echo(f"results: {summary['out']}")
+    typer.echo(f"results: {summary['out']}", err=latex)
+
+
+def _names(matcher: str | None) -> list[str] | None:
+    """The matchers of the option; None = the configured one."""
+    if matcher is None:
+        return None
+    return [] if matcher == _NONE else [name.strip() for name in matcher.split(",")]

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -26,28 +27,30 @@ _WARM_UP_ROWS: Final = 64
 
 @dataclass(frozen=True, eq=False)
 class SceneResult:
-    """Result of one matcher on one scene.
+    """Result of one matcher, or of another program, on one scene.
 
     Attributes:
         scene: The scene.
-        matcher: Name of the matcher.
-        disparity: Its disparity, at the size of the images.
+        matcher: Name of the matcher or of the folder of results.
+        values: float32 (h, w), its disparity in pixels of its own size; NaN = none.
         figures: As `score_result` gives them; ``ndisp``, the number of disparities searched, None
             of a matcher that is not ours; and ``confidence`` as `confidence_figures` gives it,
             None of a matcher with the same confidence everywhere.
-        seconds: Time of matching alone.
+        seconds: Time of matching alone; None = not known.
+        file: The file that the result was read from; None = it was made here.
     """
 
     scene: ScoredScene
     matcher: str
-    disparity: Disparity
+    values: Float32
     figures: Figures
-    seconds: float
+    seconds: float | None
+    file: Path | None = None
 
     def error_px(self) -> Float32:
         """float32 (H, W), dense absolute error in full-size pixels; NaN = truth unknown."""
         truth, rules = self.scene.truth.values, self.scene.rules
-        error = by_the_rules(dense_map(self.disparity.values), truth.shape, rules) - truth
+        error = by_the_rules(dense_map(self.values), truth.shape, rules) - truth
         return np.asarray(np.abs(error) * np.float32(rules.full_size_factor), dtype=np.float32)
 
 
@@ -96,7 +99,7 @@ class Bench:
                 figures["ndisp"] = searched_ndisp(given, self._config.matching, pair)
                 rated = confidence_figures(disparity, scene.truth) if _rates(disparity) else None
                 figures["confidence"] = rated
-                yield SceneResult(scene, name_of(given), disparity, figures, seconds)
+                yield SceneResult(scene, name_of(given), disparity.values, figures, seconds)
 
     def _matchers(self, pair: RectifiedPair) -> list[Matcher]:
         made: list[Matcher] | None = getattr(self._own, "matchers", None)

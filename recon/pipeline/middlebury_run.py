@@ -7,18 +7,21 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, Protocol
 
 from recon.errors import SettingsError, SourceError
 from recon.evaluation.middlebury import scene_weight, weighted_mean
 from recon.formats.atomic import write_text
+from recon.formats.files import StrPath
 from recon.formats.pfm import write_pfm
 from recon.matching import Matcher, check_matcher, name_of
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.machine import peak_memory_mb, use_threads
 from recon.pipeline.middlebury_bench import Bench, SceneResult
 from recon.pipeline.middlebury_confidence import weighted_confidence
+from recon.pipeline.middlebury_results import ResultFolder, find_results
 from recon.pipeline.middlebury_scenes import check_folder, find_scenes, read_scored_scene
 from recon.pipeline.middlebury_score import MASKS, Figures, weighted_figures
 from recon.pipeline.record import fingerprint, write_record
@@ -55,7 +58,9 @@ class MiddleburyOptions:
     """Options of an evaluation that are not part of the configuration.
 
     Attributes:
-        matchers: The matchers, by name or as objects; () = the configured one.
+        matchers: The matchers, by name or as objects; None = the configured one.
+        results: Folders with results of other programs, one for each program. They are scored
+            beside the matchers, under the names of their folders.
         truth: Folder of scenes that supply ground truth for scenes without their own.
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores. Changes no result.
@@ -67,8 +72,9 @@ class MiddleburyOptions:
         present: Writes the tables.
     """
 
-    matchers: Sequence[str | Matcher] = ()
-    truth: Path | None = None
+    matchers: Sequence[str | Matcher] | None = None
+    results: Sequence[StrPath] = ()
+    truth: StrPath | None = None
     out: Path | None = None
     threads: int | None = None
     parallel: int = 1
@@ -78,41 +84,50 @@ class MiddleburyOptions:
     present: Callable[[Mapping[str, Any], RunDirectory], None] | None = None
 
 
-def run_middlebury(folder: Path, config: ReconConfig, options: MiddleburyOptions) -> Figures:
+def run_middlebury(folder: StrPath, config: ReconConfig, options: MiddleburyOptions) -> Figures:
     """Match all scenes of a folder with each matcher, score them, and write tables and figures.
+
+    Means are over the scenes for which every matcher and every folder of results has a result.
 
     Returns:
         The content of ``summary.json``.
 
     Raises:
         SettingsError: A matcher is unknown or named twice.
-        SourceError: There is no scene, or none with ground truth; or a folder is missing.
+        SourceError: There is no scene, or none with ground truth; or a folder is missing or holds
+            no result.
         ReconError: A scene cannot be read or matched, or the folder cannot be written; nothing is
             left behind.
     """
     start = time.perf_counter()
-    matchers = options.matchers or (config.matching.matcher,)
+    given = options.matchers
+    matchers = (config.matching.matcher,) if given is None else given
     names = _checked(matchers)
     if options.truth is not None:
-        check_folder(options.truth)
-    paths, threads = find_scenes(folder), use_threads(options.threads)
+        check_folder(Path(options.truth))
+    paths, threads = find_scenes(Path(folder)), use_threads(options.threads)
+    results = find_results([Path(result) for result in options.results], paths, names)
+    names += [result.name for result in results]
+    if not names:
+        raise SettingsError("nothing to evaluate", hint="name a matcher, or a folder of results")
     with RunDirectory.for_command(COMMAND, options.out) as directory:
         own_threads = max(1, threads // options.parallel)
         bench = Bench(matchers, config, own_threads, auto_range=options.auto_range)
-        scenes = dict(_scenes(bench, folder, paths, options, directory))
-        skipped = [name for name, figures in scenes.items() if not figures]
-        if len(skipped) == len(scenes):
-            raise SourceError(
-                "no scene has ground truth to compare with",
-                where=folder,
-                got=", ".join(skipped),
-                hint="name a folder of scenes that have one with --truth",
-            )
+        work = _Work(bench, results, options, directory)
+        found = dict(_scenes(work, folder, paths))
+        skipped = [name for name, figures in found.items() if figures is None]
+        scenes = {name: figures for name, figures in found.items() if figures is not None}
+        common = _common(scenes, names, folder, skipped)
         summary: Figures = {
-            "matchers": {name: _of_matcher(scenes, name) for name in names},
+            "matchers": {name: _of_matcher(scenes, name, common) for name in names},
             "folder": str(folder),
+            "results": {result.name: str(result.folder) for result in results},
+            "mean_over": common,
             "skipped": skipped,
-            "warnings": [f"{name}: no truth, skipped" for name in skipped],
+            "warnings": [
+                *(f"{name}: no truth, skipped" for name in skipped),
+                *_missing(scenes, results, common),
+            ],
             "threads": threads,
             "parallel": options.parallel,
         }
@@ -121,7 +136,7 @@ def run_middlebury(folder: Path, config: ReconConfig, options: MiddleburyOptions
         summary["out"] = str(directory.folder)
         summary = dict(plain(summary))
         _write(summary, config, options, directory)
-        _record(summary, paths, directory)
+        _record(summary, paths, results, directory)
     return summary
 
 
@@ -139,28 +154,55 @@ def _checked(matchers: Sequence[str | Matcher]) -> list[str]:
     return names
 
 
+@dataclass(frozen=True)
+class _Work:
+    """What is done with each scene."""
+
+    bench: Bench
+    results: Sequence[ResultFolder]
+    options: MiddleburyOptions
+    directory: RunDirectory
+
+    def figures(self, name: str, path: Path) -> SceneFigures | None:
+        """Figures of one scene by matcher; None without ground truth."""
+        truth = self.options.truth
+        scene = read_scored_scene(name, path, None if truth is None else Path(truth))
+        if scene is None:
+            return None
+        read = (one for result in self.results if (one := result.read(scene)) is not None)
+        return {one.matcher: self._kept(one) for one in chain(self.bench.results(scene), read)}
+
+    def _kept(self, result: SceneResult) -> Figures:
+        """Write the disparity map of a result and return its figures, so that it can be freed."""
+        scene, seconds = result.scene, result.seconds
+        if result.file is None:
+            path = self.directory.path(f"disparity/{result.matcher}/{scene.name}.pfm")
+            write_pfm(path, result.values)
+        if self.options.draw is not None:
+            self.options.draw(result, self.directory)
+        return {
+            **result.figures,
+            "seconds": None if seconds is None else round(seconds, 4),
+            "width_px": scene.camera.width_px,
+            "height_px": scene.camera.height_px,
+            "full_size_factor": scene.rules.full_size_factor,
+            "weight": scene_weight(scene.name),
+        }
+
+
 def _scenes(
-    bench: Bench,
-    folder: Path,
-    paths: Mapping[str, Path],
-    options: MiddleburyOptions,
-    directory: RunDirectory,
-) -> Iterator[tuple[str, SceneFigures]]:
-    """Figures of each scene, in order; empty for a scene without ground truth."""
-
-    def work(name: str) -> SceneFigures:
-        scene = read_scored_scene(name, paths[name], options.truth)
-        results = iter(()) if scene is None else bench.results(scene)
-        return {one.matcher: _kept(one, options, directory) for one in results}
-
-    observer = options.observer
+    work: _Work, folder: StrPath, paths: Mapping[str, Path]
+) -> Iterator[tuple[str, SceneFigures | None]]:
+    """Figures of each scene, in order; None for a scene without ground truth."""
+    observer = work.options.observer
     if observer is not None:
         observer.on_start(str(folder), len(paths))
-    pool = ThreadPoolExecutor(options.parallel)
+    pool = ThreadPoolExecutor(work.options.parallel)
     try:
-        for name, figures in zip(paths, pool.map(work, paths), strict=True):
+        done = pool.map(work.figures, paths.keys(), paths.values())
+        for name, figures in zip(paths, done, strict=True):
             if observer is not None:
-                observer.on_scene(name, figures)
+                observer.on_scene(name, figures or {})
             yield name, figures
     finally:
         # After an error, scenes that have not started are cancelled.
@@ -169,33 +211,52 @@ def _scenes(
             observer.on_finish()
 
 
-def _kept(result: SceneResult, options: MiddleburyOptions, directory: RunDirectory) -> Figures:
-    """Write the disparity map of a result and return its figures, so that the map can be freed."""
-    scene = result.scene
-    path = directory.path(f"disparity/{result.matcher}/{scene.name}.pfm")
-    write_pfm(path, result.disparity.values)
-    if options.draw is not None:
-        options.draw(result, directory)
-    return {
-        **result.figures,
-        "seconds": round(result.seconds, 4),
-        "width_px": scene.camera.width_px,
-        "height_px": scene.camera.height_px,
-        "full_size_factor": scene.rules.full_size_factor,
-        "weight": scene_weight(scene.name),
-    }
+def _common(
+    scenes: Mapping[str, SceneFigures],
+    names: Sequence[str],
+    folder: StrPath,
+    skipped: Sequence[str],
+) -> list[str]:
+    """The scenes for which all have a result, so that means can be compared."""
+    if not scenes:
+        raise SourceError(
+            "no scene has ground truth to compare with",
+            where=folder,
+            got=", ".join(skipped),
+            hint="name a folder of scenes that have one with --truth",
+        )
+    common = [name for name, figures in scenes.items() if all(one in figures for one in names)]
+    if not common:
+        raise SourceError(
+            "there is no scene that all have a result for", where=folder, got=", ".join(names)
+        )
+    return common
 
 
-def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str) -> Figures:
+def _missing(
+    scenes: Mapping[str, SceneFigures], results: Sequence[ResultFolder], common: Sequence[str]
+) -> Iterator[str]:
+    """A line for each folder of results that lacks scenes."""
+    for result in results:
+        lacking = [name for name in scenes if name not in result.files]
+        if lacking:
+            yield (
+                f"{result.name}: no result for {', '.join(lacking)}; means are over "
+                f"{len(common)} of {len(scenes)} scenes, which all have"
+            )
+
+
+def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str, common: Sequence[str]) -> Figures:
     """The entry of one matcher in ``summary.json``."""
-    own = {name: figures[matcher] for name, figures in scenes.items() if figures}
-    masked = {name: {mask: figures[mask] for mask in MASKS} for name, figures in own.items()}
-    rated = {name: figures["confidence"] for name, figures in own.items()}
-    seconds = weighted_mean({name: figures["seconds"] for name, figures in own.items()})
+    own = {name: figures[matcher] for name, figures in scenes.items() if matcher in figures}
+    meant = {name: own[name] for name in common}
+    masked = {name: {mask: figures[mask] for mask in MASKS} for name, figures in meant.items()}
+    rated = {name: figures["confidence"] for name, figures in meant.items()}
+    seconds = {name: figures["seconds"] for name, figures in meant.items()}
     weighted = {
         **weighted_figures(masked),
         "confidence": weighted_confidence(rated),
-        "seconds": seconds,
+        "seconds": None if None in seconds.values() else weighted_mean(seconds),
     }
     return {"scenes": own, "weighted": weighted}
 
@@ -209,9 +270,15 @@ def _write(
     directory.write_json("summary.json", summary)
 
 
-def _record(summary: Figures, paths: Mapping[str, Path], directory: RunDirectory) -> None:
-    """Write ``run.json``, with a hash of all files of all scenes."""
+def _record(
+    summary: Figures,
+    paths: Mapping[str, Path],
+    results: Sequence[ResultFolder],
+    directory: RunDirectory,
+) -> None:
+    """Write ``run.json``, with a hash of all files of all scenes and of the results."""
     files = [file for path in paths.values() for file in sorted(path.iterdir()) if file.is_file()]
-    shared = ("folder", "threads", "parallel", "seconds", "peak_memory_mb", "warnings")
+    files += [file for result in results for file in result.files.values()]
+    shared = ("folder", "results", "threads", "parallel", "seconds", "peak_memory_mb", "warnings")
     record = {key: summary[key] for key in shared}
     write_record(directory, COMMAND, {**record, "inputs": fingerprint(files)})

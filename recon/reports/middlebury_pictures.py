@@ -12,7 +12,12 @@ from recon.pipeline.run_directory import RunDirectory
 from recon.reports.colour import colour_disparity, colour_error, value_range
 from recon.reports.html import render_html
 from recon.reports.middlebury_report import middlebury_report
-from recon.reports.middlebury_tables import csv_table, markdown_tables, text_tables
+from recon.reports.middlebury_tables import (
+    csv_table,
+    latex_tables,
+    markdown_tables,
+    text_tables,
+)
 from recon.reports.present import command_line
 
 ERROR_LIMIT_PX: Final = 4.0
@@ -20,13 +25,14 @@ ERROR_LIMIT_PX: Final = 4.0
 
 
 def present_middlebury(summary: Mapping[str, Any], directory: RunDirectory) -> None:
-    """Write the tables as text, Markdown and CSV, and ``report.html``.
+    """Write the tables as text, Markdown, LaTeX and CSV, and ``report.html``.
 
     Raises:
         OutputError: A file cannot be written.
     """
     write_text(directory.path("tables.txt"), text_tables(summary))
     write_text(directory.path("tables.md"), markdown_tables(summary))
+    write_text(directory.path("tables.tex"), latex_tables(summary))
     write_text(directory.path("figures.csv"), csv_table(summary))
     config = directory.path("config.yaml").read_text(encoding="utf-8")
     content = middlebury_report(summary, directory, config=config, command=command_line())
@@ -42,10 +48,10 @@ def draw_result(result: SceneResult, directory: RunDirectory) -> None:
     Raises:
         OutputError: A file cannot be written.
     """
-    scale = round(4 * result.scene.camera.width_px / result.scene.truth.values.shape[1]) / 4
+    scale = round(4 * result.values.shape[1] / result.scene.truth.values.shape[1]) / 4
     low, high = value_range(result.scene.truth.values)
     pictures = {
-        "disparity": colour_disparity(result.disparity.values, low * scale, high * scale),
+        "disparity": colour_disparity(result.values, low * scale, high * scale),
         "error": colour_error(result.error_px(), ERROR_LIMIT_PX),
     }
     for name, picture in pictures.items():

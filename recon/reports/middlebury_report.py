@@ -14,7 +14,7 @@ from recon.pipeline.machine import versions
 from recon.pipeline.run_directory import RunDirectory
 from recon.reports.confidence_figures import reliability_figure, sparsification_figure
 from recon.reports.html import Block, FigureBlock, ReportContent, Section, TableBlock
-from recon.reports.middlebury_tables import report_tables
+from recon.reports.middlebury_tables import report_tables, scene_names
 from recon.structures.arrays import UInt8
 
 _WIDTH_PX: Final = 300
@@ -41,10 +41,10 @@ def middlebury_report(
         command: The command line, or "".
     """
     tables = [
-        TableBlock(title, rows[0], rows[1:], wide=len(rows[0]) > _MANY_COLUMNS)
-        for title, rows in report_tables(summary)
+        TableBlock(one.title, one.rows[0], one.rows[1:], wide=len(one.rows[0]) > _MANY_COLUMNS)
+        for one in report_tables(summary)
     ]
-    scenes = next(iter(summary["matchers"].values()))["scenes"]
+    scenes = scene_names(summary["matchers"])
     sections = (
         Section("Tables", tables, _HOW_TO_READ),
         Section("Confidence", _confidence_blocks(summary)),
@@ -97,11 +97,12 @@ def _confidence_blocks(summary: Mapping[str, Any]) -> list[Block]:
 
 def _scene_block(scene: str, summary: Mapping[str, Any], directory: RunDirectory) -> FigureBlock:
     """One row of pictures per matcher: its disparity and error."""
-    rows = [_both_pictures(directory, name, scene) for name in summary["matchers"]]
+    names = [name for name, found in summary["matchers"].items() if scene in found["scenes"]]
+    rows = [_both_pictures(directory, name, scene) for name in names]
     buffer = io.BytesIO()
     Image.fromarray(np.concatenate(_spaced(rows, 0), axis=0)).save(buffer, "PNG")
     caption = (
-        f"From top to bottom: {', '.join(summary['matchers'])}. Left the disparity, right its "
+        f"From top to bottom: {', '.join(names)}. Left the disparity, right its "
         "error: blue is right, red is off by 4 full-size pixels or more, black is unknown."
     )
     return FigureBlock(scene, buffer.getvalue(), caption, wide=False)
@@ -111,10 +112,10 @@ def _both_pictures(directory: RunDirectory, matcher: str, scene: str) -> UInt8:
     """Disparity and error side by side: uint8 (H, W, 3)."""
     stem = f"pictures/{matcher}/{scene}"
     found = read_image(directory.path(f"{stem}_disparity.png"))
-    # The error has the size of the ground truth, which may differ.
+    # The error has the size of the ground truth, which is that of no or every matcher's result.
     error = read_image(directory.path(f"{stem}_error.png"))
-    width = min(_WIDTH_PX, found.shape[1])
-    size = (max(1, round(found.shape[0] * width / found.shape[1])), width)
+    width = min(_WIDTH_PX, error.shape[1])
+    size = (max(1, round(error.shape[0] * width / error.shape[1])), width)
     return np.concatenate(_spaced([_sized(found, size), _sized(error, size)], 1), axis=1)
 
 

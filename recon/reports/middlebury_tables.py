@@ -1,16 +1,20 @@
-"""Tables of an evaluation on Middlebury scenes: plain text, Markdown, CSV."""
+"""Tables of an evaluation on Middlebury scenes: plain text, Markdown, LaTeX, CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+from recon.reports.latex import latex_tabular
 
 Row = Sequence[str]
 Figures = Mapping[str, Any]
 
 WEIGHTED: Final = "weighted"
+_NOTHING: Final = "–"
 _LIMITS: Final = ("0.5", "1", "2", "4")
 _LENGTHS: Final = ("avgerr", "rms", "a50", "a90", "a95", "a99")
 _DEPTHS: Final = ("mean_m", "median_m", "rms_m", "median_percent", "over_5_percent", "infinite")
@@ -19,19 +23,47 @@ _CONFIDENCE: Final = ("ece", "ause", "within_1_sigma", "within_2_sigma")
 _KINDS: Final = (("nonocc", "dense"), ("nonocc", "sparse"), ("all", "dense"), ("all", "sparse"))
 
 
+@dataclass(frozen=True)
+class Table:
+    """One table.
+
+    Attributes:
+        title: What it shows.
+        rows: Its cells; the first row is the head, the first column names the rows.
+        compared: Where the best, that is the smallest, number is looked for: in each column, in
+            each row, or nowhere.
+    """
+
+    title: str
+    rows: Sequence[Row]
+    compared: Literal["columns", "rows", "nothing"]
+
+
 def text_tables(summary: Figures) -> str:
     """The tables in columns, for a terminal."""
-    return "\n\n".join(f"{title}\n{_columns(rows)}" for title, rows in _tables(summary)) + "\n"
+    return "\n\n".join(f"{one.title}\n{_columns(one.rows)}" for one in _tables(summary)) + "\n"
 
 
 def markdown_tables(summary: Figures) -> str:
     """The tables in Markdown."""
-    return "\n\n".join(f"### {title}\n{_markdown(rows)}" for title, rows in _tables(summary)) + "\n"
+    tables = (f"### {one.title}\n{_markdown(one.rows)}" for one in _tables(summary))
+    return "\n\n".join(tables) + "\n"
 
 
-def report_tables(summary: Figures) -> list[tuple[str, list[Row]]]:
-    """Titles and rows, the first of which is the head."""
+def latex_tables(summary: Figures) -> str:
+    """The tables in LaTeX, the best number of several in bold."""
+    tables = (latex_tabular(one.rows, _best(one), title=one.title) for one in _tables(summary))
+    return "\n\n".join(tables) + "\n"
+
+
+def report_tables(summary: Figures) -> list[Table]:
+    """All tables."""
     return list(_tables(summary))
+
+
+def scene_names(matchers: Figures) -> list[str]:
+    """Names of the scenes for which any matcher has a result, in order."""
+    return list(dict.fromkeys(name for found in matchers.values() for name in found["scenes"]))
 
 
 def csv_table(summary: Figures) -> str:
@@ -52,23 +84,52 @@ def csv_table(summary: Figures) -> str:
     return out.getvalue()
 
 
-def _tables(summary: Figures) -> Iterator[tuple[str, list[Row]]]:
-    """Titles and rows, the first of which is the head."""
-    matchers = summary["matchers"]
+def _tables(summary: Figures) -> Iterator[Table]:
+    matchers, mean = summary["matchers"], _mean_title(summary)
     for mask, holes in _KINDS:
-        yield f"Weighted mean, {mask}, {holes}", _weighted_rows(matchers, mask, holes)
+        rows = _weighted_rows(matchers, mask, holes)
+        yield Table(f"{mean}, {mask}, {holes}", rows, "columns")
     for limit in _LIMITS[1:3]:
         rows = _scene_rows(matchers, lambda one, t=limit: one["nonocc"]["dense"]["bad"][t])
-        yield f"bad {limit} of each scene, nonocc, dense", rows
+        yield Table(f"bad {limit} of each scene, nonocc, dense", rows, "rows")
     rows = _scene_rows(matchers, lambda one: one["nonocc"]["dense"]["avgerr"])
-    yield "avgerr (px) of each scene, nonocc, dense", rows
+    yield Table("avgerr (px) of each scene, nonocc, dense", rows, "rows")
     if any(found["weighted"].get("confidence") for found in matchers.values()):
-        yield "Confidence, weighted mean, all, sparse", _confidence_rows(matchers)
+        # The shares within sigma are best near those of a normal distribution, not at 0.
+        yield Table(
+            f"Confidence, {mean.lower()}, all, sparse", _confidence_rows(matchers), "nothing"
+        )
         for name in _CONFIDENCE[:2]:
             rows = _scene_rows(matchers, lambda one, n=name: _rated(one, n), digits=3)
-            yield f"{name} of each scene", rows
+            yield Table(f"{name} of each scene", rows, "rows")
     rows = _scene_rows(matchers, lambda one: one["seconds"], digits=3)
-    yield "seconds of each scene, matching alone", rows
+    yield Table("seconds of each scene, matching alone", rows, "rows")
+
+
+def _mean_title(summary: Figures) -> str:
+    averaged, scenes = len(summary["mean_over"]), len(scene_names(summary["matchers"]))
+    return "Weighted mean" + (f" of {averaged} of {scenes} scenes" if averaged < scenes else "")
+
+
+def _best(table: Table) -> set[tuple[int, int]]:
+    """Row and column of the smallest number, as it is shown, of each row or column."""
+    numbers = {
+        (r, c): float(cell.removesuffix(" %"))
+        for r, row in enumerate(table.rows)
+        for c, cell in enumerate(row)
+        if r and c and cell != _NOTHING
+    }
+    lines: dict[int, dict[tuple[int, int], float]] = {}
+    for place, number in numbers.items():
+        if table.compared != "nothing":
+            lines.setdefault(place[table.compared == "columns"], {})[place] = number
+    return {
+        place
+        for line in lines.values()
+        if len(line) > 1
+        for place, number in line.items()
+        if number == min(line.values())
+    }
 
 
 def _weighted_rows(matchers: Figures, mask: str, holes: str) -> list[Row]:
@@ -77,7 +138,7 @@ def _weighted_rows(matchers: Figures, mask: str, holes: str) -> list[Row]:
         figures = found["weighted"][mask][holes]
         depth = figures.get("depth", {}).get("median_percent")
         cells = [_number(cell) for cell in _cells(found["weighted"], mask, holes)]
-        shown = f"{_number(depth)} %" if depth is not None else "–"
+        shown = f"{_number(depth)} %" if depth is not None else _NOTHING
         rows.append((name, *cells, shown, _number(found["weighted"]["seconds"], 3)))
     return rows
 
@@ -96,11 +157,10 @@ def _rated(figures: Figures, name: str) -> float | None:
 
 def _scene_rows(matchers: Figures, pick: Any, digits: int = 2) -> list[Row]:
     """One row per scene, one column per matcher."""
-    scenes = next(iter(matchers.values()))["scenes"]
     rows: list[Row] = [("scene", *matchers)]
-    for scene in scenes:
-        picked = (pick(found["scenes"][scene]) for found in matchers.values())
-        rows.append((scene, *(_number(value, digits) for value in picked)))
+    for scene in scene_names(matchers):
+        ones = (found["scenes"].get(scene) for found in matchers.values())
+        rows.append((scene, *(_number(None if one is None else pick(one), digits) for one in ones)))
     return rows
 
 
@@ -120,7 +180,7 @@ def _all_cells(figures: Figures, mask: str, holes: str) -> list[Any]:
 
 
 def _number(value: float | None, digits: int = 2) -> str:
-    return "–" if value is None else f"{value:.{digits}f}"
+    return _NOTHING if value is None else f"{value:.{digits}f}"
 
 
 def _columns(rows: Sequence[Row]) -> str:

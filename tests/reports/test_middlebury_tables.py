@@ -6,7 +6,8 @@ import csv
 import io
 from typing import Any
 
-from recon.reports.middlebury_tables import csv_table, markdown_tables, text_tables
+from recon.reports.latex import latex_tabular
+from recon.reports.middlebury_tables import csv_table, latex_tables, markdown_tables, text_tables
 
 
 def masked(error: float | None, *, depth: bool) -> dict[str, Any]:
@@ -26,7 +27,7 @@ def summary(error: float | None = 3.25, *, depth: bool = True) -> dict[str, Any]
     rated = dict.fromkeys(("ece", "ause", "within_1_sigma", "within_2_sigma"), 0.125)
     sure = {name: {**one, "confidence": rated} for name, one in scenes.items()}
     sad = {"scenes": sure, "weighted": {**weighted, "confidence": rated}}
-    return {"matchers": {"sad": sad, "opencv-bm": found}}
+    return {"matchers": {"sad": sad, "opencv-bm": found}, "mean_over": list(scenes)}
 
 
 def test_a_table_has_a_row_per_matcher_and_a_column_per_figure() -> None:
@@ -91,3 +92,38 @@ def test_a_figure_that_is_not_known_is_a_dash_or_an_empty_cell() -> None:
     assert "–" in text_tables(given)
     row = next(csv.DictReader(io.StringIO(csv_table(given))))
     assert row["avgerr"] == row["depth_mean_m"] == ""
+
+
+def test_the_best_of_several_is_bold_in_latex() -> None:
+    given = summary()
+    given["matchers"]["sad"]["weighted"]["seconds"] = 0.25
+    better = masked(2.5, depth=True)
+    given["matchers"]["opencv-bm"]["scenes"]["Teddy"] = {"nonocc": better, "seconds": 0.125}
+    tables = {
+        part.partition("\n")[0]: part.splitlines() for part in latex_tables(given).split("\n\n")
+    }
+    mean = tables["% Weighted mean, nonocc, dense"]
+    assert mean[1] == r"\begin{tabular}{lrrrrrrrrrrrrr}"
+    assert mean[5].endswith(r"\textbf{0.250} \\")
+    assert mean[6].endswith(r" & 0.500 \\")
+    # Equal values are all the best.
+    assert mean[5].count("textbf") == mean[6].count("textbf") + 1
+    errors = tables["% avgerr (px) of each scene, nonocc, dense"]
+    assert errors[6] == r"Teddy & 3.25 & \textbf{2.50} \\"
+    sure = tables["% Confidence, weighted mean, all, sparse"]
+    assert not any("textbf" in line for line in sure)
+    assert all(lines[-1] == r"\end{tabular}" for lines in tables.values())
+
+
+def test_signs_of_latex_are_escaped() -> None:
+    table = latex_tabular([("my_method", "50 %"), ("a&b–c", "{x}~^#$\\")])
+    assert r"my\_method & 50 \% \\" in table
+    assert r"a\&b--c & \{x\}\textasciitilde{}\textasciicircum{}\#\$\textbackslash{} \\" in table
+
+
+def test_means_over_some_of_the_scenes_say_so() -> None:
+    given = summary() | {"mean_over": ["Piano"]}
+    del given["matchers"]["opencv-bm"]["scenes"]["Teddy"]
+    text = text_tables(given)
+    assert "Weighted mean of 1 of 2 scenes, nonocc, dense" in text
+    assert "Teddy  0.500          –" in text
