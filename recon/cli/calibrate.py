@@ -32,9 +32,11 @@ class Form(str, Enum):
 def calibrate(
     left: Annotated[
         str,
-        typer.Argument(help='Left images: a folder, or a pattern in quotes such as "left*.png".'),
+        typer.Argument(
+            help='Left images: a folder, a pattern in quotes such as "left*.png", or a video; or '
+            "one video with both views."
+        ),
     ],
-    right: Annotated[str, typer.Argument(help="Right images, likewise.")],
     board: Annotated[
         str,
         typer.Option(
@@ -42,6 +44,10 @@ def calibrate(
             "charuco:8x6:30mm:22mm:5x5_100 (squares, square size, marker size, dictionary)."
         ),
     ],
+    right: Annotated[
+        str | None,
+        typer.Argument(help="Right images, likewise.", show_default="both views are in LEFT"),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Calibration file to write.")
     ] = None,
@@ -88,6 +94,7 @@ def calibrate(
     Examples:
       recon calibrate "left*.png" "right*.png" --board chess:9x6:25mm -o rig.yaml
       recon calibrate left/ right/ --board charuco:8x6:30mm:22mm:5x5_100
+      recon calibrate both.mp4 --board chess:9x6:25mm
     """
     del quiet  # there is no progress to hide; every command takes the option
     with session():

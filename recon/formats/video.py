@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +42,11 @@ class VideoFile:
     rate_hz: float
 
     def read(self, start: int = 0) -> Iterator[tuple[float, UInt8]]:
-        """Decode the frames from number ``start`` on; earlier ones are decoded and dropped.
+        """Decode the frames from number ``start`` on, see `pick`."""
+        return self.pick(range(start, self.frames))
+
+    def pick(self, numbers: Iterable[int]) -> Iterator[tuple[float, UInt8]]:
+        """Decode frames of increasing numbers; those before and between are decoded and dropped.
 
         Yields:
             Seconds from the start of the file, and uint8 (H, W, 3) RGB.
@@ -51,11 +55,12 @@ class VideoFile:
             FormatError: The file cannot be opened, or a frame cannot be decoded.
         """
         with _opened(self.path) as capture:
-            for index in range(self.frames):
-                if not capture.grab():
-                    raise self._broken(index)
-                if index < start:
-                    continue
+            after = 0
+            for index in numbers:
+                for each in range(after, index + 1):
+                    if not capture.grab():
+                        raise self._broken(each)
+                after = index + 1
                 stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
                 done, image = capture.retrieve()
                 if not done:

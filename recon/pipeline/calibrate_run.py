@@ -18,12 +18,13 @@ from recon.calibration import (
     measure_spread,
     shared_pixels,
 )
-from recon.errors import OutputError
+from recon.errors import OutputError, SourceError
 from recon.formats.atomic import write_text
 from recon.formats.camera_info import write_camera_info
 from recon.formats.kalibr import write_kalibr
 from recon.formats.opencv_yaml import write_opencv_calibration
 from recon.formats.recon_yaml import write_recon_calibration
+from recon.pipeline.board_video import is_video, pick_views
 from recon.pipeline.board_views import BoardViews, find_views
 from recon.pipeline.calibrate_summary import summarise
 from recon.pipeline.calibrate_verdict import judge_calibration, verdict_of_calibration
@@ -34,7 +35,7 @@ from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.stopwatch import Stopwatch
 from recon.pipeline.summary import cost
 from recon.rectification import RectifyingTurns, plan_turns
-from recon.sources.picture_pairs import pair_pictures
+from recon.sources.picture_pairs import PicturePairs, pair_pictures
 from recon.structures.arrays import Float64
 from recon.structures.board import CalibrationBoard
 
@@ -93,7 +94,7 @@ class CalibrateOptions:
 
 def run_calibration(
     left: str,
-    right: str,
+    right: str | None,
     board: CalibrationBoard,
     config: ReconConfig,
     options: CalibrateOptions,
@@ -101,8 +102,8 @@ def run_calibration(
     """Calibrate a rig from images of a board.
 
     Args:
-        left: Folder or pattern of the left images.
-        right: Folder or pattern of the right images.
+        left: Folder or pattern of the left images, or the left video, or one with both views.
+        right: The same of the right camera; None if one video has both views.
         board: The board that they show.
         config: The configuration.
         options: Output files and threads.
@@ -114,8 +115,12 @@ def run_calibration(
     start = time.perf_counter()
     threads, watch = use_threads(options.threads), Stopwatch()
     _check_file(options.file)
-    pictures = pair_pictures(left, right)
+    videos = _videos(left, right)
+    pictures = PicturePairs((), by_order=False) if videos else pair_pictures(left, right or "")
     with RunDirectory.for_command("calibrate", options.folder) as directory:
+        if videos:
+            with watch.stage("pick"):
+                pictures = pick_views(videos, config.source, directory.path)
         with watch.stage("find"):
             seen = find_views(pictures, board, threads)
         with watch.stage("solve"), serial_algebra():
@@ -137,14 +142,27 @@ def run_calibration(
         run.summary["out"] = str(directory.folder)
         directory.write_json("summary.json", run.summary)
         record = {
-            "source": f"{left} {right}",
+            "source": " ".join(filter(None, (left, right))),
             "board": str(seen.board),
-            "inputs": fingerprint(path for pair in pictures.pairs for path in pair),
+            "inputs": fingerprint(videos or (path for pair in pictures.pairs for path in pair)),
             "timings": watch.seconds,
             "warnings": warnings,
         }
         write_record(directory, "calibrate", record)
     return run
+
+
+def _videos(left: str, right: str | None) -> list[Path]:
+    """The arguments if they are videos, else nothing."""
+    sides = [side for side in (left, right) if side is not None]
+    videos = [Path(side) for side in sides if is_video(side)]
+    if len(videos) != len(sides) and (videos or right is None):
+        raise SourceError(
+            "two folders, two patterns, two videos, or one video with both views are needed",
+            where=next(side for side in sides if not is_video(side)),
+            hint="recon calibrate LEFT RIGHT --board …",
+        )
+    return videos
 
 
 def _run(config: ReconConfig, seen: BoardViews, fit: StereoFit, spread: Spread) -> CalibrationRun:

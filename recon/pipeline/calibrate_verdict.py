@@ -139,6 +139,10 @@ def _find_left_out(
     if pictures.by_order:
         text = "names do not tell which images belong together: paired by their order"
         yield CalibrationFinding("order", "note", text)
+    if pictures.lonely:
+        names = _listed([path.name for path in pictures.lonely])
+        text = f"images without a partner, left out: {len(pictures.lonely)} ({names})"
+        yield CalibrationFinding("unpaired", "note", text)
     if summary["pictures_without_board"]:
         text = f"board not found in {_listed(summary['pictures_without_board'])}"
         yield CalibrationFinding("board", "note", text)

@@ -288,6 +288,9 @@ def _warnings(summary: dict[str, Any], pictures: PicturePairs) -> list[str]:
         lines.append(f"rows are {summary['row_error_px']:.2f} px apart: a matcher needs 0.5")
     if "row_error_px" not in summary:
         lines.append("no features to measure rows by")
+    if pictures.lonely:
+        names = ", ".join(path.name for path in pictures.lonely[:6])
+        lines.append(f"images without a partner, left out: {len(pictures.lonely)} ({names})")
     if pictures.by_order:
         lines.append("names do not tell which pictures belong together: paired by their order")
     return lines

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,10 +26,12 @@ class PicturePairs:
     Attributes:
         pairs: Left and right file of each pair, in natural order.
         by_order: Whether files were paired by order, as their names gave no clue.
+        lonely: Files that were left out since they have no partner.
     """
 
     pairs: tuple[tuple[Path, Path], ...]
     by_order: bool
+    lonely: tuple[Path, ...] = ()
 
 
 def pair_pictures(left: str | Path, right: str | Path) -> PicturePairs:
@@ -36,14 +39,15 @@ def pair_pictures(left: str | Path, right: str | Path) -> PicturePairs:
 
     Names match if they are equal apart from words and constant numbers of each side, such as
     ``left01.jpg`` and ``right01.jpg`` or ``cam0/17.png`` and ``cam1/17.png``. If no names match
-    and both sides have as many images, they are paired by order.
+    and both sides have as many images, they are paired by order. Files without a partner are left
+    out.
 
     Args:
         left: A folder, an image, or a pattern with ``*``, ``?``, ``[]`` or ``**``.
         right: The same for the right camera.
 
     Raises:
-        SourceError: A side has no images, an image has no partner, or the sides share files.
+        SourceError: A side has no images, most images have no partner, or the sides share files.
     """
     sides = (list_pictures(left), list_pictures(right))
     both = set(sides[0]) & set(sides[1])
@@ -56,7 +60,7 @@ def pair_pictures(left: str | Path, right: str | Path) -> PicturePairs:
     for keyed in (_by_name, _by_numbers):
         keys = [keyed(side) for side in sides]
         if set(keys[0]) & set(keys[1]):
-            return PicturePairs(_match(keys[0], keys[1]), by_order=False)
+            return _match(sides, keys[0], keys[1])
     if len(sides[0]) != len(sides[1]):
         raise SourceError(
             "images do not pair up",
@@ -95,30 +99,32 @@ def _by_name(side: Sequence[Path]) -> dict[Key, Path]:
 
 
 def _by_numbers(side: Sequence[Path]) -> dict[Key, Path]:
-    """Images by those numbers in their names that vary within the side."""
-    numbers = [tuple(int(word) for word in _NUMBER.findall(path.stem)) for path in side]
-    if len({len(each) for each in numbers}) != 1:
-        return {}
-    varying = [k for k in range(len(numbers[0])) if len({each[k] for each in numbers}) > 1]
-    keys = [tuple(each[k] for k in varying) for each in numbers]
-    if not varying or len(set(keys)) != len(keys):
-        return {}
-    return dict(zip(keys, side, strict=True))
+    """Images by those numbers in their names that vary within the side.
+
+    Names with more or fewer numbers than most are left out.
+    """
+    numbers = {path: tuple(int(word) for word in _NUMBER.findall(path.stem)) for path in side}
+    usual = Counter(len(each) for each in numbers.values()).most_common(1)[0][0]
+    numbers = {path: each for path, each in numbers.items() if len(each) == usual}
+    varying = [k for k in range(usual) if len({each[k] for each in numbers.values()}) > 1]
+    keyed: dict[Key, Path] = {
+        tuple(each[k] for k in varying): path for path, each in numbers.items()
+    }
+    return keyed if varying and len(keyed) == len(numbers) else {}
 
 
-def _match(left: dict[Key, Path], right: dict[Key, Path]) -> tuple[tuple[Path, Path], ...]:
-    lonely = [
-        here[key]
-        for here, there in ((left, right), (right, left))
-        for key in here
-        if key not in there
-    ]
-    if lonely:
+def _match(
+    sides: Sequence[Sequence[Path]], left: dict[Key, Path], right: dict[Key, Path]
+) -> PicturePairs:
+    pairs = tuple((path, right[key]) for key, path in left.items() if key in right)
+    paired = {path for pair in pairs for path in pair}
+    lonely = tuple(path for side in sides for path in side if path not in paired)
+    if 2 * len(pairs) < max(len(side) for side in sides):
         names = ", ".join(path.name for path in lonely[:3]) + (" …" if len(lonely) > 3 else "")
         raise SourceError(
-            "images do not pair up: these have no partner",
+            "images do not pair up: most have no partner",
             where=lonely[0].parent,
-            got=names,
-            hint="remove them, or correct their names",
+            got=f"{len(pairs)} pairs of {len(sides[0])} left, {len(sides[1])} right; {names}",
+            hint="correct their names",
         )
-    return tuple((path, right[key]) for key, path in left.items())
+    return PicturePairs(pairs, by_order=False, lonely=lonely)

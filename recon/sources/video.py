@@ -111,9 +111,7 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
         FormatError: A file is not a video, or is damaged.
         CalibrationError: The calibration cannot give depth.
     """
-    videos = tuple(open_video(file) for file in _find_videos(path, settings))
-    if len(videos) == 2:
-        _check_alike(*videos)
+    videos = open_videos(_find_videos(path, settings))
     size = view_size(videos[0], settings) if len(videos) == 1 else _size(videos[0])
     home = path if path.is_dir() else path.resolve().parent
     rig, texts = read_rig(settings, home, size)
@@ -127,6 +125,19 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
         settings=settings,
         texts=texts,
     )
+
+
+def open_videos(files: Sequence[Path]) -> tuple[VideoFile, ...]:
+    """Open one video, or a left and a right one that belong together.
+
+    Raises:
+        SourceError: The two differ in number, rate or size of frames.
+        FormatError: A file is missing, not a video, or damaged.
+    """
+    videos = tuple(open_video(file) for file in files)
+    if len(videos) == 2:
+        _check_alike(*videos)
+    return videos
 
 
 def list_videos(folder: Path) -> list[str]:

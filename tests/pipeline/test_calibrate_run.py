@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from recon.sources.picture_pairs import pair_pictures
 from recon.structures import StereoCalibration
 from recon.structures.board import parse_board
 from recon.synthetic.boards import board_rig, place_boards, render_views
+from tests.sources.drives import write_video
 
 BOARD = parse_board("chess:9x6:25mm")
 QUICK = ["calibration.bootstrap=60"]
@@ -87,7 +89,8 @@ def shrink(folder: Path) -> None:
 
 
 def lose(folder: Path) -> None:
-    (folder / "right01.png").unlink()
+    for number in range(1, 7):
+        (folder / f"right0{number}.png").unlink()
 
 
 def blank(folder: Path) -> None:
@@ -99,7 +102,7 @@ def blank(folder: Path) -> None:
     ("spoil", "error", "message"),
     [
         (shrink, SourceError, r"right01\.png: images differ in size \(got 320x240"),
-        (lose, SourceError, r"no partner \(got left01\.png\)"),
+        (lose, SourceError, r"most have no partner \(got 3 pairs of 9 left, 3 right; left01\.png"),
         (blank, CalibrationError, r"the board was not found in any image \(got 18 images"),
     ],
 )
@@ -163,6 +166,7 @@ def test_a_folder_for_a_calibration_file_is_refused(drawn: Path, tmp_path: Path)
         calibrate(drawn, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_still_board_on_video_gives_the_forecast_of_one_image_each(
     drawn: Path, tmp_path: Path
 ) -> None:
@@ -181,6 +185,61 @@ def test_a_still_board_on_video_gives_the_forecast_of_one_image_each(
     spread = "rotation_spread_deg"
     assert thrice[spread] == pytest.approx(once[spread], rel=0.35)
     assert any(finding["code"] == "repeats" for finding in thrice["findings"])
+
+
+def test_an_image_without_a_partner_is_left_out_and_counted(drawn: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(drawn, copy)
+    (copy / "right02.png").unlink()
+    summary = calibrate(copy, tmp_path).summary
+    assert (summary["views"], summary["views_used"]) == (8, 7)
+    told = {finding["code"]: finding["text"] for finding in summary["findings"]}
+    assert told["unpaired"] == "images without a partner, left out: 1 (left02.png)"
+
+
+def film(drawn: Path) -> list[tuple[np.ndarray, np.ndarray]]:
+    """A second of each view, with new noise in every image, and half a second of moving there."""
+    rng, frames = np.random.default_rng(2), []
+    for number in range(9):
+        both = [read_image(drawn / f"{side}{number:02d}.png") for side in ("left", "right")]
+        shifts = [0] * 10 + [40, 80, 120, 160, 200]
+        for shift in shifts:
+            moved = (
+                np.roll(image, shift, axis=1) + rng.normal(0, 2, image.shape) for image in both
+            )
+            left, right = (np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in moved)
+            frames.append((left, right))
+    return frames
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["two videos", "side by side"])
+def test_a_video_gives_one_view_for_each_place_where_the_board_stands_still(
+    drawn: Path, tmp_path: Path, layout: str
+) -> None:
+    frames = film(drawn)
+    if layout == "two videos":
+        left = write_video(tmp_path / "left.mkv", [left for left, _ in frames])
+        right = str(write_video(tmp_path / "right.mkv", [right for _, right in frames]))
+    else:
+        left, right = write_video(tmp_path / "both.mkv", [np.hstack(both) for both in frames]), None
+    options = CalibrateOptions(None, "recon", tmp_path / "out", 1, None)
+    run = run_calibration(str(left), right, BOARD, load_config(None, QUICK), options)
+    # In one of the nine places the right camera does not see the board.
+    assert 9 <= run.summary["views"] <= 11
+    assert run.summary["views_used"] == 8
+    assert run.summary["baseline_m"] == pytest.approx(board_rig().baseline_m, rel=0.005)
+    numbers = [int(path.stem[4:]) for path in (tmp_path / "out" / "views").glob("left*.png")]
+    assert all(number % 15 <= 9 for number in numbers)
+
+
+def test_one_video_and_one_folder_are_refused(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "left.mkv", [np.zeros((32, 32), np.uint8)] * 3)
+    options = CalibrateOptions(None, "recon", tmp_path / "out", 1, None)
+    with pytest.raises(SourceError, match="two videos, or one video with both views"):
+        run_calibration(str(video), str(tmp_path), BOARD, load_config(None, QUICK), options)
+    with pytest.raises(SourceError, match="two videos, or one video with both views"):
+        run_calibration(str(tmp_path), None, BOARD, load_config(None, QUICK), options)
 
 
 @pytest.mark.real

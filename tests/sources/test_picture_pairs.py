@@ -62,17 +62,29 @@ def test_a_single_pair_needs_no_names_in_common(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("left", "right", "message"),
     [
-        (["l1.png", "l2.png", "l3.png"], ["r1.png", "r2.png"], r"no partner \(got l3\.png\)"),
-        (["l1.png", "l2.png"], ["r2.png", "r3.png"], r"no partner \(got l1\.png, r3\.png\)"),
+        (
+            ["l1.png", "l2.png", "l3.png"],
+            ["r3.png", "r4.png", "r5.png"],
+            r"most have no partner \(got 1 pairs of 3 left, 3 right; l1\.png, l2\.png, r4\.png …",
+        ),
         (["lx.png", "ly.png"], ["r.png"], r"do not pair up \(got 2 left, 1 right"),
     ],
 )
-def test_pictures_without_a_partner_are_named(
+def test_pictures_of_which_most_have_no_partner_are_refused(
     tmp_path: Path, left: list[str], right: list[str], message: str
 ) -> None:
     touch(tmp_path, *left, *right)
     with pytest.raises(SourceError, match=message):
         pair_pictures(str(tmp_path / "l*"), str(tmp_path / "r*"))
+
+
+def test_pictures_without_a_partner_are_left_out_and_named(tmp_path: Path) -> None:
+    touch(tmp_path, *(f"left{n}.png" for n in (1, 2, 3, 5)), "left_notes.png")
+    touch(tmp_path, *(f"right{n}.png" for n in (1, 2, 3, 4)), "right_7_again.png")
+    found = pair_pictures(str(tmp_path / "left*"), str(tmp_path / "right*"))
+    assert [left.name for left, _ in found.pairs] == ["left1.png", "left2.png", "left3.png"]
+    names = {path.name for path in found.lonely}
+    assert names == {"left5.png", "left_notes.png", "right4.png", "right_7_again.png"}
 
 
 def test_a_pattern_that_takes_both_sides_is_refused(tmp_path: Path) -> None:
