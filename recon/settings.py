@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic.fields import FieldInfo
 from typing_extensions import Self
 
 from recon.errors import SettingsError
@@ -20,6 +22,15 @@ class Settings(BaseModel):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, values: Any) -> Any:
+        """Read the word none as YAML's null; give parts of a group what its default has."""
+        if not isinstance(values, Mapping):
+            return values
+        fields = cls.model_fields
+        return {k: _complete(fields[k], v) if k in fields else v for k, v in values.items()}
 
     @classmethod
     def parse(cls, values: Mapping[str, Any], *, where: str | None = None) -> Self:
@@ -36,6 +47,37 @@ class Settings(BaseModel):
             return cls.model_validate(values)
         except ValidationError as error:
             raise settings_error(error, where=where, names=[*setting_names(cls)]) from error
+
+
+def merge(base: Mapping[str, Any], update: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested mappings merged; other values of ``update`` replace those of ``base``."""
+    merged = dict(base)
+    for key, value in update.items():
+        below = merged.get(key)
+        if isinstance(value, Mapping):
+            merged[key] = merge(below if isinstance(below, Mapping) else {}, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _complete(field: FieldInfo, value: Any) -> Any:
+    if value == "none" and can_be_none(field):
+        return None
+    if isinstance(value, Mapping) and isinstance(field.default, Settings):
+        # A group may stand with other defaults than its class: keep those that are not given.
+        return merge(field.default.model_dump(), value)
+    return value
+
+
+def can_be_none(field: FieldInfo) -> bool:
+    """Whether None is a value of a field; its text is then ``none``, or YAML's ``null``."""
+    return type(None) in alternatives(field.annotation)
+
+
+def alternatives(annotation: Any) -> tuple[Any, ...]:
+    """The types that a union allows; of any other type, itself."""
+    return get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
 
 
 def setting_names(settings: type[BaseModel]) -> Iterator[str]:
@@ -59,16 +101,18 @@ def settings_error(
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"]) or "settings"
     if first["type"] == "extra_forbidden":
-        return SettingsError(f"unknown setting {key!r}", where=where, hint=_advice(key, names))
+        return SettingsError(
+            f"unknown setting {key!r}", where=where, hint=suggest_names(key, names)
+        )
     # Our own message, without the prefix that pydantic adds.
     said = first.get("ctx", {}).get("error", first["msg"])
     return SettingsError(f"setting {key!r}: {said}", where=where, got=repr(first.get("input")))
 
 
-def _advice(unknown: str, names: Sequence[str]) -> str:
+def suggest_names(unknown: str, names: Sequence[str]) -> str:
     """Suggest settings of that name elsewhere, or with a similar name."""
     last = unknown.rpartition(".")[2]
     meant = [name for name in names if name.rpartition(".")[2] == last]
     meant = meant or difflib.get_close_matches(unknown, names, n=3, cutoff=0.8)
-    listed = "`config.yaml` of any run lists them all"
+    listed = "`recon settings` lists them all"
     return f"did you mean {' or '.join(meant[:4])}? {listed}" if meant else listed

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 from pydantic import Field, ValidationError, field_validator
 
@@ -27,6 +29,26 @@ def test_settings_come_from_plain_values_and_give_them_back() -> None:
     settings = Outer.parse({"inner": {"window_px": 5}})
     assert settings == Outer(inner=Inner(window_px=5))
     assert Outer.parse(settings.model_dump()) == settings
+
+
+def test_the_word_none_leaves_open_what_can_be_left_open() -> None:
+    class Open(Settings):
+        limit_m: float | None = Field(default=1.0, description="Limit.")
+        kind: Literal["none", "all"] = Field(default="all", description="Kind.")
+
+    assert Open.parse({"limit_m": "none", "kind": "none"}) == Open(limit_m=None, kind="none")
+    with pytest.raises(SettingsError, match="inner"):
+        Outer.parse({"inner": "none"})
+
+
+def test_a_part_of_a_group_keeps_the_other_defaults_of_that_group() -> None:
+    class Filtered(Settings):
+        outer: Outer = Outer(inner=Inner(window_px=5), name="b")
+
+    assert Filtered.parse({"outer": {"name": "c"}}).outer == Outer(
+        inner=Inner(window_px=5), name="c"
+    )
+    assert Filtered.parse({"outer": {"inner": {}}}).outer.inner.window_px == 5
 
 
 def test_settings_cannot_be_changed() -> None:

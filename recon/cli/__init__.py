@@ -23,6 +23,7 @@ from recon.cli.occupancy import occupancy
 from recon.cli.pair import disparity, pair
 from recon.cli.paper import paper
 from recon.cli.rectify import rectify
+from recon.cli.settings import settings
 
 app = typer.Typer(
     name="recon",
@@ -38,6 +39,7 @@ _EVALUATE = "Evaluation"
 
 app.command(rich_help_panel=_START)(demo)
 app.command(rich_help_panel=_START)(doctor)
+app.command(rich_help_panel=_START)(settings)
 app.command(rich_help_panel=_RECONSTRUCT)(pair)
 app.command(rich_help_panel=_RECONSTRUCT)(disparity)
 app.command("map", rich_help_panel=_RECONSTRUCT)(map_)

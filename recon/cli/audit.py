@@ -18,6 +18,7 @@ from recon.cli.options import (
     Set,
     SourceKind,
     Tolerance,
+    Verbose,
 )
 from recon.cli.session import print_figures, print_json, session
 
@@ -37,6 +38,7 @@ def audit(
     set_: Set = None,
     json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Check a recording before a long run: good, usable or not usable, and why.
 
@@ -47,7 +49,7 @@ def audit(
       recon audit drive.bag --calib camchain.yaml
       recon audit rides/today --mend mended.yaml
     """
-    with session():
+    with session(quiet=quiet):
         from recon.pipeline.audit_run import mend_calibration, run_audit
         from recon.pipeline.config import load_config, source_overrides
         from recon.reports.audit_table import audit_lines
@@ -57,7 +59,7 @@ def audit(
         asked = source_overrides(calib, left, right, tolerance)
         settings = load_config(config, [*(set_ or ()), *asked])
         drive = open_source(source, kind, settings.source)
-        announce(drive, quiet=quiet)
+        announce(drive, quiet=quiet, verbose=verbose)
         found = run_audit(drive, settings)
         summary = found.summary
         if mend is not None:

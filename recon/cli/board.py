@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Json
+from recon.cli.options import Json, Quiet
 from recon.cli.session import print_figures, print_json, session
 
 
@@ -38,6 +38,7 @@ def board(
         typer.Option(min=30, max=2400, help="Approximate resolution of a PNG, in pixels per inch."),
     ] = 300.0,
     json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Draw a calibration board to scale, for printing.
 
@@ -50,7 +51,7 @@ def board(
     wanted = pattern or same
     if wanted is None or (pattern and same):
         raise typer.BadParameter("name one board, such as chess:9x6:25mm")
-    with session():
+    with session(quiet=quiet):
         from recon.reports.board_sheet import write_board
         from recon.structures.board import parse_board
 

@@ -96,8 +96,7 @@ def calibrate(
       recon calibrate left/ right/ --board charuco:8x6:30mm:22mm:5x5_100
       recon calibrate both.mp4 --board chess:9x6:25mm
     """
-    del quiet  # there is no progress to hide; every command takes the option
-    with session():
+    with session(quiet=quiet):
         from recon.pipeline.calibrate_run import CalibrateOptions, run_calibration
         from recon.pipeline.calibrate_summary import tell_depths
         from recon.pipeline.config import load_config

@@ -44,8 +44,7 @@ def capture(
       recon capture 0 2 --out rides/today --calib stereo.yaml --size 1280x720
       recon capture /dev/video4 --out rides/today --set capture.suffix=jpg
     """
-    del quiet  # there is no progress to hide; every command takes the option
-    with session():
+    with session(quiet=quiet):
         from recon.cli.interrupt import until_interrupted
         from recon.pipeline.capture_run import run_capture
         from recon.pipeline.config import capture_overrides, load_config

@@ -34,7 +34,7 @@ def demo(
       recon demo
       recon demo --frames 60 --seed 3 --out outputs/street
     """
-    with session():
+    with session(quiet=quiet):
         from recon.pipeline.config import load_config
         from recon.pipeline.demo_source import demo_source
         from recon.pipeline.map_run import MapOptions, run_map
@@ -49,7 +49,7 @@ def demo(
             out=out,
             threads=threads,
             mesh=mesh,
-            observers=(choose_viewer(quiet=quiet),),
+            observers=(choose_viewer(quiet=quiet, verbose=verbose),),
             present=present_map,
         )
         run = run_map(demo_source(settings), settings, options)

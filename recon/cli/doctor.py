@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import typer
 
-from recon.cli.options import Json
+from recon.cli.options import Json, Quiet
 from recon.cli.session import print_json, session
 
 
-def doctor(json: Json = False) -> None:
+def doctor(json: Json = False, quiet: Quiet = False) -> None:
     """Check the installation: Python, packages, system libraries, memory, folders.
 
     Exits with 1 if something is missing that runs need.
@@ -17,7 +17,7 @@ def doctor(json: Json = False) -> None:
       recon doctor
       recon doctor --json
     """
-    with session():
+    with session(quiet=quiet):
         from dataclasses import asdict
 
         from recon.pipeline.doctor import Check, examine

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Json
+from recon.cli.options import Json, Quiet
 from recon.cli.session import print_figures, print_json, session
 
 
@@ -30,6 +30,7 @@ def disparity(
         Path | None, typer.Option(help="Confidence of the map (PFM), to be evaluated too.")
     ] = None,
     json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compare a disparity map with ground truth: Middlebury's measures and KITTI's D1.
 
@@ -40,7 +41,7 @@ def disparity(
       recon evaluate disparity disparity.pfm disp0GT.pfm
       recon evaluate disparity disparity.pfm disp0GT.pfm --mask mask0nocc.png
     """
-    with session():
+    with session(quiet=quiet):
         from recon.pipeline.evaluate_run import compare_disparities
 
         figures = compare_disparities(estimate, truth, mask, scale=scale, confidence=confidence)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Json, parse_numbers
+from recon.cli.options import Json, Quiet, parse_numbers
 from recon.cli.session import print_evaluation, print_json, session
 
 
@@ -52,6 +52,7 @@ def map_(
         Path | None, typer.Option("--out", "-o", help="Folder for clouds coloured by error.")
     ] = None,
     json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compare a map with a reference cloud: precision, recall and F-score.
 
@@ -62,7 +63,7 @@ def map_(
       recon evaluate map outputs/map/latest lidar_map.ply --threshold 0.1,0.2,0.5
       recon evaluate map outputs/map/latest lidar_map.ply --align-to poses.txt
     """
-    with session():
+    with session(quiet=quiet):
         from recon.pipeline.evaluate_map import MapFiles, run_evaluate_map
         from recon.reports.map_errors import present_map_errors
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Out, Quiet, Set, Threads
+from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, session
 
 _NONE = "none"
@@ -70,6 +70,7 @@ def middlebury(
         bool, typer.Option("--latex", help="Print the tables in LaTeX, the best value in bold.")
     ] = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
     """Score matchers on Middlebury scenes with the measures of the benchmark.
@@ -84,7 +85,7 @@ def middlebury(
     """
     if json and latex:
         raise typer.BadParameter("--json and --latex exclude each other")
-    with session():
+    with session(quiet=quiet):
         from recon.pipeline.config import load_config
         from recon.pipeline.middlebury_run import MiddleburyOptions, run_middlebury
         from recon.reports.middlebury_pictures import draw_result, present_middlebury
@@ -99,7 +100,7 @@ def middlebury(
             threads=threads,
             parallel=parallel,
             auto_range=range_ is Range.auto,
-            observer=choose_scene_viewer(quiet=quiet),
+            observer=choose_scene_viewer(quiet=quiet, verbose=verbose),
             draw=draw_result,
             present=present_middlebury,
         )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Json
+from recon.cli.options import Json, Quiet
 from recon.cli.session import print_figures, print_json, session
 
 
@@ -20,6 +20,7 @@ def occupancy(
         Path | None, typer.Option(help="PNG to draw: the grid with its errors in colour.")
     ] = None,
     json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compare voxels and grid of a demo run with the exact truth.
 
@@ -29,7 +30,7 @@ def occupancy(
     Examples:
       recon evaluate occupancy outputs/demo/latest --picture compared.png
     """
-    with session():
+    with session(quiet=quiet):
         from recon.formats.image import write_image
         from recon.pipeline.evaluate_occupancy import compare_occupancy
         from recon.pipeline.summary import plain

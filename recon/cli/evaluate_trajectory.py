@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Json, parse_numbers
+from recon.cli.options import Json, Quiet, parse_numbers
 from recon.cli.session import print_evaluation, print_json, session
 
 
@@ -58,6 +58,7 @@ def trajectory(
         Path | None, typer.Option("--out", "-o", help="Folder for a report and its plots.")
     ] = None,
     json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Compare a trajectory with ground truth: KITTI's relative errors, ATE and RPE.
 
@@ -68,7 +69,7 @@ def trajectory(
       recon evaluate trajectory trajectory_kitti.txt poses.txt --out outputs/path
       recon evaluate trajectory trajectory_tum.txt groundtruth.txt --align sim3
     """
-    with session():
+    with session(quiet=quiet):
         from recon.evaluation import TrajectoryRules
         from recon.pipeline.evaluate_trajectory import TrajectoryFiles, run_evaluate_trajectory
         from recon.reports.trajectory_report import present_trajectory

@@ -95,7 +95,7 @@ def map_(
         raise typer.BadParameter("give SOURCE, or --resume FOLDER")
     if poses is not None and prior is not None:
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
-    with session():
+    with session(quiet=quiet):
         from recon.formats.trajectory import read_trajectory
         from recon.pipeline.audit_run import quick_warnings
         from recon.pipeline.config import matching_overrides, source_overrides
@@ -111,9 +111,9 @@ def map_(
         asked = MapRequest(source, kind, poses, prior, mesh, out, resume, memory_limit)
         request, settings = plan_map(asked, config, overrides)
         drive = open_requested(request, settings)
-        announce(drive, quiet=quiet)
+        announce(drive, quiet=quiet, verbose=verbose)
         found = quick_warnings(drive, settings)
-        warn(found, quiet=quiet)
+        warn(found, quiet=quiet, verbose=verbose)
         guide = None if request.prior is None else read_prior(drive, request.prior)
         options = MapOptions(
             out=request.out,
@@ -124,7 +124,7 @@ def map_(
             mesh=request.mesh,
             resume=resume is not None,
             arguments=request.arguments(),
-            observers=(choose_viewer(quiet=quiet),),
+            observers=(choose_viewer(quiet=quiet, verbose=verbose),),
             present=present_map,
             warnings=found,
         )

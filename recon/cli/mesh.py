@@ -43,8 +43,7 @@ def mesh(
       recon mesh cloud.ply --format obj --format glb
       recon mesh outputs/map/latest --set mesh.target_faces=500000
     """
-    del quiet  # there is no progress to hide; every command takes the option
-    with session():
+    with session(quiet=quiet):
         from recon.pipeline.config import load_config
         from recon.pipeline.mesh_run import MeshOptions, run_mesh
 

@@ -44,8 +44,7 @@ def occupancy(
       recon occupancy outputs/map/latest --resolution 0.1
       recon occupancy outputs/map/latest --min-height 0.5 --max-height 3.2
     """
-    del quiet  # there is no progress to hide; every command takes the option
-    with session():
+    with session(quiet=quiet):
         from recon.pipeline.occupancy_run import OccupancyRequest, run_occupancy
 
         given = {

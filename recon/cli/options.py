@@ -39,9 +39,17 @@ Matcher = Annotated[
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the summary as JSON and nothing else.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Do not show progress.")]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Show no progress: only results, warnings and errors.")
+]
 Verbose = Annotated[
-    bool, typer.Option("--verbose", "-v", help="Also print the time spent in each stage.")
+    bool,
+    typer.Option(
+        "--verbose",
+        "-v",
+        help="Also print the time spent in each stage; where standard error is no terminal, "
+        "print progress there as JSON lines.",
+    ),
 ]
 Mesh = Annotated[bool, typer.Option(help="Reconstruct the surface mesh.")]
 Threads = Annotated[

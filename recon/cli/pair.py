@@ -54,7 +54,7 @@ def pair(
       recon pair im0.png im1.png --calib calib.txt --out outputs/motorcycle
       recon pair im0.png im1.png --calib calib.txt --truth disp0GT.pfm
     """
-    with session():
+    with session(quiet=quiet):
         from recon.pipeline.config import (
             PAIR_DEFAULTS,
             check_ndisp,
@@ -71,9 +71,8 @@ def pair(
         check_ndisp(settings, ndisp)
         unit = settings.source.metres_per_unit if unit_m is None else unit_m
         given = read_pair_input(left, right, calib, truth, metres_per_unit=unit)
-        options = PairOptions(
-            "pair", out, threads, present_pair, choose_viewer(quiet=quiet).on_stage
-        )
+        viewer = choose_viewer(quiet=quiet, verbose=verbose)
+        options = PairOptions("pair", out, threads, present_pair, viewer.on_stage)
         run = run_pair(given, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)
 
@@ -103,7 +102,7 @@ def disparity(
       recon disparity left.png right.png --ndisp 128
       recon disparity raw_left.png raw_right.png --calib rig.yaml --matcher sgm
     """
-    with session():
+    with session(quiet=quiet):
         from recon.pipeline.config import (
             PAIR_DEFAULTS,
             check_ndisp,
@@ -120,8 +119,7 @@ def disparity(
         check_ndisp(settings, ndisp)
         unit = settings.source.metres_per_unit
         given = read_pair_input(left, right, calib, metres_per_unit=unit)
-        options = PairOptions(
-            "disparity", out, threads, present_disparity, choose_viewer(quiet=quiet).on_stage
-        )
+        viewer = choose_viewer(quiet=quiet, verbose=verbose)
+        options = PairOptions("disparity", out, threads, present_disparity, viewer.on_stage)
         run = run_pair(given, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Out, Set, Threads, Verbose
+from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
 
 
@@ -27,6 +27,7 @@ def paper(
     config: Config = None,
     set_: Set = None,
     json: Json = False,
+    quiet: Quiet = False,
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
@@ -39,7 +40,7 @@ def paper(
       recon paper MiddEval3/trainingQ
       recon paper MiddEval3/trainingQ --as-printed --out outputs/paper-as-printed
     """
-    with session():
+    with session(quiet=quiet):
         from recon.pipeline.config import PAIR_DEFAULTS, load_config
         from recon.pipeline.paper_run import PaperOptions, headline, run_paper
         from recon.pipeline.paper_scenes import default_scenes_folder

@@ -43,8 +43,7 @@ def rectify(
       recon rectify left/ right/ --calib rig.yaml --out rectified
       recon rectify left.png right.png
     """
-    del quiet  # there is no progress to hide; every command takes the option
-    with session():
+    with session(quiet=quiet):
         from recon.pipeline.config import load_config
         from recon.pipeline.rectify_run import RectifyOptions, run_rectify
         from recon.reports import present_rectify

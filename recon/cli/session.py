@@ -20,14 +20,14 @@ INTERRUPTED = 130
 
 
 @contextmanager
-def session() -> Iterator[None]:
+def session(*, quiet: bool = False) -> Iterator[None]:
     """Run a command's body; a `ReconError` becomes one line on standard error and exit code 1.
 
     Meanwhile file descriptor 1 is redirected to standard error, so that the output of native
-    libraries cannot get into that of ``--json``.
+    libraries cannot get into that of ``--json``; with ``quiet`` that output is dropped.
     """
     try:
-        with _standard_output_kept_clean():
+        with _standard_output_kept_clean(quiet):
             yield
     except ReconError as error:
         _fail(str(error))
@@ -99,10 +99,12 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
 
 
 @contextmanager
-def _standard_output_kept_clean() -> Iterator[None]:
+def _standard_output_kept_clean(quiet: bool) -> Iterator[None]:
     sys.stdout.flush()
     saved = os.dup(1)
-    os.dup2(2, 1)
+    instead = os.open(os.devnull, os.O_WRONLY) if quiet else os.dup(2)
+    os.dup2(instead, 1)
+    os.close(instead)
     try:
         yield
     finally:

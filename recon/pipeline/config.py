@@ -30,7 +30,7 @@ from recon.pipeline.checkpoint import CheckpointSettings
 from recon.pipeline.memory import MemorySettings
 from recon.pipeline.paper_settings import PaperSettings
 from recon.rectification import InspectionSettings, RectificationSettings, UncalibratedSettings
-from recon.settings import Settings
+from recon.settings import Settings, merge
 from recon.sources.capture import CaptureSettings
 from recon.sources.settings import SourceSettings
 from recon.synthetic import StreetSettings
@@ -112,18 +112,15 @@ def load_config(
     Raises:
         SettingsError: The file cannot be read, a key is unknown, or a value is out of range.
     """
-    values: dict[str, Any] = {}
-    _merge(values, defaults or {})
-    if path is not None:
-        _merge(values, _read_yaml(path))
-    told = dict(values)
+    given = merge(defaults or {}, {} if path is None else _read_yaml(path))
+    values = given
     for text in overrides:
-        _merge(values, _parse_override(text))
+        values = merge(values, _parse_override(text))
     try:
         return ReconConfig.parse(values)
     except SettingsError:
         if path is not None:
-            ReconConfig.parse(told, where=str(path))  # blames the file if it is invalid by itself
+            ReconConfig.parse(given, where=str(path))  # blames the file if it is invalid by itself
         raise
 
 
@@ -197,17 +194,6 @@ def capture_overrides(
 def dump_config(config: ReconConfig) -> str:
     """The configuration as YAML; `load_config` restores the same configuration."""
     return str(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
-
-
-def _merge(base: dict[str, Any], update: Mapping[str, Any]) -> None:
-    """Merge nested mappings into ``base``; other values replace those in it."""
-    for key, value in update.items():
-        if isinstance(value, Mapping):
-            below = base.get(key)
-            base[key] = dict(below) if isinstance(below, Mapping) else {}
-            _merge(base[key], value)
-        else:
-            base[key] = value
 
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:

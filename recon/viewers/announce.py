@@ -10,12 +10,19 @@ from typing import TextIO
 from recon.sources import StereoSource
 
 
-def announce(source: StereoSource, *, quiet: bool = False, stream: TextIO | None = None) -> None:
-    """Write one line: text on a terminal, else a JSON object.
+def announce(
+    source: StereoSource,
+    *,
+    quiet: bool = False,
+    verbose: bool = False,
+    stream: TextIO | None = None,
+) -> None:
+    """Write one line: text on a terminal, else a JSON object if verbose.
 
     Args:
         source: The source.
         quiet: Whether to write nothing.
+        verbose: Whether to write JSON where the stream is no terminal.
         stream: Output stream; None = standard error, as standard output is for results.
     """
     event = {
@@ -24,18 +31,25 @@ def announce(source: StereoSource, *, quiet: bool = False, stream: TextIO | None
         "description": source.description,
         "frames": len(source),
     }
-    _tell(f"{source.name}: {source.description}, {len(source)} pairs", event, quiet, stream)
+    if not quiet:
+        _write(f"{source.name}: {source.description}, {len(source)} pairs", event, verbose, stream)
 
 
-def warn(lines: Iterable[str], *, quiet: bool = False, stream: TextIO | None = None) -> None:
+def warn(
+    lines: Iterable[str],
+    *,
+    quiet: bool = False,
+    verbose: bool = False,
+    stream: TextIO | None = None,
+) -> None:
     """Write warnings before the run starts, each in the form of `announce`."""
     for line in lines:
-        _tell(f"warning: {line}", {"event": "warning", "text": line}, quiet, stream)
+        if not quiet:
+            _write(f"warning: {line}", {"event": "warning", "text": line}, verbose, stream)
 
 
-def _tell(text: str, event: dict[str, object], quiet: bool, stream: TextIO | None) -> None:
-    if quiet:
-        return
+def _write(text: str, event: dict[str, object], verbose: bool, stream: TextIO | None) -> None:
     out = sys.stderr if stream is None else stream
-    out.write((text if out.isatty() else json.dumps(event, ensure_ascii=False)) + "\n")
-    out.flush()
+    if out.isatty() or verbose:
+        out.write((text if out.isatty() else json.dumps(event, ensure_ascii=False)) + "\n")
+        out.flush()

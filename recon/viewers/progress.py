@@ -16,15 +16,18 @@ from recon.pipeline.observer import FrameResult, Observer
 _RATE_WEIGHT: Final = 0.2
 
 
-def choose_viewer(*, quiet: bool = False, stream: TextIO | None = None) -> Observer:
-    """Choose a progress bar on a terminal, else JSON lines.
+def choose_viewer(
+    *, quiet: bool = False, verbose: bool = False, stream: TextIO | None = None
+) -> Observer:
+    """Choose a progress bar on a terminal, elsewhere JSON lines if verbose, else nothing.
 
     Args:
         quiet: Whether to show no progress.
+        verbose: Whether to write JSON lines where the stream is no terminal.
         stream: Output stream; None = standard error, as standard output is for results.
     """
     out = sys.stderr if stream is None else stream
-    if quiet:
+    if quiet or not (out.isatty() or verbose):
         return Quiet()
     return RichProgress(Console(file=out)) if out.isatty() else JsonLines(out)
 

@@ -13,15 +13,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from recon.pipeline.middlebury_run import SceneObserver
 
 
-def choose_scene_viewer(*, quiet: bool = False, stream: TextIO | None = None) -> SceneObserver:
-    """Choose a progress bar on a terminal, else JSON lines.
+def choose_scene_viewer(
+    *, quiet: bool = False, verbose: bool = False, stream: TextIO | None = None
+) -> SceneObserver:
+    """Choose a progress bar on a terminal, elsewhere JSON lines if verbose, else nothing.
 
     Args:
         quiet: Whether to show no progress.
+        verbose: Whether to write JSON lines where the stream is no terminal.
         stream: Output stream; None = standard error, as standard output is for results.
     """
     out = sys.stderr if stream is None else stream
-    if quiet:
+    if quiet or not (out.isatty() or verbose):
         return QuietScenes()
     return SceneBar(Console(file=out)) if out.isatty() else SceneLines(out)
 

@@ -78,6 +78,12 @@ def test_its_text_fits_a_narrow_terminal(words: tuple[str, ...]) -> None:
     assert max(map(len, lines)) <= 80 - margins
 
 
+@every_command
+@pytest.mark.parametrize("option", ["--json", "--quiet"])
+def test_it_takes_what_every_command_takes(words: tuple[str, ...], option: str) -> None:
+    assert option in {name for parameter in _command(words).params for name in parameter.opts}
+
+
 def test_the_commands_are_grouped_by_what_they_are_for() -> None:
     shown = help_of()
     for title in ("Getting started", "Reconstruction", "Cameras", "Evaluation"):

@@ -35,11 +35,18 @@ def test_a_terminal_gets_text() -> None:
     assert rest == ["warning: too dark", "warning: too late"]
 
 
-def test_anything_else_gets_one_json_object_a_line() -> None:
+def test_anything_else_gets_one_json_object_a_line_if_verbose() -> None:
     stream = io.StringIO()
-    announce(SOURCE, stream=stream)
-    warn(["zu dunkel für alles"], stream=stream)
+    announce(SOURCE, verbose=True, stream=stream)
+    warn(["zu dunkel für alles"], verbose=True, stream=stream)
     source, warning = (json.loads(line) for line in stream.getvalue().splitlines())
     assert (source["event"], source["frames"]) == ("source", 3)
     assert source["description"] == SOURCE.description
     assert warning == {"event": "warning", "text": "zu dunkel für alles"}
+
+
+def test_anything_else_gets_nothing_unless_verbose() -> None:
+    stream = io.StringIO()
+    announce(SOURCE, stream=stream)
+    warn(["too dark"], stream=stream)
+    assert stream.getvalue() == ""

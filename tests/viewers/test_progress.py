@@ -84,13 +84,14 @@ def test_quiet_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr() == ("", "")
 
 
-def test_a_terminal_gets_a_bar_and_a_file_gets_json_lines() -> None:
+def test_a_terminal_gets_a_bar_and_a_file_json_lines_if_verbose() -> None:
     assert isinstance(choose_viewer(stream=Terminal()), RichProgress)
-    assert isinstance(choose_viewer(stream=io.StringIO()), JsonLines)
+    assert isinstance(choose_viewer(stream=io.StringIO(), verbose=True), JsonLines)
+    assert isinstance(choose_viewer(stream=io.StringIO()), Quiet)
 
 
 def test_progress_goes_to_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
-    run(choose_viewer())
+    run(choose_viewer(verbose=True))
     out, err = capsys.readouterr()
     assert out == ""
     assert err

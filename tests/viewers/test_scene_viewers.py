@@ -45,7 +45,8 @@ def test_the_bar_counts_scenes_and_names_one_without_truth() -> None:
 
 def test_the_stream_decides_and_quiet_shows_nothing() -> None:
     assert isinstance(choose_scene_viewer(stream=Terminal()), SceneBar)
-    assert isinstance(choose_scene_viewer(stream=io.StringIO()), SceneLines)
+    assert isinstance(choose_scene_viewer(stream=io.StringIO(), verbose=True), SceneLines)
+    assert isinstance(choose_scene_viewer(stream=io.StringIO()), QuietScenes)
     stream = Terminal()
     viewer = choose_scene_viewer(quiet=True, stream=stream)
     run(viewer)

@@ -1,0 +1,48 @@
+"""`recon settings`: every setting with its default, unit, values and purpose."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import Json, Quiet
+from recon.cli.session import print_json, session
+
+
+def settings(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help="A setting, a group such as matching.sgm, or a part of a name.",
+            show_default="all",
+        ),
+    ] = None,
+    markdown: Annotated[
+        bool, typer.Option("--markdown", help="Print the page docs/settings.md.")
+    ] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """List settings: name, default, unit, values, and what each does.
+
+    Change one with --set name=value, several with --config FILE.
+
+    Examples:
+      recon settings matching.sgm
+      recon settings voxel
+    """
+    with session(quiet=quiet):
+        from dataclasses import asdict
+
+        from recon.pipeline.settings_list import list_settings, settings_page
+
+        groups = list_settings(name)
+    if json:
+        print_json({"groups": [asdict(group) for group in groups]})
+    elif markdown:
+        typer.echo(settings_page(groups), nl=False)
+    else:
+        from recon.viewers.settings_table import print_settings
+
+        print_settings(groups)
