@@ -32,6 +32,13 @@ class Settings(BaseModel):
         fields = cls.model_fields
         return {k: _complete(fields[k], v) if k in fields else v for k, v in values.items()}
 
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """Show only what differs from its default."""
+        for name, value in super().__repr_args__():
+            field = type(self).model_fields.get(name or "")
+            if field is None or value != field.get_default(call_default_factory=True):
+                yield name, value
+
     @classmethod
     def parse(cls, values: Mapping[str, Any], *, where: str | None = None) -> Self:
         """Build settings from plain values.

@@ -46,6 +46,10 @@ class Audit:
     figures: dict[str, Any]
     alignment: RowAlignment | None
 
+    def __repr__(self) -> str:
+        found = ", ".join(finding.code for finding in self.findings) or "no findings"
+        return f"Audit({self.verdict!r}, {found})"
+
     @property
     def summary(self) -> dict[str, Any]:
         """The content of ``--json``."""

@@ -76,6 +76,10 @@ class MapRun:
     summary: dict[str, Any]
     warnings: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        made = f"{self.mapped}, {self.grid}, {self.mesh}"
+        return f"MapRun({self.name!r}, {made}, {len(self.warnings)} warnings)"
+
 
 @dataclass(frozen=True)
 class MapOptions:

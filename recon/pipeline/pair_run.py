@@ -90,6 +90,11 @@ class PairRun:
     summary: dict[str, Any]
     warnings: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        parts = (self.disparity, self.cloud, self.mesh)
+        made = ", ".join(repr(part) for part in parts if part is not None)
+        return f"PairRun({self.name!r}, {made}, {len(self.warnings)} warnings)"
+
 
 @dataclass(frozen=True)
 class PairOptions:

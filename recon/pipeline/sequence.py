@@ -90,6 +90,10 @@ class MappedSequence:
     loops: DriveLoops | None = None
     prior: UsedPrior | None = None
 
+    def __repr__(self) -> str:
+        trusted = sum(record.ok for record in self.health)
+        return f"MappedSequence({self.trajectory}, {trusted} of them trusted, {self.seconds:.4g} s)"
+
     @cached_property
     def map(self) -> DriveMap:
         """Fused cloud and occupancy, tile by tile."""

@@ -99,6 +99,14 @@ def map_text(values: Float32, unit: str = "px") -> str:
     return f"{finite.min():.4g} to {finite.max():.4g} {unit}, {share:.1f} %"
 
 
+def extent_text(xyz: NDArray[Any]) -> str:
+    """Range of points (N, 3) along each axis in metres, for a ``repr``."""
+    if not len(xyz):
+        return "empty"
+    ends = zip("xyz", xyz.min(axis=0), xyz.max(axis=0), strict=True)
+    return ", ".join(f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in ends) + " m"
+
+
 def _shape_text(shape: tuple[int | None, ...]) -> str:
     names = iter("NMKL")
     return "(" + ", ".join(next(names) if n is None else str(n) for n in shape) + ")"

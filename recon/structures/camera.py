@@ -51,6 +51,14 @@ class CameraIntrinsics:
                 "a fisheye camera has four distortion coefficients", got=self.distortion.size
             )
 
+    def __repr__(self) -> str:
+        (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
+        lens = ", ".join(f"{k:.4g}" for k in self.distortion)
+        return (
+            f"CameraIntrinsics({self.width_px}x{self.height_px}, fx {fx:.6g}, fy {fy:.6g}, "
+            f"cx {cx:.6g}, cy {cy:.6g} px, {self.model} [{lens}])"
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class StereoCalibration:
@@ -77,6 +85,9 @@ class StereoCalibration:
             raise CalibrationError("rotation of the right camera is not orthonormal")
         if self.baseline_m <= 0:
             raise CalibrationError("baseline is zero", got="0 m", expected="> 0 m")
+
+    def __repr__(self) -> str:
+        return f"StereoCalibration(baseline {self.baseline_m:.6g} m, {self.left}, {self.right})"
 
     @property
     def baseline_m(self) -> float:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.structures.arrays import Float32, Int32, UInt8, freeze
+from recon.structures.arrays import Float32, Int32, UInt8, extent_text, freeze
 
 Frame = Literal["camera", "world", "map"]
 
@@ -47,6 +47,11 @@ class PointCloud:
         for name in ("sigma_m", "confidence", "weight"):
             freeze(self, name, np.float32, (n,))
         freeze(self, "count", np.int32, (n,))
+
+    def __repr__(self) -> str:
+        known = [f.name for f in fields(self)[1:-1] if getattr(self, f.name) is not None]
+        parts = (f"{len(self)} points", extent_text(self.xyz), f"{self.frame} axes", *known)
+        return f"PointCloud({', '.join(parts)})"
 
     def __len__(self) -> int:
         return len(self.xyz)

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.structures.arrays import Float32, Float64, Int32, freeze
+from recon.structures.arrays import Float32, Float64, Int32, freeze, size_text
 
 FREE: Final = 0
 OCCUPIED: Final = 100
@@ -32,6 +32,11 @@ class OccupancyVoxels:
     def __post_init__(self) -> None:
         freeze(self, "keys", np.int32, (None, 3))
         freeze(self, "log_odds", np.float32, (len(self.keys),))
+
+    def __repr__(self) -> str:
+        occupied = int(np.sum(self.log_odds > 0))
+        sizes = f"{len(self)} voxels of {self.resolution_m:g} m, {occupied} occupied"
+        return f"OccupancyVoxels({sizes})"
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -59,3 +64,9 @@ class OccupancyGrid:
 
     def __post_init__(self) -> None:
         freeze(self, "cells", np.int8, (None, None))
+
+    def __repr__(self) -> str:
+        named = (("occupied", OCCUPIED), ("free", FREE))
+        shares = [f"{100 * np.mean(self.cells == cell):.1f} % {name}" for name, cell in named]
+        size = f"{size_text(self.cells)} cells of {self.resolution_m:g} m"
+        return f"OccupancyGrid({size}, {', '.join(shares)}, origin {self.origin_m} m)"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import ShapeError
-from recon.structures.arrays import UInt8, freeze
+from recon.structures.arrays import UInt8, freeze, size_text
 from recon.structures.camera import RectifiedCamera
 
 
@@ -30,6 +30,11 @@ class StereoPair:
     index: int = 0
     name: str = ""
 
+    def __repr__(self) -> str:
+        kind = "colour" if self.left.ndim == 3 else "grey"
+        name = f"{self.name!r}, " if self.name else ""
+        return f"StereoPair({name}{size_text(self.left)} {kind}, frame {self.index})"
+
     def __post_init__(self) -> None:
         for side in ("left", "right"):
             image = getattr(self, side)
@@ -39,7 +44,7 @@ class StereoPair:
             raise ShapeError(
                 "left and right image differ in size",
                 where=self.name or None,
-                got=f"left {_size(self.left)}, right {_size(self.right)}",
+                got=f"left {size_text(self.left)}, right {size_text(self.right)}",
                 hint="both cameras must record the same size",
             )
 
@@ -73,13 +78,13 @@ class RectifiedPair:
         freeze(self, "left_rgb", np.uint8, (*size, 3))
         freeze(self, "valid", np.bool_, size)
 
+    def __repr__(self) -> str:
+        kind = "grey" if self.left_rgb is None else "colour"
+        return f"RectifiedPair({kind}, frame {self.index}, {self.camera})"
+
     @property
     def colours(self) -> UInt8:
         """uint8 (H, W, 3): the left view in colour, or its grey values in all three channels."""
         if self.left_rgb is not None:
             return self.left_rgb
         return np.repeat(self.left[:, :, None], 3, axis=2)
-
-
-def _size(image: UInt8) -> str:
-    return f"{image.shape[1]}x{image.shape[0]}"

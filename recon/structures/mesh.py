@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.structures.arrays import Float32, Int32, UInt8, freeze
+from recon.structures.arrays import Float32, Int32, UInt8, extent_text, freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,3 +30,7 @@ class TriangleMesh:
         freeze(self, "faces", np.int32, (None, 3))
         freeze(self, "normals", np.float32, (len(self.vertices), 3))
         freeze(self, "rgb", np.uint8, (len(self.vertices), 3))
+
+    def __repr__(self) -> str:
+        sizes = f"{len(self.faces)} faces, {len(self.vertices)} vertices"
+        return f"TriangleMesh({sizes}, {extent_text(self.vertices)})"

@@ -53,6 +53,9 @@ class RayCloud:
         freeze(self, "confidence", np.uint8, (len(self.places),))
         freeze(self, "count", np.uint8, (len(self.places),))
 
+    def __repr__(self) -> str:
+        return f"RayCloud({len(self)} rays)"
+
     def __len__(self) -> int:
         return len(self.places)
 

@@ -30,6 +30,10 @@ class Trajectory:
         if broken.any():
             raise ShapeError("pose is not finite", where=f"pose {int(np.argmax(broken))}")
 
+    def __repr__(self) -> str:
+        seconds = self.timestamps_s[-1] - self.timestamps_s[0] if len(self) else 0.0
+        return f"Trajectory({len(self)} poses, {self.path_length_m:.4g} m, {seconds:.4g} s)"
+
     def __len__(self) -> int:
         return len(self.T_world_camera)
 
