@@ -12,7 +12,7 @@ from recon.pipeline.audit_findings import Gaps
 from recon.pipeline.audit_geometry import Geometry
 from recon.pipeline.audit_sample import Sample
 from recon.pipeline.summary import plain
-from recon.sources import StereoSource
+from recon.sources import IncompleteSource, StereoSource
 from recon.structures import RectifiedCamera
 from recon.structures.arrays import Float64
 
@@ -33,6 +33,7 @@ def audit_figures(
         "source": source.name,
         "description": source.description,
         "frames": len(source),
+        "frames_left_out": source.left_out if isinstance(source, IncompleteSource) else 0,
         "frames_read": sample.frames,
         "repeated_frames": sample.repeats.both,
         "frozen_left_frames": sample.repeats.frozen[0],

@@ -132,6 +132,7 @@ def run_calibration(
         warnings = [finding.text for finding in findings]
         run.summary["verdict"] = verdict_of_calibration(findings)
         run.summary["findings"] = [asdict(finding) for finding in findings]
+        run.summary["frames_left_out"] = len(pictures.lonely)
         run.summary["warnings"] = warnings
         _write(run, options, directory)
         run.summary.update(cost(watch, time.perf_counter() - start))

@@ -27,7 +27,7 @@ from recon.pipeline.sequence import MappedSequence, map_sequence
 from recon.pipeline.stopwatch import Stopwatch
 from recon.pipeline.summary import cost, health_warnings, plain
 from recon.pipeline.workspace import RAYS, Workspace
-from recon.sources import StereoSource
+from recon.sources import IncompleteSource, StereoSource
 from recon.structures import (
     MapMetrics,
     OccupancyGrid,
@@ -175,7 +175,7 @@ def _finish(
 ) -> MapRun:
     """Make the products that need the whole drive; map files are written immediately."""
     config = mapped.config
-    warnings = [*options.warnings, *health_warnings(mapped.health)]
+    warnings = [*options.warnings, *_left_out(source), *health_warnings(mapped.health)]
     if mapped.prior is not None:
         warnings += mapped.prior.warnings()
     if mapped.loops is not None:
@@ -214,9 +214,19 @@ def _finish(
     odometry = "known poses" if given else config.odometry.method
     sizes = {"points": written.points, "voxels": written.voxels, "faces": faces}
     run.summary.update(odometry=odometry, **_summary(run), **sizes)
+    if isinstance(source, IncompleteSource):
+        run.summary["frames_left_out"] = source.left_out
     if mapped.prior is not None:
         run.summary["prior"] = {"from": options.prior_origin, **plain(mapped.prior)}
     return run
+
+
+def _left_out(source: StereoSource) -> list[str]:
+    """A warning if images of the source have no partner."""
+    count = source.left_out if isinstance(source, IncompleteSource) else 0
+    if not count:
+        return []
+    return [f"{count} {'image has' if count == 1 else 'images have'} no partner: left out"]
 
 
 def _mesh(

@@ -119,6 +119,7 @@ def run_rectify(left: str, right: str, config: ReconConfig, options: RectifyOpti
                 write_image(directory.path(f"right/{right_path.stem}.png"), warped[1])
         run = _measure(plan, first, config)
         run.summary["pairs"] = len(pictures.pairs)
+        run.summary["frames_left_out"] = len(pictures.lonely)
         run.summary["warnings"] = _warnings(run.summary, pictures)
         plan.write(directory)
         write_text(directory.path("config.yaml"), dump_config(config))

@@ -32,7 +32,7 @@ from recon.pipeline.mapper import Mapper
 from recon.pipeline.observer import FrameResult, Observer
 from recon.pipeline.submap_store import SubmapStore
 from recon.pipeline.workspace import Workspace
-from recon.sources import StampedSource, StereoSource
+from recon.sources import IncompleteSource, StampedSource, StereoSource
 from recon.structures import OccupancyVoxels, PointCloud, RectifiedCamera, Trajectory
 from recon.structures.arrays import Float64
 
@@ -318,11 +318,16 @@ def _odometry(
             axes = settings.prior.model_copy(update={"axes": used.axes})
             settings = settings.model_copy(update={"prior": axes})
         return make_odometry(settings.method, settings, prior)
-    if len(known_poses) < len(source):
+    count = len(known_poses)
+    lines = list(range(len(source))) if count >= len(source) else None
+    if isinstance(source, IncompleteSource):
+        lines = source.lines(count)
+    if lines is None:
         raise RegistrationError(
             "fewer known poses than frames",
-            got=f"{len(known_poses)} poses",
+            got=f"{count} poses",
             expected=f"{len(source)}",
             hint="the pose file must list every frame of the source",
         )
-    return KnownPoses(known_poses)
+    poses, times_s = known_poses.T_world_camera[lines], known_poses.timestamps_s[lines]
+    return KnownPoses(Trajectory(poses, times_s))

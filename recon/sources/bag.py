@@ -24,7 +24,7 @@ from recon.sources.bag_topics import (
     names_rectified,
 )
 from recon.sources.files import join_pair
-from recon.sources.pairing import StampPairs, check_increasing, pair_stamps
+from recon.sources.pairing import Roll, StampPairs, check_increasing, check_most, pair_stamps
 from recon.sources.rig import Rig, as_rectified, read_rig
 from recon.sources.settings import SourceSettings
 from recon.structures import SequenceTruth, StereoPair, check_size
@@ -45,6 +45,7 @@ class BagSource:
         bag: The recording.
         topics: Left and right image topic.
         pairs: Pairs of left and right messages.
+        roll: Which left messages are in pairs.
         left_s: float64 (M,), timestamps of all left messages.
         recorded_ns: int64 (M,) and (K,), recording times of the left and right messages.
         texts: The calibration file, if one was given.
@@ -57,6 +58,7 @@ class BagSource:
     bag: Bag
     topics: tuple[str, str]
     pairs: StampPairs
+    roll: Roll
     left_s: Float64
     recorded_ns: tuple[NDArray[np.int64], NDArray[np.int64]]
     texts: tuple[Path, ...]
@@ -75,6 +77,15 @@ class BagSource:
             for path in self.bag.paths
         )
         return [*self.texts, *(file for files in inside for file in files)]
+
+    @property
+    def left_out(self) -> int:
+        """Number of images without a partner."""
+        return sum(self.roll.alone)
+
+    def lines(self, count: int) -> list[int] | None:
+        """The line of each pair in a file with one line per frame; see `Roll.lines`."""
+        return self.roll.lines(count)
 
     @property
     def stamps_s(self) -> Float64:
@@ -142,14 +153,18 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
     pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(path))
     rig, texts, source = _read_rig(bag, topics, pairs, settings, path)
     also += list_others(bag, topics)
+    roll = Roll([""] * len(stamps[0]), pairs.left, pairs.alone)
+    check_most(len(pairs.left), min(map(len, stamps)), path)
     kind = {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(bag.paths[0].suffix, "ROS 2 bag")
     return BagSource(
         name=path.resolve().name,
-        description=f"{kind}, {topics[0]} and {topics[1]}, {pairs}{clock}, {source}{also}",
+        description=f"{kind}, {topics[0]} and {topics[1]}, paired by stamps{roll}{clock}, "
+        f"{source}{also}",
         calibration=rig,
         bag=bag,
         topics=topics,
         pairs=pairs,
+        roll=roll,
         left_s=stamps[0],
         recorded_ns=(times[topics[0]][:, 0], times[topics[1]][:, 0]),
         texts=texts,

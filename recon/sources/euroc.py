@@ -22,8 +22,8 @@ import numpy as np
 from recon.errors import SourceError
 from recon.formats.euroc import NS, read_euroc_camera, read_euroc_truth
 from recon.geometry.se3 import invert
-from recon.sources.pairing import check_increasing, pair_stamps
-from recon.sources.pictures import PictureFrame, PictureSource, picture_size
+from recon.sources.pairing import check_increasing
+from recon.sources.pictures import PictureSource, pair_listed, picture_size
 from recon.sources.rig import Rig, as_rectified, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_stamped_names
@@ -47,19 +47,16 @@ def open_euroc(folder: Path, settings: SourceSettings) -> PictureSource:
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
     views = [root / (settings.left or "cam0"), root / (settings.right or "cam1")]
     lists = [_read_list(view) for view in views]
-    stamps = [np.array([stamp for stamp, _ in entries]) for entries in lists]
-    pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(root))
-    frames = [
-        PictureFrame(lists[0][left][1], lists[1][right][1], lists[0][left][0])
-        for left, right in zip(pairs.left, pairs.right, strict=True)
-    ]
+    frames, roll = pair_listed(lists, settings.tolerance_s, root)
     rig, calibration_files = _read_rig(root, settings, views, picture_size(frames[0].left))
     truth, note = _read_truth(root, views[0], np.array([frame.timestamp_s for frame in frames]))
     return PictureSource(
         name=folder.resolve().name,
-        description=f"EuRoC drive, {views[0].name} and {views[1].name}, {pairs}{note}",
+        description=f"EuRoC drive, {views[0].name} and {views[1].name}, paired by stamps{roll}"
+        f"{note}",
         calibration=rig,
         pictures=frames,
+        roll=roll,
         truth=truth,
         texts=(*calibration_files, *(view / "data.csv" for view in views)),
     )
@@ -71,11 +68,7 @@ def _read_list(view: Path) -> list[tuple[float, Path]]:
     path = view / "data.csv"
     entries = read_stamped_names(path, unit_s=NS)
     check_increasing(np.array([stamp for stamp, _ in entries]), str(path))
-    listed = [(stamp, view / "data" / name) for stamp, name in entries]
-    missing = next((picture for _, picture in listed if not picture.is_file()), None)
-    if missing is not None:
-        raise SourceError("image is missing", where=missing, hint=f"{path} lists it")
-    return listed
+    return [(stamp, view / "data" / name) for stamp, name in entries]
 
 
 def _read_rig(

@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -22,10 +23,12 @@ from recon.errors import SourceError
 from recon.formats.frames_csv import FRAMES, read_frames
 from recon.formats.kitti import kitti_cameras_of
 from recon.sources.pairing import (
+    Roll,
     check_increasing,
     find_partners,
-    pair_stamps,
+    natural_key,
     partner_names,
+    split_sides,
     stamps_of_names,
 )
 from recon.sources.pictures import (
@@ -33,6 +36,8 @@ from recon.sources.pictures import (
     PictureSource,
     is_picture,
     list_pictures,
+    pair_listed,
+    pair_named,
     picture_size,
 )
 from recon.sources.rig import read_rig
@@ -45,12 +50,16 @@ DEFAULT_RATE_HZ: Final = 10.0
 _TIMES: Final = "times.txt"
 _INSIDE: Final = ("", "data", "images", "image", "img")
 
+_Frames = list[tuple[Path | None, Path | None]]
+"""Left and right image of each frame; None = missing."""
+
 
 @dataclass(frozen=True)
 class _Pairing:
     """Pairs in order; ``stamps_s`` is None if their times are unknown."""
 
     pairs: list[tuple[Path, Path]]
+    roll: Roll
     stamps_s: Float64 | None
     how: str
     texts: tuple[Path, ...] = ()
@@ -72,12 +81,13 @@ def open_folders(folder: Path, settings: SourceSettings) -> PictureSource:
     truth, note = read_tum_truth(folder, stamps_s)
     return PictureSource(
         name=folder.resolve().name,
-        description=f"plain folders, {found.how}{clock}{note}",
+        description=f"plain folders, {found.how}{found.roll}{clock}{note}",
         calibration=rig,
         pictures=[
             PictureFrame(left, right, float(stamp))
             for (left, right), stamp in zip(found.pairs, stamps_s, strict=True)
         ],
+        roll=found.roll,
         truth=truth,
         texts=(*texts, *found.texts),
     )
@@ -128,35 +138,40 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
     stamps = _stamps(left, right) if by in {"auto", "stamp"} else None
     if stamps is not None:
         found = _pair_by_stamp(left, right, stamps, settings, folder)
-        return found if listed is None else _with_times(found, listed, left)
+        return found if listed is None else _with_times(found, listed)
     if by == "stamp":
         raise SourceError("names of the images are not timestamps", where=left[0])
-    named = _by_name(left, right) if by in {"auto", "name"} else None
+    frames = _by_name(left, right) if by in {"auto", "name"} else None
     how = "by name"
-    if named is None:
-        named, how = _by_index(left, right, by, folder), "by their order"
+    if frames is None:
+        frames, how = _by_index(left, right, by, folder), "by their order"
+    named, roll = pair_named(frames, folder)
     label = f"{views[0].name} and {views[1].name}" if views[0] != views[1] else "one folder"
-    found = _Pairing(named, None, f"{label}, paired {how}")
-    return found if listed is None else _with_times(found, listed, left)
+    found = _Pairing(named, roll, None, f"{label}, paired {how}")
+    return found if listed is None else _with_times(found, listed)
 
 
 def _list_both(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
     if left != right:
         return list_pictures(left), list_pictures(right)
     by_stem = {path.stem: path for path in list_pictures(left)}
-    pairs = find_partners(by_stem)
-    return [by_stem[name] for name, _ in pairs], [by_stem[name] for _, name in pairs]
+    sides = split_sides(by_stem)
+    return [by_stem[name] for name in sides[0]], [by_stem[name] for name in sides[1]]
 
 
 def _pair_as_listed(folder: Path) -> _Pairing:
     frames = read_frames(folder / FRAMES)
     check_increasing(np.array([frame.left_s for frame in frames]), str(folder / FRAMES))
-    pairs = [(folder / frame.left, folder / frame.right) for frame in frames]
-    missing = next((path for pair in pairs for path in pair if not path.is_file()), None)
-    if missing is not None:
-        raise SourceError("image is missing", where=missing, hint=f"{FRAMES} lists it")
-    stamps_s = np.array([frame.left_s for frame in frames])
-    return _Pairing(pairs, stamps_s, f"paired according to {FRAMES}", (folder / FRAMES,))
+    pairs, roll = pair_named(
+        [(_existing(folder / frame.left), _existing(folder / frame.right)) for frame in frames],
+        folder,
+    )
+    stamps_s = np.array([frames[k].left_s for k in roll.kept])
+    return _Pairing(pairs, roll, stamps_s, f"paired according to {FRAMES}", (folder / FRAMES,))
+
+
+def _existing(path: Path) -> Path | None:
+    return path if path.is_file() else None
 
 
 def _stamps(left: list[Path], right: list[Path]) -> tuple[Float64, Float64] | None:
@@ -174,27 +189,42 @@ def _pair_by_stamp(
 ) -> _Pairing:
     for series, paths in zip(stamps, (left, right), strict=True):
         check_increasing(series, str(paths[0].parent))
-    pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(folder))
-    chosen = [(left[i], right[j]) for i, j in zip(pairs.left, pairs.right, strict=True)]
-    return _Pairing(chosen, stamps[0][list(pairs.left)], str(pairs))
+    lists = [
+        list(zip(series.tolist(), paths, strict=True))
+        for series, paths in zip(stamps, (left, right), strict=True)
+    ]
+    frames, roll = pair_listed(lists, settings.tolerance_s, folder)
+    pairs = [(frame.left, frame.right) for frame in frames]
+    stamps_s = np.array([frame.timestamp_s for frame in frames])
+    return _Pairing(pairs, roll, stamps_s, "paired by stamps")
 
 
-def _by_name(left: list[Path], right: list[Path]) -> list[tuple[Path, Path]] | None:
-    """Pair names that are equal or differ only in the side; None if one has no partner."""
+def _by_name(left: list[Path], right: list[Path]) -> _Frames | None:
+    """Frames by names that are equal or differ only in the side.
+
+    None if most images have no partner, so that their names tell nothing.
+    """
     rights = {path.stem: path for path in right}
-    pairs = []
+    frames: _Frames = []
     for path in left:
         names = [path.stem, *partner_names(path.stem)]
-        partner = next((rights[name] for name in names if name in rights), None)
-        if partner is None:
-            return None
-        pairs.append((path, partner))
-    return pairs if len(pairs) == len(right) else None
+        partner = next((rights.pop(name) for name in names if name in rights), None)
+        frames.append((path, partner))
+    paired = len(right) - len(rights)
+    if 2 * paired < max(len(left), len(right)):
+        return None
+    frames += [(None, path) for path in rights.values()]
+    return sorted(frames, key=_place)
 
 
-def _by_index(
-    left: list[Path], right: list[Path], by: str, folder: Path
-) -> list[tuple[Path, Path]]:
+def _place(frame: tuple[Path | None, Path | None]) -> list[tuple[int, str]]:
+    """Sort key: the last number in a name, which counts frames, else the whole name."""
+    stem = (frame[0] or frame[1] or Path()).stem
+    numbers = re.findall(r"\d+", stem)
+    return [(int(numbers[-1]), "")] if numbers else natural_key(stem)
+
+
+def _by_index(left: list[Path], right: list[Path], by: str, folder: Path) -> _Frames:
     if len(left) != len(right) or by == "name":
         raise SourceError(
             "left and right images cannot be paired by name"
@@ -207,11 +237,9 @@ def _by_index(
     return list(zip(left, right, strict=True))
 
 
-def _with_times(found: _Pairing, path: Path, left: list[Path]) -> _Pairing:
+def _with_times(found: _Pairing, path: Path) -> _Pairing:
     """The pairs with the times of a file, which win over those in names."""
-    paired = {pair[0] for pair in found.pairs}
-    kept = [k for k, image in enumerate(left) if image in paired]
-    stamps_s = read_times_of_pairs(path, [image.stem for image in left], kept)
+    stamps_s = read_times_of_pairs(path, found.roll)
     return replace(found, stamps_s=stamps_s, how=f"{found.how}, times of {_TIMES}", texts=(path,))
 
 
@@ -221,4 +249,4 @@ def _times(found: _Pairing, settings: SourceSettings) -> tuple[Float64, str]:
         return found.stamps_s, ""
     rate_hz = settings.rate_hz or DEFAULT_RATE_HZ
     given = "" if settings.rate_hz else ", no times: assumed"
-    return np.arange(len(found.pairs)) / rate_hz, f"{given or ','} {rate_hz:g} Hz"
+    return np.array(found.roll.kept) / rate_hz, f"{given or ','} {rate_hz:g} Hz"

@@ -24,16 +24,17 @@ from recon.formats.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset
 from recon.formats.kitti_raw import read_kitti_rig
 from recon.formats.trajectory import read_kitti_poses
 from recon.geometry.se3 import invert
+from recon.sources.pairing import Roll, natural_key
 from recon.sources.pictures import (
     PictureFrame,
     PictureSource,
     is_picture,
-    list_pictures,
+    pair_named,
     picture_size,
 )
 from recon.sources.rig import Rig, as_rectified, read_rig
 from recon.sources.settings import SourceSettings
-from recon.sources.times import read_times
+from recon.sources.times import read_times_of_pairs
 from recon.structures import SequenceTruth, Trajectory
 from recon.structures.arrays import Float64
 
@@ -46,8 +47,8 @@ def open_kitti(
     """Open a drive in KITTI's odometry layout.
 
     File names, calibration, times and poses are read and checked at once; the images are read
-    while iterating. Lines of times.txt and poses.txt beyond the last image are ignored, so a
-    drive may be shortened by deleting images.
+    while iterating. Images may be deleted: those without a partner are left out, and the lines of
+    times.txt and poses.txt are found by the numbers in the names.
 
     Args:
         folder: The folder of the drive.
@@ -55,8 +56,8 @@ def open_kitti(
         cameras: (0, 1) for the grey pair, (2, 3) for the colour pair; None = grey if present.
 
     Raises:
-        SourceError: A folder or image is missing, or there are fewer times or poses than
-            images.
+        SourceError: A folder or most of the images are missing, or there are fewer times or
+            poses than images.
         FormatError: A file is damaged.
         CalibrationError: The calibration cannot give depth.
     """
@@ -64,20 +65,21 @@ def open_kitti(
     if not path.is_dir():
         raise SourceError("folder does not exist", where=path)
     pair = cameras or choose_cameras(path, "image_{}")
-    pictures = list_pairs(*(path / f"image_{camera}" for camera in pair))
+    pictures, roll = list_pairs(*(path / f"image_{camera}" for camera in pair))
     settings = settings or SourceSettings()
-    times, time_files = _read_times(path, len(pictures), settings)
+    times, time_files = _read_times(path, roll, settings)
     rig, calibration_files = _read_rig(path, settings, pair, pictures[0][0])
     texts = (*calibration_files, *time_files, _find_poses(path))
     return PictureSource(
         name=path.resolve().name,
-        description=f"KITTI odometry drive, image_{pair[0]} and image_{pair[1]}",
+        description=f"KITTI odometry drive, image_{pair[0]} and image_{pair[1]}{roll}",
         calibration=rig,
         pictures=[
             PictureFrame(left, right, float(time_s))
             for (left, right), time_s in zip(pictures, times, strict=True)
         ],
-        truth=_read_truth(path, times, pair[0]),
+        roll=roll,
+        truth=_read_truth(path, times, roll, pair[0]),
         texts=tuple(text for text in texts if text is not None),
     )
 
@@ -109,24 +111,21 @@ def choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
     )
 
 
-def list_pairs(left: Path, right: Path) -> list[tuple[Path, Path]]:
+def list_pairs(left: Path, right: Path) -> tuple[list[tuple[Path, Path]], Roll]:
     """Left and right image of each frame, paired by equal names.
 
     Raises:
-        SourceError: An image has no partner, or there are no images.
+        SourceError: Most images have no partner, or there are no images.
     """
-    folders = (left, right)
-    names = [_names(folder) for folder in folders]
-    for here, there in ((0, 1), (1, 0)):
-        missing = sorted(names[here] - names[there])
-        if missing:
-            raise SourceError(
-                "image is missing",
-                where=folders[there] / missing[0],
-                got=f"{len(names[0])} left and {len(names[1])} right images",
-                hint="each frame needs a left and a right image of the same name",
-            )
-    return [(left / path.name, right / path.name) for path in list_pictures(left)]
+    names = [_names(folder) for folder in (left, right)]
+    for folder, found in zip((left, right), names, strict=True):
+        if not found:
+            raise SourceError("folder contains no images", where=folder)
+    frames = [
+        (left / name if name in names[0] else None, right / name if name in names[1] else None)
+        for name in sorted(names[0] | names[1], key=natural_key)
+    ]
+    return pair_named(frames, left.parent)
 
 
 def _names(folder: Path) -> set[str]:
@@ -136,11 +135,11 @@ def _names(folder: Path) -> set[str]:
 
 
 def _read_times(
-    folder: Path, frames: int, settings: SourceSettings
+    folder: Path, roll: Roll, settings: SourceSettings
 ) -> tuple[Float64, tuple[Path, ...]]:
     """Times of the frames in seconds, and their file; no file if a rate is given."""
     if settings.rate_hz is not None:
-        return np.arange(frames) / settings.rate_hz, ()
+        return np.array(roll.kept) / settings.rate_hz, ()
     path = folder / "times.txt"
     if not path.exists():
         raise SourceError(
@@ -149,7 +148,7 @@ def _read_times(
             hint="write the time of each frame in seconds, one per line, or give the frames per "
             "second with --set source.rate_hz=",
         )
-    return read_times(path, frames), (path,)
+    return read_times_of_pairs(path, roll), (path,)
 
 
 def _read_rig(
@@ -166,22 +165,23 @@ def _read_rig(
     return as_rectified(read_kitti_rig(path, *size, cameras)), (path,)
 
 
-def _read_truth(folder: Path, times: Float64, camera: int) -> SequenceTruth | None:
+def _read_truth(folder: Path, times: Float64, roll: Roll, camera: int) -> SequenceTruth | None:
     path = _find_poses(folder)
     if path is None:
         return None
     poses = read_kitti_poses(path).T_world_camera
-    if len(poses) < len(times):
+    lines = roll.lines(len(poses))
+    if lines is None:
         raise SourceError(
             "fewer poses than images",
             where=path,
             got=f"{len(poses)} poses",
-            expected=f"{len(times)}",
+            expected=f"{len(roll.names)}",
         )
     calibration = folder / "calib.txt"
     # KITTI's poses are those of camera 0, which need not be the left camera of this pair.
     offset = read_kitti_offset(calibration, camera) if calibration.exists() else np.eye(4)
-    left = poses[: len(times)] @ invert(offset)
+    left = poses[lines] @ invert(offset)
     return SequenceTruth(Trajectory(invert(left[0]) @ left, times))
 
 

@@ -18,13 +18,12 @@ from typing import Final
 from recon.errors import SourceError
 from recon.formats.kitti_raw import read_kitti_rig
 from recon.sources.kitti import choose_cameras
-from recon.sources.pairing import check_increasing, pair_stamps
-from recon.sources.pictures import PictureFrame, PictureSource, list_pictures, picture_size
+from recon.sources.pairing import check_increasing
+from recon.sources.pictures import PictureSource, list_pictures, pair_listed, picture_size
 from recon.sources.rig import Rig, as_rectified, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_dates
 from recon.structures import RectifiedCamera
-from recon.structures.arrays import Float64
 
 _CALIBRATION: Final = "calib_cam_to_cam.txt"
 
@@ -40,37 +39,39 @@ def open_kitti_raw(folder: Path, settings: SourceSettings) -> PictureSource:
     """
     cameras = choose_cameras(folder, "image_{:02d}")
     views = [folder / f"image_{camera:02d}" for camera in cameras]
-    pictures = [list_pictures(view / "data") for view in views]
-    stamps = [_read_stamps(v, len(p)) for v, p in zip(views, pictures, strict=True)]
-    pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(folder))
-    rig, calibration_files = _read_rig(folder, settings, cameras, picture_size(pictures[0][0]))
+    frames, roll = pair_listed([_read_list(v) for v in views], settings.tolerance_s, folder)
+    rig, calibration_files = _read_rig(folder, settings, cameras, picture_size(frames[0].left))
     rectified = "rectified" if isinstance(rig, RectifiedCamera) else "not rectified"
     return PictureSource(
         name=folder.resolve().name,
-        description=f"KITTI raw drive, {views[0].name} and {views[1].name}, {rectified}, {pairs}",
+        description=f"KITTI raw drive, {views[0].name} and {views[1].name}, {rectified}, "
+        f"paired by stamps{roll}",
         calibration=rig,
-        pictures=[
-            PictureFrame(pictures[0][left], pictures[1][right], float(stamps[0][left]))
-            for left, right in zip(pairs.left, pairs.right, strict=True)
-        ],
+        pictures=frames,
+        roll=roll,
         texts=(*calibration_files, *(view / "timestamps.txt" for view in views)),
     )
 
 
-def _read_stamps(view: Path, pictures: int) -> Float64:
-    path = view / "timestamps.txt"
+def _read_list(view: Path) -> list[tuple[float, Path]]:
+    """Time stamp and image of each frame; where images are missing, names give the frame."""
+    path, pictures = view / "timestamps.txt", list_pictures(view / "data")
     if not path.exists():
         raise SourceError("times are missing", where=path)
     stamps = read_dates(path)
-    if len(stamps) != pictures:
+    check_increasing(stamps, str(path))
+    if len(stamps) == len(pictures):
+        return list(zip(stamps.tolist(), pictures, strict=True))
+    if len(stamps) < len(pictures) or not all(image.stem.isdecimal() for image in pictures):
         raise SourceError(
             "numbers of times and images differ",
             where=path,
             got=f"{len(stamps)} times",
-            expected=f"{pictures}",
+            expected=f"{len(pictures)}",
         )
-    check_increasing(stamps, str(path))
-    return stamps
+    named = {int(image.stem): image for image in pictures}
+    missing = [view / "data" / f"{number:010d}.png" for number in range(len(stamps))]
+    return [(stamp, named.get(k, missing[k])) for k, stamp in enumerate(stamps.tolist())]
 
 
 def _read_rig(

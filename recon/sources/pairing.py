@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -53,10 +54,47 @@ class StampPairs:
     right: Sequence[int]
     alone: tuple[int, int]
 
+
+@dataclass(frozen=True)
+class Roll:
+    """Which frames of a recording are pairs.
+
+    Attributes:
+        names: Names without suffix of all frames in order, also of those without a partner; empty
+            names where there are none.
+        kept: Positions of the pairs among them.
+        alone: Numbers of left and right images without a partner, which are left out.
+    """
+
+    names: Sequence[str]
+    kept: Sequence[int]
+    alone: tuple[int, int] = (0, 0)
+
     def __str__(self) -> str:
         if not any(self.alone):
-            return "paired by stamps"
-        return f"paired by stamps, {self.alone[0]} left and {self.alone[1]} right without a partner"
+            return ""
+        return f", {self.alone[0]} left and {self.alone[1]} right without a partner left out"
+
+    def lines(self, count: int) -> list[int] | None:
+        """The line of each pair in a file with one line per frame, such as ``times.txt``.
+
+        One line per pair fits at once. Else names that are counters give the line, so that it
+        stays the right one where images are missing; else the position does, and further lines
+        are ignored.
+
+        Args:
+            count: Number of lines of the file.
+
+        Returns:
+            Indices from 0; None = the file has too few lines.
+        """
+        if count == len(self.kept):
+            return list(range(count))
+        names = [self.names[k] for k in self.kept]
+        numbers = [int(name) if name.isdecimal() else count for name in names]
+        if max(numbers) < count:
+            return numbers
+        return list(self.kept) if len(self.names) <= count else None
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:
@@ -67,16 +105,43 @@ def natural_key(name: str) -> list[tuple[int, str]]:
 
 def partner_names(name: str) -> list[str]:
     """Possible names of the right camera for a name of the left one, most likely first."""
-    found = []
-    for left, right in SIDES:
-        bounded = rf"(?<![A-Za-z0-9]){left}(?![A-Za-z0-9])" if len(left) == 1 else left
-        matches = list(re.finditer(bounded, name))
-        # All occurrences at once ("left/left_raw"), else only the last ("cam0/cam0_0").
-        if matches:
-            found.append(re.sub(bounded, right, name))
-            last = matches[-1]
-            found.append(name[: last.start()] + right + name[last.end() :])
+    found = [other for left, right in SIDES for other in _replaced(name, left, right)]
     return list(dict.fromkeys(found))
+
+
+def _replaced(name: str, left: str, right: str) -> list[str]:
+    """A name with the mark of the left side replaced by that of the right one."""
+    matches = list(re.finditer(_bounded(left), name))
+    if not matches:
+        return []
+    # All occurrences at once ("left/left_raw"), else only the last ("cam0/cam0_0").
+    last = matches[-1]
+    whole = re.sub(_bounded(left), right, name)
+    return [whole, name[: last.start()] + right + name[last.end() :]]
+
+
+def _has(name: str, mark: str) -> bool:
+    return re.search(_bounded(mark), name) is not None
+
+
+def _bounded(mark: str) -> str:
+    """The pattern of a mark; a single letter or digit counts only if it stands alone."""
+    return rf"(?<![A-Za-z0-9]){mark}(?![A-Za-z0-9])" if len(mark) == 1 else mark
+
+
+def split_sides(names: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Names of the left and of the right camera among some names, also those without a partner."""
+    known = sorted(names, key=natural_key)
+    pairs = find_partners(known)
+    if not pairs:
+        return [], []
+    mark = next(mark for mark in SIDES if pairs[0][1] in _replaced(pairs[0][0], *mark))
+    paired = [{pair[side] for pair in pairs} for side in (0, 1)]
+    left, right = (
+        [n for n in known if n in paired[k] or (n not in paired[1 - k] and _has(n, mark[k]))]
+        for k in (0, 1)
+    )
+    return left, right
 
 
 def find_partners(names: Iterable[str]) -> list[tuple[str, str]]:
@@ -128,26 +193,24 @@ def _are_counters(stems: Sequence[str]) -> bool:
     return len(stems[0]) == _SECONDS_DIGITS or not steps.size or np.median(steps) < _CLOCK_STEPS
 
 
-def lines_of_pairs(frames: Sequence[str], kept: Sequence[int], lines: int) -> list[int] | None:
-    """The line of each pair in a file with one line per frame, such as ``times.txt``.
-
-    One line per pair fits at once. Else names that are counters give the line, so that it stays
-    the right one where images were removed; else the position does, and further lines are ignored.
+def check_most(pairs: int, images: int, where: Path) -> None:
+    """Refuse a recording of which most is missing.
 
     Args:
-        frames: Names without suffix of all frames in order, also of those without a partner.
-        kept: Positions of the pairs among them.
-        lines: Number of lines of the file.
+        pairs: Number of pairs.
+        images: Number of images of one camera, found or listed.
+        where: The source, for the error message.
 
-    Returns:
-        Indices from 0; None = the file has too few lines.
+    Raises:
+        SourceError: Fewer than half of the images have a partner.
     """
-    if lines == len(kept):
-        return list(range(lines))
-    numbers = [int(frames[k]) if frames[k].isdecimal() else lines for k in kept]
-    if max(numbers) < lines:
-        return numbers
-    return list(kept) if len(frames) <= lines else None
+    if 2 * pairs < images:
+        raise SourceError(
+            "most images have no partner",
+            where=where,
+            got=f"{pairs} pairs of {images} images",
+            hint="give both images of a pair the same name or time, and copy missing files again",
+        )
 
 
 def check_increasing(stamps_s: Float64, where: str) -> None:

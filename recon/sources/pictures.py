@@ -12,7 +12,7 @@ import numpy as np
 from recon.errors import SourceError
 from recon.formats.image import read_image
 from recon.sources.files import join_pair
-from recon.sources.pairing import natural_key
+from recon.sources.pairing import Roll, check_most, natural_key, pair_stamps
 from recon.structures import (
     RectifiedCamera,
     SequenceTruth,
@@ -49,6 +49,7 @@ class PictureSource:
         description: Recognised kind and layout, in one line.
         calibration: The rectified camera, or the two raw ones.
         pictures: The files of each frame, in order.
+        roll: Which frames of the recording are pairs.
         truth: Ground truth trajectory, if known.
         texts: Files other than images that were read.
     """
@@ -57,6 +58,7 @@ class PictureSource:
     description: str
     calibration: RectifiedCamera | StereoCalibration
     pictures: Sequence[PictureFrame]
+    roll: Roll
     truth: SequenceTruth | None = None
     texts: tuple[Path, ...] = ()
 
@@ -65,6 +67,15 @@ class PictureSource:
         """Calibration and other text files, then the images."""
         pictures = (path for frame in self.pictures for path in (frame.left, frame.right))
         return [*self.texts, *pictures]
+
+    @property
+    def left_out(self) -> int:
+        """Number of images without a partner."""
+        return sum(self.roll.alone)
+
+    def lines(self, count: int) -> list[int] | None:
+        """The line of each pair in a file with one line per frame; see `Roll.lines`."""
+        return self.roll.lines(count)
 
     @property
     def stamps_s(self) -> Float64:
@@ -93,6 +104,67 @@ class PictureSource:
         image = read_image(path)
         check_size(self.calibration, image.shape[1], image.shape[0], path)
         return image
+
+
+def pair_listed(
+    lists: Sequence[Sequence[tuple[float, Path]]], tolerance_s: float, where: Path
+) -> tuple[list[PictureFrame], Roll]:
+    """Pair two lists of images by time; a listed image that is missing has no partner.
+
+    Args:
+        lists: Time stamp and file of the left images, and of the right ones, in order of time.
+        tolerance_s: Largest difference within a pair.
+        where: The source, for error messages.
+
+    Raises:
+        SourceError: No two images are close enough, or most have no partner.
+    """
+    for one in lists:
+        check_most(sum(path.is_file() for _, path in one), len(one), where)
+    stamps = [np.array([stamp for stamp, _ in one]) for one in lists]
+    pairs = pair_stamps(stamps[0], stamps[1], tolerance_s, str(where))
+    # Of two cameras with different rates, the slower one decides what is missing.
+    check_most(len(pairs.left), min(map(len, lists)), where)
+    partner = dict(zip(pairs.left, pairs.right, strict=True))
+    taken = set(pairs.right)
+    frames = [
+        (stamp, _existing(path), _existing(lists[1][partner[k]][1]) if k in partner else None)
+        for k, (stamp, path) in enumerate(lists[0])
+    ]
+    frames += [(stamp, None, path) for k, (stamp, path) in enumerate(lists[1]) if k not in taken]
+    frames.sort(key=lambda frame: frame[0])
+    chosen, roll = pair_named([frame[1:] for frame in frames])
+    return [
+        PictureFrame(left, right, frames[k][0])
+        for k, (left, right) in zip(roll.kept, chosen, strict=True)
+    ], roll
+
+
+def pair_named(
+    frames: Sequence[tuple[Path | None, Path | None]], where: Path | None = None
+) -> tuple[list[tuple[Path, Path]], Roll]:
+    """The pairs among frames of which an image may be missing.
+
+    Args:
+        frames: Left and right image of each frame in order; None = missing.
+        where: The source, for the error message; None = any number may be missing.
+
+    Raises:
+        SourceError: Most images have no partner.
+    """
+    pairs = [(left, right) for left, right in frames if left is not None and right is not None]
+    kept = [k for k, frame in enumerate(frames) if None not in frame]
+    # A listed frame without any image counts as one, on the left.
+    alone_right = sum(left is None and right is not None for left, right in frames)
+    alone_left = len(frames) - len(pairs) - alone_right
+    if where is not None:
+        check_most(len(pairs), len(pairs) + max(alone_left, alone_right), where)
+    names = [(left or right or Path()).stem for left, right in frames]
+    return pairs, Roll(names, kept, (alone_left, alone_right))
+
+
+def _existing(path: Path) -> Path | None:
+    return path if path.is_file() else None
 
 
 def picture_size(path: Path) -> tuple[int, int]:

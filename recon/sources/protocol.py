@@ -91,3 +91,21 @@ class StampedSource(Protocol):
     def stamps_s(self) -> Float64:
         """float64 (N,), seconds, one for each pair."""
         ...
+
+
+@runtime_checkable
+class IncompleteSource(Protocol):
+    """A source that may leave out frames of its recording."""
+
+    @property
+    def left_out(self) -> int:
+        """Number of images without a partner."""
+        ...
+
+    def lines(self, count: int) -> list[int] | None:
+        """The line of each pair in a file of ``count`` lines with one line per frame.
+
+        Returns:
+            Indices from 0; None = the file has too few lines.
+        """
+        ...

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from recon.errors import FormatError, SourceError
 from recon.formats.files import read_table, read_text
-from recon.sources.pairing import lines_of_pairs
+from recon.sources.pairing import Roll
 from recon.structures.arrays import Float64
 
 
@@ -24,16 +23,11 @@ def read_times(path: Path, frames: int) -> Float64:
         SourceError: The file is missing or too short.
         FormatError: A line is not a number, or time runs backwards.
     """
-    return read_times_of_pairs(path, [""] * frames, range(frames))
+    return read_times_of_pairs(path, Roll([""] * frames, range(frames)))
 
 
-def read_times_of_pairs(path: Path, frames: Sequence[str], kept: Sequence[int]) -> Float64:
-    """Read ``times.txt`` for the frames that are pairs; see `lines_of_pairs`.
-
-    Args:
-        path: The file: seconds, one line per frame.
-        frames: Names without suffix of all frames in order, also of those without a partner.
-        kept: Positions of the pairs among them.
+def read_times_of_pairs(path: Path, roll: Roll) -> Float64:
+    """Read ``times.txt`` for the frames that are pairs; see `Roll.lines`.
 
     Returns:
         float64, one time per pair, not decreasing.
@@ -45,13 +39,13 @@ def read_times_of_pairs(path: Path, frames: Sequence[str], kept: Sequence[int]) 
     if not path.exists():
         raise SourceError("file does not exist", where=path)
     table, lines = read_table(path, (1,))
-    chosen = lines_of_pairs(frames, kept, len(table))
+    chosen = roll.lines(len(table))
     if chosen is None:
         raise SourceError(
             "fewer times than images",
             where=path,
             got=f"{len(table)} times",
-            expected=f"{len(frames)}",
+            expected=f"{len(roll.names)}",
         )
     times: Float64 = table[chosen, 0]
     backwards = np.diff(times) < 0

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from recon.errors import SourceError
-from recon.sources.pairing import check_increasing, find_partners, pair_stamps
-from recon.sources.pictures import PictureFrame, PictureSource, is_picture, picture_size
+from recon.sources.pairing import check_increasing, find_partners
+from recon.sources.pictures import PictureSource, is_picture, pair_listed, picture_size
 from recon.sources.rig import read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_stamped_names
@@ -34,19 +34,15 @@ def open_tum(folder: Path, settings: SourceSettings) -> PictureSource:
     """
     paths = _find_lists(folder, settings)
     lists = [_read_list(path) for path in paths]
-    stamps = [np.array([stamp for stamp, _ in entries]) for entries in lists]
-    pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(folder))
-    frames = [
-        PictureFrame(lists[0][left][1], lists[1][right][1], lists[0][left][0])
-        for left, right in zip(pairs.left, pairs.right, strict=True)
-    ]
+    frames, roll = pair_listed(lists, settings.tolerance_s, folder)
     rig, texts = read_rig(settings, folder, picture_size(frames[0].left))
     truth, note = read_tum_truth(folder, np.array([frame.timestamp_s for frame in frames]))
     return PictureSource(
         name=folder.resolve().name,
-        description=f"TUM drive, {paths[0].name} and {paths[1].name}, {pairs}{note}",
+        description=f"TUM drive, {paths[0].name} and {paths[1].name}, paired by stamps{roll}{note}",
         calibration=rig,
         pictures=frames,
+        roll=roll,
         truth=truth,
         texts=(*texts, *paths),
     )
@@ -82,7 +78,4 @@ def _find_lists(folder: Path, settings: SourceSettings) -> tuple[Path, Path]:
 def _read_list(path: Path) -> list[tuple[float, Path]]:
     listed = [(stamp, path.parent / name) for stamp, name in read_stamped_names(path)]
     check_increasing(np.array([stamp for stamp, _ in listed]), str(path))
-    missing = next((picture for _, picture in listed if not picture.is_file()), None)
-    if missing is not None:
-        raise SourceError("image is missing", where=missing, hint=f"{path} lists it")
     return listed

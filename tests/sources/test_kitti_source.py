@@ -146,10 +146,7 @@ def empty_both(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "error", "message"),
     [
-        (remove("image_1/000001.png"), SourceError,
-         r"image_1/000001\.png: image is missing \(got 3 left and 2 right images\)"),
-        (remove("image_0/000002.png"), SourceError, r"image_0/000002\.png: image is missing"),
-        (empty("image_1"), SourceError, r"image_1/000000\.png: image is missing"),
+        (empty("image_1"), SourceError, "image_1: folder contains no images"),
         (empty_both, SourceError, "image_0: folder contains no images"),
         (drop_folder("image_1"), SourceError, "folder of the other camera is missing.*image_1"),
         (remove("calib.txt"), SourceError, r"calib\.txt: calibration is missing; .*--calib"),

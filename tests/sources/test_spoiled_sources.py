@@ -169,9 +169,13 @@ def test_videos_of_different_length_are_refused(drive: Drive, tmp_path: Path) ->
     fails(tmp_path, r"different numbers of frames \(got left 12, right 10\)")
 
 
-def test_numbers_of_pictures_that_differ_are_refused(drive: Drive, tmp_path: Path) -> None:
+def test_numbers_of_pictures_that_differ_are_refused_where_names_tell_nothing(
+    drive: Drive, tmp_path: Path
+) -> None:
     drives.write_folders(*drive, tmp_path)
-    (tmp_path / "right" / "right3.png").unlink()
+    for number, path in enumerate(sorted((tmp_path / "right").iterdir())[1:]):
+        path.rename(path.with_stem(f"photo{100 + 7 * number}"))
+    (tmp_path / "right" / "right0.png").unlink()
     fails(tmp_path, r"numbers of left and right images differ \(got 12 left and 11 right")
 
 
@@ -196,14 +200,6 @@ def test_a_calibration_of_another_size_is_told(drive: Drive, tmp_path: Path) -> 
     for path in tmp_path.rglob("*.png"):
         write_image(path, np.zeros((16, 32), np.uint8))
     with pytest.raises(ReconError, match=r"images have another size.*got 32x16, expected 64x32"):
-        open_source(tmp_path)
-
-
-def test_a_listed_picture_that_is_missing_is_named(drive: Drive, tmp_path: Path) -> None:
-    drives.write_tum(*drive, tmp_path)
-    victim = sorted((tmp_path / "right").iterdir())[4]
-    victim.unlink()
-    with pytest.raises(ReconError, match=rf"{victim.name}: image is missing"):
         open_source(tmp_path)
 
 
