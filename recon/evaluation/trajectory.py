@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from recon.errors import EvaluationError
+from recon.evaluation.straight import open_roll_axis, without_roll
 from recon.geometry.alignment import Similarity, fit_points
 from recon.geometry.se3 import angle_rad, invert
 from recon.settings import Settings
@@ -90,6 +91,28 @@ class TrajectoryComparison:
         """float64 (N,): distance of each position from the true one."""
         away = self.estimate.positions_m - self.truth.positions_m
         return np.asarray(np.linalg.norm(away, axis=1))
+
+    @property
+    def roll_axis(self) -> Float64 | None:
+        """float64 (3,): direction of a straight path whose alignment leaves the roll about it open.
+
+        None if the positions fix every rotation, or if they are not what was aligned.
+        """
+        if self.metrics.alignment in ("none", "origin"):
+            return None
+        return open_roll_axis(self.estimate, self.truth)
+
+    @property
+    def rotation_errors_rad(self) -> Float64:
+        """float64 (N,): angle between each orientation and the true one.
+
+        Where the alignment leaves the roll open (`roll_axis`), the estimate is rolled to fit best:
+        the common roll would be an error of the alignment, not of the estimate.
+        """
+        axis, estimate = self.roll_axis, self.estimate
+        if axis is not None:
+            estimate = without_roll(estimate, self.truth, axis)
+        return angle_rad(invert(self.truth.T_world_camera) @ estimate.T_world_camera)
 
 
 def evaluate_trajectory(

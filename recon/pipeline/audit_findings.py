@@ -33,8 +33,14 @@ class Gaps:
     usual_s: float = float("nan")
 
 
-def find_picture_faults(sample: Sample, settings: AuditSettings) -> Iterator[Finding]:
-    """Problems of single images: unreadable, black, blurred, of unequal brightness."""
+def find_picture_faults(sample: Sample, settings: AuditSettings, matcher: str) -> Iterator[Finding]:
+    """Problems of single images: unreadable, black, blurred, of unequal brightness.
+
+    Args:
+        sample: The sampled images.
+        settings: Limits.
+        matcher: Name of the matcher that will be used.
+    """
     if sample.broken is not None:
         code = "size" if "size" in sample.broken.what else "unreadable"
         yield Finding(code, True, str(sample.broken))
@@ -52,11 +58,13 @@ def find_picture_faults(sample: Sample, settings: AuditSettings) -> Iterator[Fin
     if len(gains) >= settings.min_features:
         gain = float(np.median(gains))
         if not 1 / settings.gain < gain < settings.gain:
+            # The census transform of sgm compares grey levels only with their neighbours.
+            other = "" if matcher == "sgm" else ", or match with sgm"
             yield Finding(
                 "gain",
                 False,
                 f"the right camera is {gain:.2f} times as bright as the left one; give both the "
-                "same fixed exposure and gain, or match with sgm",
+                f"same fixed exposure and gain{other}",
             )
 
 

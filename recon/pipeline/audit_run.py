@@ -79,7 +79,7 @@ def run_audit(source: StereoSource, config: ReconConfig, *, quick: bool = False)
     gaps = find_gaps(source, settings)
     reach_px = _reach_px(camera, config.matching)
     findings = [
-        *find_picture_faults(sample, settings),
+        *find_picture_faults(sample, settings, config.matching.matcher),
         *find_series_faults(sample, gaps, settings),
         *find_geometry_faults(geometry, settings),
         *find_range_faults(geometry, reach_px, camera, settings),

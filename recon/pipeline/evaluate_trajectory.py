@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from recon.evaluation import TrajectoryComparison, TrajectoryRules, associate, compare_paths
 from recon.formats.trajectory import holds_times, read_trajectory, write_tum
 from recon.pipeline.record import fingerprint, write_record
@@ -75,6 +77,8 @@ def run_evaluate_trajectory(
     comparison = compare_paths(estimate, truth, rules)
     summary = {
         **plain(comparison.metrics),
+        "rotation_deg": float(np.degrees(np.sqrt((comparison.rotation_errors_rad**2).mean()))),
+        "roll": "fixed" if comparison.roll_axis is None else "not observable on a straight path",
         "associated": "by time" if by_time else "in order",
         **poses,
         "warnings": _warnings(len(truth), poses),

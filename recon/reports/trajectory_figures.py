@@ -7,7 +7,6 @@ from typing import Final
 import numpy as np
 
 from recon.evaluation import TrajectoryComparison
-from recon.geometry.se3 import angle_rad, invert
 from recon.reports.canvas import (
     ESTIMATE,
     FAINT,
@@ -41,14 +40,13 @@ def paths_figure(comparison: TrajectoryComparison) -> bytes:
 
 def errors_along_figure(comparison: TrajectoryComparison) -> bytes:
     """Position and rotation error of each aligned pose, along the true path."""
-    truth, estimate = comparison.truth, comparison.estimate
-    turned = angle_rad(invert(truth.T_world_camera) @ estimate.T_world_camera)
+    truth = comparison.truth
     figure = new_figure(WIDE_IN, 4.6)
     upper, lower = figure.subplots(2, 1, sharex=True)
     upper.plot(truth.distances_m, comparison.position_errors_m, color=ESTIMATE)
     upper.axhline(comparison.metrics.ate_m, color=FAINT, linestyle="--", label="root mean square")
     upper.legend(loc="best", frameon=False)
-    lower.plot(truth.distances_m, np.degrees(turned), color=ESTIMATE)
+    lower.plot(truth.distances_m, np.degrees(comparison.rotation_errors_rad), color=ESTIMATE)
     for axes in (upper, lower):
         axes.set_ylim(bottom=0)
     style_plot(upper, "", "position error (m)")

@@ -43,6 +43,15 @@ def present_trajectory(run: TrajectoryRun, directory: RunDirectory) -> None:
     write_text(directory.path("report.html"), render_html(_content(run, figures)))
 
 
+def _roll_note(run: TrajectoryRun) -> str:
+    if run.comparison.roll_axis is None:
+        return ""
+    return (
+        " The path is straight, so its positions do not fix the roll about it: the rotation error "
+        "is without a roll common to all poses, which cannot be observed here."
+    )
+
+
 def _content(run: TrajectoryRun, figures: Mapping[str, bytes]) -> ReportContent:
     found = run.comparison.metrics
     spread = "Dots are means, bars the middle half of the segments."
@@ -50,7 +59,7 @@ def _content(run: TrajectoryRun, figures: Mapping[str, bytes]) -> ReportContent:
         Section("Paths", [
             FigureBlock("From above", figures["path"], _ALIGNED[found.alignment]),
             FigureBlock("Error along the path", figures["error_along_path"],
-                        "Of each pose, after the alignment."),
+                        f"Of each pose, after the alignment.{_roll_note(run)}"),
         ]),
         Section("Relative errors", [
             FigureBlock("Translation", figures["translation_by_length"], spread, wide=False),

@@ -57,6 +57,13 @@ def test_each_planted_fault_is_found_and_no_other(street: faults.Spoiled, fault:
     assert all("\n" not in finding.text for finding in audit.findings)
 
 
+@pytest.mark.parametrize("matcher", ["sad", "sgm"])
+def test_sgm_is_not_advised_to_those_who_use_it(street: faults.Spoiled, matcher: str) -> None:
+    config = load_config(None, [f"matching.matcher={matcher}"])
+    (finding,) = run_audit(faults.gain(street, 1.4), config).findings
+    assert ("match with sgm" in finding.text) == (matcher != "sgm")
+
+
 @pytest.mark.parametrize("fault", faults.FAULTS)
 def test_a_quick_look_finds_what_spoils_every_frame(street: faults.Spoiled, fault: str) -> None:
     code, plant = faults.FAULTS[fault]

@@ -13,6 +13,7 @@ from recon.evaluation.trajectory import (
     KITTI_LENGTHS_M,
     TrajectoryRules,
     choose_segments,
+    compare_paths,
     evaluate_trajectory,
     segments_of,
 )
@@ -215,3 +216,40 @@ def _read(path: Path) -> Trajectory:
     poses = np.tile(np.eye(4), (len(path.read_text().splitlines()), 1, 1))
     poses[:, :3] = np.loadtxt(path).reshape(-1, 3, 4)
     return trajectory(poses)
+
+
+def jittered(poses: np.ndarray, sigma_m: float, seed: int = 1) -> np.ndarray:
+    """Poses with the true orientations and noise in their positions."""
+    moved = poses.copy()
+    moved[:, :3, 3] += np.random.default_rng(seed).normal(0, sigma_m, (len(poses), 3))
+    return moved
+
+
+def test_the_roll_that_a_straight_path_does_not_fix_is_no_rotation_error() -> None:
+    truth = jittered(straight(60), 0.05, seed=2)
+    estimate = make_transform(exp_so3(np.array([0.1, 0.2, 0.8])), np.ones(3)) @ truth
+    found = compare_paths(trajectory(jittered(estimate, 0.05)), trajectory(truth))
+    assert found.roll_axis is not None
+    np.testing.assert_allclose(np.abs(found.roll_axis), [0, 0, 1], atol=0.01)
+    # Pitch and yaw of the line: 0.07 m of noise over 60 m, at 60 poses.
+    assert np.degrees(found.rotation_errors_rad).max() < 0.2
+    assert found.metrics.ate_m == pytest.approx(0.05 * math.sqrt(3), rel=0.3)
+
+
+def test_a_roll_that_changes_along_a_straight_path_stays_a_rotation_error() -> None:
+    truth = jittered(straight(60), 0.02, seed=2)
+    estimate = jittered(truth, 0.02)
+    rolls = [exp_so3(np.array([0.0, 0.0, roll])) for roll in np.linspace(-0.1, 0.1, 60)]
+    estimate[:, :3, :3] = np.stack(rolls) @ estimate[:, :3, :3]
+    found = compare_paths(trajectory(estimate), trajectory(truth))
+    # Evenly from -0.1 to 0.1: an rms of 0.1 / sqrt(3).
+    rms = np.sqrt((found.rotation_errors_rad**2).mean())
+    assert rms == pytest.approx(0.1 / math.sqrt(3), rel=0.05)
+
+
+@pytest.mark.parametrize("alignment", ["se3", "none"])
+def test_a_bend_fixes_every_rotation_and_so_does_no_alignment(alignment: str) -> None:
+    poses = bend(100, 0.02) if alignment == "se3" else straight(100)
+    rules = TrajectoryRules(alignment=alignment)  # type: ignore[arg-type]
+    found = compare_paths(trajectory(jittered(poses, 0.02)), trajectory(poses), rules)
+    assert found.roll_axis is None
