@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon.audit import AuditSettings, Finding
+from recon.matching import Matcher
 from recon.pipeline.audit_geometry import Geometry
 from recon.pipeline.audit_sample import Sample
 from recon.sources import StampedSource, StereoSource
@@ -33,13 +34,15 @@ class Gaps:
     usual_s: float = float("nan")
 
 
-def find_picture_faults(sample: Sample, settings: AuditSettings, matcher: str) -> Iterator[Finding]:
+def find_picture_faults(
+    sample: Sample, settings: AuditSettings, matcher: str | Matcher
+) -> Iterator[Finding]:
     """Problems of single images: unreadable, black, blurred, of unequal brightness.
 
     Args:
         sample: The sampled images.
         settings: Limits.
-        matcher: Name of the matcher that will be used.
+        matcher: The matcher that will be used, or its name.
     """
     if sample.broken is not None:
         code = "size" if "size" in sample.broken.what else "unreadable"
