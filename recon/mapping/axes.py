@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from recon.errors import MappingError
 from recon.geometry.se3 import exp_so3, make_transform
 from recon.settings import Settings
 from recon.structures import PointCloud
@@ -21,7 +22,13 @@ _UP_CAMERA: Final = np.array([0.0, -1.0, 0.0])
 
 
 class AxesSettings(Settings):
-    """How the ground is found, and when the map is levelled by it."""
+    """How the ground is found, when the map is levelled by it, and where it has its origin."""
+
+    origin: Literal["camera", "ground"] = Field(
+        "camera",
+        description="Origin of the map: the first left camera, or the ground below it, so that "
+        "z = 0 is on the ground at the start.",
+    )
 
     level_min_tilt_deg: float = Field(
         3.0,
@@ -65,17 +72,23 @@ class GroundPlane:
         return math.degrees(math.acos(min(1.0, max(-1.0, float(self.normal @ _UP_CAMERA)))))
 
 
-def map_axes(ground: GroundPlane | None, settings: AxesSettings) -> Float64:
-    """The turn from world to map axes, ``T_map_world``; both have the same origin.
+def map_axes(
+    ground: GroundPlane | None, settings: AxesSettings, camera_height_m: float | None = None
+) -> Float64:
+    """Return ``T_map_world``, from world to map axes.
 
     Args:
         ground: The ground below the first camera, or None (not found).
-        settings: When to level.
+        settings: When to level, and where the origin is.
+        camera_height_m: Known height of the camera above the ground; None = that of ``ground``.
 
     Returns:
         float64 (4, 4). Without a ground, or with a tilt below the limit, exactly
         x_map = z_world, y_map = -x_world, z_map = -y_world; else also turned the short way so
-        that the ground's normal is z_map.
+        that the ground's normal is z_map. With its origin on the ground, also moved up along z.
+
+    Raises:
+        MappingError: The origin is to be on the ground, and there is none.
     """
     turn = AXES_MAP_WORLD
     if ground is not None and ground.tilt_deg > settings.level_min_tilt_deg:
@@ -83,7 +96,29 @@ def map_axes(ground: GroundPlane | None, settings: AxesSettings) -> Float64:
         axis = np.cross(normal_map, [0.0, 0.0, 1.0])
         axis /= np.linalg.norm(axis)
         turn = exp_so3(axis * math.radians(ground.tilt_deg)) @ AXES_MAP_WORLD
-    return make_transform(turn, np.zeros(3))
+    height_m = 0.0
+    if settings.origin == "ground":
+        height_m = _height_along_z(ground, turn) if camera_height_m is None else camera_height_m
+    return make_transform(turn, np.array([0.0, 0.0, height_m]))
+
+
+def base_axes(T_map_world: Float64, camera_height_m: float | None) -> Float64:
+    """Return ``T_base_camera``, from the left camera to the base of the vehicle (`base_link`).
+
+    The base has the axes of the map in the first frame (x forward, y left, z up), and its origin
+    on the ground below the camera; in the camera where its height is not known (None).
+    """
+    return make_transform(T_map_world[:3, :3], np.array([0.0, 0.0, camera_height_m or 0.0]))
+
+
+def _height_along_z(ground: GroundPlane | None, turn: NDArray[Any]) -> float:
+    """How far the ground is below the camera, along z of the map."""
+    if ground is None:
+        raise MappingError(
+            "the first frame shows no ground to put the map's origin on",
+            hint="start where it is seen, set ground.camera_height_m, or use axes.origin=camera",
+        )
+    return ground.height_m / float(turn[2] @ ground.normal)
 
 
 def estimate_ground(cloud: PointCloud, settings: AxesSettings) -> GroundPlane | None:

@@ -44,6 +44,13 @@ class GridSettings(Settings):
     min_blob_cells: int = Field(
         3, ge=1, description="Connected blocked cells fewer than this are taken for noise."
     )
+    vehicle_width_m: float = Field(
+        0.6,
+        ge=0.0,
+        le=10.0,
+        description="Width of what carried the camera: cells that it passed over are free; 0 = "
+        "only what was seen is free.",
+    )
     joined_cells: int = Field(
         2,
         ge=0,

@@ -23,6 +23,8 @@ from recon.structures import PointCloud
 from recon.structures.arrays import Float64, freeze
 
 _BIN_M: Final = 0.05
+_DEEPEST_M: Final = 5.0
+"""Points farther below the path are not what the camera is carried on."""
 _NEIGHBOURS: Final = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
 
 
@@ -62,15 +64,19 @@ class GroundSurface:
         cell_m: Edge of a cell.
         origin_m: (x, y) of the outer corner of cell (0, 0).
         camera_height_m: Height of the camera above the ground along the path; NaN = unknown.
+        drops_m: float64 (rows, columns), commonest height of the path above the points below it;
+            NaN = too few points, or no path. None = not measured.
     """
 
     heights_m: Float64
     cell_m: float
     origin_m: tuple[float, float]
     camera_height_m: float = float("nan")
+    drops_m: Float64 | None = None
 
     def __post_init__(self) -> None:
         freeze(self, "heights_m", np.float64, (None, None))
+        freeze(self, "drops_m", np.float64, self.heights_m.shape)
 
     def height_at(self, xy: NDArray[Any]) -> Float64:
         """Height of the ground at places (N, 2), metres; float64 (N,), NaN = unknown.
@@ -91,12 +97,20 @@ class GroundSurface:
         known = np.isfinite(own) & (weight > 0)
         return np.where(known, total / np.where(known, weight, 1.0), np.nan)
 
-    def _cells(self, row: Float64, column: Float64) -> Float64:
-        """Heights of cells; NaN outside the surface."""
-        rows, columns = self.heights_m.shape
+    def drop_at(self, xy: NDArray[Any]) -> Float64:
+        """`drops_m` of the cells of places (N, 2); float64 (N,), NaN = unknown."""
+        if self.drops_m is None:
+            return np.full(len(xy), np.nan)
+        column, row = np.floor((np.asarray(xy, np.float64) - self.origin_m) / self.cell_m).T
+        return self._cells(row, column, self.drops_m)
+
+    def _cells(self, row: Float64, column: Float64, values: Float64 | None = None) -> Float64:
+        """Values of cells, by default heights; NaN outside the surface."""
+        values = self.heights_m if values is None else values
+        rows, columns = values.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         r, c = np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)
-        return np.where(inside, self.heights_m[r, c], np.nan)
+        return np.where(inside, values[r, c], np.nan)
 
 
 def estimate_ground_surface(
@@ -125,17 +139,24 @@ def estimate_ground_surface(
         cell_m=settings.cell_m,
         origin_m=field.origin,
         camera_height_m=camera_height,
+        drops_m=field.drops(),
     )
 
 
-def estimate_camera_height(
+def measure_camera_height(
     cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings
-) -> float:
-    """Height of the camera above the ground along a path; NaN where none was found.
+) -> tuple[float, Float64]:
+    """Measure the height of the camera above the ground along a path.
 
     Takes and raises what `estimate_ground_surface` does.
+
+    Returns:
+        The commonest height, NaN where no ground was found; and the commonest one in each cell of
+        the path that has points below it, float64 (C,).
     """
-    return _field(cloud, positions_m, settings).camera_height()
+    field = _field(cloud, positions_m, settings)
+    drops = field.drops()
+    return field.camera_height(), drops[np.isfinite(drops)]
 
 
 def _field(cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings) -> _Field:
@@ -167,13 +188,29 @@ class _Field:
         """The commonest height of the path above the points near it; NaN without points."""
         near = self._ring.ravel()[self._cell] == 0
         drop = self._path_z.ravel()[self._cell[near]] - self._z[near]
-        drop = drop[(drop > 2 * _BIN_M) & (drop < 5.0)]
+        drop = drop[(drop > 2 * _BIN_M) & (drop < _DEEPEST_M)]
         if len(drop) < self._settings.min_points:
             return math.nan
         votes = np.bincount((drop / _BIN_M).astype(int), minlength=3)
         smooth = np.convolve(votes, [1, 1, 1], mode="same")
         mode = (int(np.argmax(smooth)) + 0.5) * _BIN_M
         return float(np.median(drop[np.abs(drop - mode) < 3 * _BIN_M]))
+
+    def drops(self) -> Float64:
+        """Commonest height of the path above the points of each cell that it crosses, else NaN."""
+        drop = self._path_z.ravel()[self._cell] - self._z
+        below = (drop > 2 * _BIN_M) & (drop < _DEEPEST_M)
+        found = np.full(self.heights.size, np.nan)
+        cells, slot = np.unique(self._cell[below], return_inverse=True)
+        bins = math.ceil(_DEEPEST_M / _BIN_M)
+        place = slot * bins + (drop[below] / _BIN_M).astype(int)
+        votes = np.bincount(place, minlength=len(cells) * bins).reshape(-1, bins)
+        wide = np.pad(votes, ((0, 0), (1, 1)))
+        smooth = wide[:, :-2] + votes + wide[:, 2:]
+        mode = (smooth.argmax(axis=1) + 0.5) * _BIN_M
+        enough = smooth.max(axis=1, initial=0) >= self._settings.min_points
+        found[cells[enough]] = mode[enough]
+        return np.asarray(found.reshape(self.heights.shape))
 
     def grow(self, camera_height_m: float) -> None:
         """Fill ring after ring, from the path outward."""

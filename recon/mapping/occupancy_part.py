@@ -99,3 +99,26 @@ def join_occupancy(parts: Iterable[OccupancyPart]) -> OccupancyPart:
     known = [part for part in points if part is not None]
     joined = join_points(known) if known and len(known) == len(points) else None
     return OccupancyPart(clamped.observed_rows(blocks), joined)
+
+
+def free_part(keys: Int32, log_odds: float) -> OccupancyPart:
+    """A part of a drive after which cells have given log-odds, whatever was known of them before.
+
+    Args:
+        keys: int32 (N, 3), the cells, each once.
+        log_odds: What they have afterwards.
+    """
+    home = voxels.pack_keys(keys >> raycast.BLOCK_BITS)
+    order = np.argsort(home, kind="stable")
+    blocks, starts = np.unique(home[order], return_index=True)
+    edge = raycast.BLOCK_EDGE
+    cells = np.ravel_multi_index(tuple((keys[order] % edge).T), (edge, edge, edge))
+    rows = clamped.CellRows(
+        blocks,
+        np.append(starts, len(keys)).astype(np.int64),
+        cells.astype(np.uint16),
+        # x -> min(max(x + 0, low), high) with low = high.
+        np.tile(np.array([0.0, log_odds, log_odds], np.float32), (len(keys), 1)),
+    )
+    nothing = SurfacePoints(np.zeros(0, np.int64), np.zeros((0, 4), np.float32))
+    return OccupancyPart(rows, nothing)

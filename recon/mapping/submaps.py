@@ -28,7 +28,8 @@ from recon.structures.arrays import Float64
 class SubmapSettings(Settings):
     """Where a drive is divided into submaps, and into which tiles its map.
 
-    Both bound the memory; apart from rounding they change no result.
+    Both bound the memory; apart from rounding they change no result, except where a vehicle turned
+    back and saw something on its own track: whether that came later is known by submaps.
     """
 
     length_m: float = Field(

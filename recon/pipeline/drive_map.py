@@ -16,7 +16,7 @@ from recon.cloud import filter_cloud
 from recon.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
 from recon.mapping import Submap, SubmapMotion
 from recon.mapping.fused_part import KNOWABLE, join_fused
-from recon.mapping.occupancy_part import join_occupancy
+from recon.mapping.occupancy_part import OccupancyPart, join_occupancy
 from recon.pipeline.config import ReconConfig
 from recon.pipeline.submap_store import SubmapStore
 from recon.structures import OccupancyVoxels, PointCloud
@@ -107,6 +107,17 @@ class DriveMap:
         return self.occupancy_tile_cells * self._config.occupancy.resolution_m
 
     @property
+    def submap_of_frame(self) -> NDArray[np.int64]:
+        """int64 (N,), number of the submap of each frame."""
+        entries = self._store.entries
+        return np.repeat(np.arange(len(entries)), [entry.frames for entry in entries])
+
+    @property
+    def tiles(self) -> list[Tile]:
+        """The tiles with occupancy in them or in their margin, along the drive."""
+        return _along_the_drive(reach.occupancy for reach in self._reach)
+
+    @property
     def columns(self) -> tuple[Tile, Tile]:
         """Smallest x and y of the observed voxels, and the largest ones plus one."""
         seen = [reach for reach in self._reach if reach.low != reach.high]
@@ -130,20 +141,36 @@ class DriveMap:
 
     def occupancy_tiles(self) -> Iterator[tuple[Tile, OccupancyVoxels]]:
         """The observed voxels, map axes, tile by tile along the drive, each with its margin."""
-        for tile in _along_the_drive(reach.occupancy for reach in self._reach):
+        for tile in self.tiles:
             voxels = self.occupancy_of(tile)
             self._config.memory.check("putting the occupancy together")
             yield tile, voxels
 
-    def occupancy_of(self, tile: Tile) -> OccupancyVoxels:
-        """The observed voxels of a tile, and of its margin."""
+    def occupancy_of(
+        self, tile: Tile, after: Mapping[int, OccupancyPart] | None = None
+    ) -> OccupancyVoxels:
+        """The observed voxels of a tile, and of its margin.
+
+        Args:
+            tile: The tile.
+            after: What else was observed at the end of submaps, by their numbers.
+        """
         edge, margin = self._blocks_per_tile, self._margin_blocks
         low, high = np.array(tile) * edge - margin, (np.array(tile) + 1) * edge + margin
-        near = self._near(tile, lambda reach: reach.occupancy)
         # Joined one by one, so that a place passed often takes no more memory than one passed once.
-        parts = (self._submap(index).occupancy for index in near)
+        parts = self._parts(self._near(tile, lambda reach: reach.occupancy), after or {})
         inside = (part.select(_inside(part.blocks[:, :2], low, high)) for part in parts)
         return join_occupancy(inside).voxels(self._config.occupancy.resolution_m)
+
+    def _parts(
+        self, near: Sequence[int], after: Mapping[int, OccupancyPart]
+    ) -> Iterator[OccupancyPart]:
+        """The occupancy of submaps, in order, each followed by what comes after it."""
+        for index in sorted({*near, *after}):
+            if index in near:
+                yield self._submap(index).occupancy
+            if index in after:
+                yield after[index]
 
     def inner(self, tile: Tile, voxels: OccupancyVoxels) -> OccupancyVoxels:
         """The voxels of a tile without its margin."""

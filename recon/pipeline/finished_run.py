@@ -22,6 +22,8 @@ CLOUD: Final = "map/cloud.ply"
 TRAJECTORY: Final = "trajectory_kitti.txt"
 MAPPED_BY: Final = "mapped_by"
 """Record key of a run made from another run: the command that mapped the drive."""
+UNTRUSTED: Final = "untrusted_frames"
+"""Record key of the numbers of frames whose pose is not to be trusted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +35,14 @@ class FinishedRun:
         mapped_by: The command that mapped the drive, such as ``demo``.
         config: Its configuration.
         T_map_world: float64 (4, 4), from world to map axes.
+        untrusted: Numbers of the frames whose pose is not to be trusted.
     """
 
     folder: Path
     mapped_by: str
     config: ReconConfig
     T_map_world: Float64
+    untrusted: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         freeze(self, "T_map_world", np.float64, (4, 4))
@@ -56,7 +60,11 @@ def open_run(folder: Path) -> FinishedRun:
     if T_map_world is None:
         raise FormatError("the run made no map: its record has no T_map_world", where=folder)
     mapped_by = record.get(MAPPED_BY, record.get("command"))
-    return FinishedRun(folder, str(mapped_by), load_config(folder / CONFIG), T_map_world)
+    untrusted = record.get(UNTRUSTED, [])
+    if not isinstance(untrusted, list) or not all(type(n) is int for n in untrusted):
+        raise FormatError(f"record of the run has no valid {UNTRUSTED}", where=folder / RECORD)
+    config = load_config(folder / CONFIG)
+    return FinishedRun(folder, str(mapped_by), config, T_map_world, tuple(untrusted))
 
 
 def refuse_as_target(run: Path, out: Path | None) -> None:

@@ -31,13 +31,15 @@ class WrittenMap:
         points: Number of points in the whole fused cloud.
         voxels: Number of observed voxels.
         grid: The flat grid.
-        warnings: What could not be written.
+        camera_height_m: As in `WrittenGrid`.
+        warnings: What could not be written, or is not in the grid.
     """
 
     cloud: PointCloud
     points: int
     voxels: int
     grid: OccupancyGrid
+    camera_height_m: float | None
     warnings: tuple[str, ...]
 
 
@@ -54,14 +56,16 @@ def write_map(mapped: MappedSequence, directory: RunDirectory, watch: Stopwatch)
         OutputError: A file cannot be written.
     """
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
-    writer = OccupancyWriter(mapped.map, mapped.config, path_m, directory)
+    trusted = np.array([record.ok for record in mapped.health])
+    writer = OccupancyWriter(mapped.map, mapped.config, path_m, trusted, directory)
     with watch.stage("cloud"):
         cloud, points = _write_cloud(mapped, directory, writer)
     with watch.stage("octomap"):
         voxels, warnings = writer.octomap()
     with watch.stage("grid"):
-        grid = writer.grid()
-    return WrittenMap(cloud, points, voxels, grid, tuple(warnings))
+        written = writer.grid()
+    told = (*warnings, *written.warnings)
+    return WrittenMap(cloud, points, voxels, written.grid, written.camera_height_m, told)
 
 
 def _write_cloud(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,10 +12,12 @@ from recon.errors import EvaluationError, MeshingError
 from recon.evaluation import evaluate_map, evaluate_trajectory
 from recon.formats.atomic import write_text
 from recon.formats.trajectory import write_kitti_poses, write_tum
+from recon.geometry.se3 import invert
+from recon.mapping import base_axes
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.drive_mesh import mesh_to_show, store_map, write_drive_mesh
 from recon.pipeline.empty_map import check_map
-from recon.pipeline.finished_run import RAYS_FILE
+from recon.pipeline.finished_run import RAYS_FILE, UNTRUSTED
 from recon.pipeline.machine import use_threads
 from recon.pipeline.map_files import write_map
 from recon.pipeline.observer import Observer
@@ -53,6 +55,7 @@ class MapRun:
         mapped: Trajectory, health, fused cloud, voxels.
         cloud: Even sample of the fused cloud; all points of a small one. Frame ``map``.
         grid: The flat grid.
+        camera_height_m: Height of the camera above the ground; None = unknown, or not steady.
         mesh: The surface in map axes, or None if none was requested, none could be made, or it
             does not fit in memory.
         truth: Ground truth of path and surface, as far as the source knows it.
@@ -68,6 +71,7 @@ class MapRun:
     mapped: MappedSequence
     cloud: PointCloud
     grid: OccupancyGrid
+    camera_height_m: float | None
     mesh: TriangleMesh | None
     truth: SequenceTruth | None
     metrics: TrajectoryMetrics | None
@@ -158,6 +162,7 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
                 "source_description": source.description,
                 "inputs": inputs,
                 "T_map_world": mapped.T_map_world.tolist(),
+                UNTRUSTED: [n for n, record in enumerate(mapped.health) if not record.ok],
                 "timings": watch.seconds,
                 "peak_memory_mb": run.summary["peak_memory_mb"],
                 "warnings": list(run.warnings),
@@ -203,6 +208,7 @@ def _finish(
         mapped=mapped,
         cloud=written.cloud,
         grid=written.grid,
+        camera_height_m=written.camera_height_m,
         mesh=mesh,
         truth=truth,
         metrics=metrics,
@@ -280,6 +286,8 @@ def _summary(run: MapRun) -> dict[str, Any]:
         "path_length_m": run.mapped.trajectory.path_length_m,
         "frames_not_trusted": sum(not record.ok for record in run.mapped.health),
         "T_map_world": run.mapped.T_map_world.tolist(),
+        "camera_height_m": run.camera_height_m,
+        "T_base_camera": base_axes(run.mapped.T_map_world, run.camera_height_m).tolist(),
         "warnings": list(run.warnings),
     }
     if run.mapped.loops is not None:
@@ -297,12 +305,20 @@ def _write(run: MapRun, directory: RunDirectory) -> None:
     path = directory.path
     write_kitti_poses(path("trajectory_kitti.txt"), run.mapped.trajectory)
     write_tum(path("trajectory_tum.txt"), run.mapped.trajectory)
+    write_tum(path("trajectory_map_base_tum.txt"), _base_in_map(run))
     if run.mapped.loops is not None and run.mapped.loops.closure.closed:
         write_tum(path("trajectory_odometry_tum.txt"), run.mapped.loops.odometry)
         directory.write_json("loops.json", run.mapped.loops.edges())
     if run.config.occupancy.keep_rays:
         directory.keep(RAYS, RAYS_FILE)
     write_text(path("config.yaml"), dump_config(run.config))
+
+
+def _base_in_map(run: MapRun) -> Trajectory:
+    """The poses of the vehicle's base in the map, ``T_map_base``, as a trajectory."""
+    path, T_map_world = run.mapped.trajectory, run.mapped.T_map_world
+    T_camera_base = invert(base_axes(T_map_world, run.camera_height_m))
+    return replace(path, T_world_camera=T_map_world @ path.T_world_camera @ T_camera_base)
 
 
 def _tell(observers: Iterable[Observer], stage: str) -> None:

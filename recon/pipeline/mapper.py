@@ -149,7 +149,8 @@ class Mapper:
         """The submap under construction; the first frame fixes the map axes."""
         if self._builder is None:
             ground = estimate_ground(frame.cloud, self._config.axes)
-            self.T_map_world = map_axes(ground, self._config.axes)
+            height_m = self._config.ground.camera_height_m
+            self.T_map_world = map_axes(ground, self._config.axes, height_m)
             self._builder = self._new_builder()
         return self._builder
 

@@ -19,7 +19,7 @@ from recon.formats.ply import read_ply_pieces
 from recon.formats.rays import RayFile
 from recon.formats.trajectory import read_kitti_poses
 from recon.geometry.se3 import apply
-from recon.mapping import SubmapBuilder
+from recon.mapping import SubmapBuilder, base_axes
 from recon.pipeline.config import ReconConfig, dump_config, load_config
 from recon.pipeline.drive_map import DriveMap, Tile
 from recon.pipeline.finished_run import (
@@ -27,6 +27,7 @@ from recon.pipeline.finished_run import (
     MAPPED_BY,
     RAYS_FILE,
     TRAJECTORY,
+    UNTRUSTED,
     FinishedRun,
     open_run,
     refuse_as_target,
@@ -82,20 +83,25 @@ def run_occupancy(request: OccupancyRequest) -> dict[str, Any]:
             store = drive.submaps(directory)
         path_m = apply(drive.run.T_map_world, drive.trajectory.positions_m)
         tiles = DriveMap(store, drive.config, drive.run.T_map_world)
-        writer = OccupancyWriter(tiles, drive.config, path_m, directory)
+        trusted = ~np.isin(np.arange(len(path_m)), drive.run.untrusted)
+        writer = OccupancyWriter(tiles, drive.config, path_m, trusted, directory)
         with watch.stage("octomap"):
             for tile, cloud in drive.clouds(tiles.cloud_tile_m):
                 writer.put_cloud(tile, cloud)
             voxels, warnings = writer.octomap()
         with watch.stage("grid"):
-            grid = writer.grid()
+            written = writer.grid()
+        warnings += written.warnings
+        T_map_world = drive.run.T_map_world
         write_text(directory.path("config.yaml"), dump_config(drive.config))
         summary = {
             "run": str(request.run),
             "frames": len(drive.trajectory),
             "voxels": voxels,
-            **_cells(grid),
-            "T_map_world": drive.run.T_map_world.tolist(),
+            **_cells(written.grid),
+            "T_map_world": T_map_world.tolist(),
+            "camera_height_m": written.camera_height_m,
+            "T_base_camera": base_axes(T_map_world, written.camera_height_m).tolist(),
             "warnings": warnings,
             **cost(watch, time.perf_counter() - start),
             "out": str(directory.folder),
@@ -105,7 +111,8 @@ def run_occupancy(request: OccupancyRequest) -> dict[str, Any]:
             "source": str(request.run),
             MAPPED_BY: drive.run.mapped_by,
             "inputs": fingerprint([request.run / n for n in (RAYS_FILE, CLOUD, TRAJECTORY)]),
-            "T_map_world": drive.run.T_map_world.tolist(),
+            "T_map_world": T_map_world.tolist(),
+            UNTRUSTED: list(drive.run.untrusted),
             "timings": watch.seconds,
             "warnings": warnings,
         }

@@ -15,6 +15,7 @@ FRAMES = 24
 PRODUCTS = {
     "trajectory_kitti.txt",
     "trajectory_tum.txt",
+    "trajectory_map_base_tum.txt",
     "map/cloud.ply",
     "map/grid.pgm",
     "map/grid.yaml",

@@ -36,6 +36,7 @@ ALIKE = StreetSettings(
 FILES = [
     "trajectory_kitti.txt",
     "trajectory_tum.txt",
+    "trajectory_map_base_tum.txt",
     "map/cloud.ply",
     "map/grid.pgm",
     "map/octomap.ot",

@@ -24,6 +24,7 @@ SETTINGS = ["checkpoints.every_frames=5", "submaps.length_m=4", "submaps.tile_m=
 FILES = [
     "trajectory_kitti.txt",
     "trajectory_tum.txt",
+    "trajectory_map_base_tum.txt",
     "map/cloud.ply",
     "map/grid.pgm",
     "map/grid.yaml",

@@ -31,7 +31,7 @@ from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.sequence import MappedSequence, map_sequence
 from recon.pipeline.stopwatch import Stopwatch
 from recon.sources.synthetic import SyntheticSource
-from recon.structures import FREE, OCCUPIED, PointCloud
+from recon.structures import FREE, OCCUPIED, UNKNOWN, PointCloud
 from recon.synthetic import StreetSettings
 
 STREET = StreetSettings(frames=20, width_px=192, height_px=72, focal_px=110.0)
@@ -78,15 +78,44 @@ def test_the_grid_of_tiles_is_that_of_the_whole(
     floor = add_floors(cloud, find_floors(mapped.voxels), config.ground)
     ground = estimate_ground_surface(floor, path_m, config.ground)
     whole = flatten(mapped.voxels, ground, config.grid)
-    written = write_map(mapped, folder, Stopwatch()).grid
-    assert (written.cells.shape, written.resolution_m) == (whole.cells.shape, whole.resolution_m)
-    np.testing.assert_allclose(written.origin_m, whole.origin_m, atol=1e-9)
+    narrow = load_config(None, [*SETTINGS, "grid.vehicle_width_m=0"])
+    written = write_map(replace(mapped, config=narrow), folder, Stopwatch()).grid
+    # Beyond the voxels, there is a margin of at least 5 m around the path.
+    low = np.minimum(whole.origin_m, np.floor((path_m.min(axis=0)[:2] - 5) / 0.2) * 0.2)
+    np.testing.assert_allclose(written.origin_m, low, atol=1e-9)
+    margin = np.rint((np.array(whole.origin_m) - low) / 0.2).astype(int)
+    rows, columns = (
+        slice(n, n + size) for n, size in zip(margin[::-1], whole.cells.shape, strict=True)
+    )
+    beyond = written.cells.copy()
+    beyond[rows, columns] = UNKNOWN
+    assert (beyond == UNKNOWN).all()
+    written = replace(written, cells=written.cells[rows, columns])
     # The height of the camera is a median over tiles in place of one over the drive, so a voxel
     # at the very edge of the height band may change sides.
     for value in (OCCUPIED, FREE):
         ours, theirs = written.cells == value, whole.cells == value
         assert (ours & theirs).sum() >= 0.995 * (ours | theirs).sum() > 100
-    np.testing.assert_array_equal(read_nav2(folder.path("map/grid.yaml")).cells, written.cells)
+
+
+def test_the_vehicle_frees_its_own_track_alone(
+    mapped: MappedSequence, folder: RunDirectory
+) -> None:
+    narrow = load_config(None, [*SETTINGS, "grid.vehicle_width_m=0"])
+    seen = write_map(replace(mapped, config=narrow), folder, Stopwatch()).grid
+    grid = write_map(mapped, folder, Stopwatch()).grid
+    np.testing.assert_array_equal(read_nav2(folder.path("map/grid.yaml")).cells, grid.cells)
+    path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)[:, :2]
+    columns, rows = np.floor((path_m - grid.origin_m) / 0.2).astype(int).T
+    assert (seen.cells[rows, columns] == UNKNOWN).sum() >= 2  # the camera does not see its start
+    trusted = np.array([record.ok for record in mapped.health])
+    assert (grid.cells[rows, columns] == FREE)[trusted].all()
+    changed = np.argwhere(grid.cells != seen.cells)[:, ::-1]
+    centres = (changed + 0.5) * 0.2 + np.array(grid.origin_m)
+    away = np.linalg.norm(centres[:, None] - path_m, axis=2).min(axis=1)
+    # Half of 0.6 m from the path, or half of the 1 m between two poses.
+    assert len(changed) > 0
+    assert away.max() < np.hypot(0.3, 0.55)
 
 
 def test_a_map_too_large_for_an_octomap_has_all_else(

@@ -1,0 +1,189 @@
+"""A map as Nav2 reads it: the robot starts in free space, inside the grid, and knows its base."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from recon.formats.trajectory import read_tum
+from recon.geometry.se3 import invert
+from recon.pipeline.config import load_config
+from recon.pipeline.demo_source import demo_source
+from recon.pipeline.map_run import MapOptions, run_map
+from recon.pipeline.occupancy_run import OccupancyRequest, run_occupancy
+from recon.sources import StereoSource
+from recon.sources.kitti import open_kitti
+from recon.structures import Trajectory
+from tests.flow.rooms import RoomSource
+
+FOOTPRINT_M = 0.3
+FREE, OCCUPIED, UNKNOWN = 0, 100, -1
+
+
+class ServedMap:
+    """A map by the documented rule of nav2_map_server's trinary mode, without our reader.
+
+    The occupancy of a pixel is (255 - value) / 255: above occupied_thresh it is occupied, below
+    free_thresh free, else unknown. `origin` is the lower left corner of the lower left pixel.
+    """
+
+    def __init__(self, run: Path) -> None:
+        described = yaml.safe_load((run / "map/grid.yaml").read_text())
+        assert described["mode"] == "trinary"
+        assert described["negate"] == 0
+        assert described["origin"][2] == 0.0
+        image = cv2.imread(str(run / "map" / described["image"]), cv2.IMREAD_UNCHANGED)
+        occupancy = (255 - image.astype(np.float64)) / 255
+        self.cells = np.full(image.shape, UNKNOWN)
+        self.cells[occupancy > described["occupied_thresh"]] = OCCUPIED
+        self.cells[occupancy < described["free_thresh"]] = FREE
+        self._corner = np.array(described["origin"][:2])
+        self._resolution = described["resolution"]
+
+    def at(self, xy: np.ndarray) -> np.ndarray:
+        """The cells of places (N, 2); fails outside of the map."""
+        column, row = np.floor((xy - self._corner) / self._resolution).astype(int).T
+        row = len(self.cells) - 1 - row
+        assert (column >= 0).all()
+        assert (row >= 0).all()
+        return self.cells[row, column]
+
+
+def _disc(centre: np.ndarray, radius_m: float) -> np.ndarray:
+    """Places (N, 2) within a radius."""
+    grid = np.arange(-radius_m, radius_m + 0.01, 0.05)
+    xy = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+    return centre + xy[np.linalg.norm(xy, axis=1) <= radius_m]
+
+
+def _summary(run: Path) -> dict[str, Any]:
+    return json.loads((run / "summary.json").read_text())
+
+
+def _check_start(run: Path, least_free: float = 1.0) -> None:
+    """The start and all trusted poses are free, with room for a robot around the start."""
+    served, base = ServedMap(run), read_tum(run / "trajectory_map_base_tum.txt")
+    untrusted = json.loads((run / "run.json").read_text())["untrusted_frames"]
+    path = np.delete(base.positions_m[:, :2], untrusted, axis=0)
+    assert np.linalg.norm(path[0]) < 1e-6
+    # The corners of cells that a footprint cuts are not all within it: the inner cells are free.
+    assert (served.at(_disc(path[0], FOOTPRINT_M - 0.15)) == FREE).all()
+    # Every footprint of up to 5 m lies inside of the map: at() fails otherwise.
+    assert len(served.at(_disc(path[0], 4.9)))
+    assert (served.at(path) == FREE).mean() >= least_free
+
+
+def test_a_robot_starts_in_free_space_inside_the_map(small_demo: Path) -> None:
+    _check_start(small_demo)
+
+
+def test_a_remade_map_has_the_same_start(small_demo: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    summary = run_occupancy(OccupancyRequest(small_demo, ("grid.vehicle_width_m=1.8",), out=out))
+    # Poses come from a file with 13 digits.
+    T_base_camera = _summary(small_demo)["T_base_camera"]
+    np.testing.assert_allclose(summary["T_base_camera"], T_base_camera, atol=1e-9)
+    served = ServedMap(out)
+    assert (served.at(_disc(np.zeros(2), 0.75)) == FREE).all()
+    nothing = ("grid.vehicle_width_m=0",)
+    run_occupancy(OccupancyRequest(small_demo, nothing, out=tmp_path / "seen"))
+    assert (ServedMap(tmp_path / "seen").at(np.zeros((1, 2))) == UNKNOWN).all()
+
+
+def test_the_base_is_where_the_camera_stands_on_the_road(small_demo: Path) -> None:
+    summary = _summary(small_demo)
+    # 1.65 m in the street's settings; the ground is measured to a few centimetres.
+    assert summary["camera_height_m"] == pytest.approx(1.65, abs=0.06)
+    T_base_camera = np.array(summary["T_base_camera"])
+    assert T_base_camera[:3, 3].tolist() == [0, 0, summary["camera_height_m"]]
+    base = read_tum(small_demo / "trajectory_map_base_tum.txt")
+    camera = read_tum(small_demo / "trajectory_tum.txt")
+    # By definition: T_map_world T_world_camera = T_map_base T_base_camera.
+    expected = np.array(summary["T_map_world"]) @ camera.T_world_camera @ invert(T_base_camera)
+    np.testing.assert_allclose(base.T_world_camera, expected, atol=1e-9)
+    np.testing.assert_array_equal(base.timestamps_s, camera.timestamps_s)
+    # The start is the map's own pose, one camera height down; it drives along x.
+    np.testing.assert_allclose(base.T_world_camera[0, :3, :3], np.eye(3), atol=1e-9)
+    assert base.positions_m[0, 2] == pytest.approx(-summary["camera_height_m"])
+    assert base.positions_m[-1, 0] > 10
+
+
+def test_frames_that_are_not_trusted_free_nothing(small_demo: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for name in ("config.yaml", "trajectory_kitti.txt"):
+        (copy / name).symlink_to(small_demo / name)
+    (copy / "map").symlink_to(small_demo / "map")
+    record = json.loads((small_demo / "run.json").read_text())
+    assert 0 not in record["untrusted_frames"]
+    (copy / "run.json").write_text(json.dumps(record | {"untrusted_frames": [0, 1]}))
+    run_occupancy(OccupancyRequest(copy, out=tmp_path / "out"))
+    assert (ServedMap(tmp_path / "out").at(np.zeros((1, 2))) == UNKNOWN).all()
+
+
+@pytest.mark.slow
+def test_the_map_can_have_its_origin_on_the_ground(tmp_path: Path) -> None:
+    street = [
+        "street.frames=8",
+        "street.width_px=256",
+        "street.height_px=96",
+        "street.focal_px=150",
+    ]
+    config = load_config(None, [*street, "axes.origin=ground"])
+    out = tmp_path / "run"
+    run = run_map(demo_source(config), config, MapOptions(command="demo", out=out, mesh=False))
+    base = read_tum(out / "trajectory_map_base_tum.txt")
+    # One frame's ground plane against the ground of the whole drive: some centimetres apart.
+    assert abs(base.positions_m[0, 2]) < 0.1
+    assert np.array(run.summary["T_map_world"])[2, 3] == pytest.approx(1.65, abs=0.1)
+    assert run.occupancy_metrics is not None
+    assert run.occupancy_metrics.voxels.precision > 0.8
+    _check_start(out)
+
+
+FRAMES = 20
+CARRIED = 1.1 + 0.03 * np.sin(np.arange(FRAMES))
+FLOWN = 1.4 + 0.8 * np.sin(np.arange(FRAMES) / 3)
+
+
+def _mapped(source: StereoSource, out: Path, poses: Trajectory | None = None) -> Path:
+    config = load_config(None, ["loops.enabled=false"])
+    run_map(source, config, MapOptions(out=out, mesh=False, known_poses=poses))
+    return out
+
+
+@pytest.mark.slow
+def test_a_carried_rig_frees_its_way_through_a_room(tmp_path: Path) -> None:
+    source = RoomSource(CARRIED)
+    run = _mapped(source, tmp_path / "run", source.trajectory)
+    assert _summary(run)["camera_height_m"] == pytest.approx(1.1, abs=0.05)
+    assert _summary(run)["warnings"] == []
+    _check_start(run)
+
+
+@pytest.mark.slow
+def test_a_flown_rig_frees_nothing_below_it(tmp_path: Path) -> None:
+    source = RoomSource(FLOWN)
+    run = _mapped(source, tmp_path / "run", source.trajectory)
+    summary = _summary(run)
+    assert summary["camera_height_m"] is None
+    assert "not carried at one height" in summary["warnings"][0]
+    # Its base is the camera itself.
+    assert np.array(summary["T_base_camera"])[:3, 3].tolist() == [0, 0, 0]
+    assert (ServedMap(run).at(np.zeros((1, 2))) == UNKNOWN).all()
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_a_real_car_starts_in_free_space(recon_data: Path, tmp_path: Path) -> None:
+    drive = open_kitti(recon_data / "driven" / "kitti_raw_0013")
+    run = _mapped(drive, tmp_path / "run")
+    assert _summary(run)["camera_height_m"] == pytest.approx(1.65, abs=0.1)  # KITTI's setup paper
+    # Of what was seen to be occupied after the car was there, nothing is freed.
+    _check_start(run, least_free=0.99)
