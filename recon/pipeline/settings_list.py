@@ -10,6 +10,7 @@ from typing import Any, Final, Literal, get_args, get_origin
 from pydantic.fields import FieldInfo
 
 from recon.errors import SettingsError
+from recon.matching import Matcher
 from recon.pipeline.config import PAIR_DEFAULTS, ReconConfig
 from recon.settings import Settings, alternatives, can_be_none, suggest_names
 
@@ -174,7 +175,7 @@ def _as_yaml(value: Any) -> str:
 
 def _values(field: FieldInfo) -> str:
     """The values of a field in words: choices, kind or bounds."""
-    kinds = [kind for kind in alternatives(field.annotation) if kind is not type(None)]
+    kinds = [kind for kind in alternatives(field.annotation) if _is_written(kind)]
     words = [_kind(kind) for kind in kinds]
     bounds = [
         f"{sign} {getattr(mark, name):g}"
@@ -184,6 +185,11 @@ def _values(field: FieldInfo) -> str:
     ]
     text = ", ".join(words if not bounds or len(kinds) > 1 else bounds)
     return f"{text}, or none" if can_be_none(field) else text
+
+
+def _is_written(kind: Any) -> bool:
+    """Whether a file can hold a value of this kind: not none, and no object."""
+    return kind is not type(None) and getattr(kind, "__origin__", None) is not Matcher
 
 
 def _kind(kind: Any) -> str:
