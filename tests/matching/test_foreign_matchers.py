@@ -61,6 +61,25 @@ def test_an_object_is_taken_where_a_name_is() -> None:
     assert config.model_dump(mode="json")["matching"]["matcher"] == "Flat"
 
 
+def test_a_run_is_made_with_an_object_and_records_its_name(tmp_path: Path) -> None:
+    config = recon.load_config().with_matcher(Flat())
+    given = recon.PairInput(recon.StereoPair(image(), image()), CAMERA)
+    out = tmp_path / "run"
+    run = recon.run_pair(given, config, recon.PairOptions("disparity", out=out))
+    assert np.nanmedian(run.disparity.values) == 5
+    assert "matcher: Flat" in (out / "config.yaml").read_text()
+
+
+@pytest.mark.slow
+def test_a_drive_is_mapped_with_an_object() -> None:
+    small = ["frames=3", "width_px=256", "height_px=96", "focal_px=150"]
+    config = recon.load_config(overrides=[f"street.{setting}" for setting in small])
+    mine = Flat()
+    mapped = recon.map_sequence(recon.SyntheticSource(config.street), config.with_matcher(mine))
+    assert len(mapped.trajectory) == 3
+    assert mine.ndisp is not None
+
+
 def test_a_matcher_of_others_is_told_how_far_to_search() -> None:
     mine = Flat()
     for kind in ("auto", "usual"):
