@@ -30,7 +30,13 @@ T_UPRIGHT_CAMERA: Final[Float64] = np.array(
 _BACKGROUND = "#14181d"
 _PATH_COLOURS = ("#ff5252", "#ffb74d", "#81c784")
 _OUTLIER_SHARE = 0.002
-_BEHIND_AND_ABOVE = (-0.95, -1.15, 0.75)
+# Candidate viewpoints: from behind (x is forward), from the sides, and from above.
+_TURNS_RAD = np.radians(np.arange(-75.0, 76.0, 15.0))
+_ABOVE_RAD = np.radians((25.0, 35.0, 50.0))
+_HALF_VIEW = np.array([0.62, 0.36])  # tangents across and up: plotly's 45 degrees, with a margin
+_CELLS = np.array([48, 28])  # of the view, to count how much of it is filled
+_TRIED_POINTS = 4000
+_CENTRED = 4  # rounds of moving the look-at point to the middle of what is seen
 _FARTHEST_EYE = 2.2  # in units of plotly: a cube of edge 2 then fills most of the view
 _LOOK_AT = (-0.1, -0.1, -0.1)  # nearer than the centre, as near objects fill more of the view
 Json = dict[str, Any]
@@ -45,7 +51,7 @@ class Scene:
         cloud: Points, or None.
         mesh: A surface, or None.
         paths: Named camera paths, float64 (N, 3).
-        eye_m: Initial viewpoint, view axes; None = behind and above.
+        eye_m: Initial viewpoint, view axes; None = above, from where the content fills the view.
     """
 
     T_view_frame: Float64
@@ -78,8 +84,13 @@ def plot_scene(scene: Scene, max_points: int = MAX_POINTS, max_faces: int = MAX_
     for number, (name, path) in enumerate(scene.paths):
         traces.append(_path_trace(name, path, T, _PATH_COLOURS[number % len(_PATH_COLOURS)]))
     config = {"displaylogo": False, "responsive": True, "scrollZoom": True}
-    box = _bounding_box(cloud, scene, T)
-    layout = _layout(_eye(scene, box), box)
+    seen = _content(cloud, scene, T)
+    box = _bounding_box(seen)
+    if scene.eye_m is None:
+        eye, look_at = _whole_view((seen - box.mean(axis=0)) * _scale(box))
+    else:
+        eye, look_at = _eye(scene.eye_m, box), np.array(_LOOK_AT)
+    layout = _layout(eye, look_at, box)
     return {"data": traces, "layout": layout, "config": config, "colourings": colourings}
 
 
@@ -175,14 +186,18 @@ def _without_outliers(cloud: PointCloud) -> PointCloud:
     return cloud.select(inside)
 
 
-def _bounding_box(cloud: PointCloud | None, scene: Scene, T: Float64) -> Float64:
-    """float64 (2, 3): bounds of the initially visible content, view axes."""
+def _content(cloud: PointCloud | None, scene: Scene, T: Float64) -> Float64:
+    """float64 (N, 3): the initially visible points, view axes."""
     parts = [path for _, path in scene.paths]
     if cloud is not None and len(cloud):
         parts.append(cloud.xyz.astype(np.float64))
     elif scene.mesh is not None:
         parts.append(scene.mesh.vertices.astype(np.float64))
-    seen = apply(T, np.concatenate([np.zeros((0, 3)), *parts]))
+    return np.asarray(apply(T, np.concatenate([np.zeros((0, 3)), *parts])))
+
+
+def _bounding_box(seen: Float64) -> Float64:
+    """float64 (2, 3): bounds of points, with a small margin."""
     if not len(seen):
         return np.array([[-1.0] * 3, [1.0] * 3])
     middle, half = (seen.max(axis=0) + seen.min(axis=0)) / 2, np.ptp(seen, axis=0) / 2
@@ -195,16 +210,49 @@ def _scale(box: Float64) -> float:
     return 2.0 / float(np.ptp(box, axis=0).max())
 
 
-def _eye(scene: Scene, box: Float64) -> Float64:
+def _eye(eye_m: tuple[float, float, float], box: Float64) -> Float64:
     """float64 (3,): viewpoint, in units of plotly relative to the centre of the box."""
-    if scene.eye_m is None:
-        return np.array(_BEHIND_AND_ABOVE)
-    eye = (np.asarray(scene.eye_m) - box.mean(axis=0)) * _scale(box)
+    eye = (np.asarray(eye_m) - box.mean(axis=0)) * _scale(box)
     # Seen from the position of a long lens, everything would be small in this wider view.
     return np.asarray(eye * min(1.0, _FARTHEST_EYE / max(float(np.linalg.norm(eye)), 1e-9)))
 
 
-def _layout(eye: Float64, box: Float64) -> Json:
+def _whole_view(seen: Float64) -> tuple[Float64, Float64]:
+    """The viewpoint that sees all points, and in which they fill most of the view.
+
+    Args:
+        seen: float64 (N, 3), in units of plotly relative to the centre of the box.
+
+    Returns:
+        float64 (3,) twice: the viewpoint, and the point that it looks at.
+    """
+    points = seen[:: max(1, len(seen) // _TRIED_POINTS)] if len(seen) else np.zeros((1, 3))
+    tried = [_view_from(points, turn, above) for turn in _TURNS_RAD for above in _ABOVE_RAD]
+    _, eye, look_at = max(tried, key=lambda view: view[0])
+    return eye, look_at
+
+
+def _view_from(points: Float64, turn_rad: float, above_rad: float) -> tuple[int, Float64, Float64]:
+    """The nearest view of all points from one direction: cells filled, viewpoint, look-at point."""
+    level = -np.array([np.cos(turn_rad), np.sin(turn_rad), 0.0])
+    towards = np.cos(above_rad) * level + [0.0, 0.0, np.sin(above_rad)]
+    across = np.array([-level[1], level[0], 0.0])
+    axes = np.stack([across, np.cross(towards, across)])
+    look_at, place = np.zeros(3), np.zeros((1, 2))
+    away = 0.0
+    for _ in range(_CENTRED):
+        flat, near = (points - look_at) @ axes.T, (points - look_at) @ towards
+        # A point at distance z before the eye is in view up to z times the tangent of half of it.
+        away = max(float((np.abs(flat) / _HALF_VIEW + near[:, None]).max()), 0.1)
+        place = flat / (away - near)[:, None]
+        look_at = look_at + away * (place.max(axis=0) + place.min(axis=0)) / 2 @ axes
+    cells = np.floor((place / _HALF_VIEW + 1) / 2 * _CELLS)
+    # Not to be moved after the last measurement of what is in view.
+    centre = look_at - away * (place.max(axis=0) + place.min(axis=0)) / 2 @ axes
+    return len(np.unique(cells, axis=0)), centre + away * towards, centre
+
+
+def _layout(eye: Float64, look_at: Float64, box: Float64) -> Json:
     aspect = dict(zip("xyz", (_scale(box) * np.ptp(box, axis=0)).tolist(), strict=True))
     titles = {"x": "x forward (m)", "y": "y left (m)", "z": "z up (m)"}
     axes = {
@@ -220,7 +268,7 @@ def _layout(eye: Float64, box: Float64) -> Json:
     }
     camera = {
         "eye": dict(zip("xyz", eye.tolist(), strict=True)),
-        "center": dict(zip("xyz", _LOOK_AT, strict=True)),
+        "center": dict(zip("xyz", look_at.tolist(), strict=True)),
     }
     return {
         "paper_bgcolor": _BACKGROUND,

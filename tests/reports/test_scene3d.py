@@ -113,3 +113,37 @@ def test_large_cloud_is_thinned_and_takes_few_bytes_per_point() -> None:
     assert 10_000 < points <= 20_000
     # 12 bytes of position and three times 1 of colour, times 4/3 for base64; the scales are small.
     assert len(json.dumps(scene)) < 20 * points + 50_000
+
+
+def drive(angle_deg: float, length_m: float = 300.0) -> PointCloud:
+    """A straight street, 16 m wide, between fronts of 7 m."""
+    rng, turn = np.random.default_rng(0), np.radians(angle_deg)
+    along, aside = rng.uniform(0, length_m, 4000), rng.choice([-8.0, 8.0], 4000)
+    x, y = np.cos(turn) * along - np.sin(turn) * aside, np.sin(turn) * along + np.cos(turn) * aside
+    return PointCloud(np.stack([x, y, rng.uniform(0, 7, 4000)], axis=1).astype(np.float32))
+
+
+def seen_places(cloud: PointCloud) -> np.ndarray:
+    """Where the points are in the first view: -1 to 1 from border to border, across and up."""
+    scene = plot_scene(Scene(np.eye(4), cloud))["layout"]["scene"]
+    box = np.array([scene[f"{axis}axis"]["range"] for axis in "xyz"])
+    unit = scene["aspectratio"]["x"] / np.ptp(box[0])
+    eye, centre = (np.array(list(scene["camera"][key].values())) for key in ("eye", "center"))
+    ahead = (centre - eye) / np.linalg.norm(centre - eye)
+    right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
+    rays = (cloud.xyz - box.mean(axis=1)) * unit - eye
+    # plotly's field of view: 45 degrees from bottom to top, here 1.7 times as much across.
+    half = np.tan(np.radians(22.5)) * np.array([1.7, 1.0])
+    places = np.stack([rays @ right, rays @ np.cross(right, ahead)], axis=1)
+    return places / (rays @ ahead)[:, None] / half
+
+
+@pytest.mark.parametrize("angle_deg", [0, 45, 90, -60, 135])
+def test_a_long_drive_fills_the_first_view_whatever_its_direction(angle_deg: float) -> None:
+    places = seen_places(drive(angle_deg))
+    assert np.abs(places).max() <= 1
+    # From one border almost to the other, in one direction at least, and not as a thin strip:
+    # seen from its side it would cover 2 % of the view.
+    assert np.ptp(places, axis=0).max() > 1.6
+    cells = np.unique(np.floor((places + 1) * 12), axis=0)
+    assert len(cells) > 0.1 * 24**2
