@@ -70,13 +70,13 @@ def _read(
     text = read_text(path)
     if _OURS.search(text):
         return read_recon_calibration(path)
-    # OpenCV before KITTI: its extrinsics contain a ``P1:`` as well.
-    if _OPENCV.search(text):
-        return read_opencv_calibration(path, size_px=size, metres_per_unit=metres_per_unit)
     if _CAMERA_INFO.search(text):
         return read_camera_info(path)
     if _KALIBR.search(text):
         return read_kalibr(path)
+    # OpenCV after the others that may have its header, before KITTI: it may contain a ``P1:``.
+    if _OPENCV.search(text):
+        return read_opencv_calibration(path, size_px=size, metres_per_unit=metres_per_unit)
     if _MIDDLEBURY.search(text):
         return read_middlebury_calib(path).camera
     if _KITTI.search(text):

@@ -74,18 +74,44 @@ def rig_of_camera_infos(
     Raises:
         CalibrationError: The calibration cannot give depth.
     """
-    if P_right[0, 3] >= 0:
-        raise CalibrationError(
-            "CameraInfo has no baseline",
-            where=where,
-            got=f"P[0, 3] = {P_right[0, 3]:g}",
-            expected="-fx * baseline, below 0",
-            hint="the cameras were calibrated one by one, or left and right are swapped",
-        )
+    check_shift(P_right, 0.0, where)
     offset = np.array([P_right[0, 3] / P_right[0, 0], 0.0, 0.0])
     with naming(where):
         T = orthonormalise(make_transform(right[1].T @ left[1], right[1].T @ offset))
         return StereoCalibration(left[0], right[0], T)
+
+
+def check_shift(P_right: Float64, left_shift: float, where: StrPath) -> None:
+    """Check that the projection matrix of the right camera contains a baseline.
+
+    Args:
+        P_right: float64 (3, 4).
+        left_shift: ``P[0, 3]`` of the left camera, usually 0.
+        where: File or topic, for the error message.
+
+    Raises:
+        CalibrationError: The baseline is zero, or the cameras are swapped.
+    """
+    shift = float(P_right[0, 3]) - left_shift
+    if shift < 0:
+        return
+    got, expected = f"P[0, 3] = {P_right[0, 3]:g}", "-fx * baseline, below 0"
+    if shift > 0:
+        raise CalibrationError(
+            "right camera is to the left of the left camera",
+            where=where,
+            got=got,
+            expected=expected,
+            hint="swap left and right",
+        )
+    raise CalibrationError(
+        "CameraInfo has no baseline",
+        where=where,
+        got=got,
+        expected=expected,
+        hint="the right camera was calibrated alone: calibrate both as a pair, or name a "
+        "calibration file with --calib",
+    )
 
 
 def write_camera_info(

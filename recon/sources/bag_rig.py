@@ -8,7 +8,7 @@ import numpy as np
 
 from recon.adapters.rosbags import BagCameraInfo
 from recon.errors import CalibrationError
-from recon.formats.camera_info import rig_of_camera_infos
+from recon.formats.camera_info import check_shift, rig_of_camera_infos
 from recon.formats.files import naming
 from recon.formats.lens_models import ROS_MODELS, lens_of
 from recon.sources.rig import Rig
@@ -43,6 +43,7 @@ def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rect
 
 
 def _rectified(left: BagCameraInfo, right: BagCameraInfo, where: Path) -> RectifiedCamera:
+    check_shift(right.P, float(left.P[0, 3]), where)
     with naming(where):
         return RectifiedCamera(
             focal_px=float(left.P[0, 0]),

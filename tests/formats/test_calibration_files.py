@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from recon.errors import CalibrationError, FormatError
 from recon.formats.calibration import read_calibration
@@ -192,8 +193,31 @@ def test_camera_info_without_its_other_half_says_which_is_missing(tmp_path: Path
 def test_camera_info_of_two_single_calibrations_is_refused(tmp_path: Path) -> None:
     write_ros(tmp_path / "rig.yaml", rig("brown"))
     (tmp_path / "rig_right.yaml").write_text((tmp_path / "rig_left.yaml").read_text())
-    with pytest.raises(CalibrationError, match=r"rig_right\.yaml: CameraInfo has no baseline"):
+    with pytest.raises(
+        CalibrationError,
+        match=r"rig_right\.yaml: CameraInfo has no baseline \(got P\[0, 3\] = 0.*alone.*--calib$",
+    ):
         read_camera_info(tmp_path / "rig_left.yaml")
+
+
+def test_camera_info_of_swapped_cameras_says_so(tmp_path: Path) -> None:
+    write_ros(tmp_path / "rig.yaml", rig("brown"))
+    left, right = (tmp_path / f"rig_{side}.yaml" for side in ("left", "right"))
+    P = yaml.safe_load(right.read_text())["projection_matrix"]["data"]
+    right.write_text(right.read_text().replace(repr(P[3]), repr(-P[3])))
+    with pytest.raises(CalibrationError, match=r"to the left of the left.*swap left and right"):
+        read_camera_info(left)
+
+
+@pytest.mark.parametrize("write", [write_kalibr, write_ros])
+def test_a_header_of_opencv_does_not_hide_the_format(
+    tmp_path: Path, write: Callable[[Path, StereoCalibration], object]
+) -> None:
+    write(tmp_path / "rig.yaml", rig("radtan"))
+    for path in tmp_path.iterdir():
+        path.write_text("%YAML:1.0\n---\n" + path.read_text())
+    path = min(tmp_path.iterdir())
+    assert isinstance(read_calibration(path, 640, 480), StereoCalibration)
 
 
 def test_camera_info_has_the_baseline_in_the_right_projection(tmp_path: Path) -> None:
