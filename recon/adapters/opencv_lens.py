@@ -71,7 +71,8 @@ def project_into_picture(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64
 def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
     """float64 (N, 3), the rays of pixels (N, 2) in camera axes, with z = 1.
 
-    A ray is NaN where the lens model cannot be inverted (outside the image).
+    A ray is NaN where the lens model cannot be inverted (outside the image), or at 90 degrees or
+    more from the optical axis.
     """
     points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
     matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
@@ -82,12 +83,12 @@ def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
     else:
         plane = cv2.undistortPoints(points, matrix, distortion, criteria=_EXACT)
     rays = np.concatenate([plane.reshape(-1, 2), np.ones((len(points), 1))], axis=1)
-    # OpenCV marks failures of the fisheye model with -1e6, those of other models not at all.
+    # OpenCV marks some failures of the fisheye model with -1e6; of other failures, and of rays at
+    # more than 90 degrees, it returns the ray of another pixel.
     rays[~(np.abs(rays).max(axis=1) < 1e5)] = np.nan
-    if camera.model != "fisheye":
-        with np.errstate(invalid="ignore"):
-            missed = np.abs(project(camera, rays) - points[:, 0]).max(axis=1) > _LARGEST_MISS_PX
-        rays[missed] = np.nan
+    with np.errstate(invalid="ignore"):
+        missed = np.abs(project(camera, rays) - points[:, 0]).max(axis=1) > _LARGEST_MISS_PX
+    rays[missed] = np.nan
     return rays
 
 

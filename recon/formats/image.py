@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from threading import Lock
@@ -18,6 +18,7 @@ from recon.formats.files import StrPath, read_bytes
 from recon.formats.image_integrity import check_image_bytes, is_tiff
 from recon.structures.arrays import UInt8
 
+FULL_WHITE: Final = 65535
 _LOG_LEVEL_LOCK: Final = Lock()
 _GREY_ONLY: Final = frozenset({".pgm"})
 _COLOUR_ONLY: Final = frozenset({".ppm"})
@@ -25,15 +26,16 @@ _EIGHT_BIT_ONLY: Final = frozenset({".jpg", ".jpeg"})
 _WRITABLE: Final = _GREY_ONLY | _COLOUR_ONLY | _EIGHT_BIT_ONLY | {".png", ".tif", ".tiff"}
 
 
-def read_image(path: StrPath) -> UInt8:
+def read_image(path: StrPath, white: int = FULL_WHITE) -> UInt8:
     """Read an image for display or matching, as 8 bits.
 
-    16-bit images are scaled over their full range to 8 bits (``value / 257``, rounded). An alpha
-    channel is dropped. The EXIF orientation is ignored: a calibration refers to the pixels as the
-    sensor recorded them.
+    16-bit images are scaled to 8 bits, linearly. An alpha channel is dropped. The EXIF orientation
+    is ignored: a calibration refers to the pixels as the sensor recorded them.
 
     Args:
         path: PNG, JPEG, PGM, PPM, BMP or TIFF, recognised by content.
+        white: The 16-bit value that becomes 255, see `find_white`; the same for all images of a
+            drive.
 
     Returns:
         uint8 (H, W) if the file is grey, else (H, W, 3) RGB.
@@ -42,14 +44,24 @@ def read_image(path: StrPath) -> UInt8:
         FormatError: The file is missing, empty, truncated, not an image, or has floating-point
             pixels.
     """
-    return _eight_bits(read_levels(path))
+    return eight_bits(read_levels(path), white)
 
 
-def _eight_bits(levels: NDArray[Any]) -> UInt8:
-    """Scale 16 bits to 8, rounded."""
+def eight_bits(levels: NDArray[Any], white: int = FULL_WHITE) -> UInt8:
+    """Scale 16 bits to 8, rounded; brighter values than ``white`` are 255."""
     if levels.dtype == np.uint8:
         return levels
-    return ((levels.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    scaled = (levels.astype(np.uint32) * 255 + white // 2) // white
+    return np.minimum(scaled, 255).astype(np.uint8)
+
+
+def find_white(images: Iterable[NDArray[Any]]) -> int:
+    """The largest value that the sensor of some images can give: 2^n - 1, 8 to 16 bits.
+
+    Cameras of 10, 12 or 14 bits often store their values unscaled in 16 bits.
+    """
+    brightest = max((int(image.max()) for image in images if image.size), default=FULL_WHITE)
+    return int(2 ** max(8, brightest.bit_length()) - 1)
 
 
 def read_levels(path: StrPath) -> NDArray[Any]:
@@ -70,7 +82,7 @@ def decode_image(content: bytes, where: StrPath) -> UInt8:
     Raises:
         FormatError: As in `read_image`.
     """
-    return _eight_bits(decode_levels(content, where))
+    return eight_bits(decode_levels(content, where))
 
 
 def decode_levels(content: bytes, path: StrPath) -> NDArray[Any]:

@@ -27,7 +27,10 @@ _SIZE: Final = ("image_size", "imageSize", "img_size")
 _WIDTH: Final = ("image_width", "imageWidth", "width")
 _HEIGHT: Final = ("image_height", "imageHeight", "height")
 _MODEL: Final = ("distortion_model", "camera_model", "model")
-_FISHEYE_NAMES: Final = frozenset({"fisheye", "equidistant"})
+_FISHEYE_NAMES: Final = frozenset({"fisheye", "equidistant", "kannala-brandt", "kannalabrandt8"})
+# OpenCV names no lens model, and both have four coefficients. A pinhole that sees more than 90
+# degrees has a distortion above this; a fisheye's polynomial is close to 1.
+_FISHEYE_LIKE: Final = 0.1
 
 # Numbers of coefficients that OpenCV's distortion model supports.
 _DISTORTION_COUNTS: Final = frozenset({0, 4, 5, 8, 12, 14})
@@ -71,8 +74,12 @@ def read_opencv_calibration(
             expected="image_width and image_height",
         )
     model = _model(intrinsics)
-    left = _camera(nodes, (_LEFT_MATRIX, _LEFT_DISTORTION), size, model, intrinsics)
-    right = _camera(nodes, (_RIGHT_MATRIX, _RIGHT_DISTORTION), size, model, intrinsics)
+    lens: LensModel = model or "pinhole"
+    left = _camera(nodes, (_LEFT_MATRIX, _LEFT_DISTORTION), size, lens, intrinsics)
+    right = _camera(nodes, (_RIGHT_MATRIX, _RIGHT_DISTORTION), size, lens, intrinsics)
+    if model is None:
+        for camera in (left, right):
+            _check_model(camera, intrinsics)
     if stated is None:
         check_unsized((left.matrix[0, 2], left.matrix[1, 2]), *size, intrinsics)
     outer_nodes = _read_nodes(outer)
@@ -111,12 +118,26 @@ def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> N
     write_text(path, storage.releaseAndGetString())
 
 
-def _model(path: StrPath) -> LensModel:
-    """The lens model named in a file; a pinhole if none is named."""
+def _model(path: StrPath) -> LensModel | None:
+    """The lens model named in a file, if any."""
     storage = cv2.FileStorage(read_text(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     nodes = [storage.getNode(name) for name in _MODEL]
     named = {node.string().lower() for node in nodes if node.isString()}
+    if not named:
+        return None
     return "fisheye" if named & _FISHEYE_NAMES else "pinhole"
+
+
+def _check_model(camera: CameraIntrinsics, path: StrPath) -> None:
+    """Raise if a camera of an unnamed lens model may as well be a fisheye."""
+    wide = camera.width_px / 2 > camera.matrix[0, 0]
+    largest = np.abs(camera.distortion).max(initial=0.0)
+    if camera.distortion.size == 4 and wide and 0 < largest < _FISHEYE_LIKE:
+        raise FormatError(
+            "calibration does not say which lens model its four coefficients belong to",
+            where=path,
+            expected="a line 'distortion_model: fisheye', or 'distortion_model: pinhole'",
+        )
 
 
 def _read_nodes(path: StrPath) -> Nodes:

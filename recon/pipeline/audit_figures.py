@@ -50,6 +50,7 @@ def audit_figures(
         "time_skew_frames": None if geometry.skew is None else geometry.skew[0],
         "baseline_m": camera.baseline_m,
         "focal_px": camera.focal_px,
+        "field_of_view_deg": camera.field_of_view_deg,
         "speed_m_per_s": float(np.median(sample.speeds_m_per_s)) if sample.speeds_m_per_s else None,
         **_row_figures(geometry.alignment),
         **_depth_figures(geometry.alignment, geometry.disparity_px, camera),

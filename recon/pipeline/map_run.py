@@ -285,6 +285,8 @@ def _summary(run: MapRun) -> dict[str, Any]:
         "fps": frames / seconds if seconds > 0 else None,
         "path_length_m": run.mapped.trajectory.path_length_m,
         "frames_not_trusted": sum(not record.ok for record in run.mapped.health),
+        "focal_px": run.mapped.camera.focal_px,
+        "field_of_view_deg": run.mapped.camera.field_of_view_deg,
         "T_map_world": run.mapped.T_map_world.tolist(),
         "camera_height_m": run.camera_height_m,
         "T_base_camera": base_axes(run.mapped.T_map_world, run.camera_height_m).tolist(),

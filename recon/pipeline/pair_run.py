@@ -250,6 +250,7 @@ def _metric_summary(frame: ReconstructedFrame, mesh: TriangleMesh | None) -> dic
         "depth_median_m": float(np.median(z)) if len(z) else None,
         "faces": 0 if mesh is None else len(mesh.faces),
         "focal_px": camera.focal_px,
+        "field_of_view_deg": camera.field_of_view_deg,
         "baseline_m": camera.baseline_m,
         "doffs_px": camera.doffs_px,
     }

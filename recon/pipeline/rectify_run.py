@@ -186,6 +186,7 @@ def _by_file(
             "method": "calibration",
             "up_to_scale": False,
             "focal_px": camera.focal_px,
+            "field_of_view_deg": camera.field_of_view_deg,
             "baseline_m": camera.baseline_m,
         },
     )

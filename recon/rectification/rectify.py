@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import cv2
@@ -17,6 +17,7 @@ from recon.rectification.grey import GreyMode, to_grey
 from recon.rectification.wide import plan_wide_view
 from recon.settings import Settings
 from recon.structures import (
+    CameraIntrinsics,
     RectifiedCamera,
     RectifiedPair,
     StereoCalibration,
@@ -34,6 +35,8 @@ _INTERPOLATIONS: Final = {
 _BORDER_TOLERANCE_PX: Final = 1e-3
 # At larger angles the views of two pinhole cameras hardly overlap.
 _LARGEST_ANGLE_RAD: Final = math.radians(60)
+# Focal lengths of raw and rectified views differ by a factor of two or three at most.
+_OUT_OF_PROPORTION: Final = 20.0
 
 
 class RectificationSettings(Settings):
@@ -45,6 +48,13 @@ class RectificationSettings(Settings):
         le=1,
         description="Zoom of the rectified views: 0 = only valid pixels, 1 = all source pixels, "
         "none = OpenCV's default. No effect on rectified input.",
+    )
+    field_of_view_deg: float | None = Field(
+        default=None,
+        ge=10,
+        le=150,
+        description="Horizontal field of view of the rectified views, in place of alpha. none = by "
+        "alpha; 0 of a fisheye keeps the resolution at its centre, at most 120 degrees.",
     )
     same_principal_point: bool = Field(
         default=True,
@@ -102,7 +112,8 @@ class Rectifier:
 
     Raises:
         CalibrationError: The rig is vertical, left and right are swapped, the cameras diverge by
-            more than 60 degrees or differ in image size, or a rectified view would be empty.
+            more than 60 degrees or differ in image size, or a rectified view would be empty or of
+            a focal length out of all proportion.
     """
 
     def __init__(
@@ -208,7 +219,9 @@ def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) 
             R1, R2, P1, P2 = _plan_pinholes(calibration, size, settings)
     except cv2.error as error:
         raise CalibrationError("cameras cannot be rectified", got=error.err) from error
-    return RectifyingTurns(R1, R2, _camera_of(P1, P2, size))
+    camera = _camera_of(P1, P2, size)
+    _check_focal(camera, left)
+    return RectifyingTurns(R1, R2, _with_field(camera, settings.field_of_view_deg))
 
 
 def plan_rectification(
@@ -260,6 +273,33 @@ def _camera_of(P1: Float64, P2: Float64, size: tuple[int, int]) -> RectifiedCame
         width_px=size[0],
         height_px=size[1],
     )
+
+
+def _with_field(camera: RectifiedCamera, field_of_view_deg: float | None) -> RectifiedCamera:
+    """Zoom about the image centre to a horizontal field of view; None = unchanged."""
+    if field_of_view_deg is None:
+        return camera
+    x, y = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
+    zoom = camera.width_px / 2 / math.tan(math.radians(field_of_view_deg / 2)) / camera.focal_px
+    return replace(
+        camera,
+        focal_px=camera.focal_px * zoom,
+        cx_px=x + (camera.cx_px - x) * zoom,
+        cy_px=y + (camera.cy_px - y) * zoom,
+        cx_right_px=x + (camera.cx_right_px - x) * zoom,
+    )
+
+
+def _check_focal(camera: RectifiedCamera, raw: CameraIntrinsics) -> None:
+    ratio = camera.focal_px / float(raw.matrix[0, 0])
+    if not 1 / _OUT_OF_PROPORTION < ratio < _OUT_OF_PROPORTION:
+        raise CalibrationError(
+            "the rectified views came out with a focal length out of all proportion",
+            got=f"{camera.focal_px:.4g} px",
+            expected=f"about {raw.matrix[0, 0]:.4g} px as in the raw images",
+            hint="check the distortion coefficients; if they are right, this is an error of recon: "
+            "please report it with the calibration",
+        )
 
 
 def _check_rig(calibration: StereoCalibration) -> None:

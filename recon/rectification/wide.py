@@ -24,8 +24,8 @@ def plan_wide_view(
 ) -> tuple[Float64, Float64, Float64, Float64]:
     """Rotations and projections of the rectified views, like ``stereoRectify`` for pinholes.
 
-    Along their shorter side the views reach at most 60 degrees from the optical axis, however wide
-    the lenses are.
+    The centre of the views keeps the resolution of the lens, so they show less than a wide lens
+    sees; along their shorter side they reach at most 60 degrees from the optical axis.
 
     Returns:
         ``R_left, R_right`` (3, 3) and ``P_left, P_right`` (3, 4).
@@ -102,6 +102,6 @@ def _focal(
     if alpha is None:
         return raw_px
     pixels = np.array(size) - 1.0
-    zoomed = float((pixels / np.maximum(inner[1] - inner[0], 1e-6)).max())
+    zoomed = max(raw_px, float((pixels / np.maximum(inner[1] - inner[0], 1e-6)).max()))
     whole = float((pixels / np.maximum(outer[1] - outer[0], 1e-6)).min())
     return zoomed * (1 - alpha) + whole * alpha

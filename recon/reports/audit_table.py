@@ -87,7 +87,8 @@ def _time(summary: Mapping[str, Any]) -> str:
 def _rig(summary: Mapping[str, Any]) -> str:
     speed = summary["speed_m_per_s"]
     moving = "" if speed is None else f", moving at {speed:.1f} m/s"
-    return f"baseline {_length(summary['baseline_m'])}, f {summary['focal_px']:.0f} px{moving}"
+    view = f"f {summary['focal_px']:.0f} px ({summary['field_of_view_deg']:.0f} deg wide)"
+    return f"baseline {_length(summary['baseline_m'])}, {view}{moving}"
 
 
 def _known(text: str, *values: float | None) -> str:

@@ -50,6 +50,7 @@ _FIGURES: Final[FigureFormats] = MappingProxyType(
         "fps": ("Mapping rate", "{:.1f} fps"),
         "seconds": ("Run time", "{:.1f} s"),
         "peak_memory_mb": ("Peak memory", "{:,.0f} MB"),
+        "field_of_view_deg": ("Field of view of the rectified images", "{:.0f}°"),
         "points": ("Points in the map", "{:,}"),
         "faces": ("Triangles", "{:,}"),
     }

@@ -86,8 +86,9 @@ def pair_report(inputs: PairReportInputs) -> ReportContent:
     return ReportContent(
         title=f"Stereo pair {inputs.source}",
         subtitle=(
-            f"{camera.width_px} × {camera.height_px} px, focal length {camera.focal_px:.1f} px, "
-            f"baseline {camera.baseline_m:.4g} m, doffs {camera.doffs_px:.4g} px"
+            f"{camera.width_px} × {camera.height_px} px, focal length {camera.focal_px:.1f} px "
+            f"({camera.field_of_view_deg:.0f}° wide), baseline {camera.baseline_m:.4g} m, "
+            f"doffs {camera.doffs_px:.4g} px"
         ),
         command=inputs.command,
         warnings=inputs.warnings,

@@ -7,7 +7,7 @@
         cam0/ cam1/
           data.csv                     time [ns], file name
           data/1403636579763555584.png
-          sensor.yaml                  lens, size, T_BS
+          sensor.yaml                  lens, size, T_BS (or a camchain for both cameras)
         state_groundtruth_estimate0/   optional: ground truth trajectory of the body
           data.csv
 """
@@ -24,7 +24,7 @@ from recon.formats.euroc import NS, read_euroc_camera, read_euroc_truth
 from recon.geometry.se3 import invert
 from recon.sources.pairing import check_increasing
 from recon.sources.pictures import PictureSource, pair_listed, picture_size
-from recon.sources.rig import Rig, as_rectified, read_rig
+from recon.sources.rig import Rig, as_rectified, find_calibration, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_stamped_names
 from recon.sources.truth import truth_at
@@ -77,10 +77,18 @@ def _read_rig(
     if settings.calibration is not None:
         return read_rig(settings, root, size)
     paths = [view / "sensor.yaml" for view in views]
+    if not paths[0].is_file():
+        # TUM VI has one file for both cameras instead, beside mav0 or in another folder there.
+        return read_rig(settings, _with_calibration(root), size)
     (left, T_body_left), (right, T_body_right) = (read_euroc_camera(path) for path in paths)
     rig = StereoCalibration(left, right, invert(T_body_right) @ T_body_left)
     check_size(rig, *size, paths[0])
     return as_rectified(rig), tuple(paths)
+
+
+def _with_calibration(root: Path) -> Path:
+    places = (root, root.parent, root.parent / "dso")
+    return next((place for place in places if find_calibration(place)), root)
 
 
 def _read_truth(root: Path, left: Path, stamps_s: Float64) -> tuple[SequenceTruth | None, str]:

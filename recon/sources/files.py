@@ -8,7 +8,7 @@ from pathlib import Path
 from recon.errors import SourceError
 from recon.formats.calibration import read_calibration
 from recon.formats.files import StrPath
-from recon.formats.image import read_image
+from recon.formats.image import eight_bits, find_white, read_levels
 from recon.formats.kitti import kitti_cameras_of
 from recon.formats.middlebury import stand_in_camera
 from recon.structures import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
@@ -94,11 +94,15 @@ class FilesSource:
 def read_pair(left: StrPath, right: StrPath) -> StereoPair:
     """Read the two images of a pair; if only one is in colour, the other is converted.
 
+    16-bit images are scaled to 8 bits, both alike, by the brightest pixel.
+
     Raises:
         SourceError: The images differ in size.
         FormatError: An image is missing or damaged.
     """
-    pictures = [read_image(path) for path in (left, right)]
+    levels = [read_levels(path) for path in (left, right)]
+    white = find_white(levels)
+    pictures = [eight_bits(each, white) for each in levels]
     sizes = [f"{picture.shape[1]}x{picture.shape[0]}" for picture in pictures]
     if sizes[0] != sizes[1]:
         raise SourceError(

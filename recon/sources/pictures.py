@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from recon.errors import SourceError
-from recon.formats.image import read_image
+from recon.formats.image import FULL_WHITE, find_white, read_image, read_levels
 from recon.sources.files import join_pair
 from recon.sources.pairing import Roll, check_most, natural_key, pair_stamps
 from recon.structures import (
@@ -23,6 +24,9 @@ from recon.structures import (
 from recon.structures.arrays import Float64, UInt8
 
 PICTURES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
+
+_WHITE_SAMPLE: Final = 8
+"""Frames, spread over a drive of 16-bit images, that its white is taken from."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +104,17 @@ class PictureSource:
             left, right = (self._read(path) for path in (frame.left, frame.right))
             yield join_pair(left, right, frame.timestamp_s, index, frame.left.name)
 
+    @cached_property
+    def white(self) -> int:
+        """The 16-bit value that becomes white in all images; from a sample of both cameras."""
+        if not self.pictures or read_levels(self.pictures[0].left).dtype == np.uint8:
+            return FULL_WHITE
+        chosen = np.unique(np.linspace(0, len(self.pictures) - 1, _WHITE_SAMPLE).astype(int))
+        frames = [self.pictures[index] for index in chosen]
+        return find_white(read_levels(p) for frame in frames for p in (frame.left, frame.right))
+
     def _read(self, path: Path) -> UInt8:
-        image = read_image(path)
+        image = read_image(path, self.white)
         check_size(self.calibration, image.shape[1], image.shape[0], path)
         return image
 

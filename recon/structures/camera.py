@@ -141,6 +141,12 @@ class RectifiedCamera:
         return self.cx_right_px - self.cx_px
 
     @property
+    def field_of_view_deg(self) -> float:
+        """Horizontal field of view of the left view, degrees."""
+        left = math.atan((self.cx_px + 0.5) / self.focal_px)
+        return math.degrees(left + math.atan((self.width_px - 0.5 - self.cx_px) / self.focal_px))
+
+    @property
     def matrix(self) -> Float64:
         """float64 (3, 3) pinhole matrix of the left view."""
         f, cx, cy = self.focal_px, self.cx_px, self.cy_px

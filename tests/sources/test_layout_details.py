@@ -9,12 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from recon.adapters.rosbags import BagCameraInfo
 from recon.errors import ReconError
 from recon.formats.image import write_image
+from recon.formats.kalibr import write_kalibr
 from recon.formats.ros_image import pixels_of_ros_image
+from recon.geometry.se3 import make_transform
 from recon.sources import SourceSettings, open_source
+from recon.sources.bag_rig import rig_of_messages
 from recon.sources.pairing import find_partners, natural_key, pair_stamps, stamp_of_name
-from recon.structures import RectifiedCamera, StereoCalibration, StereoPair
+from recon.structures import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
 from tests.sources import drives
 
 CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)
@@ -46,6 +50,43 @@ def test_an_unrectified_kitti_drive_gets_its_raw_lenses(
     calib.write_text(text)
     with pytest.raises(ReconError, match=r"got 64x32, expected 60x30 rectified, or 1392x512 raw"):
         open_source(drive)
+
+
+@pytest.mark.parametrize("tag", ["", "!!opencv-matrix"])
+def test_sensor_yaml_may_have_the_header_of_opencv(
+    pairs: list[StereoPair], tmp_path: Path, tag: str
+) -> None:
+    drives.write_euroc(pairs, CAMERA, tmp_path)
+    for path in tmp_path.rglob("sensor.yaml"):
+        text = path.read_text().replace("T_BS:", f"T_BS: {tag}")
+        path.write_text("%YAML:1.0\n---\n" + text)
+    assert open_source(tmp_path).calibration == CAMERA
+
+
+def test_a_euroc_drive_without_sensor_yaml_takes_the_camchain_beside_it(
+    pairs: list[StereoPair], tmp_path: Path
+) -> None:
+    """As TUM VI is published."""
+    drives.write_euroc(pairs, CAMERA, tmp_path)
+    left = CameraIntrinsics(CAMERA.matrix, np.zeros(4), 64, 32)
+    T = make_transform(np.eye(3), np.array([-CAMERA.baseline_m, 0, 0]))
+    (tmp_path / "dso").mkdir()
+    write_kalibr(tmp_path / "dso" / "camchain.yaml", StereoCalibration(left, left, T))
+    for path in tmp_path.rglob("sensor.yaml"):
+        path.unlink()
+    assert open_source(tmp_path).calibration == CAMERA
+    (tmp_path / "dso" / "camchain.yaml").unlink()
+    with pytest.raises(ReconError, match=r"calibration is missing.*--calib"):
+        open_source(tmp_path)
+
+
+def test_messages_of_two_single_calibrations_have_no_baseline() -> None:
+    K = CAMERA.matrix
+    P = np.hstack([K, np.zeros((3, 1))])
+    info = BagCameraInfo(64, 32, "plumb_bob", np.zeros(5), K, np.eye(3), P)
+    for rectified in (True, False):
+        with pytest.raises(ReconError, match=r"drive\.bag: CameraInfo has no baseline.*--calib"):
+            rig_of_messages(info, info, Path("drive.bag"), rectified)
 
 
 def test_the_true_path_of_euroc_is_that_of_the_left_camera(
