@@ -11,12 +11,15 @@ from recon.cli.options import (
     SOURCES_HELP,
     Calib,
     Config,
+    End,
     Json,
     LeftView,
     Quiet,
     RightView,
     Set,
     SourceKind,
+    Start,
+    Stride,
     Tolerance,
     Verbose,
 )
@@ -34,6 +37,9 @@ def audit(
     left: LeftView = None,
     right: RightView = None,
     tolerance: Tolerance = None,
+    start: Start = None,
+    end: End = None,
+    stride: Stride = None,
     config: Config = None,
     set_: Set = None,
     json: Json = False,
@@ -56,7 +62,7 @@ def audit(
         from recon.sources import open_source
         from recon.viewers import announce
 
-        asked = source_overrides(calib, left, right, tolerance)
+        asked = source_overrides(calib, left, right, tolerance, (start, end, stride))
         settings = load_config(config, [*(set_ or ()), *asked])
         drive = open_source(source, kind, settings.source)
         announce(drive, quiet=quiet, verbose=verbose)

@@ -11,6 +11,7 @@ import typer
 from recon.cli.options import (
     Calib,
     Config,
+    End,
     Json,
     LeftView,
     Matcher,
@@ -22,6 +23,8 @@ from recon.cli.options import (
     Set,
     SourceArgument,
     SourceKind,
+    Start,
+    Stride,
     Threads,
     Tolerance,
     Verbose,
@@ -45,6 +48,9 @@ def map_(
     left: LeftView = None,
     right: RightView = None,
     tolerance: Tolerance = None,
+    start: Start = None,
+    end: End = None,
+    stride: Stride = None,
     odometry: Annotated[
         OdometryName | None,
         typer.Option(
@@ -106,7 +112,7 @@ def map_(
         from recon.viewers import announce, choose_viewer, warn
 
         method = [] if odometry is None else [f"odometry.method={odometry.value}"]
-        views = source_overrides(calib, left, right, tolerance)
+        views = source_overrides(calib, left, right, tolerance, (start, end, stride))
         overrides = [*(set_ or ()), *method, *matching_overrides(matcher), *views]
         asked = MapRequest(source, kind, poses, prior, mesh, out, resume, memory_limit)
         request, settings = plan_map(asked, config, overrides)

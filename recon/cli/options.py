@@ -101,6 +101,19 @@ Tolerance = Annotated[
     ),
 ]
 
+Start = Annotated[
+    int | None,
+    typer.Option("--start", help="First frame to use.", show_default="0"),
+]
+End = Annotated[
+    int | None,
+    typer.Option("--end", help="Frame at which to stop.", show_default="after the last"),
+]
+Stride = Annotated[
+    int | None,
+    typer.Option("--stride", help="Use every so many frames.", show_default="1"),
+]
+
 
 def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:
     """Parse an option that takes several numbers, separated by commas.

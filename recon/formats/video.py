@@ -41,10 +41,6 @@ class VideoFile:
     height_px: int
     rate_hz: float
 
-    def read(self, start: int = 0) -> Iterator[tuple[float, UInt8]]:
-        """Decode the frames from number ``start`` on, see `pick`."""
-        return self.pick(range(start, self.frames))
-
     def pick(self, numbers: Iterable[int]) -> Iterator[tuple[float, UInt8]]:
         """Decode frames of increasing numbers; those before and between are decoded and dropped.
 

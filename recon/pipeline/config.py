@@ -150,14 +150,27 @@ def check_ndisp(config: ReconConfig, ndisp: int | None) -> None:
 
 
 def source_overrides(
-    calib: Path | None, left: str | None, right: str | None, tolerance_s: float | None
+    calib: Path | None,
+    left: str | None,
+    right: str | None,
+    tolerance_s: float | None,
+    frames: tuple[int | None, int | None, int | None] = (None, None, None),
 ) -> list[str]:
-    """Overrides for facts that the files of a source do not contain; None = unchanged."""
+    """Overrides for facts that the files of a source do not contain; None = unchanged.
+
+    Args:
+        calib: Calibration file.
+        left: Folder or topic of the left camera.
+        right: That of the right one.
+        tolerance_s: Largest difference within a pair.
+        frames: First frame, frame at which to stop, and stride.
+    """
     given = {
         "calibration": None if calib is None else str(calib),
         "left": left,
         "right": right,
         "tolerance_s": tolerance_s,
+        **dict(zip(("start", "end", "stride"), frames, strict=True)),
     }
     # Quoted, since a topic or folder may be named 0 or null.
     return [

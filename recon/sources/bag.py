@@ -153,7 +153,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
     pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(path))
     rig, texts, source = _read_rig(bag, topics, pairs, settings, path)
     also += list_others(bag, topics)
-    roll = Roll([""] * len(stamps[0]), pairs.left, pairs.alone)
+    roll = Roll([""] * len(stamps[0]), pairs.left, pairs.alone).choose(settings, path)
     check_most(len(pairs.left), min(map(len, stamps)), path)
     kind = {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(bag.paths[0].suffix, "ROS 2 bag")
     return BagSource(
@@ -163,7 +163,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
         calibration=rig,
         bag=bag,
         topics=topics,
-        pairs=pairs,
+        pairs=pairs.chosen(roll.chosen),
         roll=roll,
         left_s=stamps[0],
         recorded_ns=(times[topics[0]][:, 0], times[topics[1]][:, 0]),

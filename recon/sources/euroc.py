@@ -47,7 +47,7 @@ def open_euroc(folder: Path, settings: SourceSettings) -> PictureSource:
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
     views = [root / (settings.left or "cam0"), root / (settings.right or "cam1")]
     lists = [_read_list(view) for view in views]
-    frames, roll = pair_listed(lists, settings.tolerance_s, root)
+    frames, roll = pair_listed(lists, settings, root)
     rig, calibration_files = _read_rig(root, settings, views, picture_size(frames[0].left))
     truth, note = _read_truth(root, views[0], np.array([frame.timestamp_s for frame in frames]))
     return PictureSource(

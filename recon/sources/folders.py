@@ -123,7 +123,7 @@ def _with_pictures(folder: Path) -> Path | None:
 
 def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
     if (folder / FRAMES).is_file() and settings.pair_by == "auto":
-        return _pair_as_listed(folder)
+        return _pair_as_listed(folder, settings)
     views = find_views(folder, settings)
     if views is None:
         raise SourceError(
@@ -145,7 +145,7 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
     how = "by name"
     if frames is None:
         frames, how = _by_index(left, right, by, folder), "by their order"
-    named, roll = pair_named(frames, folder)
+    named, roll = _choose(*pair_named(frames, folder), settings, folder)
     label = f"{views[0].name} and {views[1].name}" if views[0] != views[1] else "one folder"
     found = _Pairing(named, roll, None, f"{label}, paired {how}")
     return found if listed is None else _with_times(found, listed)
@@ -159,13 +159,22 @@ def _list_both(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
     return [by_stem[name] for name in sides[0]], [by_stem[name] for name in sides[1]]
 
 
-def _pair_as_listed(folder: Path) -> _Pairing:
+def _choose(
+    pairs: list[tuple[Path, Path]], roll: Roll, settings: SourceSettings, folder: Path
+) -> tuple[list[tuple[Path, Path]], Roll]:
+    """The pairs that the settings choose."""
+    roll = roll.choose(settings, folder)
+    return pairs if roll.chosen is None else [pairs[k] for k in roll.chosen], roll
+
+
+def _pair_as_listed(folder: Path, settings: SourceSettings) -> _Pairing:
     frames = read_frames(folder / FRAMES)
     check_increasing(np.array([frame.left_s for frame in frames]), str(folder / FRAMES))
     pairs, roll = pair_named(
         [(_existing(folder / frame.left), _existing(folder / frame.right)) for frame in frames],
         folder,
     )
+    pairs, roll = _choose(pairs, roll, settings, folder)
     stamps_s = np.array([frames[k].left_s for k in roll.kept])
     return _Pairing(pairs, roll, stamps_s, f"paired according to {FRAMES}", (folder / FRAMES,))
 
@@ -193,7 +202,7 @@ def _pair_by_stamp(
         list(zip(series.tolist(), paths, strict=True))
         for series, paths in zip(stamps, (left, right), strict=True)
     ]
-    frames, roll = pair_listed(lists, settings.tolerance_s, folder)
+    frames, roll = pair_listed(lists, settings, folder)
     pairs = [(frame.left, frame.right) for frame in frames]
     stamps_s = np.array([frame.timestamp_s for frame in frames])
     return _Pairing(pairs, roll, stamps_s, "paired by stamps")

@@ -67,6 +67,8 @@ def open_kitti(
     pair = cameras or choose_cameras(path, "image_{}")
     pictures, roll = list_pairs(*(path / f"image_{camera}" for camera in pair))
     settings = settings or SourceSettings()
+    roll = roll.choose(settings, path)
+    pictures = pictures if roll.chosen is None else [pictures[k] for k in roll.chosen]
     times, time_files = _read_times(path, roll, settings)
     rig, calibration_files = _read_rig(path, settings, pair, pictures[0][0])
     texts = (*calibration_files, *time_files, _find_poses(path))

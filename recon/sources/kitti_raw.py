@@ -39,7 +39,7 @@ def open_kitti_raw(folder: Path, settings: SourceSettings) -> PictureSource:
     """
     cameras = choose_cameras(folder, "image_{:02d}")
     views = [folder / f"image_{camera:02d}" for camera in cameras]
-    frames, roll = pair_listed([_read_list(v) for v in views], settings.tolerance_s, folder)
+    frames, roll = pair_listed([_read_list(v) for v in views], settings, folder)
     rig, calibration_files = _read_rig(folder, settings, cameras, picture_size(frames[0].left))
     rectified = "rectified" if isinstance(rig, RectifiedCamera) else "not rectified"
     return PictureSource(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from recon.errors import SourceError
+from recon.sources.settings import SourceSettings
 from recon.structures.arrays import Float64
 
 # Parts of names that mark the left camera, each with its counterpart for the right one.
@@ -54,6 +55,13 @@ class StampPairs:
     right: Sequence[int]
     alone: tuple[int, int]
 
+    def chosen(self, which: range | None) -> StampPairs:
+        """Some of the pairs; None = all."""
+        if which is None:
+            return self
+        left, right = ([side[k] for k in which] for side in (self.left, self.right))
+        return replace(self, left=left, right=right)
+
 
 @dataclass(frozen=True)
 class Roll:
@@ -62,25 +70,55 @@ class Roll:
     Attributes:
         names: Names without suffix of all frames in order, also of those without a partner; empty
             names where there are none.
-        kept: Positions of the pairs among them.
+        paired: Positions of the pairs among them.
         alone: Numbers of left and right images without a partner, which are left out.
+        chosen: Which of the pairs are used; None = all.
     """
 
     names: Sequence[str]
-    kept: Sequence[int]
+    paired: Sequence[int]
     alone: tuple[int, int] = (0, 0)
+    chosen: range | None = None
 
     def __str__(self) -> str:
-        if not any(self.alone):
-            return ""
-        return f", {self.alone[0]} left and {self.alone[1]} right without a partner left out"
+        told = ""
+        if any(self.alone):
+            told = f", {self.alone[0]} left and {self.alone[1]} right without a partner left out"
+        if self.chosen is None:
+            return told
+        every = f" in steps of {self.chosen.step}" if self.chosen.step > 1 else ""
+        return f"{told}, frames {self.chosen[0]} to {self.chosen[-1]}{every}"
+
+    @property
+    def kept(self) -> Sequence[int]:
+        """Positions of the pairs that are used."""
+        return self.paired if self.chosen is None else [self.paired[k] for k in self.chosen]
+
+    def choose(self, settings: SourceSettings, where: Path) -> Roll:
+        """The same recording, of which the frames from ``start`` to ``end`` are used.
+
+        Raises:
+            SourceError: There are none.
+        """
+        if (settings.start, settings.end, settings.stride) == (0, None, 1):
+            return self
+        chosen = range(len(self.paired))[settings.start : settings.end : settings.stride]
+        if not chosen:
+            raise SourceError(
+                "no frame is chosen",
+                where=where,
+                got=f"from {settings.start} to before {settings.end or len(self.paired)}",
+                expected=f"frames from 0 to {len(self.paired) - 1}",
+                hint="see --start and --end",
+            )
+        return replace(self, chosen=chosen)
 
     def lines(self, count: int) -> list[int] | None:
         """The line of each pair in a file with one line per frame, such as ``times.txt``.
 
-        One line per pair fits at once. Else names that are counters give the line, so that it
-        stays the right one where images are missing; else the position does, and further lines
-        are ignored.
+        One line per pair fits at once, whether of all pairs or of those used. Else names that are
+        counters give the line, so that it stays the right one where images are missing; else the
+        position does, and further lines are ignored.
 
         Args:
             count: Number of lines of the file.
@@ -88,13 +126,19 @@ class Roll:
         Returns:
             Indices from 0; None = the file has too few lines.
         """
-        if count == len(self.kept):
+        of_pairs = self._lines_of_all(count)
+        if of_pairs is None:
+            return list(range(count)) if count == len(self.kept) else None
+        return of_pairs if self.chosen is None else [of_pairs[k] for k in self.chosen]
+
+    def _lines_of_all(self, count: int) -> list[int] | None:
+        if count == len(self.paired):
             return list(range(count))
-        names = [self.names[k] for k in self.kept]
+        names = [self.names[k] for k in self.paired]
         numbers = [int(name) if name.isdecimal() else count for name in names]
         if max(numbers) < count:
             return numbers
-        return list(self.kept) if len(self.names) <= count else None
+        return list(self.paired) if len(self.names) <= count else None
 
 
 def natural_key(name: str) -> list[tuple[int, str]]:

@@ -14,6 +14,7 @@ from recon.errors import SourceError
 from recon.formats.image import FULL_WHITE, find_white, read_image, read_levels
 from recon.sources.files import join_pair
 from recon.sources.pairing import Roll, check_most, natural_key, pair_stamps
+from recon.sources.settings import SourceSettings
 from recon.structures import (
     RectifiedCamera,
     SequenceTruth,
@@ -120,13 +121,15 @@ class PictureSource:
 
 
 def pair_listed(
-    lists: Sequence[Sequence[tuple[float, Path]]], tolerance_s: float, where: Path
+    lists: Sequence[Sequence[tuple[float, Path]]], settings: SourceSettings, where: Path
 ) -> tuple[list[PictureFrame], Roll]:
     """Pair two lists of images by time; a listed image that is missing has no partner.
 
+    Only the frames that the settings choose are returned.
+
     Args:
         lists: Time stamp and file of the left images, and of the right ones, in order of time.
-        tolerance_s: Largest difference within a pair.
+        settings: Largest difference within a pair, and the frames to use.
         where: The source, for error messages.
 
     Raises:
@@ -135,7 +138,7 @@ def pair_listed(
     for one in lists:
         check_most(sum(path.is_file() for _, path in one), len(one), where)
     stamps = [np.array([stamp for stamp, _ in one]) for one in lists]
-    pairs = pair_stamps(stamps[0], stamps[1], tolerance_s, str(where))
+    pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(where))
     # Of two cameras with different rates, the slower one decides what is missing.
     check_most(len(pairs.left), min(map(len, lists)), where)
     partner = dict(zip(pairs.left, pairs.right, strict=True))
@@ -147,10 +150,12 @@ def pair_listed(
     frames += [(stamp, None, path) for k, (stamp, path) in enumerate(lists[1]) if k not in taken]
     frames.sort(key=lambda frame: frame[0])
     chosen, roll = pair_named([frame[1:] for frame in frames])
-    return [
+    paired = [
         PictureFrame(left, right, frames[k][0])
-        for k, (left, right) in zip(roll.kept, chosen, strict=True)
-    ], roll
+        for k, (left, right) in zip(roll.paired, chosen, strict=True)
+    ]
+    roll = roll.choose(settings, where)
+    return paired if roll.chosen is None else [paired[k] for k in roll.chosen], roll
 
 
 def pair_named(

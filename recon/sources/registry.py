@@ -17,6 +17,7 @@ from recon.sources.folders import find_views, open_folders
 from recon.sources.kitti import open_kitti
 from recon.sources.kitti_raw import open_kitti_raw
 from recon.sources.middlebury import MiddleburySource
+from recon.sources.pairing import Roll
 from recon.sources.protocol import StereoSource
 from recon.sources.settings import SourceSettings
 from recon.sources.tum import list_files, open_tum
@@ -24,7 +25,8 @@ from recon.sources.video import list_videos, open_video_source
 
 
 def _open_middlebury(path: Path, settings: SourceSettings) -> StereoSource:
-    del settings  # a scene has its own calibration
+    # A scene has its own calibration, and is one pair.
+    Roll([""], [0]).choose(settings, path)
     return MiddleburySource(path)
 
 

@@ -33,7 +33,7 @@ class SourceSettings(Settings):
     pair_by: Literal["auto", "stamp", "name", "index"] = Field(
         default="auto",
         description="How images of plain folders are paired. auto = by timestamps if the names "
-        "have them, else by equal names, else by order if both cameras have as many.",
+        "have them, else by names if most have a partner, else by order.",
     )
     tolerance_s: float = Field(
         default=0.01,
@@ -45,6 +45,13 @@ class SourceSettings(Settings):
         gt=0,
         description="Frame rate of a KITTI drive, plain folders or videos, in place of their "
         "times. none = their times, or 10 Hz for plain folders without times.",
+    )
+    start: int = Field(default=0, ge=0, description="First frame used; earlier ones are not read.")
+    end: int | None = Field(
+        default=None, ge=1, description="Frame at which to stop, itself not used. none = the last."
+    )
+    stride: int = Field(
+        default=1, ge=1, description="Use every so many frames; the others are not read."
     )
     side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = Field(
         default="left-right", description="Arrangement of the two views in the frames of one video."

@@ -11,7 +11,7 @@ import numpy as np
 
 from recon.errors import FormatError, SourceError
 from recon.formats.video import VIDEOS, VideoFile, open_video
-from recon.sources.pairing import find_partners
+from recon.sources.pairing import Roll, find_partners
 from recon.sources.rig import Rig, read_rig
 from recon.sources.settings import SourceSettings
 from recon.structures import SequenceTruth, StereoPair, check_size
@@ -31,6 +31,7 @@ class VideoSource:
         videos: One file with both views, or left and right.
         settings: Arrangement of the views, and the frame rate if that of the file is overridden.
         texts: The calibration file.
+        roll: Which frames are used.
     """
 
     name: str
@@ -39,6 +40,7 @@ class VideoSource:
     videos: tuple[VideoFile, ...]
     settings: SourceSettings
     texts: tuple[Path, ...]
+    roll: Roll
 
     @property
     def truth(self) -> SequenceTruth | None:
@@ -50,8 +52,17 @@ class VideoSource:
         """The calibration, then the videos."""
         return [*self.texts, *(video.path for video in self.videos)]
 
+    @property
+    def left_out(self) -> int:
+        """0: every frame has both views."""
+        return 0
+
+    def lines(self, count: int) -> list[int] | None:
+        """The line of each frame in a file with one line per frame; see `Roll.lines`."""
+        return self.roll.lines(count)
+
     def __len__(self) -> int:
-        return self.videos[0].frames
+        return len(self.roll.kept)
 
     def __iter__(self) -> Iterator[StereoPair]:
         return self.frames()
@@ -63,31 +74,33 @@ class VideoSource:
             SourceError: The times of the two files drift apart.
             FormatError: A frame cannot be decoded, or its time does not increase.
         """
-        last_s = -np.inf
-        for index, (stamp_s, left, right) in enumerate(self._views(start), start=start):
+        last_s, numbers = -np.inf, self.roll.kept[start:]
+        views = zip(numbers, self._views(numbers), strict=True) if numbers else ()
+        for index, (number, (stamp_s, left, right)) in enumerate(views, start=start):
             for view in (left, right):
                 check_size(self.calibration, view.shape[1], view.shape[0], self.videos[0].path)
-            time_s = index / self.settings.rate_hz if self.settings.rate_hz else stamp_s
+            time_s = number / self.settings.rate_hz if self.settings.rate_hz else stamp_s
             if time_s <= last_s:
                 raise FormatError(
                     "times of the video do not increase",
-                    where=f"{self.videos[0].path}, frame {index}",
+                    where=f"{self.videos[0].path}, frame {number}",
                     hint="give the rate with --set source.rate_hz=",
                 )
             last_s = time_s
-            yield StereoPair(left, right, time_s, index, f"frame {index}")
+            yield StereoPair(left, right, time_s, index, f"frame {number}")
 
-    def _views(self, start: int) -> Iterator[tuple[float, UInt8, UInt8]]:
+    def _views(self, numbers: Sequence[int]) -> Iterator[tuple[float, UInt8, UInt8]]:
+        """The views of some frames, numbered as in the files and evenly spaced."""
         if len(self.videos) == 1:
-            for stamp_s, image in self.videos[0].read(start):
+            for stamp_s, image in self.videos[0].pick(numbers):
                 yield stamp_s, *split_views(image, self.settings)
             return
-        pairs = zip(*(video.read(start) for video in self.videos), strict=True)
+        pairs = zip(*(video.pick(numbers) for video in self.videos), strict=True)
         apart_s: float | None = None
-        for index, ((left_s, left), (right_s, right)) in enumerate(pairs, start=start):
+        for number, ((left_s, left), (right_s, right)) in zip(numbers, pairs, strict=True):
             # Two containers may start at different times, but must then advance alike.
             apart_s = right_s - left_s if apart_s is None else apart_s
-            self._check_pace(index, right_s - left_s - apart_s)
+            self._check_pace(number, right_s - left_s - apart_s)
             yield left_s, left, right
 
     def _check_pace(self, index: int, drift_s: float) -> None:
@@ -112,6 +125,7 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
         CalibrationError: The calibration cannot give depth.
     """
     videos = open_videos(_find_videos(path, settings))
+    roll = Roll([""] * videos[0].frames, range(videos[0].frames)).choose(settings, path)
     size = view_size(videos[0], settings) if len(videos) == 1 else _size(videos[0])
     home = path if path.is_dir() else path.resolve().parent
     rig, texts = read_rig(settings, home, size)
@@ -119,11 +133,12 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
     layout = f"{settings.side_by_side} in one video" if len(videos) == 1 else "two videos"
     return VideoSource(
         name=path.resolve().name,
-        description=f"{layout}, {rate_hz:g} Hz, paired frame by frame",
+        description=f"{layout}, {rate_hz:g} Hz, paired frame by frame{roll}",
         calibration=rig,
         videos=videos,
         settings=settings,
         texts=texts,
+        roll=roll,
     )
 
 
