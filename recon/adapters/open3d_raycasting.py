@@ -9,7 +9,7 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from recon.errors import ShapeError
-from recon.structures.arrays import Bool, Float64, Int32
+from recon.structures.arrays import Bool, Float32, Float64, Int32
 
 _NO_HIT = np.uint32(0xFFFFFFFF)
 
@@ -55,6 +55,12 @@ class RayScene:
         hits = self._scene.cast_rays(_rays(origin, directions), nthreads=self._threads)
         faces = hits["primitive_ids"].numpy()
         return np.where(faces == _NO_HIT, -1, faces.astype(np.int64)).astype(np.int32)
+
+    def distance(self, points: NDArray[Any]) -> Float32:
+        """Distance of each point (N, 3) to the nearest triangle: float32 (N,), metres."""
+        wanted = o3d.core.Tensor.from_numpy(np.array(points, dtype=np.float32))
+        found = self._scene.compute_distance(wanted, nthreads=self._threads)
+        return np.asarray(found.numpy(), dtype=np.float32)
 
     def blocked(
         self, origins: NDArray[Any], reaches: NDArray[Any], near: float = 0.0, far: float = 1.0

@@ -29,6 +29,7 @@ def screened_poisson(
     normals: NDArray[Any],
     *,
     depth: int,
+    scale: float,
     samples_per_node: float,
     point_weight: float,
 ) -> tuple[Float32, Int32, Float32]:
@@ -37,7 +38,8 @@ def screened_poisson(
     Args:
         xyz: (N, 3), metres, finite.
         normals: (N, 3), unit, finite, outwards.
-        depth: Depth of the octree: the surface has at most 2^depth cells along its longest side.
+        depth: Depth of the octree: its edge has 2^depth cells.
+        scale: Edge of the octree, as a multiple of the longest side of the cloud.
         samples_per_node: Minimum number of points per octree cell; larger for noisy points.
         point_weight: Weight of interpolating the points relative to fitting the normals.
 
@@ -54,6 +56,7 @@ def screened_poisson(
         raise MeshingError("a point or normal of the cloud is not finite")
     options = {
         "depth": depth,
+        "scale": scale,
         "samplespernode": samples_per_node,
         "pointweight": point_weight,
         # More threads make the result non-deterministic, and busy-wait: on a loaded machine, two

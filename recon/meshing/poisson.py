@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
@@ -18,11 +18,11 @@ from recon.structures import PointCloud, TriangleMesh
 from recon.structures.arrays import Bool, Float32, Int32
 
 _MIN_POINTS = 50
-_MIN_DEPTH = 4
+MIN_DEPTH = 4
 _SPACING_NEIGHBOURS = 7
 _SPACING_SAMPLES = 20_000
 #: MeshLab's octree is this much wider than the cloud.
-_OCTREE_SCALE = 1.1
+OCTREE_SCALE = 1.1
 Point = tuple[float, float, float]
 
 
@@ -114,12 +114,46 @@ def reconstruct_mesh(
 
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
-    cloud = _oriented(_usable(cloud), settings, viewpoint_m)
+    cloud = oriented(usable(cloud), settings, viewpoint_m)
     depth = settings.depth or _fitting_depth(cloud.xyz, settings)
+    return trimmed_surface(cloud, settings, Octree(depth), wrong)
+
+
+@dataclass(frozen=True)
+class Octree:
+    """The grid that a surface is computed on.
+
+    Attributes:
+        depth: Its edge has 2^depth cells.
+        scale: Its edge, as a multiple of the longest side of the cloud.
+    """
+
+    depth: int
+    scale: float = OCTREE_SCALE
+
+
+def trimmed_surface(
+    cloud: PointCloud,
+    settings: MeshSettings,
+    octree: Octree,
+    wrong: Callable[[Float32], Bool] | None = None,
+) -> TriangleMesh:
+    """The Poisson surface of a cloud with normals, without what no points support.
+
+    Args:
+        cloud: Finite points with unit normals, in coordinates that are equally precise everywhere.
+        settings: Settings of the reconstruction.
+        octree: Resolution of the surface.
+        wrong: Returns which vertices (V, 3) cannot be on a surface; None = unknown.
+
+    Raises:
+        MeshingError: Poisson failed, or trimming left no face.
+    """
     vertices, faces, density = screened_poisson(
         cloud.xyz,
         _required(cloud.normals),
-        depth=depth,
+        depth=octree.depth,
+        scale=octree.scale,
         samples_per_node=settings.samples_per_node,
         point_weight=settings.point_weight,
     )
@@ -140,8 +174,12 @@ def reconstruct_mesh(
     )
 
 
-def _usable(cloud: PointCloud) -> PointCloud:
-    """The finite points of a cloud, if they can span a surface."""
+def usable(cloud: PointCloud) -> PointCloud:
+    """The finite points of a cloud, if they can span a surface.
+
+    Raises:
+        MeshingError: The points are too few, coincident or collinear.
+    """
     finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
     if finite.sum() < _MIN_POINTS:
         raise MeshingError(
@@ -164,7 +202,7 @@ def _usable(cloud: PointCloud) -> PointCloud:
     return cloud
 
 
-def _oriented(cloud: PointCloud, settings: MeshSettings, viewpoint_m: Point | None) -> PointCloud:
+def oriented(cloud: PointCloud, settings: MeshSettings, viewpoint_m: Point | None) -> PointCloud:
     """The points that have a normal, or all points with estimated normals."""
     if cloud.normals is not None:
         # NaN fails the comparison, so it counts as no normal.
@@ -186,14 +224,19 @@ def _required(normals: Float32 | None) -> Float32:
     return normals
 
 
+def widest_cell(xyz: Float32, settings: MeshSettings) -> float:
+    """Widest octree cell that the settings allow, in the unit of the points."""
+    step = max(1, len(xyz) // _SPACING_SAMPLES)
+    return settings.cell_spacings * float(np.median(_spacing(xyz[::step], xyz)))
+
+
 def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
     """The smallest octree depth whose cells are no wider than the settings allow."""
-    step = max(1, len(xyz) // _SPACING_SAMPLES)
-    cell_m = settings.cell_spacings * float(np.median(_spacing(xyz[::step], xyz)))
-    extent_m = float(np.ptp(xyz, axis=0).max()) * _OCTREE_SCALE
+    cell_m = widest_cell(xyz, settings)
+    extent_m = float(np.ptp(xyz, axis=0).max()) * OCTREE_SCALE
     if cell_m * 2**settings.max_depth <= extent_m:
         return settings.max_depth
-    return int(np.clip(math.ceil(math.log2(extent_m / cell_m)), _MIN_DEPTH, settings.max_depth))
+    return int(np.clip(math.ceil(math.log2(extent_m / cell_m)), MIN_DEPTH, settings.max_depth))
 
 
 def _spacing(some_xyz: Float32, xyz: Float32) -> Float32:

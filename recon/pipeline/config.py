@@ -92,7 +92,7 @@ class ReconConfig(Settings):
 PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
     "cloud": {"max_range_m": None, "max_relative_sigma": None},
     "filters": ANY_SCALE.model_dump(),
-    "mesh": {"max_depth": 9},
+    "mesh": {"point_weight": 16.0},
 }
 """Defaults of a single pair that differ from a drive: the scale of its scene is unknown."""
 

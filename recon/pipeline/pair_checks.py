@@ -11,6 +11,7 @@ import numpy as np
 
 from recon.audit import Finding
 from recon.errors import CalibrationError, MatchingError
+from recon.meshing import COVERED_WITHIN
 from recon.pipeline.audit_run import run_audit
 from recon.pipeline.config import ReconConfig
 from recon.structures import (
@@ -31,6 +32,10 @@ _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
 FEW_VALID_SHARE: Final = 0.25
 """Share of pixels with a disparity below which the images are hardly a stereo pair: real pairs,
 even of bare walls, exceed 40 %; swapped images, or those of different moments, stay under 15 %."""
+
+
+LEAST_COVERAGE: Final = 0.8
+"""Share of the points of a pair that its mesh should cover."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +119,19 @@ def check_found(
         got=_reasons(disparity),
         hint=next((fault.text for fault in faults if fault.fatal), advice),
     )
+
+
+def check_coverage(coverage: float) -> tuple[str, ...]:
+    """A warning if the mesh of a pair leaves out much of its cloud.
+
+    Args:
+        coverage: Share of the points that are on the mesh, see `mesh_coverage`.
+    """
+    if coverage >= LEAST_COVERAGE:
+        return ()
+    tolerance = f"points within {100 * COVERED_WITHIN:g} % of their depth"
+    advice = "lower mesh.cell_spacings or mesh.min_component_faces, or use the cloud"
+    return (f"the mesh covers {100 * coverage:.2g} % of the cloud ({tolerance}); {advice}",)
 
 
 def _reasons(disparity: Disparity) -> str:

@@ -21,12 +21,12 @@ from recon.formats.mlp import write_mlp
 from recon.formats.pfm import write_pfm
 from recon.formats.ply import write_ply
 from recon.geometry.triangulation import depth_from_disparity
-from recon.meshing import reconstruct_mesh
+from recon.meshing import mesh_coverage, reconstruct_view
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.empty_map import check_cloud
 from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
 from recon.pipeline.machine import use_threads
-from recon.pipeline.pair_checks import OnePair, check_found, find_pair_faults
+from recon.pipeline.pair_checks import OnePair, check_coverage, check_found, find_pair_faults
 from recon.pipeline.record import fingerprint, write_record
 from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.stopwatch import Stopwatch
@@ -195,14 +195,17 @@ def _reconstruct(
     frame = reconstructor.reconstruct(given.pair)
     options.tell("mesh")
     mesh: TriangleMesh | None = None
+    coverage: float | None = None
     warnings = frame.warnings
     try:
         with watch.stage("mesh"):
-            mesh = reconstruct_mesh(frame.cloud, config.mesh)
+            mesh = reconstruct_view(frame.cloud, frame.pair.camera, config.mesh)
+            coverage = mesh_coverage(mesh, frame.cloud)
+        warnings = (*warnings, *check_coverage(coverage))
     except MeshingError as error:
         warnings = (*warnings, f"no mesh: {error}")
     run = _run(given, config, frame.pair, frame.disparity)
-    figures = _metric_summary(frame, mesh)
+    figures = _metric_summary(frame, mesh) | {"mesh_coverage": coverage}
     return replace(
         run, cloud=frame.cloud, mesh=mesh, summary=run.summary | figures, warnings=warnings
     )

@@ -35,6 +35,7 @@ _FIGURES: Final[FigureFormats] = MappingProxyType(
         "seconds": ("Run time", "{:.2f} s"),
         "points": ("Points", "{:,}"),
         "faces": ("Triangles", "{:,}"),
+        "mesh_coverage": ("Points on the mesh", "{:.1%}"),
         "peak_memory_mb": ("Peak memory", "{:,.0f} MB"),
     }
 )

@@ -13,7 +13,9 @@ from recon.errors import MeshingError
 
 
 def reconstruct(xyz: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, ...]:
-    return screened_poisson(xyz, normals, depth=5, samples_per_node=1.5, point_weight=4.0)
+    return screened_poisson(
+        xyz, normals, depth=5, scale=1.1, samples_per_node=1.5, point_weight=4.0
+    )
 
 
 def ball(n: int = 600) -> np.ndarray:

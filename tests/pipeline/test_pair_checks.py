@@ -11,6 +11,7 @@ import pytest
 
 from recon.errors import MappingError, MatchingError
 from recon.pipeline.config import PAIR_DEFAULTS, load_config
+from recon.pipeline.pair_checks import check_coverage
 from recon.pipeline.pair_run import PairInput, PairOptions, PairRun, run_pair
 from recon.structures import RectifiedCamera, StereoPair
 
@@ -93,3 +94,18 @@ def test_a_calibration_that_gives_a_cloud_of_wrong_size_is_warned_of(
     assert run_.summary["warnings"] == list(run_.warnings)
     # Nobody asked for depth here.
     assert run(pair, tmp_path / "disparity", camera).warnings == ()
+
+
+def test_the_summary_says_how_much_of_the_cloud_the_mesh_covers(
+    pair: StereoPair, tmp_path: Path
+) -> None:
+    result = run(pair, tmp_path / "out", command="pair")
+    # One plane: all but a rim of two pixels.
+    assert 0.95 < result.summary["mesh_coverage"] <= 1
+    assert not [text for text in result.warnings if "mesh" in text]
+
+
+def test_a_mesh_that_leaves_out_much_of_the_cloud_is_warned_of() -> None:
+    assert check_coverage(0.8) == ()
+    (warning,) = check_coverage(0.003)
+    assert "covers 0.3 % of the cloud (points within 0.5 % of their depth)" in warning
