@@ -14,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.formats.atomic import write_bytes
+from recon.geometry.axes import T_YUP_FRAME
 from recon.structures import TriangleMesh
 from recon.structures.arrays import UInt8
+from recon.structures.cloud import Frame
 
 _FLOAT, _UINT, _USHORT = 5126, 5125, 5123
 _VERTICES, _INDICES = 34962, 34963
@@ -27,8 +29,10 @@ _MATERIAL: Final = {
 _UNLIT: Final = "KHR_materials_unlit"
 
 
-def write_glb(path: str | PathLike[str], mesh: TriangleMesh) -> None:
+def write_glb(path: str | PathLike[str], mesh: TriangleMesh, frame: Frame | None = None) -> None:
     """Write a mesh as GLB with float vertices, without changing its coordinates.
+
+    The y axis of glTF is up, so the node of the mesh is rotated upright if the frame is known.
 
     Vertex colours of glTF are linear, so sRGB colours are converted, to 16 bits to keep dark tones
     distinct.
@@ -42,6 +46,9 @@ def write_glb(path: str | PathLike[str], mesh: TriangleMesh) -> None:
     if mesh.rgb is not None:
         attributes["COLOR_0"] = (_linear(mesh.rgb), _USHORT)
     document, binary = _document(mesh, attributes)
+    if frame is not None:
+        # Column by column, in metres.
+        document["nodes"][0]["matrix"] = T_YUP_FRAME[frame].T.ravel().tolist()
     head = _chunk(b"JSON", json.dumps(document).encode(), b" ")
     body = _chunk(b"BIN\0", binary, b"\0")
     length = 12 + len(head) + len(body)

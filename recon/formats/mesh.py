@@ -23,13 +23,14 @@ from recon.formats.ply_tables import (
 )
 from recon.structures import TriangleMesh
 from recon.structures.arrays import Int32
+from recon.structures.cloud import Frame
 
 MESH_SUFFIXES: Final = (".ply", ".obj", ".stl", ".glb")
 #: Both names are in use for this property of a face.
 _INDICES: Final = ("vertex_indices", "vertex_index")
 
 
-def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
+def write_mesh(path: str | PathLike[str], mesh: TriangleMesh, frame: Frame | None = None) -> None:
     """Write a mesh atomically.
 
     PLY is binary with float vertices. PLY, OBJ and GLB keep normals and colours; STL has neither.
@@ -38,6 +39,7 @@ def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
     Args:
         path: The file; its suffix (.ply, .obj, .stl or .glb) gives the format.
         mesh: The mesh.
+        frame: Axes of its vertices, so that GLB viewers show it upright; None = unknown.
 
     Raises:
         OutputError: The suffix is unknown, the mesh has no face, or the file cannot be written.
@@ -50,7 +52,7 @@ def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
     if suffix == ".ply":
         write_tables(path, _tables(mesh))
     elif suffix == ".glb":
-        write_glb(path, mesh)
+        write_glb(path, mesh, frame)
     else:
         # Importing Open3D takes two seconds; PLY files do not need it.
         from recon.adapters import open3d_meshes  # noqa: PLC0415

@@ -125,7 +125,7 @@ def write_drive_mesh(
     if len(found.tiles) == 1:
         found.tiles[0].path.unlink()
         layers = {"mesh": whole}
-    write_mlp(directory.path("mesh/mesh.mlp"), {**layers, "cloud": cloud})
+    write_mlp(directory.path("mesh/mesh.mlp"), {**layers, "cloud": cloud}, "map")
     return found
 
 

@@ -17,7 +17,7 @@ from recon.formats.atomic import write_text
 from recon.formats.disparity_png import fitting_scale, write_disparity_png
 from recon.formats.image import write_image
 from recon.formats.mesh import write_mesh
-from recon.formats.mlp import write_mlp
+from recon.formats.mlp import Photo, write_mlp
 from recon.formats.pfm import write_pfm
 from recon.formats.ply import write_ply
 from recon.geometry.triangulation import depth_from_disparity
@@ -276,4 +276,6 @@ def _write(run: PairRun, directory: RunDirectory) -> None:
     if run.mesh is not None:
         write_mesh(path("mesh/mesh.ply"), run.mesh)
         layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("clouds/cloud.ply")}
-        write_mlp(path("mesh/mesh.mlp"), layers)
+        write_image(path("mesh/left.png"), run.pair.colours)
+        photo = Photo(path("mesh/left.png"), run.pair.camera)
+        write_mlp(path("mesh/mesh.mlp"), layers, "camera", photo)

@@ -242,7 +242,7 @@ def _write(run: PaperRun, directory: RunDirectory) -> None:
         for one in result.methods:
             _write_method(one, f"{folder}/{one.method}", directory)
             layers[one.method] = directory.path(f"{folder}/{one.method}/cloud.ply")
-        write_mlp(directory.path(f"{folder}/clouds.mlp"), layers)
+        write_mlp(directory.path(f"{folder}/clouds.mlp"), layers, "camera")
 
 
 def _write_method(result: MethodResult, folder: str, directory: RunDirectory) -> None:

@@ -148,6 +148,7 @@ class Rectifier:
             right=to_grey(right, self.settings.grey),
             camera=self.camera,
             left_rgb=left if left.ndim == 3 else None,
+            right_rgb=right if right.ndim == 3 else None,
             valid=self.valid,
             timestamp_s=pair.timestamp_s,
             index=pair.index,

@@ -58,7 +58,8 @@ def pair_figure(pair: RectifiedPair) -> bytes:
     figure = new_figure(WIDE_IN, (picture_in + 0.3) * (2 if stacked else 1))
     titles = ("Left, rectified", "Right, rectified")
     all_axes = figure.subplots(2 if stacked else 1, columns)
-    for axes, picture, title in zip(all_axes.flat, (pair.colours, pair.right), titles, strict=True):
+    right = pair.right if pair.right_rgb is None else pair.right_rgb
+    for axes, picture, title in zip(all_axes.flat, (pair.colours, right), titles, strict=True):
         axes.imshow(picture, cmap="gray", vmin=0, vmax=255)
         style_picture(axes, title)
     return to_png(figure)

@@ -58,6 +58,7 @@ class RectifiedPair:
         right: uint8 (H, W), grey.
         camera: Geometry of both views.
         left_rgb: uint8 (H, W, 3) colour of the left view, or None where the source is grey.
+        right_rgb: The same of the right view.
         valid: bool (H, W), False where rectification had no source pixel; None = all valid.
         timestamp_s: Time of exposure.
         index: Number of the frame in its source.
@@ -67,6 +68,7 @@ class RectifiedPair:
     right: UInt8
     camera: RectifiedCamera
     left_rgb: UInt8 | None = None
+    right_rgb: UInt8 | None = None
     valid: NDArray[np.bool_] | None = None
     timestamp_s: float = 0.0
     index: int = 0
@@ -76,6 +78,7 @@ class RectifiedPair:
         freeze(self, "left", np.uint8, size)
         freeze(self, "right", np.uint8, size)
         freeze(self, "left_rgb", np.uint8, (*size, 3))
+        freeze(self, "right_rgb", np.uint8, (*size, 3))
         freeze(self, "valid", np.bool_, size)
 
     def __repr__(self) -> str:

@@ -11,6 +11,7 @@ import pytest
 
 from recon.formats.glb import srgb_from_linear, write_glb
 from recon.structures import TriangleMesh
+from recon.structures.cloud import Frame
 
 MESH = TriangleMesh(
     vertices=np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], dtype=np.float32),
@@ -77,3 +78,24 @@ def test_only_colours_from_pictures_are_unlit(tmp_path: Path, rgb: np.ndarray | 
     write_glb(tmp_path / "a.glb", TriangleMesh(MESH.vertices, MESH.faces, rgb=rgb))
     document, _ = read_chunks(tmp_path / "a.glb")
     assert ("extensionsUsed" in document) == (rgb is not None)
+
+
+@pytest.mark.parametrize(
+    ("frame", "up", "ahead"),
+    [("camera", [0, -1, 0], [0, 0, 1]), ("map", [0, 0, 1], [1, 0, 0])],
+)
+def test_the_node_turns_the_mesh_upright(
+    tmp_path: Path, frame: Frame, up: list[int], ahead: list[int]
+) -> None:
+    write_glb(tmp_path / "a.glb", MESH, frame)
+    document, _ = read_chunks(tmp_path / "a.glb")
+    turn = np.reshape(document["nodes"][0]["matrix"], (4, 4)).T
+    # In glTF y is up, and a viewer looks along -z.
+    np.testing.assert_array_equal(turn @ [*up, 1], [0, 1, 0, 1])
+    np.testing.assert_array_equal(turn @ [*ahead, 1], [0, 0, -1, 1])
+    assert np.linalg.det(turn) == pytest.approx(1)
+
+
+def test_a_mesh_of_unknown_axes_is_not_turned(tmp_path: Path) -> None:
+    write_glb(tmp_path / "a.glb", MESH)
+    assert read_chunks(tmp_path / "a.glb")[0]["nodes"] == [{"mesh": 0}]

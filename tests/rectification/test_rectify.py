@@ -191,6 +191,8 @@ def test_colours_are_kept_beside_the_grey(calibration: str) -> None:
     rectified = rectifier.rectify(pair(shape=(HEIGHT, WIDTH, 3)))
     assert rectified.left_rgb is not None
     assert rectified.left_rgb.shape == (HEIGHT, WIDTH, 3)
+    assert rectified.right_rgb is not None
+    assert rectified.right_rgb.shape == (HEIGHT, WIDTH, 3)
     assert rectified.left.shape == rectified.right.shape == (HEIGHT, WIDTH)
     assert (rectified.timestamp_s, rectified.index) == (1.5, 4)
 
