@@ -45,6 +45,7 @@ _WARN_ROW_PX: Final = 0.5
 # A row error above this multiple of the median is a false match, not a calibration error.
 _WRONG: Final = 5.0
 _NEVER_WRONG_PX: Final = 0.5
+_KEPT_TYPES: Final = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
 
 Lines = tuple[list[Float64], list[Float64]]
 
@@ -115,8 +116,8 @@ def run_rectify(left: str, right: str, config: ReconConfig, options: RectifyOpti
         with watch.stage("rectify"):
             for pair, (left_path, right_path) in _pairs(pictures):
                 warped = plan.warp(pair)
-                write_image(directory.path(f"left/{left_path.stem}.png"), warped[0])
-                write_image(directory.path(f"right/{right_path.stem}.png"), warped[1])
+                write_image(directory.path(f"left/{_rectified_name(left_path)}"), warped[0])
+                write_image(directory.path(f"right/{_rectified_name(right_path)}"), warped[1])
         run = _measure(plan, first, config)
         run.summary["pairs"] = len(pictures.pairs)
         run.summary["frames_left_out"] = len(pictures.lonely)
@@ -200,7 +201,19 @@ def _by_features(pictures: PicturePairs, config: ReconConfig, first: StereoPair)
     step = max(1, len(pictures.pairs) // settings.pairs)
     some = replace(pictures, pairs=pictures.pairs[::step][: settings.pairs])
     greys = [(to_grey(pair.left), to_grey(pair.right)) for pair, _ in _pairs(some)]
-    result = rectify_pictures(greys, settings)
+    try:
+        result = rectify_pictures(greys, settings)
+    except CalibrationError as error:
+        if len(pictures.pairs) > 1:
+            raise
+        raise CalibrationError(
+            error.what,
+            where=pictures.pairs[0][0],
+            got=error.got,
+            expected=error.expected,
+            hint=f"{error.hint}; or it has too few good matches, and several pairs are needed: "
+            "give two folders of one rig, or a calibration with --calib",
+        ) from error
 
     def warp(pair: StereoPair) -> tuple[UInt8, UInt8]:
         left, right = (
@@ -225,6 +238,11 @@ def _by_features(pictures: PicturePairs, config: ReconConfig, first: StereoPair)
         ),
         figures=figures,
     )
+
+
+def _rectified_name(path: Path) -> str:
+    """The name of an image in its own file type; PNG for the types that are not written."""
+    return path.name if path.suffix.lower() in _KEPT_TYPES else f"{path.stem}.png"
 
 
 def _uncalibrated_figures(result: UncalibratedRectification) -> dict[str, Any]:

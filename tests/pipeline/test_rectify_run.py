@@ -93,3 +93,26 @@ def test_blank_pictures_are_one_clear_line(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match="too few matched features"):
         run_rectify(str(tmp_path / "l.png"), str(tmp_path / "r.png"), load_config(), options)
     assert not (tmp_path / "out").exists()
+
+
+def test_one_pair_is_enough_with_features_and_keeps_its_file_type(
+    street: Path, tmp_path: Path
+) -> None:
+    for side in ("left", "right"):
+        write_image(tmp_path / side / "0.jpg", read_image(street / side / "0.png"))
+    sides = (str(tmp_path / "left" / "0.jpg"), str(tmp_path / "right" / "0.jpg"))
+    run = run_rectify(*sides, load_config(), RectifyOptions(out=tmp_path / "out", threads=1))
+    assert run.summary["row_error_px"] < 0.7
+    for side, rectified in zip(("left", "right"), run.rectified, strict=True):
+        written = read_image(tmp_path / "out" / side / "0.jpg").astype(int)
+        # What JPEG at OpenCV's quality of 95 loses.
+        assert np.abs(written - rectified).mean() < 3
+
+
+def test_one_pair_with_too_few_matches_asks_for_several(tmp_path: Path) -> None:
+    for side in ("l", "r"):
+        write_image(tmp_path / f"{side}.png", np.full((60, 80), 128, np.uint8))
+    with pytest.raises(CalibrationError, match=r"l\.png: .*several pairs are needed.*--calib"):
+        run_rectify(
+            str(tmp_path / "l.png"), str(tmp_path / "r.png"), load_config(), RectifyOptions()
+        )
