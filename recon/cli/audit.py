@@ -32,6 +32,10 @@ def audit(
         Path | None,
         typer.Option(help="Write a calibration with corrected row alignment to this file."),
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for a report with images.", show_default="none"),
+    ] = None,
     kind: SourceKind = None,
     calib: Calib = None,
     left: LeftView = None,
@@ -50,14 +54,18 @@ def audit(
 
     Looks at row alignment, swapped, delayed or frozen cameras, missing and
     repeated frames, exposure, focus and baseline, and predicts the depth error.
+    With --out, sample pairs, row errors and disparities are drawn in a report.
 
     Examples:
       recon audit drive.bag --calib camchain.yaml
       recon audit rides/today --mend mended.yaml
+      recon audit rides/today --out audited
     """
     with session(quiet=quiet):
         from recon.pipeline.audit_run import mend_calibration, run_audit
         from recon.pipeline.config import load_config, source_overrides
+        from recon.pipeline.run_directory import RunDirectory
+        from recon.reports import present_audit
         from recon.reports.audit_table import audit_lines
         from recon.sources import open_source
         from recon.viewers import announce
@@ -70,6 +78,9 @@ def audit(
         summary = found.summary
         if mend is not None:
             summary["mended"] = mend_calibration(drive, settings, found, mend)
+        if out is not None:
+            with RunDirectory.for_command("audit", out) as directory:
+                present_audit(found, drive, settings, directory)
     if json:
         print_json(summary)
         return
@@ -77,3 +88,5 @@ def audit(
     for finding in found.findings:
         typer.echo(f"{'fatal' if finding.fatal else 'warning'}: {finding.text}")
     typer.echo(f"verdict: {found.verdict}")
+    if out is not None:
+        typer.echo(f"results: {out}")

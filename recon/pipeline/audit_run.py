@@ -23,7 +23,7 @@ from recon.pipeline.audit_findings import (
     find_series_faults,
 )
 from recon.pipeline.audit_geometry import measure_geometry
-from recon.pipeline.audit_sample import take_sample
+from recon.pipeline.audit_sample import Look, take_sample
 from recon.pipeline.config import ReconConfig
 from recon.rectification import Rectifier, plan_turns
 from recon.sources import StereoSource
@@ -39,12 +39,14 @@ class Audit:
         findings: Problems found, fatal ones first.
         figures: All measures, ready for JSON.
         alignment: Row errors of all pairs together; None if there are too few features.
+        looks: What was measured in each pair, and a few of the images.
     """
 
     verdict: Verdict
     findings: tuple[Finding, ...]
     figures: dict[str, Any]
     alignment: RowAlignment | None
+    looks: tuple[Look, ...] = ()
 
     def __repr__(self) -> str:
         found = ", ".join(finding.code for finding in self.findings) or "no findings"
@@ -87,7 +89,8 @@ def run_audit(source: StereoSource, config: ReconConfig, *, quick: bool = False)
     ]
     findings.sort(key=lambda finding: not finding.fatal)
     figures = audit_figures(source, sample, geometry, gaps, camera)
-    return Audit(verdict_of(findings), tuple(findings), figures, geometry.alignment)
+    looks = tuple(sample.looks)
+    return Audit(verdict_of(findings), tuple(findings), figures, geometry.alignment, looks)
 
 
 def quick_warnings(source: StereoSource, config: ReconConfig) -> tuple[str, ...]:

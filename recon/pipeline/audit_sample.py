@@ -34,6 +34,31 @@ _LEAST_SIDE_PX = 16
 _NO_FEATURES = PairFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
 
 
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What was measured in one pair.
+
+    Attributes:
+        index: Number of the pair.
+        brightness_dn: (left, right) mean grey level.
+        sharpness: (left, right) share of the finest detail; NaN if unknown.
+        features: Matched features.
+        pair: The images; None where they are not kept.
+    """
+
+    index: int
+    brightness_dn: tuple[float, float]
+    sharpness: tuple[float, float]
+    features: PairFeatures
+    pair: RectifiedPair | None
+
+    @property
+    def rows_px(self) -> Float64:
+        """float64 (N,): row of each feature in the right image minus that in the left one."""
+        apart = self.features.right_uv[:, 1] - self.features.left_uv[:, 1]
+        return apart.astype(np.float64)
+
+
 @dataclass(eq=False)
 class Sample:
     """Measures of the sampled images.
@@ -52,6 +77,7 @@ class Sample:
         speeds_m_per_s: Speed of the rig at each pair where it could be measured.
         flows: float64 (N,) per pair, rows by which each feature moves to the next frame; NaN if
             unknown.
+        looks: Each measured pair; a few of them with their images.
         broken: The error that ended the sampling, if any.
     """
 
@@ -66,6 +92,7 @@ class Sample:
     lagged: dict[int, list[PairFeatures]] = field(default_factory=dict)
     speeds_m_per_s: list[float] = field(default_factory=list)
     flows: list[Float64] = field(default_factory=list)
+    looks: list[Look] = field(default_factory=list)
     broken: ReconError | None = None
 
 
@@ -127,6 +154,8 @@ class _Sampler:
         self.sample = Sample()
         self._source, self._rectifier, self._settings = source, rectifier, settings
         self._centres = centres
+        # The first, middle and last pair are kept; all would not fit into memory.
+        self._kept = {centres[n] for n in (0, len(centres) // 2, -1)} if centres else set()
         self._with_lag = set(centres[:: max(1, len(centres) // _LAG_PAIRS)])
         self._recent: dict[int, RectifiedPair] = {}
 
@@ -154,6 +183,7 @@ class _Sampler:
         sample.contrast_dn.append((float(pair.left.std()), float(pair.right.std())))
         sample.brightness_dn.append((float(pair.left.mean()), float(pair.right.mean())))
         if min(sample.contrast_dn[-1]) < settings.contrast_dn:
+            self._note(pair, (np.nan, np.nan), _NO_FEATURES)
             return
         if min(pair.left.shape) < _LEAST_SIDE_PX:
             sample.features.append(_NO_FEATURES)
@@ -162,11 +192,20 @@ class _Sampler:
         sample.sharpness.append((measure_sharpness(pair.left), measure_sharpness(pair.right)))
         features = match_features(pair.left, pair.right, settings.features)
         sample.features.append(features)
+        self._note(pair, sample.sharpness[-1], features)
         gains = measure_gain(pair.left, pair.right, features.left_uv, features.right_uv)
         sample.gains.append(gains)
         if centre in self._with_lag:
             self._compare_lags(centre, features)
         self._follow(centre, features)
+
+    def _note(
+        self, pair: RectifiedPair, sharpness: tuple[float, float], features: PairFeatures
+    ) -> None:
+        """Keep what the report shows of a pair."""
+        kept = pair if pair.index in self._kept else None
+        brightness = self.sample.brightness_dn[-1]
+        self.sample.looks.append(Look(pair.index, brightness, sharpness, features, kept))
 
     def _compare_lags(self, centre: int, features: PairFeatures) -> None:
         """Match the left image with the right images before and after it."""

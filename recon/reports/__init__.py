@@ -1,5 +1,6 @@
 """Reports of runs: figures, tables and one self-contained HTML file."""
 
+from recon.reports.audit_report import present_audit
 from recon.reports.calibration_report import present_calibration
 from recon.reports.html import ReportContent, render_html
 from recon.reports.map_report import MapReportInputs, map_report
@@ -15,6 +16,7 @@ __all__ = [
     "map_report",
     "pair_report",
     "paper_report",
+    "present_audit",
     "present_calibration",
     "present_disparity",
     "present_map",

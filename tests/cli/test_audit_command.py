@@ -54,6 +54,28 @@ def test_a_good_drive_is_announced_measured_and_found_good(good: Path) -> None:
     assert "not known" not in done.stdout
 
 
+def test_a_report_shows_pairs_rows_and_frames(good: Path, tmp_path: Path) -> None:
+    done = recon("audit", good, "--out", tmp_path / "audited")
+    assert done.exit_code == 0
+    assert "verdict: good" in done.stdout
+    page = (tmp_path / "audited" / "report.html").read_text()
+    for words in ("Verdict: good", "Row errors", "Disparity", "Exposure, focus and rows"):
+        assert words in page
+    assert "<link" not in page
+    assert "http-equiv" in page  # the policy that blocks whatever is not in the file
+    summary = json.loads((tmp_path / "audited" / "summary.json").read_text())
+    assert summary["verdict"] == "good"
+
+
+def test_a_report_is_made_of_a_camera_that_shows_nothing(drive: Drive, tmp_path: Path) -> None:
+    pairs, camera = drive
+    dark = [replace(pair, right=pair.right * 0) for pair in pairs]
+    folder = drives.write_kitti(dark, camera, tmp_path / "dark")
+    done = recon("audit", folder, "--out", tmp_path / "audited")
+    assert done.exit_code == 0
+    assert "shows nothing" in (tmp_path / "audited" / "report.html").read_text()
+
+
 def test_the_kind_can_be_overridden(good: Path) -> None:
     assert recon("audit", good, "--source", "kitti").exit_code == 0
     done = recon("audit", good, "--source", "euroc")
