@@ -27,8 +27,8 @@ _OPENCV: Final = re.compile(r"^%YAML|<opencv_storage>|opencv-matrix")
 
 def read_calibration(
     path: StrPath,
-    width_px: int,
-    height_px: int,
+    width_px: int | None = None,
+    height_px: int | None = None,
     *,
     metres_per_unit: float = 1.0,
     cameras: tuple[int, int] | None = None,
@@ -42,7 +42,7 @@ def read_calibration(
 
     Args:
         path: The file.
-        width_px: Image width.
+        width_px: Image width; None = that of the file, which KITTI's and some of OpenCV's lack.
         height_px: Image height.
         metres_per_unit: Unit of the translation in an OpenCV file; other formats define theirs.
         cameras: Left and right camera of a KITTI file; None = the grey pair if it has one.
@@ -51,18 +51,20 @@ def read_calibration(
         A `RectifiedCamera` if the images are already rectified.
 
     Raises:
-        FormatError: The file is missing, damaged or of an unknown format.
+        FormatError: The file is missing, damaged or of an unknown format, or it does not contain
+            the image size and none is given.
         CalibrationError: The calibration cannot give depth, or is of another image size.
     """
-    size = (width_px, height_px)
+    size = None if width_px is None or height_px is None else (width_px, height_px)
     rig = _read(path, size, metres_per_unit, cameras)
-    check_size(rig, *size, path)
+    if size is not None:
+        check_size(rig, *size, path)
     return rig
 
 
 def _read(
     path: StrPath,
-    size: tuple[int, int],
+    size: tuple[int, int] | None,
     metres_per_unit: float,
     cameras: tuple[int, int] | None,
 ) -> RectifiedCamera | StereoCalibration:
@@ -80,6 +82,13 @@ def _read(
     if _MIDDLEBURY.search(text):
         return read_middlebury_calib(path).camera
     if _KITTI.search(text):
+        if size is None:
+            raise FormatError(
+                "a KITTI calibration does not say which images it is of",
+                where=path,
+                hint="pass width_px and height_px, or give the file itself to recon.reconstruct or "
+                "recon.match, which take the size from the images",
+            )
         return read_kitti_rig(path, *size, cameras or _kitti_cameras(path))
     if _HOMOGRAPHIES.search(text):
         raise CalibrationError(

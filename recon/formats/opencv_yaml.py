@@ -72,6 +72,8 @@ def read_opencv_calibration(
             "calibration does not contain the image size",
             where=intrinsics,
             expected="image_width and image_height",
+            hint="from Python: pass width_px and height_px, or give the file itself to "
+            "recon.reconstruct or recon.match, which take the size from the images",
         )
     model = _model(intrinsics)
     lens: LensModel = model or "pinhole"

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from recon.errors import SettingsError
+from recon.formats.calibration import read_calibration
+from recon.formats.files import StrPath
 from recon.formats.middlebury import stand_in_camera
 from recon.matching import MATCHERS, Matcher, check_matcher, field_of, name_of
 from recon.pipeline.config import PAIR_DEFAULTS, ReconConfig, load_config
@@ -13,7 +15,8 @@ from recon.pipeline.frame import FrameReconstructor, ReconstructedFrame
 from recon.structures import Disparity, RectifiedCamera, StereoCalibration, StereoPair
 from recon.structures.arrays import UInt8
 
-Calibration = RectifiedCamera | StereoCalibration
+_Rig = RectifiedCamera | StereoCalibration
+Calibration = RectifiedCamera | StereoCalibration | StrPath
 
 
 def match(
@@ -30,6 +33,7 @@ def match(
         left: uint8 (H, W) grey or (H, W, 3) RGB.
         right: The same shape as ``left``.
         calibration: Needed if the images are not rectified; it also gives the disparity range.
+            A value, or a file that `read_calibration` understands.
         matcher: Name of the matcher, one of recon's or one that an installed package registers;
             or any object with the methods of `Matcher`.
         **settings: Settings of a matcher of recon's, such as ``ndisp=64`` or ``window_px=9``.
@@ -39,10 +43,14 @@ def match(
         SettingsError: There is no such matcher, or a setting is unknown or out of its range.
         MatchingError: A matcher that is not recon's fails, or returns no disparity of the pair.
     """
-    height_px, width_px = left.shape[:2]
     config = ReconConfig.parse({"matching": _own_settings(matcher, settings)}).with_matcher(matcher)
-    camera = calibration or stand_in_camera(width_px, height_px)
-    return FrameReconstructor(camera, config).match(StereoPair(left, right))[1]
+    pair = StereoPair(left, right)
+    height_px, width_px = pair.left.shape[:2]
+    if calibration is None:
+        camera: _Rig = stand_in_camera(width_px, height_px)
+    else:
+        camera = _rig_of(calibration, pair)
+    return FrameReconstructor(camera, config).match(pair)[1]
 
 
 def reconstruct(
@@ -58,7 +66,7 @@ def reconstruct(
     Args:
         left: uint8 (H, W) grey or (H, W, 3) RGB.
         right: The same shape as ``left``.
-        calibration: Of the two cameras.
+        calibration: Of the two cameras: a value, or a file that `read_calibration` understands.
         config: Settings of the stages; None = those of ``recon pair``.
         matcher: As for `match`; None = that of the settings.
 
@@ -66,7 +74,16 @@ def reconstruct(
         ReconError: The images, the calibration and the settings do not fit together.
     """
     settings = (config or load_config(defaults=PAIR_DEFAULTS)).with_matcher(matcher)
-    return FrameReconstructor(calibration, settings).reconstruct(StereoPair(left, right))
+    pair = StereoPair(left, right)
+    return FrameReconstructor(_rig_of(calibration, pair), settings).reconstruct(pair)
+
+
+def _rig_of(calibration: Calibration, pair: StereoPair) -> _Rig:
+    """The calibration, read for images of this size if it is a file."""
+    if isinstance(calibration, RectifiedCamera | StereoCalibration):
+        return calibration
+    height_px, width_px = pair.left.shape[:2]
+    return read_calibration(calibration, width_px, height_px)
 
 
 def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[str, Any]:
