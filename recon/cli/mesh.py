@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli.options import Config, Formats, Json, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
 
 
@@ -20,12 +20,7 @@ def mesh(
         ),
     ],
     out: Out = None,
-    formats: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--format", "-f", help="ply, obj, stl or glb. May be repeated.", show_default="ply"
-        ),
-    ] = None,
+    formats: Formats = None,
     config: Config = None,
     set_: Set = None,
     json: Json = False,
@@ -33,20 +28,22 @@ def mesh(
     verbose: Verbose = False,
     threads: Threads = None,
 ) -> None:
-    """Reconstruct a surface mesh from a PLY point cloud or from the map of a run.
+    """Reconstruct a surface mesh from a PLY point cloud, or from a run of map or pair.
 
     Screened Poisson reconstruction, trimmed where there are no points. The map
     of a run is meshed in tiles, and surfaces in space that the cameras saw to
-    be free are removed.
+    be free are removed. The cloud of a pair is meshed as recon pair does.
 
     Examples:
       recon mesh cloud.ply --format obj --format glb
       recon mesh outputs/map/latest --set mesh.target_faces=500000
     """
     with session(quiet=quiet):
-        from recon.pipeline.config import load_config
+        from recon.pipeline.config import PAIR_DEFAULTS, load_config
+        from recon.pipeline.finished_run import is_pair_run
         from recon.pipeline.mesh_run import MeshOptions, run_mesh
 
         options = MeshOptions(out=out, formats=tuple(formats or ("ply",)), threads=threads)
-        summary = run_mesh(source, load_config(config, set_ or ()), options)
+        defaults = PAIR_DEFAULTS if source.is_dir() and is_pair_run(source) else None
+        summary = run_mesh(source, load_config(config, set_ or (), defaults), options)
     print_json(summary) if json else print_run(summary, stages=verbose)

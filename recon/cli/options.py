@@ -51,6 +51,15 @@ Verbose = Annotated[
         "print progress there as JSON lines.",
     ),
 ]
+Formats = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--format",
+        "-f",
+        help="Format of the mesh: ply, obj, stl or glb. May be repeated; PLY is always written.",
+        show_default="ply",
+    ),
+]
 Mesh = Annotated[bool, typer.Option(help="Reconstruct the surface mesh.")]
 Threads = Annotated[
     int | None,

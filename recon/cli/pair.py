@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Matcher, Out, Quiet, Set, Threads, Verbose
+from recon.cli.options import Config, Formats, Json, Matcher, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
 
 Left = Annotated[Path, typer.Argument(help="Left image.")]
@@ -36,6 +36,7 @@ def pair(
         typer.Option(help="Ground-truth disparity (PFM or 16-bit PNG) to compare with."),
     ] = None,
     out: Out = None,
+    formats: Formats = None,
     matcher: Matcher = None,
     ndisp: Ndisp = None,
     config: Config = None,
@@ -53,6 +54,7 @@ def pair(
     Examples:
       recon pair im0.png im1.png --calib calib.txt --out outputs/motorcycle
       recon pair im0.png im1.png --calib calib.txt --truth disp0GT.pfm
+      recon pair im0.png im1.png --calib calib.txt --format glb
     """
     with session(quiet=quiet):
         from recon.pipeline.config import (
@@ -72,7 +74,8 @@ def pair(
         unit = settings.source.metres_per_unit if unit_m is None else unit_m
         given = read_pair_input(left, right, calib, truth, metres_per_unit=unit)
         viewer = choose_viewer(quiet=quiet, verbose=verbose)
-        options = PairOptions("pair", out, threads, present_pair, viewer.on_stage)
+        others = tuple(name for name in dict.fromkeys(formats or ()) if name != "ply")
+        options = PairOptions("pair", out, threads, present_pair, viewer.on_stage, others)
         run = run_pair(given, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)
 

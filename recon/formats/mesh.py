@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.errors import FormatError, OutputError
+from recon.errors import FormatError, OutputError, SettingsError
 from recon.formats.atomic import atomic_path
 from recon.formats.glb import srgb_from_linear, write_glb
 from recon.formats.ply import colours_of, fill_vertices, normals_of, vertex_dtype
@@ -59,6 +59,25 @@ def write_mesh(path: str | PathLike[str], mesh: TriangleMesh, frame: Frame | Non
 
         with atomic_path(path) as temporary:
             open3d_meshes.write_mesh(temporary, mesh)
+
+
+def check_mesh_formats(formats: Sequence[str]) -> None:
+    """Refuse unknown formats before the work is done.
+
+    Args:
+        formats: Suffixes without the dot.
+
+    Raises:
+        SettingsError: One is not a suffix that `write_mesh` knows.
+    """
+    unknown = [name for name in formats if f".{name}" not in MESH_SUFFIXES]
+    if unknown:
+        raise SettingsError(
+            "unknown mesh format",
+            where="--format",
+            got=unknown[0],
+            expected=", ".join(suffix.lstrip(".") for suffix in MESH_SUFFIXES),
+        )
 
 
 def join_meshes(path: str | PathLike[str], parts: Sequence[tuple[Path, int, int]]) -> None:

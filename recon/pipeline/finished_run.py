@@ -12,6 +12,7 @@ import numpy as np
 from recon.errors import FormatError, SettingsError
 from recon.pipeline.config import ReconConfig, load_config
 from recon.pipeline.run_directory import RECORD
+from recon.structures import RectifiedCamera
 from recon.structures.arrays import Float64, freeze
 
 CONFIG: Final = "config.yaml"
@@ -19,6 +20,8 @@ GRID: Final = "map/grid.yaml"
 OCTOMAP: Final = "map/octomap.ot"
 RAYS_FILE: Final = "map/rays.bin"
 CLOUD: Final = "map/cloud.ply"
+PAIR_CLOUD: Final = "clouds/cloud.ply"
+SUMMARY: Final = "summary.json"
 TRAJECTORY: Final = "trajectory_kitti.txt"
 MAPPED_BY: Final = "mapped_by"
 """Record key of a run made from another run: the command that mapped the drive."""
@@ -65,6 +68,36 @@ def open_run(folder: Path) -> FinishedRun:
         raise FormatError(f"record of the run has no valid {UNTRUSTED}", where=folder / RECORD)
     config = load_config(folder / CONFIG)
     return FinishedRun(folder, str(mapped_by), config, T_map_world, tuple(untrusted))
+
+
+def is_pair_run(folder: Path) -> bool:
+    """Whether a folder holds a finished run of `recon pair`.
+
+    Raises:
+        FormatError: The folder does not contain a finished run.
+    """
+    return _read_record(folder / RECORD).get("command") == "pair"
+
+
+def camera_of_pair(folder: Path) -> RectifiedCamera:
+    """The rectified camera of a run of `recon pair`, from its summary.
+
+    Raises:
+        FormatError: The summary cannot be read, or names no camera.
+        CalibrationError: It is none that could have measured anything.
+    """
+    summary = _read_record(folder / SUMMARY)
+    names = ("focal_px", "cx_px", "cy_px", "doffs_px", "baseline_m", "width_px", "height_px")
+    try:
+        focal, cx, cy, doffs, baseline, width, height = (float(summary[name]) for name in names)
+        return RectifiedCamera(focal, cx, cy, cx + doffs, baseline, int(width), int(height))
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise FormatError(
+            "the summary of the run does not describe its camera",
+            where=folder / SUMMARY,
+            expected=", ".join(names),
+            hint="run recon pair again",
+        ) from error
 
 
 def refuse_as_target(run: Path, out: Path | None) -> None:

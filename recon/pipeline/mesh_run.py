@@ -8,22 +8,32 @@ from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
-from recon.errors import SettingsError
 from recon.formats.atomic import atomic_path, write_text
-from recon.formats.mesh import MESH_SUFFIXES, read_mesh, write_mesh
+from recon.formats.mesh import check_mesh_formats, read_mesh, write_mesh
 from recon.formats.mlp import write_mlp
 from recon.formats.octomap_leaves import octomap_pieces
 from recon.formats.ply import read_ply, read_ply_pieces, write_ply
-from recon.meshing import MeshSettings, reconstruct_mesh
+from recon.meshing import MeshSettings, mesh_coverage, reconstruct_mesh, reconstruct_view
 from recon.pipeline.config import ReconConfig, dump_config
 from recon.pipeline.drive_mesh import write_drive_mesh
-from recon.pipeline.finished_run import CLOUD, OCTOMAP, open_run, refuse_as_target
+from recon.pipeline.finished_run import (
+    CLOUD,
+    OCTOMAP,
+    PAIR_CLOUD,
+    camera_of_pair,
+    is_pair_run,
+    open_run,
+    refuse_as_target,
+)
 from recon.pipeline.machine import use_threads
+from recon.pipeline.pair_checks import check_coverage
 from recon.pipeline.record import fingerprint, write_record
 from recon.pipeline.run_directory import RunDirectory
 from recon.pipeline.stopwatch import Stopwatch
 from recon.pipeline.summary import cost
 from recon.pipeline.tile_store import TileStore
+from recon.structures import RectifiedCamera
+from recon.structures.cloud import Frame
 
 
 @dataclass(frozen=True)
@@ -44,8 +54,9 @@ class MeshOptions:
 def run_mesh(source: Path, config: ReconConfig, options: MeshOptions) -> dict[str, Any]:
     """Reconstruct the surface of a cloud file or of a run's map, and write a MeshLab project.
 
-    A cloud file is meshed in one piece, since its scale is unknown. The map of a run is meshed in
-    tiles, and faces in observed free space are removed.
+    A cloud file is meshed in one piece, since its scale is unknown; the cloud of a pair as
+    `recon pair` does. The map of a run is meshed in tiles, and faces in observed free space are
+    removed.
 
     Returns:
         The figures of ``summary.json``.
@@ -56,22 +67,26 @@ def run_mesh(source: Path, config: ReconConfig, options: MeshOptions) -> dict[st
     """
     start = time.perf_counter()
     threads = use_threads(options.threads)
-    _check_formats(options.formats)
+    check_mesh_formats(options.formats)
     watch = Stopwatch()
-    cloud_path = source
+    cloud_path, camera = source, None
     if source.is_dir():
-        cloud_path = open_run(source).folder / CLOUD
         refuse_as_target(source, options.out)
+        if is_pair_run(source):
+            cloud_path, camera = source / PAIR_CLOUD, camera_of_pair(source)
+        else:
+            cloud_path = open_run(source).folder / CLOUD
+    frame: Frame | None = None if source.is_file() else "camera" if camera else "map"
     with RunDirectory.for_command("mesh", options.out) as directory:
-        if source.is_dir():
+        if frame == "map":
             figures = _mesh_run(source, config.mesh, directory, threads, watch)
         else:
-            figures = _mesh_cloud(source, config.mesh, directory, watch)
+            figures = _mesh_cloud(cloud_path, camera, config.mesh, directory, watch)
         with watch.stage("write"):
             whole = directory.path("mesh/mesh.ply")
             others = [suffix for suffix in dict.fromkeys(options.formats) if suffix != "ply"]
             for suffix in others:
-                write_mesh(directory.path(f"mesh/mesh.{suffix}"), read_mesh(whole))
+                write_mesh(directory.path(f"mesh/mesh.{suffix}"), read_mesh(whole), frame)
             write_text(directory.path("config.yaml"), dump_config(config))
         summary = {
             "cloud": str(cloud_path),
@@ -90,23 +105,33 @@ def run_mesh(source: Path, config: ReconConfig, options: MeshOptions) -> dict[st
 
 
 def _mesh_cloud(
-    path: Path, settings: MeshSettings, directory: RunDirectory, watch: Stopwatch
+    path: Path,
+    camera: RectifiedCamera | None,
+    settings: MeshSettings,
+    directory: RunDirectory,
+    watch: Stopwatch,
 ) -> dict[str, Any]:
-    """Mesh a cloud file in one piece and write the surface."""
+    """Mesh a cloud file in one piece, as its camera saw it if it is that of a pair."""
     with watch.stage("read"):
         cloud = read_ply(path)
         write_ply(directory.path("mesh/cloud.ply"), cloud)
     with watch.stage("mesh"):
-        mesh = reconstruct_mesh(cloud, settings)
+        if camera is None:
+            mesh, coverage = reconstruct_mesh(cloud, settings), None
+        else:
+            mesh = reconstruct_view(cloud, camera, settings)
+            coverage = mesh_coverage(mesh, cloud)
     write_mesh(directory.path("mesh/mesh.ply"), mesh)
     layers = {name: directory.path(f"mesh/{name}.ply") for name in ("mesh", "cloud")}
-    write_mlp(directory.path("mesh/mesh.mlp"), layers)
-    return {
+    write_mlp(directory.path("mesh/mesh.mlp"), layers, None if camera is None else "camera")
+    figures = {
         "points": len(cloud),
         "vertices": len(mesh.vertices),
         "faces": len(mesh.faces),
-        "warnings": [],
     }
+    if coverage is None:
+        return {**figures, "warnings": []}
+    return {**figures, "mesh_coverage": coverage, "warnings": list(check_coverage(coverage))}
 
 
 def _mesh_run(
@@ -135,14 +160,3 @@ def _mesh_run(
         "tiles": len(written.tiles),
         "warnings": [*warnings, *written.warnings],
     }
-
-
-def _check_formats(formats: tuple[str, ...]) -> None:
-    unknown = [name for name in formats if f".{name}" not in MESH_SUFFIXES]
-    if unknown:
-        raise SettingsError(
-            "unknown mesh format",
-            where="--format",
-            got=unknown[0],
-            expected=", ".join(suffix.lstrip(".") for suffix in MESH_SUFFIXES),
-        )

@@ -16,7 +16,7 @@ from recon.evaluation import evaluate_disparity
 from recon.formats.atomic import write_text
 from recon.formats.disparity_png import fitting_scale, write_disparity_png
 from recon.formats.image import write_image
-from recon.formats.mesh import write_mesh
+from recon.formats.mesh import check_mesh_formats, write_mesh
 from recon.formats.mlp import Photo, write_mlp
 from recon.formats.pfm import write_pfm
 from recon.formats.ply import write_ply
@@ -104,6 +104,7 @@ class PairOptions:
         command: ``pair``, or ``disparity`` for the disparity alone.
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores. Changes no result.
+        formats: Suffixes of the mesh files besides PLY, without the dot.
         present: Writes figures and the report into the result folder.
         on_stage: Called with the name of each long stage when it begins.
     """
@@ -113,6 +114,7 @@ class PairOptions:
     threads: int | None = None
     present: Callable[[PairRun, RunDirectory], None] | None = None
     on_stage: Callable[[str], None] | None = None
+    formats: tuple[str, ...] = ()
 
     def tell(self, stage: str) -> None:
         """Report that a stage begins."""
@@ -131,6 +133,7 @@ def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> Pai
             behind.
     """
     start = time.perf_counter()
+    check_mesh_formats(options.formats)
     threads, watch = use_threads(options.threads), Stopwatch()
     with RunDirectory.for_command(options.command, options.out) as directory:
         reconstructor = FrameReconstructor(
@@ -148,7 +151,7 @@ def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> Pai
             check_cloud(len(run.cloud), run.disparity, camera, config.cloud, run.name)
         run = replace(run, warnings=(*(fault.text for fault in faults), *few, *run.warnings))
         with watch.stage("write"):
-            _write(run, directory)
+            _write(run, directory, options.formats)
         run.summary.update(cost(watch, time.perf_counter() - start))
         if options.present is not None:
             options.tell("report")
@@ -254,12 +257,14 @@ def _metric_summary(frame: ReconstructedFrame, mesh: TriangleMesh | None) -> dic
         "faces": 0 if mesh is None else len(mesh.faces),
         "focal_px": camera.focal_px,
         "field_of_view_deg": camera.field_of_view_deg,
+        "cx_px": camera.cx_px,
+        "cy_px": camera.cy_px,
         "baseline_m": camera.baseline_m,
         "doffs_px": camera.doffs_px,
     }
 
 
-def _write(run: PairRun, directory: RunDirectory) -> None:
+def _write(run: PairRun, directory: RunDirectory, formats: tuple[str, ...]) -> None:
     path, disparity = directory.path, run.disparity
     write_pfm(path("disparity/disparity.pfm"), disparity.values)
     scale = fitting_scale(disparity.values)
@@ -274,7 +279,8 @@ def _write(run: PairRun, directory: RunDirectory) -> None:
     write_pfm(path("disparity/depth.pfm"), depth_m)
     write_ply(path("clouds/cloud.ply"), run.cloud)
     if run.mesh is not None:
-        write_mesh(path("mesh/mesh.ply"), run.mesh)
+        for suffix in ("ply", *formats):
+            write_mesh(path(f"mesh/mesh.{suffix}"), run.mesh, "camera")
         layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("clouds/cloud.ply")}
         write_image(path("mesh/left.png"), run.pair.colours)
         photo = Photo(path("mesh/left.png"), run.pair.camera)

@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.errors import MappingError, MatchingError
+from recon.errors import FormatError, MappingError, MatchingError, SettingsError
 from recon.pipeline.config import PAIR_DEFAULTS, load_config
+from recon.pipeline.mesh_run import MeshOptions, run_mesh
 from recon.pipeline.pair_checks import check_coverage
 from recon.pipeline.pair_run import PairInput, PairOptions, PairRun, run_pair
 from recon.structures import RectifiedCamera, StereoPair
@@ -109,3 +110,35 @@ def test_a_mesh_that_leaves_out_much_of_the_cloud_is_warned_of() -> None:
     assert check_coverage(0.8) == ()
     (warning,) = check_coverage(0.003)
     assert "covers 0.3 % of the cloud (points within 0.5 % of their depth)" in warning
+
+
+def test_the_run_of_a_pair_is_meshed_again_as_the_pair_was(
+    pair: StereoPair, tmp_path: Path
+) -> None:
+    settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
+    options = PairOptions("pair", tmp_path / "run", formats=("glb",))
+    first = run_pair(PairInput(pair, CAMERA), settings, options)
+    assert (tmp_path / "run" / "mesh" / "mesh.glb").is_file()
+    again = run_mesh(
+        tmp_path / "run", settings, MeshOptions(tmp_path / "again", formats=("glb", "obj"))
+    )
+    assert again["mesh_coverage"] == pytest.approx(first.summary["mesh_coverage"], abs=1e-3)
+    for name in ("mesh.ply", "mesh.glb"):
+        files = [tmp_path / run / "mesh" / name for run in ("run", "again")]
+        assert files[0].read_bytes() == files[1].read_bytes()
+    project = (tmp_path / "again" / "mesh" / "mesh.mlp").read_text()
+    assert "0 -1 0 0" in project  # camera axes, turned upright
+
+
+def test_a_pair_run_that_does_not_name_its_camera_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text('{"command": "pair"}')
+    (tmp_path / "summary.json").write_text('{"focal_px": null}')
+    with pytest.raises(FormatError, match="does not describe its camera"):
+        run_mesh(tmp_path, load_config(), MeshOptions(tmp_path / "out"))
+
+
+def test_an_unknown_format_is_refused_before_the_work(pair: StereoPair, tmp_path: Path) -> None:
+    options = PairOptions("pair", tmp_path / "run", formats=("fbx",))
+    with pytest.raises(SettingsError, match=r"--format: unknown mesh format .*fbx"):
+        run_pair(PairInput(pair, CAMERA), load_config(), options)
+    assert not (tmp_path / "run").exists()
