@@ -9,6 +9,7 @@ import typer
 
 from recon.cli.options import Config, Formats, Json, Matcher, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
+from recon.errors import SettingsError
 
 Left = Annotated[Path, typer.Argument(help="Left image.")]
 Right = Annotated[Path, typer.Argument(help="Right image.")]
@@ -26,7 +27,40 @@ _CALIB_HELP = "Calibration file: recon, KITTI, Middlebury, OpenCV, ROS CameraInf
 def pair(
     left: Left,
     right: Right,
-    calib: Annotated[Path, typer.Option(help=_CALIB_HELP)],
+    calib: Annotated[
+        Path | None,
+        typer.Option(help=_CALIB_HELP + " Without one, the pair must be rectified already."),
+    ] = None,
+    focal: Annotated[
+        float | None,
+        typer.Option(
+            min=1.0,
+            metavar="PX",
+            help="Focal length in pixels, without --calib.",
+            show_default="EXIF",
+        ),
+    ] = None,
+    baseline: Annotated[
+        float | None,
+        typer.Option(
+            min=1e-6,
+            metavar="M",
+            help="Distance between the cameras in metres, without --calib.",
+            show_default="unknown: the cloud is up to scale",
+        ),
+    ] = None,
+    cx: Annotated[
+        float | None,
+        typer.Option(
+            metavar="PX",
+            help="Column of the principal point of both images.",
+            show_default="middle",
+        ),
+    ] = None,
+    cy: Annotated[
+        float | None,
+        typer.Option(metavar="PX", help="Row of the principal point.", show_default="middle"),
+    ] = None,
     unit_m: Annotated[
         float | None,
         typer.Option(min=1e-6, help="Metres per unit in an OpenCV file, e.g. 0.001 for mm. [1]"),
@@ -48,13 +82,15 @@ def pair(
 ) -> None:
     """Reconstruct one stereo pair: disparity, depth, point cloud, mesh, report.
 
-    The images may be raw or rectified; the calibration tells which. Pixels
-    without a disparity have a reason code.
+    The images may be raw or rectified; the calibration tells which. Without
+    one they must be rectified, and the focal length is that of --focal or of
+    the EXIF data. Pixels without a disparity have a reason code.
 
     Examples:
       recon pair im0.png im1.png --calib calib.txt --out outputs/motorcycle
       recon pair im0.png im1.png --calib calib.txt --truth disp0GT.pfm
       recon pair im0.png im1.png --calib calib.txt --format glb
+      recon pair left.png right.png --focal 721.5 --baseline 0.54
     """
     with session(quiet=quiet):
         from recon.pipeline.config import (
@@ -63,7 +99,11 @@ def pair(
             load_config,
             matching_overrides,
         )
-        from recon.pipeline.pair_input import read_pair_input
+        from recon.pipeline.pair_input import (
+            KnownCamera,
+            read_pair_input,
+            read_uncalibrated_pair,
+        )
         from recon.pipeline.pair_run import PairOptions, run_pair
         from recon.reports import present_pair
         from recon.viewers import choose_viewer
@@ -72,7 +112,18 @@ def pair(
         settings = load_config(config, overrides, PAIR_DEFAULTS)
         check_ndisp(settings, ndisp)
         unit = settings.source.metres_per_unit if unit_m is None else unit_m
-        given = read_pair_input(left, right, calib, truth, metres_per_unit=unit)
+        known = KnownCamera(focal, baseline, cx, cy)
+        if calib is None:
+            given = read_uncalibrated_pair(left, right, known, truth)
+        elif known != KnownCamera():
+            raise SettingsError(
+                "--focal, --baseline, --cx and --cy replace a calibration file",
+                where="--calib",
+                got=calib,
+                hint="give either",
+            )
+        else:
+            given = read_pair_input(left, right, calib, truth, metres_per_unit=unit)
         viewer = choose_viewer(quiet=quiet, verbose=verbose)
         others = tuple(name for name in dict.fromkeys(formats or ()) if name != "ply")
         options = PairOptions("pair", out, threads, present_pair, viewer.on_stage, others)

@@ -2,17 +2,89 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
-from recon.errors import FormatError
+from recon.errors import CalibrationError, FormatError
 from recon.formats.disparity_png import read_disparity_png
+from recon.formats.exif import read_focal_length
+from recon.formats.middlebury import stand_in_camera
 from recon.formats.pfm import read_pfm
 from recon.pipeline.pair_run import PairInput
 from recon.sources.files import FilesSource
-from recon.structures import DisparityTruth
+from recon.structures import DisparityTruth, RectifiedCamera
 from recon.structures.arrays import Float32
+
+UP_TO_SCALE: Final = "no baseline was given: all lengths are in baselines, not in metres"
+
+
+@dataclass(frozen=True)
+class KnownCamera:
+    """What is known of the camera of a rectified pair that has no calibration file.
+
+    Attributes:
+        focal_px: Focal length; None = that in the EXIF data of the left image.
+        baseline_m: Distance between the cameras; None = unknown, the cloud is up to scale.
+        cx_px: Column of the principal point of both views; None = the middle.
+        cy_px: Its row; None = the middle.
+    """
+
+    focal_px: float | None = None
+    baseline_m: float | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
+
+
+def read_uncalibrated_pair(
+    left: Path, right: Path, known: KnownCamera, truth: Path | None = None
+) -> PairInput:
+    """Read a rectified pair without a calibration file.
+
+    Args:
+        left: Left image.
+        right: Right image.
+        known: What is known of its camera.
+        truth: See `read_pair_input`.
+
+    Returns:
+        The pair, with notes on what its camera was taken from.
+
+    Raises:
+        CalibrationError: The focal length is neither given nor in the image, or not positive.
+        FormatError: A file is missing, damaged or of the wrong size.
+        SourceError: The images differ in size.
+    """
+    given = read_pair_input(left, right, None, truth)
+    height_px, width_px = given.pair.left.shape[:2]
+    focal_px, basis = known.focal_px, ""
+    if focal_px is None:
+        found = read_focal_length(left, width_px, height_px)
+        if found is None:
+            raise CalibrationError(
+                "focal length is unknown: there is no calibration and no EXIF data",
+                where=left,
+                hint="--calib FILE, or --focal PX",
+            )
+        focal_px = found.focal_px
+        basis = f"focal length of {focal_px:.0f} px from EXIF ({found.basis})"
+    middle = stand_in_camera(width_px, height_px)
+    cx_px = middle.cx_px if known.cx_px is None else known.cx_px
+    camera = RectifiedCamera(
+        focal_px=focal_px,
+        cx_px=cx_px,
+        cy_px=middle.cy_px if known.cy_px is None else known.cy_px,
+        cx_right_px=cx_px,
+        baseline_m=1.0 if known.baseline_m is None else known.baseline_m,
+        width_px=width_px,
+        height_px=height_px,
+    )
+    up_to_scale = known.baseline_m is None
+    unscaled = f"{UP_TO_SCALE}; --baseline M gives metres" if up_to_scale else ""
+    notes = tuple(note for note in (basis, unscaled) if note)
+    return replace(given, calibration=camera, notes=notes, up_to_scale=up_to_scale)
 
 
 def read_pair_input(

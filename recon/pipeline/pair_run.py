@@ -54,12 +54,16 @@ class PairInput:
         calibration: Calibration of the two cameras.
         files: Files that the pair was read from.
         truth: True disparity of the rectified left view, or None.
+        notes: What the camera was taken from, where there is no calibration file; for warnings.
+        up_to_scale: True if the baseline is unknown and counts as 1 m.
     """
 
     pair: StereoPair
     calibration: RectifiedCamera | StereoCalibration
     files: tuple[Path, ...] = ()
     truth: DisparityTruth | None = None
+    notes: tuple[str, ...] = ()
+    up_to_scale: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +153,9 @@ def run_pair(given: PairInput, config: ReconConfig, options: PairOptions) -> Pai
         if run.cloud is not None:
             camera = run.pair.camera
             check_cloud(len(run.cloud), run.disparity, camera, config.cloud, run.name)
-        run = replace(run, warnings=(*(fault.text for fault in faults), *few, *run.warnings))
+        run = replace(
+            run, warnings=(*given.notes, *(fault.text for fault in faults), *few, *run.warnings)
+        )
         with watch.stage("write"):
             _write(run, directory, options.formats)
         run.summary.update(cost(watch, time.perf_counter() - start))
@@ -178,7 +184,9 @@ def _look(
     """Audit the images and their calibration before matching."""
     with watch.stage("audit"):
         one = OnePair(given.pair, given.calibration, given.files)
-        return find_pair_faults(one, config, metric=options.command == "pair")
+        return find_pair_faults(
+            one, config, metric=options.command == "pair" and not given.up_to_scale
+        )
 
 
 def _match(given: PairInput, config: ReconConfig, reconstructor: FrameReconstructor) -> PairRun:
@@ -209,6 +217,7 @@ def _reconstruct(
         warnings = (*warnings, f"no mesh: {error}")
     run = _run(given, config, frame.pair, frame.disparity)
     figures = _metric_summary(frame, mesh) | {"mesh_coverage": coverage}
+    figures["up_to_scale"] = given.up_to_scale
     return replace(
         run, cloud=frame.cloud, mesh=mesh, summary=run.summary | figures, warnings=warnings
     )

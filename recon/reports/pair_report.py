@@ -88,7 +88,7 @@ def pair_report(inputs: PairReportInputs) -> ReportContent:
         title=f"Stereo pair {inputs.source}",
         subtitle=(
             f"{camera.width_px} × {camera.height_px} px, focal length {camera.focal_px:.1f} px "
-            f"({camera.field_of_view_deg:.0f}° wide), baseline {camera.baseline_m:.4g} m, "
+            f"({camera.field_of_view_deg:.0f}° wide), {_baseline(inputs)}, "
             f"doffs {camera.doffs_px:.4g} px"
         ),
         command=inputs.command,
@@ -98,6 +98,12 @@ def pair_report(inputs: PairReportInputs) -> ReportContent:
         config=inputs.config,
         versions=inputs.versions,
     )
+
+
+def _baseline(inputs: PairReportInputs) -> str:
+    if inputs.summary.get("up_to_scale"):
+        return "baseline unknown: every m in this report is one baseline"
+    return f"baseline {inputs.pair.camera.baseline_m:.4g} m"
 
 
 def _beside_camera(inputs: PairReportInputs) -> tuple[float, float, float]:
