@@ -23,7 +23,10 @@ The command line prints ``str(error)`` and exits with 1; the library only raises
 from __future__ import annotations
 
 from os import PathLike
-from typing import Any
+from typing import Any, Final
+
+_LONGEST: Final = 300
+"""Letters of a value in a message: content from outside may have any length."""
 
 
 class ReconError(Exception):
@@ -55,14 +58,26 @@ class ReconError(Exception):
 
     def _line(self) -> str:
         found = [
-            f"{label} {value}"
+            f"{label} {_clip(str(value))}"
             for label, value in (("got", self.got), ("expected", self.expected))
             if value is not None
         ]
-        line = f"{self.where}: {self.what}" if self.where is not None else self.what
+        what = _clip(self.what)
+        line = f"{self.where}: {what}" if self.where is not None else what
         line += f" ({', '.join(found)})" if found else ""
         line += f"; {self.hint}" if self.hint else ""
-        return " ".join(line.split())
+        return " ".join("".join(map(_visible, line)).split())
+
+
+def _clip(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+
+
+def _visible(letter: str) -> str:
+    """A letter of a message; control characters and bytes of odd file names are escaped."""
+    if letter.isprintable() or letter.isspace():
+        return letter
+    return letter.encode("unicode_escape", "backslashreplace").decode()
 
 
 class SettingsError(ReconError):

@@ -5,6 +5,7 @@ Nothing heavy is imported before a command runs, so ``recon --help`` answers at 
 
 from __future__ import annotations
 
+import sys
 from typing import Annotated
 
 import typer
@@ -23,6 +24,7 @@ from recon.cli.occupancy import occupancy
 from recon.cli.pair import disparity, pair
 from recon.cli.paper import paper
 from recon.cli.rectify import rectify
+from recon.cli.session import BUG, report_bug
 from recon.cli.settings import settings
 
 app = typer.Typer(
@@ -74,4 +76,8 @@ def _root(
 
 def main() -> None:
     """Run the program."""
-    app()
+    try:
+        app()
+    except Exception as error:  # noqa: BLE001 - outside of a session, as while printing a table
+        report_bug(error)
+        sys.exit(BUG)

@@ -1,34 +1,44 @@
 """Shared by all commands: clean standard output, one-line errors, exit codes.
 
-0 = success, 1 = an error reported in one line, 2 = wrong usage (typer), 130 = interrupted.
+0 = success, 1 = an error reported in one line, 2 = wrong usage (typer), 3 = a bug of recon, also in
+one line, 130 = interrupted.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import sys
+import tempfile
+import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NoReturn, TextIO
 
 import typer
 
 from recon.errors import ReconError
 
 INTERRUPTED = 130
+BUG = 3
 
 
 @contextmanager
 def session(*, quiet: bool = False) -> Iterator[None]:
     """Run a command's body; a `ReconError` becomes one line on standard error and exit code 1.
 
+    Any other exception is a bug: one line with the file that has its traceback, and exit code 3.
     Meanwhile file descriptor 1 is redirected to standard error, so that the output of native
     libraries cannot get into that of ``--json``; with ``quiet`` that output is dropped.
     """
+    for stream in (sys.stdout, sys.stderr):
+        _escape_what_is_not_unicode(stream)
     try:
         with _standard_output_kept_clean(quiet):
             yield
+    except (typer.Exit, typer.Abort, typer.BadParameter):
+        raise
     except ReconError as error:
         _fail(str(error))
     except MemoryError:
@@ -36,7 +46,7 @@ def session(*, quiet: bool = False) -> Iterator[None]:
     except ImportError as error:
         # Ctrl-C while a native library initialises surfaces as an import failure.
         if not _interrupted(error):
-            raise
+            _fail_by_bug(error)
         typer.echo("interrupted", err=True)
         raise typer.Exit(INTERRUPTED) from None
     except OSError as error:
@@ -45,6 +55,26 @@ def session(*, quiet: bool = False) -> Iterator[None]:
     except KeyboardInterrupt as interrupt:
         typer.echo("; ".join(["interrupted", *map(str, interrupt.args)]), err=True)
         raise typer.Exit(INTERRUPTED) from None
+    except Exception as error:  # noqa: BLE001 - whatever it is, it is a bug
+        _fail_by_bug(error)
+
+
+def report_bug(error: BaseException) -> None:
+    """Print one line for an exception that should not have happened.
+
+    Its traceback goes to a new file in the folder for temporary files.
+    """
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="recon-error-", suffix=".txt", delete=False, errors="backslashreplace"
+        ) as file:
+            file.write(" ".join(sys.argv) + "\n")
+            traceback.print_exception(error, file=file)
+        where = file.name
+    except OSError:
+        where = "(no folder for temporary files can be written; set TMPDIR for the traceback)"
+    what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+    typer.echo(f"error: internal error ({what}), please report: {where}", err=True)
 
 
 def print_json(content: Mapping[str, Any]) -> None:
@@ -112,12 +142,23 @@ def _standard_output_kept_clean(quiet: bool) -> Iterator[None]:
         os.close(saved)
 
 
+def _escape_what_is_not_unicode(stream: TextIO) -> None:
+    """Print bytes of file names that are not UTF-8 as escapes, instead of failing."""
+    if isinstance(stream, io.TextIOWrapper):
+        stream.reconfigure(errors="backslashreplace")
+
+
 def _interrupted(error: BaseException) -> bool:
     """Whether an error was caused by Ctrl-C."""
     earlier = error.__cause__ or error.__context__
     if earlier is None:
         return isinstance(error, KeyboardInterrupt)
     return isinstance(error, KeyboardInterrupt) or _interrupted(earlier)
+
+
+def _fail_by_bug(error: BaseException) -> NoReturn:
+    report_bug(error)
+    raise typer.Exit(BUG) from None
 
 
 def _fail(line: str) -> None:

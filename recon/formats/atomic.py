@@ -49,7 +49,8 @@ def write_text(path: str | PathLike[str], text: str) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    write_bytes(path, text.encode())
+    # A name of a file that is not UTF-8 is written as \\udcXX, which JSON and YAML read back.
+    write_bytes(path, text.encode(errors="backslashreplace"))
 
 
 def write_bytes(path: str | PathLike[str], content: bytes) -> None:

@@ -7,7 +7,7 @@ from typing import Final
 
 from recon.errors import CalibrationError, FormatError
 from recon.formats.camera_info import read_camera_info
-from recon.formats.files import StrPath, read_text
+from recon.formats.files import SMALL_FILE_BYTES, StrPath, read_text, reader
 from recon.formats.kalibr import read_kalibr
 from recon.formats.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras
 from recon.formats.kitti_raw import read_kitti_rig
@@ -25,6 +25,7 @@ _HOMOGRAPHIES: Final = re.compile(r"^H_left:", re.MULTILINE)
 _OPENCV: Final = re.compile(r"^%YAML|<opencv_storage>|opencv-matrix")
 
 
+@reader
 def read_calibration(
     path: StrPath,
     width_px: int | None = None,
@@ -69,7 +70,7 @@ def _read(
     cameras: tuple[int, int] | None,
 ) -> RectifiedCamera | StereoCalibration:
     """Recognise the format; ``size`` is for files that do not state one, or more than one."""
-    text = read_text(path)
+    text = read_text(path, SMALL_FILE_BYTES)
     if _OURS.search(text):
         return read_recon_calibration(path)
     if _CAMERA_INFO.search(text):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from recon.errors import CalibrationError, FormatError
 from recon.formats.atomic import write_text
 from recon.formats.fields import Fields
-from recon.formats.files import StrPath, naming
+from recon.formats.files import StrPath, reader, reading
 from recon.formats.lens_models import ROS_MODELS, lens_of, name_lens
 from recon.formats.yaml_file import read_yaml
 from recon.geometry.se3 import make_transform, orthonormalise
@@ -34,6 +34,7 @@ def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
     return given.with_name(names[0]), given.with_name(names[1])
 
 
+@reader
 def read_camera_info(path: StrPath) -> StereoCalibration:
     """Read a rig from either of its two files; the other is found by its name.
 
@@ -76,7 +77,7 @@ def rig_of_camera_infos(
     """
     check_shift(P_right, 0.0, where)
     offset = np.array([P_right[0, 3] / P_right[0, 0], 0.0, 0.0])
-    with naming(where):
+    with reading(where):
         T = orthonormalise(make_transform(right[1].T @ left[1], right[1].T @ offset))
         return StereoCalibration(left[0], right[0], T)
 
@@ -168,6 +169,7 @@ def _matrix(values: NDArray[Any]) -> dict[str, Any]:
     return {"rows": rows, "cols": columns, "data": values.ravel().tolist()}
 
 
+@reader
 def _read_one(path: Path) -> tuple[CameraIntrinsics, Float64, Float64]:
     """Read a camera, its rectifying rotation (3, 3) and its projection matrix (3, 4)."""
     fields = Fields(read_yaml(path), path)
@@ -181,13 +183,12 @@ def _read_one(path: Path) -> tuple[CameraIntrinsics, Float64, Float64]:
         data["distortion_coefficients"].numbers("data"),
         path,
     )
-    with naming(path):
-        camera = CameraIntrinsics(
-            data["camera_matrix"].numbers("data", (3, 3)),
-            distortion,
-            fields.count("image_width"),
-            fields.count("image_height"),
-            model,
-        )
+    camera = CameraIntrinsics(
+        data["camera_matrix"].numbers("data", (3, 3)),
+        distortion,
+        fields.count("image_width"),
+        fields.count("image_height"),
+        model,
+    )
     rotation = data["rectification_matrix"].numbers("data", (3, 3))
     return camera, rotation, fields.below("projection_matrix").numbers("data", (3, 4))

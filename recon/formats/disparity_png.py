@@ -7,11 +7,12 @@ import math
 import numpy as np
 
 from recon.errors import FormatError, OutputError
-from recon.formats.files import StrPath
+from recon.formats.files import StrPath, reader
 from recon.formats.image import read_grey_levels, write_image
 from recon.structures.arrays import Float32, frozen_array
 
 
+@reader
 def read_disparity_png(path: StrPath, *, scale: float = 256.0) -> Float32:
     """Read a disparity stored as grey levels.
 

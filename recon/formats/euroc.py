@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.errors import FormatError
-from recon.formats.files import StrPath, naming, read_table
+from recon.formats.files import StrPath, read_table, reader
 from recon.formats.lens_models import Models, lens_of, pinhole_matrix
 from recon.formats.yaml_file import read_yaml
 from recon.geometry.quaternion import rotation_from_quaternion
@@ -22,6 +22,7 @@ _MODELS: Final[Models] = {
 NS: Final = 1e-9
 
 
+@reader
 def read_euroc_camera(path: StrPath) -> tuple[CameraIntrinsics, Float64]:
     """Read one camera.
 
@@ -44,16 +45,16 @@ def read_euroc_camera(path: StrPath) -> tuple[CameraIntrinsics, Float64]:
         _numbers(content, "distortion_coefficients", (None,), path),
         path,
     )
-    with naming(path):
-        camera = CameraIntrinsics(
-            pinhole_matrix(fu, fv, cu, cv), distortion, int(width_px), int(height_px), model
-        )
+    camera = CameraIntrinsics(
+        pinhole_matrix(fu, fv, cu, cv), distortion, int(width_px), int(height_px), model
+    )
     pose = content.get("T_BS")
     data = pose.get("data") if isinstance(pose, dict) else None
     T = _numbers({"T_BS": data}, "T_BS", (16,), path).reshape(4, 4)
     return camera, make_transform(T[:3, :3], T[:3, 3])
 
 
+@reader
 def read_euroc_truth(path: StrPath) -> Trajectory:
     """Read the true trajectory of the body: ``time [ns], x y z, qw qx qy qz``, and more columns.
 

@@ -1,11 +1,14 @@
-"""Reads whole files, with a clear error if that fails."""
+"""Reads whole files; `reading` turns whatever a parser raises into an error that names the file."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import stat
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from os import PathLike
 from pathlib import Path
+from typing import Final, ParamSpec, TypeVar, cast
 
 import numpy as np
 
@@ -13,37 +16,18 @@ from recon.errors import FormatError, ReconError
 from recon.structures.arrays import Float64
 
 StrPath = str | PathLike[str]
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
-
-def read_bytes(path: StrPath) -> bytes:
-    """Read a file that must not be empty.
-
-    Raises:
-        FormatError: The file does not exist, cannot be read or is empty.
-    """
-    try:
-        content = Path(path).read_bytes()
-    except FileNotFoundError as error:
-        raise FormatError("file does not exist", where=path) from error
-    except OSError as error:
-        raise FormatError("cannot read the file", where=path, got=error.strerror) from error
-    if not content:
-        raise FormatError("file is empty", where=path)
-    return content
-
-
-def read_text(path: StrPath) -> str:
-    """Read a UTF-8 text file that must not be empty.
-
-    Raises:
-        FormatError: The file does not exist, cannot be read, is empty or is not text.
-    """
-    try:
-        return read_bytes(path).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise FormatError(
-            "not a text file", where=path, got=f"byte {error.start} is not UTF-8"
-        ) from error
+#: Larger than any calibration or configuration: other files are not read to the end.
+SMALL_FILE_BYTES: Final = 1 << 22
+_LONGEST_REASON: Final = 120
+_KINDS: Final = (
+    (stat.S_ISFIFO, "a named pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
 
 
 @contextmanager
@@ -59,6 +43,102 @@ def naming(path: StrPath) -> Iterator[None]:
         ) from error
 
 
+@contextmanager
+def reading(path: StrPath) -> Iterator[None]:
+    """Name the file in every error raised while its content is parsed.
+
+    Content from outside can make a parser raise anything. Around parsing, and only there, every
+    exception is a fault of the file; elsewhere it is a fault of ours and must not pass as one.
+
+    Args:
+        path: The file, or another name of the content. Pipes and devices, whose reading may never
+            end, are refused.
+
+    Raises:
+        FormatError: The content cannot be parsed. Other errors of this project stay what they are.
+    """
+    try:
+        _refuse_special(path)
+        with naming(path), np.errstate(all="ignore"):
+            yield
+    except ReconError:
+        raise
+    except FileNotFoundError as error:
+        raise FormatError("file does not exist", where=error.filename or path) from error
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise FormatError("cannot read the file", where=path, got=reason) from error
+    except MemoryError as error:
+        raise FormatError("content does not fit in memory", where=path) from error
+    except RecursionError as error:
+        raise FormatError("content is nested too deeply", where=path) from error
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"[:_LONGEST_REASON]
+        raise FormatError("content cannot be read", where=path, got=reason) from error
+
+
+def reader(read: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Decorate a function that reads the file given by its first argument; see `reading`."""
+
+    @wraps(read)
+    def named(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        path = args[0] if args else next(iter(kwargs.values()))
+        with reading(cast("StrPath", path)):
+            return read(*args, **kwargs)
+
+    return named
+
+
+def _refuse_special(path: StrPath) -> None:
+    try:
+        mode = Path(path).stat().st_mode
+    except (OSError, ValueError):  # missing, or not a path: found when it is opened
+        return
+    kind = next((name for test, name in _KINDS if test(mode)), None)
+    if kind is not None:
+        raise FormatError("not a regular file", where=path, got=kind)
+
+
+@reader
+def read_bytes(path: StrPath, at_most: int | None = None) -> bytes:
+    """Read a file that must not be empty.
+
+    Args:
+        path: The file.
+        at_most: Largest size in bytes; None = any.
+
+    Raises:
+        FormatError: The file does not exist, cannot be read, is empty or too large.
+    """
+    with Path(path).open("rb") as file:
+        content = file.read(-1 if at_most is None else at_most + 1)
+    if not content:
+        raise FormatError("file is empty", where=path)
+    if at_most is not None and len(content) > at_most:
+        expected = f"at most {at_most / 1e6:.0f} MB"
+        raise FormatError("file is too large for its kind", where=path, expected=expected)
+    return content
+
+
+def read_text(path: StrPath, at_most: int | None = None) -> str:
+    """Read a UTF-8 text file that must not be empty.
+
+    Args:
+        path: The file.
+        at_most: Largest size in bytes; None = any.
+
+    Raises:
+        FormatError: The file does not exist, cannot be read, is empty, too large or not text.
+    """
+    try:
+        return read_bytes(path, at_most).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FormatError(
+            "not a text file", where=path, got=f"byte {error.start} is not UTF-8"
+        ) from error
+
+
+@reader
 def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[int]]:
     """Read rows of numbers separated by spaces or commas; ``#`` starts a comment.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from recon.errors import FormatError
-from recon.formats.files import StrPath, read_text
+from recon.formats.files import StrPath, read_text, reader
 
 FRAMES: Final = "frames.csv"
 HEADER: Final = "# left picture, right picture, left time [s], right time [s]\n"
@@ -37,6 +37,7 @@ class CapturedFrame:
         return f"{self.left},{self.right},{self.left_s:.6f},{self.right_s:.6f}\n"
 
 
+@reader
 def read_frames(path: StrPath) -> list[CapturedFrame]:
     """Read the list.
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from recon.errors import FormatError, OutputError, ShapeError
 from recon.formats.atomic import write_bytes
-from recon.formats.files import StrPath, read_bytes
+from recon.formats.files import StrPath, read_bytes, reader
 from recon.formats.image_integrity import check_image_bytes, is_tiff
 from recon.structures.arrays import UInt8
 
@@ -64,6 +64,7 @@ def find_white(images: Iterable[NDArray[Any]]) -> int:
     return int(2 ** max(8, brightest.bit_length()) - 1)
 
 
+@reader
 def read_levels(path: StrPath) -> NDArray[Any]:
     """Read an image with its values as stored, such as a mask or a scaled disparity.
 

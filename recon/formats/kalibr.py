@@ -9,13 +9,14 @@ import yaml
 from recon.errors import FormatError
 from recon.formats.atomic import write_text
 from recon.formats.fields import Fields
-from recon.formats.files import StrPath, naming
+from recon.formats.files import StrPath, reader
 from recon.formats.lens_models import KALIBR_MODELS, lens_of, name_lens, pinhole_matrix
 from recon.formats.yaml_file import read_yaml
 from recon.geometry.se3 import orthonormalise
 from recon.structures import CameraIntrinsics, StereoCalibration
 
 
+@reader
 def read_kalibr(path: StrPath) -> StereoCalibration:
     """Read ``cam0`` as the left and ``cam1`` as the right camera of a camera chain.
 
@@ -28,11 +29,10 @@ def read_kalibr(path: StrPath) -> StereoCalibration:
     """
     fields = Fields(read_yaml(path), path)
     right = fields.below("cam1")
-    with naming(path):
-        T_right_left = orthonormalise(right.numbers("T_cn_cnm1", (4, 4)))
-        return StereoCalibration(
-            _camera(fields.below("cam0"), path), _camera(right, path), T_right_left
-        )
+    T_right_left = orthonormalise(right.numbers("T_cn_cnm1", (4, 4)))
+    return StereoCalibration(
+        _camera(fields.below("cam0"), path), _camera(right, path), T_right_left
+    )
 
 
 def write_kalibr(path: StrPath, calibration: StereoCalibration) -> None:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from recon.errors import CalibrationError, FormatError
-from recon.formats.files import StrPath, read_text
+from recon.formats.files import StrPath, read_text, reader
 from recon.structures import RectifiedCamera, check_unsized
 from recon.structures.arrays import Float64
 
@@ -19,6 +19,7 @@ _FOLDER: Final = re.compile(r"image_0?([0-3])")
 _LINE: Final = re.compile(r"^P(?:_rect_0)?(\d):(.*)$", re.MULTILINE)
 
 
+@reader
 def read_kitti_calib(
     path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int] = GREY_CAMERAS
 ) -> RectifiedCamera:
@@ -67,6 +68,7 @@ def read_kitti_calib(
     )
 
 
+@reader
 def read_kitti_offset(path: StrPath, camera: int) -> Float64:
     """Pose of a camera: float64 (4, 4), ``T_camera_camera0``, a translation in metres.
 
@@ -89,6 +91,7 @@ def kitti_cameras_of(left: Path) -> tuple[int, int] | None:
     return None
 
 
+@reader
 def list_kitti_cameras(path: StrPath) -> frozenset[int]:
     """Numbers of the cameras that have a matrix in a calibration file.
 

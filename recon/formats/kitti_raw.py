@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from recon.errors import FormatError
-from recon.formats.files import StrPath, naming, read_text
+from recon.formats.files import StrPath, read_text, reader
 from recon.formats.kitti import read_kitti_calib
 from recon.geometry.se3 import invert, make_transform
 from recon.structures import CameraIntrinsics, RectifiedCamera, StereoCalibration, other_size
@@ -18,6 +18,7 @@ _LINE: Final = re.compile(r"^([A-Z](?:_rect)?_\d\d):(.*)$", re.MULTILINE)
 _SIZES: Final = {"S": 2, "K": 9, "D": 5, "R": 9, "T": 3, "S_rect": 2}
 
 
+@reader
 def read_kitti_rig(
     path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int]
 ) -> RectifiedCamera | StereoCalibration:
@@ -51,9 +52,8 @@ def read_kitti_rig(
         expected = f"{rectified[0]}x{rectified[1]} rectified, or {recorded[0]}x{recorded[1]} raw"
         raise other_size(width_px, height_px, expected, path)
     T_left_0, T_right_0 = (_pose(rows, camera, path) for camera in cameras)
-    with naming(path):
-        left, right = (_camera(rows, camera, recorded, path) for camera in cameras)
-        return StereoCalibration(left, right, T_right_0 @ invert(T_left_0))
+    left, right = (_camera(rows, camera, recorded, path) for camera in cameras)
+    return StereoCalibration(left, right, T_right_0 @ invert(T_left_0))
 
 
 def _camera(

@@ -12,6 +12,7 @@ import numpy as np
 
 from recon.errors import FormatError, OutputError, SettingsError
 from recon.formats.atomic import atomic_path
+from recon.formats.files import reader
 from recon.formats.glb import srgb_from_linear, write_glb
 from recon.formats.ply import colours_of, fill_vertices, normals_of, vertex_dtype
 from recon.formats.ply_tables import (
@@ -104,6 +105,7 @@ def join_meshes(path: str | PathLike[str], parts: Sequence[tuple[Path, int, int]
     )
 
 
+@reader
 def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
     """Read a mesh.
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from recon.errors import FormatError
-from recon.formats.files import StrPath, read_table
+from recon.formats.files import StrPath, read_table, reader
 from recon.formats.image import read_image
 from recon.formats.middlebury_calib import (
     MiddleburyCalib,
@@ -55,6 +55,7 @@ class MiddleburyScene:
     full_size_factor: float
 
 
+@reader
 def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
     """Read one scene; `middlebury_layout` lists the supported layouts.
 

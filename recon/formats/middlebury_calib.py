@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from recon.errors import CalibrationError, FormatError
-from recon.formats.files import StrPath, naming, read_text
+from recon.formats.files import StrPath, read_text, reader
 from recon.structures import RectifiedCamera
 from recon.structures.arrays import Float64
 
@@ -41,6 +41,7 @@ class MiddleburyCalib:
     doffs_px: float | None = None
 
 
+@reader
 def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
     """Read a ``calib.txt`` of the 2014 data or of MiddEval3.
 
@@ -53,17 +54,16 @@ def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
     cam0, cam1 = (_matrix(entries, key, path) for key in ("cam0", "cam1"))
     doffs_px = _number(entries, "doffs", path)
     _check_views(cam0, cam1, doffs_px, path)
-    with naming(path):
-        camera = RectifiedCamera(
-            focal_px=float(cam0[0, 0]),
-            cx_px=float(cam0[0, 2]),
-            cy_px=float(cam0[1, 2]),
-            cx_right_px=float(cam1[0, 2]),
-            baseline_m=_number(entries, "baseline", path) / 1000,
-            width_px=int(_number(entries, "width", path)),
-            height_px=int(_number(entries, "height", path)),
-            ndisp=int(_number(entries, "ndisp", path)) if "ndisp" in entries else None,
-        )
+    camera = RectifiedCamera(
+        focal_px=float(cam0[0, 0]),
+        cx_px=float(cam0[0, 2]),
+        cy_px=float(cam0[1, 2]),
+        cx_right_px=float(cam1[0, 2]),
+        baseline_m=_number(entries, "baseline", path) / 1000,
+        width_px=int(_number(entries, "width", path)),
+        height_px=int(_number(entries, "height", path)),
+        ndisp=int(_number(entries, "ndisp", path)) if "ndisp" in entries else None,
+    )
     vmin, vmax = (_number(entries, k, path) if k in entries else None for k in ("vmin", "vmax"))
     isint = "isint" in entries and _number(entries, "isint", path) != 0
     return MiddleburyCalib(camera, isint, vmin, vmax, doffs_px)

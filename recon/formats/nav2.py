@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from recon.errors import FormatError
 from recon.formats.atomic import atomic_path, write_text
+from recon.formats.files import read_bytes, reader
+from recon.formats.yaml_file import read_yaml
 from recon.structures import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.structures.arrays import UInt8
 
@@ -54,6 +56,7 @@ def write_nav2(path: str | PathLike[str], grid: OccupancyGrid) -> tuple[Path, Pa
     return picture, description
 
 
+@reader
 def read_nav2(path: str | PathLike[str]) -> OccupancyGrid:
     """Read a map as Nav2 does in mode ``trinary``.
 
@@ -100,12 +103,7 @@ def _describe(grid: OccupancyGrid, image: str) -> dict[str, Any]:
 
 def _fields(path: Path) -> dict[str, Any]:
     """Read and validate the content of the YAML file."""
-    try:
-        fields = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FormatError("cannot read the map's YAML file", where=path) from error
-    if not isinstance(fields, dict):
-        raise FormatError("the map's YAML file is not a mapping", where=path)
+    fields = read_yaml(path)
     missing = [key for key in _KEYS if key not in fields]
     if missing:
         raise FormatError(f"the map's YAML file has no {missing[0]!r}", where=path)
@@ -128,12 +126,10 @@ def _check_numbers(fields: dict[str, Any], path: Path) -> None:
         raise FormatError("the map is rotated", where=path, got=f"yaw {origin[2]:g}", expected="0")
 
 
+@reader
 def _read_pgm(path: Path) -> UInt8:
     """Read a binary 8-bit PGM, uint8 (rows, columns)."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise FormatError("cannot read the map's image", where=path) from error
+    content = read_bytes(path)
     header = _PGM_HEADER.match(content)
     if header is None or int(header[3]) != 255:
         raise FormatError("the map's image is not a binary 8-bit PGM", where=path)

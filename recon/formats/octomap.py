@@ -12,8 +12,9 @@ from typing import IO
 import numpy as np
 
 from recon.adapters.pyoctomap import decode_octomap
-from recon.errors import FormatError, MappingError
+from recon.errors import MappingError
 from recon.formats.atomic import atomic_path
+from recon.formats.files import reader
 from recon.formats.octomap_leaves import FULL_TREE, octomap_pieces
 from recon.formats.octree import (
     DEPTH,
@@ -175,6 +176,7 @@ def _check(voxels: OccupancyVoxels) -> None:
         )
 
 
+@reader
 def read_octomap(path: str | PathLike[str]) -> OccupancyVoxels:
     """Read a ``.bt`` or ``.ot`` file, according to its header; pruned leaves are expanded.
 
@@ -195,8 +197,5 @@ def read_octomap(path: str | PathLike[str]) -> OccupancyVoxels:
 
 def _is_full(path: Path) -> bool:
     """Whether a file has the header of an ``.ot``."""
-    try:
-        with path.open("rb") as file:
-            return file.readline(200).strip() == FULL_TREE
-    except OSError as error:
-        raise FormatError("cannot read the OctoMap", where=path, got=error.strerror) from error
+    with path.open("rb") as file:
+        return file.readline(200).strip() == FULL_TREE

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.errors import FormatError
+from recon.formats.files import reading
 from recon.formats.octree import DEPTH, KEY_LIMIT
 from recon.kernels.octree import Leaves, TreeWalk, begin_walk, find_leaves
 from recon.structures import OccupancyVoxels
@@ -38,11 +39,8 @@ def octomap_pieces(path: Path, nodes_each: int = 1 << 19) -> Iterator[OccupancyV
     Raises:
         FormatError: The file is missing, truncated, damaged or not an ``.ot`` file.
     """
-    try:
-        with path.open("rb") as file:
-            yield from _pieces(file, path, nodes_each)
-    except OSError as error:
-        raise FormatError("cannot read the OctoMap", where=path, got=error.strerror) from error
+    with reading(path), path.open("rb") as file:
+        yield from _pieces(file, path, nodes_each)
 
 
 def _pieces(file: IO[bytes], path: Path, nodes_each: int) -> Iterator[OccupancyVoxels]:

@@ -11,7 +11,8 @@ import numpy as np
 
 from recon.errors import CalibrationError, FormatError
 from recon.formats.atomic import write_text
-from recon.formats.files import StrPath, naming, read_text
+from recon.formats.file_storage import read_file_storage
+from recon.formats.files import StrPath, reader, reading
 from recon.geometry.se3 import make_transform
 from recon.structures import CameraIntrinsics, LensModel, StereoCalibration, check_unsized
 from recon.structures.arrays import Float64
@@ -38,9 +39,10 @@ _DISTORTION_COUNTS: Final = frozenset({0, 4, 5, 8, 12, 14})
 # Longer than any stereo rig: a longer baseline means millimetres read as metres.
 _LONGEST_BASELINE_M: Final = 20.0
 
-Nodes = dict[str, Float64]
+Nodes = dict[str, Float64 | str]
 
 
+@reader
 def read_opencv_calibration(
     intrinsics: StrPath,
     extrinsics: StrPath | None = None,
@@ -63,7 +65,7 @@ def read_opencv_calibration(
         FormatError: A file or matrix is missing, or the image size is unknown.
         CalibrationError: The calibration cannot give depth, or cannot be of images of ``size_px``.
     """
-    nodes = _read_nodes(intrinsics)
+    nodes = read_file_storage(intrinsics)
     outer = _find_extrinsics(intrinsics, extrinsics, nodes)
     stated = _size(nodes)
     size = stated or size_px
@@ -75,7 +77,7 @@ def read_opencv_calibration(
             hint="from Python: pass width_px and height_px, or give the file itself to "
             "recon.reconstruct or recon.match, which take the size from the images",
         )
-    model = _model(intrinsics)
+    model = _model(nodes)
     lens: LensModel = model or "pinhole"
     left = _camera(nodes, (_LEFT_MATRIX, _LEFT_DISTORTION), size, lens, intrinsics)
     right = _camera(nodes, (_RIGHT_MATRIX, _RIGHT_DISTORTION), size, lens, intrinsics)
@@ -84,10 +86,10 @@ def read_opencv_calibration(
             _check_model(camera, intrinsics)
     if stated is None:
         check_unsized((left.matrix[0, 2], left.matrix[1, 2]), *size, intrinsics)
-    outer_nodes = _read_nodes(outer)
+    outer_nodes = read_file_storage(outer)
     rotation = _matrix(outer_nodes, _ROTATION, (3, 3), outer)
     translation = _matrix(outer_nodes, _TRANSLATION, (3,), outer)
-    with naming(outer):
+    with reading(outer):
         calibration = StereoCalibration(
             left, right, make_transform(rotation, translation * metres_per_unit)
         )
@@ -120,11 +122,9 @@ def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> N
     write_text(path, storage.releaseAndGetString())
 
 
-def _model(path: StrPath) -> LensModel | None:
+def _model(nodes: Nodes) -> LensModel | None:
     """The lens model named in a file, if any."""
-    storage = cv2.FileStorage(read_text(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    nodes = [storage.getNode(name) for name in _MODEL]
-    named = {node.string().lower() for node in nodes if node.isString()}
+    named = {str(nodes[name]).lower() for name in _MODEL if name in nodes}
     if not named:
         return None
     return "fisheye" if named & _FISHEYE_NAMES else "pinhole"
@@ -142,35 +142,10 @@ def _check_model(camera: CameraIntrinsics, path: StrPath) -> None:
         )
 
 
-def _read_nodes(path: StrPath) -> Nodes:
-    """Read every top-level number, list of numbers and matrix of a file, as float64 arrays."""
-    text = read_text(path)
-    flags = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
-    try:
-        # Nodes point into the storage, so it must stay alive until all are copied.
-        storage = cv2.FileStorage(text, flags)
-        root = storage.root() if storage.isOpened() else cv2.FileNode()
-        nodes = {name: _numbers(root.getNode(name)) for name in root.keys()}  # noqa: SIM118
-    except (cv2.error, SystemError) as error:  # the bindings raise both for one syntax error
-        raise FormatError("not an OpenCV FileStorage file", where=path) from error
-    return {name: numbers for name, numbers in nodes.items() if numbers is not None}
-
-
-def _numbers(node: cv2.FileNode) -> Float64 | None:
-    if node.isInt() or node.isReal():
-        return np.array(node.real())
-    if node.isSeq():
-        parts = [node.at(i) for i in range(node.size())]
-        numeric = all(part.isInt() or part.isReal() for part in parts)
-        return np.array([part.real() for part in parts]) if numeric else None
-    if node.isMap() and not node.getNode("data").isNone():
-        matrix = node.mat()  # None where it has no elements
-        return np.zeros(0) if matrix is None else np.asarray(matrix, dtype=np.float64)
-    return None
-
-
 def _find(nodes: Nodes, names: Sequence[str]) -> Float64 | None:
-    return next((nodes[name] for name in names if name in nodes), None)
+    """The numbers under the first of some names that has any."""
+    found = (nodes.get(name) for name in names)
+    return next((value for value in found if isinstance(value, np.ndarray)), None)
 
 
 def _matrix(nodes: Nodes, names: Sequence[str], shape: tuple[int, ...], path: StrPath) -> Float64:
@@ -207,8 +182,7 @@ def _camera(
             got=f"{distortion.size} coefficients",
             expected="4, 5, 8, 12 or 14",
         )
-    with naming(path):
-        return CameraIntrinsics(matrix, distortion, *size_px, model)
+    return CameraIntrinsics(matrix, distortion, *size_px, model)
 
 
 def _size(nodes: Nodes) -> tuple[int, int] | None:

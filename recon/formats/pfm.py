@@ -9,12 +9,13 @@ import numpy as np
 
 from recon.errors import FormatError
 from recon.formats.atomic import write_bytes
-from recon.formats.files import StrPath, read_bytes
+from recon.formats.files import StrPath, read_bytes, reader
 from recon.structures.arrays import Float32, frozen_array
 
 _HEADER: Final = re.compile(rb"(Pf|PF)\s+(\d+)\s+(\d+)\s+([-+.\deE]+)\s")
 
 
+@reader
 def read_pfm(path: StrPath) -> Float32:
     """Read a grey PFM file.
 

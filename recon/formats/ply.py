@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from recon.errors import FormatError
 from recon.formats.atomic import atomic_path
+from recon.formats.files import reader
 from recon.formats.ply_tables import (
     PlyHeader,
     Table,
@@ -95,6 +96,7 @@ def write_ply_tiles(
     return stream.rows
 
 
+@reader
 def read_ply(path: str | PathLike[str]) -> PointCloud:
     """Read the vertices of a cloud or mesh, in ascii or binary, float or double.
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from recon.errors import FormatError
 from recon.formats.atomic import atomic_path
+from recon.formats.files import reader, reading
 
 #: A structured array with one field per property. Lists are supported only with three entries, as
 #: a field of shape (3,) that follows a field with the length (`list_length`).
@@ -52,6 +53,7 @@ def list_length(name: str) -> str:
     return f"{name} length"
 
 
+@reader
 def read_tables(
     path: str | PathLike[str], wanted: Sequence[str]
 ) -> tuple[PlyHeader, dict[str, Table]]:
@@ -68,12 +70,9 @@ def read_tables(
         FormatError: The file is missing, truncated, not a PLY, or has lists of a length other
             than three.
     """
-    try:
-        with Path(path).open("rb") as stream:
-            header = _read_header(stream, path)
-            return header, _read_body(stream, header, wanted, path)
-    except OSError as error:
-        raise FormatError("cannot read the file", where=path, got=error.strerror) from error
+    with Path(path).open("rb") as stream:
+        header = _read_header(stream, path)
+        return header, _read_body(stream, header, wanted, path)
 
 
 def read_table_pieces(
@@ -89,17 +88,14 @@ def read_table_pieces(
     Raises:
         FormatError: As in `read_tables`.
     """
-    try:
-        with Path(path).open("rb") as stream:
-            header = _read_header(stream, path)
-            for element in header.elements:
-                for table in _pieces(stream, header, element, rows_each, path):
-                    if element[0] == wanted:
-                        yield header, table
+    with reading(path), Path(path).open("rb") as stream:
+        header = _read_header(stream, path)
+        for element in header.elements:
+            for table in _pieces(stream, header, element, rows_each, path):
                 if element[0] == wanted:
-                    return
-    except OSError as error:
-        raise FormatError("cannot read the file", where=path, got=error.strerror) from error
+                    yield header, table
+            if element[0] == wanted:
+                return
 
 
 def write_tables(

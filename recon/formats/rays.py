@@ -16,6 +16,7 @@ from typing import IO, Final
 import numpy as np
 
 from recon.errors import FormatError
+from recon.formats.files import reading
 from recon.structures import RayCloud, RayGrain
 
 _MAGIC: Final = b"recon rays 1\n\0\0\0"
@@ -83,7 +84,7 @@ class RayFile:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        with self._open() as file:
+        with reading(path), path.open("rb") as file:
             header = file.read(_HEADER.size)
         if len(header) != _HEADER.size or not header.startswith(_MAGIC):
             raise FormatError("not a ray file of a run", where=path)
@@ -96,7 +97,7 @@ class RayFile:
             FormatError: The file is truncated.
         """
         frames = 0
-        with self._open() as file:
+        with reading(self._path), self._path.open("rb") as file:
             file.seek(_HEADER.size)
             while (head := self._head(file)) is not None:
                 file.seek(head[0] * _RAY_BYTES, os.SEEK_CUR)
@@ -109,7 +110,7 @@ class RayFile:
         Raises:
             FormatError: The file is truncated or damaged.
         """
-        with self._open() as file:
+        with reading(self._path), self._path.open("rb") as file:
             file.seek(_HEADER.size)
             while (head := self._head(file)) is not None:
                 count, checksum = head
@@ -117,12 +118,6 @@ class RayFile:
                 if zlib.crc32(content) != checksum:
                     raise self._damaged()
                 yield _unpack(content, count, self.grain.unit_m)
-
-    def _open(self) -> IO[bytes]:
-        try:
-            return self._path.open("rb")
-        except OSError as error:
-            raise FormatError("cannot read the rays", where=self._path, got=error) from error
 
     def _head(self, file: IO[bytes]) -> tuple[int, int] | None:
         """Number of rays and checksum of the frame that starts here; None at the end."""

@@ -11,7 +11,7 @@ import yaml
 from recon.errors import FormatError
 from recon.formats.atomic import write_text
 from recon.formats.fields import Fields
-from recon.formats.files import StrPath, naming
+from recon.formats.files import StrPath, reader
 from recon.formats.lens_models import pinhole_matrix
 from recon.formats.yaml_file import read_yaml
 from recon.geometry.se3 import make_transform
@@ -66,6 +66,7 @@ def write_recon_calibration(
     write_text(path, _HEADER + text)
 
 
+@reader
 def read_recon_calibration(path: StrPath) -> StereoCalibration | RectifiedCamera:
     """Read what `write_recon_calibration` wrote.
 
@@ -86,8 +87,7 @@ def read_recon_calibration(path: StrPath) -> StereoCalibration | RectifiedCamera
         raise FormatError(
             "unknown kind of calibration", where=path, got=kind, expected="stereo or rectified"
         )
-    with naming(path):
-        return _read_rectified(fields) if kind == "rectified" else _read_stereo(fields)
+    return _read_rectified(fields) if kind == "rectified" else _read_stereo(fields)
 
 
 def _content(calibration: StereoCalibration | RectifiedCamera) -> dict[str, Any]:

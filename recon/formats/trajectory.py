@@ -6,7 +6,7 @@ import numpy as np
 
 from recon.errors import FormatError
 from recon.formats.atomic import write_text
-from recon.formats.files import StrPath, read_table
+from recon.formats.files import StrPath, read_table, reader
 from recon.geometry.quaternion import quaternion_from_rotation, rotation_from_quaternion
 from recon.geometry.se3 import make_transform, orthonormalise
 from recon.structures import Trajectory
@@ -19,6 +19,7 @@ _UNIT_TOLERANCE = 1e-2
 _FARTHEST_M = 1e8
 
 
+@reader
 def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
     """Read a KITTI or TUM trajectory, recognised by the number of columns (12 or 8).
 
@@ -35,6 +36,7 @@ def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Traje
     return _from_tum(table, lines, path)
 
 
+@reader
 def holds_times(path: StrPath) -> bool:
     """Whether a trajectory file has timestamps: TUM files do, KITTI files do not.
 
@@ -44,6 +46,7 @@ def holds_times(path: StrPath) -> bool:
     return bool(read_table(path, (12, 8))[0].shape[1] == 8)
 
 
+@reader
 def read_kitti_poses(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
     """Read poses of the left camera, one row-major 3×4 matrix per line.
 
@@ -60,6 +63,7 @@ def read_kitti_poses(path: StrPath, timestamps_s: Float64 | None = None) -> Traj
     return _from_kitti(*read_table(path, (12,)), path, timestamps_s)
 
 
+@reader
 def read_tum(path: StrPath) -> Trajectory:
     """Read timestamped poses, ``t tx ty tz qx qy qz qw`` per line.
 

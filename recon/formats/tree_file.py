@@ -16,6 +16,7 @@ import numpy as np
 
 from recon.errors import FormatError
 from recon.formats.atomic import atomic_path
+from recon.formats.files import reader
 
 _TEXT: Final = "tree.json"
 _ARRAY: Final = "array"
@@ -41,17 +42,15 @@ def write_tree(path: str | PathLike[str], tree: Mapping[str, Any]) -> None:
                 np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
 
 
+@reader
 def read_tree(path: str | PathLike[str]) -> dict[str, Any]:
     """Read what `write_tree` wrote.
 
     Raises:
         FormatError: The file is missing, damaged or of another kind.
     """
-    try:
-        with zipfile.ZipFile(Path(path)) as file:
-            tree = _with_arrays(json.loads(file.read(_TEXT)), file)
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise FormatError("the state cannot be read", where=path, got=error) from error
+    with zipfile.ZipFile(Path(path)) as file:
+        tree = _with_arrays(json.loads(file.read(_TEXT)), file)
     if not isinstance(tree, dict):
         raise FormatError("the state is not a tree", where=path)
     return tree

@@ -12,7 +12,7 @@ from typing import Final
 import cv2
 
 from recon.errors import FormatError
-from recon.formats.files import StrPath
+from recon.formats.files import StrPath, reader
 from recon.formats.image import silent_opencv, swap_red_and_blue
 from recon.structures.arrays import UInt8
 
@@ -73,6 +73,7 @@ class VideoFile:
         )
 
 
+@reader
 def open_video(path: StrPath) -> VideoFile:
     """Open a video file and count its frames without decoding them.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
 import pickle
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -116,7 +117,7 @@ def quick_fingerprint(files: Iterable[Path]) -> dict[str, Any]:
     digest, count, size = hashlib.sha256(), 0, 0
     for path in files:
         length = path.stat().st_size
-        digest.update(path.name.encode() + b"\0" + length.to_bytes(8, "little"))
+        digest.update(os.fsencode(path.name) + b"\0" + length.to_bytes(8, "little"))
         with path.open("rb") as content:
             digest.update(content.read(_HEAD_BYTES))
         count, size = count + 1, size + length

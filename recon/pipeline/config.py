@@ -13,7 +13,9 @@ from pydantic import Field
 from recon.audit import AuditSettings
 from recon.calibration import CalibrationSettings
 from recon.cloud import ANY_SCALE, CloudSettings, EdgeSettings, FilterSettings
-from recon.errors import SettingsError
+from recon.errors import FormatError, SettingsError
+from recon.formats.files import SMALL_FILE_BYTES, read_text
+from recon.formats.yaml_file import parse_yaml
 from recon.loops import LoopSettings
 from recon.mapping import (
     AxesSettings,
@@ -35,6 +37,7 @@ from recon.sources.capture import CaptureSettings
 from recon.sources.settings import SourceSettings
 from recon.synthetic import StreetSettings
 
+_MOST_DOTS: Final = 10
 NO_FILTER: Final = FilterSettings(voxel_m=None)
 NO_ISLANDS: Final = FilterSettings(voxel_m=None, radius_m=0.3, radius_neighbours=2)
 
@@ -211,12 +214,12 @@ def dump_config(config: ReconConfig) -> str:
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not text"
-        raise SettingsError("configuration cannot be read", where=path, got=reason) from error
-    except yaml.YAMLError as error:
-        raise SettingsError("configuration is not YAML", where=path, got=error) from error
+        content = parse_yaml(read_text(path, SMALL_FILE_BYTES), path)
+    except FormatError as error:
+        reason = f"{error.what} ({error.got})" if error.got else error.what
+        raise SettingsError(
+            "configuration cannot be read", where=error.where, got=reason
+        ) from error
     if content is None:
         return {}
     if not isinstance(content, Mapping):
@@ -228,13 +231,13 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
 
 def _parse_override(text: str) -> dict[str, Any]:
     key, equals, value = text.partition("=")
-    if not equals or not key.strip():
+    if not equals or not key.strip() or key.count(".") > _MOST_DOTS:
         raise SettingsError(
             "cannot read this setting", where="--set", got=repr(text), expected="key=value"
         )
     try:
-        nested: Any = yaml.safe_load(value)
-    except yaml.YAMLError as error:
+        nested: Any = parse_yaml(value, "--set")
+    except FormatError as error:
         raise SettingsError(f"value of {key!r} is not YAML", where="--set", got=value) from error
     for part in reversed(key.strip().split(".")):
         nested = {part: nested}

@@ -32,8 +32,11 @@ _PEAK: Final = re.compile(r"^VmHWM:\s+(\d+) kB$", re.MULTILINE)
 
 
 def use_threads(threads: int | None) -> int:
-    """Limit OpenCV to ``threads`` (None = all cores) and return the number in use."""
-    count = threads or available_cores()
+    """Limit OpenCV to ``threads`` (None = all cores) and return the number in use.
+
+    More threads than cores would only take memory.
+    """
+    count = min(threads or available_cores(), available_cores())
     cv2.setNumThreads(count)
     return count
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
@@ -22,7 +23,7 @@ def fingerprint(files: Iterable[Path]) -> dict[str, Any]:
     digest, count, size = hashlib.sha256(), 0, 0
     for path in files:
         length = path.stat().st_size
-        digest.update(path.name.encode() + b"\0" + length.to_bytes(8, "little"))
+        digest.update(os.fsencode(path.name) + b"\0" + length.to_bytes(8, "little"))
         # In pieces: a recording may be larger than memory.
         with path.open("rb") as content:
             while piece := content.read(_PIECE_BYTES):

@@ -21,6 +21,7 @@ from typing import Any, Final
 from typing_extensions import Self
 
 from recon.errors import MemoryLimitError, OutputError
+from recon.formats.atomic import write_text
 
 RECORD: Final = "run.json"
 STARTED: Final = "started.json"
@@ -100,7 +101,7 @@ class RunDirectory:
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
         """Write a JSON file; NaN is refused, since it is not valid JSON."""
         text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
-        self.path(name).write_text(text + "\n", encoding="utf-8")
+        write_text(self.path(name), text + "\n")
 
     def __enter__(self) -> Self:
         if not self.resumes:

@@ -9,7 +9,7 @@ import numpy as np
 from recon.adapters.rosbags import BagCameraInfo
 from recon.errors import CalibrationError
 from recon.formats.camera_info import check_shift, rig_of_camera_infos
-from recon.formats.files import naming
+from recon.formats.files import reading
 from recon.formats.lens_models import ROS_MODELS, lens_of
 from recon.sources.rig import Rig
 from recon.structures import CameraIntrinsics, RectifiedCamera
@@ -44,7 +44,7 @@ def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rect
 
 def _rectified(left: BagCameraInfo, right: BagCameraInfo, where: Path) -> RectifiedCamera:
     check_shift(right.P, float(left.P[0, 3]), where)
-    with naming(where):
+    with reading(where):
         return RectifiedCamera(
             focal_px=float(left.P[0, 0]),
             cx_px=float(left.P[0, 2]),
@@ -60,5 +60,5 @@ def _camera(info: BagCameraInfo, where: Path) -> CameraIntrinsics:
     # Drivers of rectified images may leave the model empty.
     name = info.model or "plumb_bob"
     model, distortion = lens_of(ROS_MODELS, name, np.asarray(info.D), where)
-    with naming(where):
+    with reading(where):
         return CameraIntrinsics(info.K, distortion, info.width_px, info.height_px, model)

@@ -32,8 +32,8 @@ SIDES: Final = (
     ("L", "R"),
     ("0", "1"),
 )
-_DIGITS: Final = re.compile(r"(\d+)")
-_STAMP: Final = re.compile(r"\d{10}(\.\d+)?|\d{13}|\d{16}|\d{19}|\d+\.\d+")
+_DIGITS: Final = re.compile(r"([0-9]+)")
+_STAMP: Final = re.compile(r"\d{10}(\.\d+)?|\d{13}|\d{16}|\d{19}|\d+\.\d+", re.ASCII)
 
 _SECONDS_DIGITS: Final = 10
 """Digits of a time in seconds since 1970, from 2001 to 2286."""
@@ -143,8 +143,9 @@ class Roll:
 
 def natural_key(name: str) -> list[tuple[int, str]]:
     """Sort key under which 2 comes before 10."""
-    parts = _DIGITS.split(name)
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts if part]
+    # Only ASCII: "²" is a digit to Python, but not a number.
+    parts = enumerate(_DIGITS.split(name))
+    return [(int(part), "") if at % 2 else (-1, part) for at, part in parts if part]
 
 
 def partner_names(name: str) -> list[str]:

@@ -14,7 +14,7 @@ from recon.errors import SourceError
 from recon.sources.pairing import natural_key
 from recon.sources.pictures import PICTURES
 
-_NUMBER: Final = re.compile(r"\d+")
+_NUMBER: Final = re.compile(r"[0-9]+")
 
 Key = tuple[object, ...]
 

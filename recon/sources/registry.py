@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from recon.errors import SourceError
-from recon.formats.files import StrPath
+from recon.formats.files import StrPath, reading
 from recon.formats.frames_csv import FRAMES
 from recon.formats.middlebury_layout import find_layout
 from recon.formats.video import VIDEOS
@@ -63,11 +63,12 @@ def open_source(
         MissingDependencyError: It is a bag, and the extra ``ros`` is not installed.
     """
     settings = settings or SourceSettings()
-    if kind is None:
-        kind = recognise_source(path, settings)
-    if kind not in SOURCES:
-        raise SourceError("unknown kind of source", got=kind, expected=", ".join(SOURCES))
-    return SOURCES[kind](Path(path), settings)
+    with reading(path):
+        if kind is None:
+            kind = recognise_source(path, settings)
+        if kind not in SOURCES:
+            raise SourceError("unknown kind of source", got=kind, expected=", ".join(SOURCES))
+        return SOURCES[kind](Path(path), settings)
 
 
 def recognise_source(path: StrPath, settings: SourceSettings | None = None) -> str:

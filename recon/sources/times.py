@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from recon.errors import FormatError, SourceError
-from recon.formats.files import read_table, read_text
+from recon.formats.files import read_table, read_text, reader
 from recon.sources.pairing import Roll
 from recon.structures.arrays import Float64
 
 
+@reader
 def read_times(path: Path, frames: int) -> Float64:
     """Read ``times.txt``: seconds, one line per frame; lines beyond the last frame are ignored.
 
@@ -56,6 +57,7 @@ def read_times_of_pairs(path: Path, roll: Roll) -> Float64:
     return times
 
 
+@reader
 def read_dates(path: Path) -> Float64:
     """Read KITTI raw's ``timestamps.txt``: a date and a time of day per line.
 
@@ -84,6 +86,7 @@ def _parse_date(text: str, where: str) -> float:
         ) from error
 
 
+@reader
 def read_stamped_names(path: Path, *, unit_s: float = 1.0) -> list[tuple[float, str]]:
     """Read a list of images: timestamp and file name per line, separated by spaces or a comma.
 

@@ -147,7 +147,7 @@ def test_a_bad_calibration_is_one_clear_line_with_the_file(
 )
 def test_what_file_storage_cannot_parse_is_one_clear_line(tmp_path: Path, text: str) -> None:
     (tmp_path / "stereo.yml").write_text(text)
-    with pytest.raises(FormatError, match=r"stereo\.yml: not an OpenCV FileStorage file"):
+    with pytest.raises(FormatError, match=r"stereo\.yml.*: not a"):
         read_opencv_calibration(tmp_path / "stereo.yml", size_px=(640, 480))
 
 

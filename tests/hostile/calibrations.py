@@ -1,0 +1,196 @@
+"""Valid calibration files of all formats, and what can be wrong with them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+OURS: Final = """\
+format: recon-calibration
+version: 1
+kind: rectified
+camera: {width_px: 48, height_px: 32, focal_px: 50.0, cx_px: 24.0, cy_px: 16.0, cx_right_px: 24.0,
+  baseline_m: 0.1}
+"""
+KITTI: Final = "P0: 50 0 24 0 0 50 16 0 0 0 1 0\nP1: 50 0 24 -5 0 50 16 0 0 0 1 0\n"
+MIDDLEBURY: Final = """\
+cam0=[50 0 24; 0 50 16; 0 0 1]
+cam1=[50 0 24; 0 50 16; 0 0 1]
+doffs=0
+baseline=100
+width=48
+height=32
+ndisp=16
+"""
+OPENCV: Final = """\
+%YAML:1.0
+---
+image_width: 48
+image_height: 32
+M1: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 50., 0., 24., 0., 50., 16., 0., 0., 1. ]
+D1: !!opencv-matrix
+   rows: 1
+   cols: 4
+   dt: d
+   data: [ 0., 0., 0., 0. ]
+M2: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 50., 0., 24., 0., 50., 16., 0., 0., 1. ]
+D2: !!opencv-matrix
+   rows: 1
+   cols: 4
+   dt: d
+   data: [ 0., 0., 0., 0. ]
+R: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 1., 0., 0., 0., 1., 0., 0., 0., 1. ]
+T: !!opencv-matrix
+   rows: 3
+   cols: 1
+   dt: d
+   data: [ -0.1, 0., 0. ]
+"""
+KALIBR: Final = """\
+cam0:
+  camera_model: pinhole
+  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]
+  distortion_model: radtan
+  intrinsics: [50.0, 50.0, 24.0, 16.0]
+  resolution: [48, 32]
+cam1:
+  T_cn_cnm1: [[1, 0, 0, -0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+  camera_model: pinhole
+  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]
+  distortion_model: radtan
+  intrinsics: [50.0, 50.0, 24.0, 16.0]
+  resolution: [48, 32]
+"""
+CAMERA_INFO: Final = """\
+image_width: 48
+image_height: 32
+camera_matrix: {rows: 3, cols: 3, data: [50, 0, 24, 0, 50, 16, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}
+rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
+projection_matrix: {rows: 3, cols: 4, data: [50, 0, 24, SHIFT, 0, 50, 16, 0, 0, 0, 1, 0]}
+"""
+VALID: Final = {
+    "ours": ("rig.yaml", OURS),
+    "kitti": ("calib.txt", KITTI),
+    "middlebury": ("calib.txt", MIDDLEBURY),
+    "opencv": ("stereo.yml", OPENCV),
+    "kalibr": ("chain.yaml", KALIBR),
+    "camera-info": ("rig_right.yaml", CAMERA_INFO.replace("SHIFT", "-5")),
+}
+
+#: Values in place of a number: what YAML makes of them, and what float() and int() do.
+NUMBERS: Final = {
+    "date": "2020-13-45",
+    "time": "2020-01-01 25:61:61",
+    "tag int abc": "!!int abc",
+    "tag float abc": "!!float abc",
+    "tag timestamp x": "!!timestamp x",
+    "tag binary x": "!!binary x",
+    "tag python": "!!python/object/apply:os.getcwd []",
+    "5000 digits": "1" * 5000,
+    "400 digits": "1" * 400,
+    "1e400": "1e400",
+    "1e300": "1e300",
+    "1e-300": "1e-300",
+    "minus 1e300": "-1e300",
+    "nan": ".nan",
+    "inf": ".inf",
+    "list": "[1, 2]",
+    "ragged list": "[1, [2, 3]]",
+    "map": "{a: 1}",
+    "null": "null",
+    "word": "word",
+    "zero": "0",
+    "negative": "-5",
+    "arabic digits and a letter": "٣x",
+    "superscript": "²",
+    "sexagesimal": "190:20:30",
+    "alias to itself": "&a [*a]",
+    "alias to itself by name": "&a {b: *a}",
+    "unknown alias": "*b",
+}
+
+
+def replace_one(text: str, old: str, new: str) -> str:
+    """The text with the first occurrence replaced, which must exist."""
+    assert old in text
+    return text.replace(old, new, 1)
+
+
+def deep(levels: int) -> dict[str, str]:
+    """Texts of a deep nesting."""
+    storage = "<?xml version='1.0'?>\n<opencv_storage>\n"
+    opencv = "%YAML:1.0\n---\n"
+    hidden = '[ "]", ' * levels
+    return {
+        "yaml lists": f"cam0: {'[' * levels}{']' * levels}\n",
+        "yaml open lists": f"cam0: {'[' * levels}\n",
+        "yaml maps": f"cam0: {'{a: ' * levels}1{'}' * levels}\n",
+        "yaml dashes": f"cam0:\n  {'- ' * levels}1\n",
+        "opencv yaml lists": f"{opencv}M1: {'[' * levels}{']' * levels}\n",
+        "opencv yaml open lists": f"{opencv}M1: {'[' * levels}\n",
+        "opencv yaml maps": f"{opencv}M1: {'{a: ' * levels}1{'}' * levels}\n",
+        "opencv yaml dashes": f"{opencv}M1:\n   {'- ' * levels}1\n",
+        "opencv yaml, closed only in text": f"{opencv}M1: {hidden}\n",
+        "opencv xml": f"{storage}{'<a>' * levels}1{'</a>' * levels}</opencv_storage>\n",
+        "opencv xml, not closed": f"{storage}{'<a>' * levels}",
+        "opencv xml, closed only in comments": f"{storage}{'<a><!--</a>-->' * levels}",
+        "opencv json": f'{{"opencv-matrix": {"[" * levels}1{"]" * levels}}}\n',
+        "ours": f"format: recon-calibration\nversion: {'[' * levels}{']' * levels}\n",
+    }
+
+
+def expanding() -> Iterator[str]:
+    """Lines of YAML that expand to 10^10 values."""
+    yield "l0: &l0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"
+    for n in range(1, 10):
+        yield f"l{n}: &l{n} [{', '.join([f'*l{n - 1}'] * 10)}]"
+
+
+#: Bytes that replace the content of a calibration file.
+CONTENT: Final[dict[str, Callable[[bytes], bytes]]] = {
+    "empty": lambda content: b"",
+    "one NUL": lambda content: b"\0",
+    "NUL bytes at the end": lambda content: content + b"\0" * 100,
+    "a NUL byte inside": lambda content: content[:20] + b"\0" + content[20:],
+    "half": lambda content: content[: len(content) // 2],
+    "UTF-16": lambda content: content.decode().encode("utf-16"),
+    "Latin-1": lambda content: content + "# é\n".encode("latin-1"),
+    "random bytes": lambda content: bytes(range(256)) * 8,
+    "a PNG": lambda content: b"\x89PNG\r\n\x1a\n" + bytes(200),
+    "5 MB of spaces": lambda content: content + b" " * 5_000_000,
+    "tabs for spaces": lambda content: content.replace(b" ", b"\t"),
+    "5000 digits for every 50": lambda content: content.replace(b"50", b"5" * 5000),
+    "words for every 50": lambda content: content.replace(b"50", b"fifty"),
+    "nan for every 50": lambda content: content.replace(b"50", b"nan"),
+    "1e-300 for every 50": lambda content: content.replace(b"50", b"1e-300"),
+    "1e300 for every 50": lambda content: content.replace(b"50", b"1e300"),
+    "all digits Arabic": lambda content: (
+        content.decode().translate({48 + n: 0x660 + n for n in range(10)}).encode()
+    ),
+    "lines swapped end to end": lambda content: b"\n".join(content.split(b"\n")[::-1]),
+    "commas dropped": lambda content: content.replace(b",", b"").replace(b";", b""),
+}
+
+
+def write_valid(folder: Path, kind: str) -> Path:
+    """Write a valid file of a format (the two of CameraInfo) and return its path."""
+    name, text = VALID[kind]
+    (folder / name).write_text(text)
+    if kind == "camera-info":
+        (folder / "rig_left.yaml").write_text(CAMERA_INFO.replace("SHIFT", "0"))
+    return folder / name

@@ -1,0 +1,44 @@
+"""An interrupted run, and what is kept in its folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from recon.pipeline.config import load_config
+from recon.pipeline.map_run import MapOptions, run_map
+from recon.pipeline.observer import FrameResult
+from recon.pipeline.resume import MapRequest
+from recon.sources import open_source
+from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.synthetic import StreetSettings
+
+DRIVE = {"frames": 5, "width_px": 192, "height_px": 72, "focal_px": 110.0}
+STATE = Path(".partial") / ".state"
+
+
+class _Stops:
+    """An observer that interrupts a run at its fourth frame."""
+
+    def on_start(self, name: str, total: int) -> None: ...
+
+    def on_frame(self, result: FrameResult) -> None:
+        if result.index == 3:
+            raise KeyboardInterrupt
+
+    def on_stage(self, name: str) -> None: ...
+
+    def on_finish(self) -> None: ...
+
+
+def interrupt_run(folder: Path) -> None:
+    """Write a drive to ``folder/drive`` and an interrupted run of it to ``folder/run``."""
+    write_kitti(SyntheticSource(StreetSettings(**DRIVE)), folder / "drive")
+    config = load_config(None, ["checkpoints.every_frames=1", "submaps.max_frames=2"])
+    request = MapRequest(folder / "drive", mesh=False)
+    options = MapOptions(
+        out=folder / "run", mesh=False, observers=(_Stops(),), arguments=request.arguments()
+    )
+    with pytest.raises(KeyboardInterrupt):
+        run_map(open_source(folder / "drive"), config, options)
