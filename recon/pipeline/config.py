@@ -213,13 +213,12 @@ def dump_config(config: ReconConfig) -> str:
 
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:
+    if path.is_file() and path.stat().st_size == 0:
+        return {}
     try:
         content = parse_yaml(read_text(path, SMALL_FILE_BYTES), path)
     except FormatError as error:
-        reason = f"{error.what} ({error.got})" if error.got else error.what
-        raise SettingsError(
-            "configuration cannot be read", where=error.where, got=reason
-        ) from error
+        raise SettingsError(error.what, where=error.where, got=error.got) from error
     if content is None:
         return {}
     if not isinstance(content, Mapping):

@@ -76,7 +76,7 @@ def test_writing_into_a_file_is_an_output_error(tmp_path: Path) -> None:
         ({"origin": [0, 0, 0.5]}, "rotated"),
         ({"origin": "here"}, "not a number"),
         ({"resolution": None}, "not a number"),
-        ({"image": "other.pgm"}, "image"),
+        ({"image": "other.pgm"}, "other.pgm"),
     ],
 )
 def test_maps_that_cannot_be_read_rightly_are_refused(

@@ -111,5 +111,5 @@ def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
 
 
 def test_a_missing_file_is_told(tmp_path: Path) -> None:
-    with pytest.raises(FormatError, match="cannot read the rays"):
+    with pytest.raises(FormatError, match="does not exist"):
         RayFile(tmp_path / "none.bin")
