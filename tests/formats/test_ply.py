@@ -214,7 +214,7 @@ def test_a_cloud_of_nothing_but_nan_is_refused(tmp_path: Path) -> None:
 
 def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "none.ply", tmp_path):
-        with pytest.raises(FormatError, match="does not exist|cannot read the file"):
+        with pytest.raises(FormatError, match=r"does not exist|cannot read the file"):
             read_ply(path)
 
 
