@@ -237,5 +237,6 @@ def test_ctrl_c_while_a_native_library_starts_is_an_interruption(
 
 
 def test_a_library_that_is_missing_is_no_interruption() -> None:
-    with pytest.raises(ImportError, match="nothing of that name"), session():
+    with pytest.raises(typer.Exit) as ended, session():
         raise ImportError("nothing of that name")
+    assert ended.value.exit_code == 3
