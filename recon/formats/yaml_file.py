@@ -90,8 +90,7 @@ def write_yaml(path: StrPath, values: Mapping[str, Any]) -> None:
 
 def plain_yaml(text: str) -> str:
     """The text without what makes OpenCV's dialect invalid YAML: its header and matrix tags."""
-    body, headers = _OPENCV_HEADER.subn("", text)
-    return _OPENCV_TAG.sub("", body) if headers else text
+    return _OPENCV_TAG.sub("", _OPENCV_HEADER.sub("", text))
 
 
 def _place(path: StrPath, error: yaml.YAMLError) -> str:
