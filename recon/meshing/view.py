@@ -34,9 +34,9 @@ COVERED_WITHIN: Final = 0.005
 _DISPARITY_STEP: Final = 2.0
 """Pixels that a pixel of disparity counts for: what is trimmed as farther than two pixel spacings
 from the points (2.8 pixels) is then a step of 1.4 pixels of disparity or more."""
-_MOST_CELLS: Final = 150_000
-"""Cells that the surface may cross; more take Poisson longer than 20 s, so that images beyond
-about half a megapixel get larger cells."""
+_MOST_CELLS: Final = 60_000
+"""Cells that the surface may cross, about. The time of Poisson grows with them, 20 s for so many;
+images of more than a quarter of a megapixel get larger cells."""
 _COVERAGE_SAMPLES: Final = 100_000
 
 
