@@ -139,28 +139,35 @@ class KissIcp:
         # The order of kiss-icp's hash map depends on its history; sorted order does not.
         return points[np.lexsort(points.T[::-1])]
 
-    def __getstate__(self) -> dict[str, Any]:
-        """The full state as plain values, from which a drive can be resumed."""
+    def state(self) -> dict[str, Any]:
+        """Everything that later results depend on, as arrays and plain values."""
         icp = self._icp
         return {
-            "options": self._options,
             "points": np.array(icp.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3),
             "last_pose": np.array(icp.last_pose),
             "last_delta": np.array(icp.last_delta),
-            "threshold": icp.adaptive_threshold,
+            "threshold": icp.adaptive_threshold.state(),
         }
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        KissIcp.__init__(self, state["options"])
-        if len(state["points"]):
-            self._icp.local_map.add_points(state["points"].copy())
-        self._icp.last_pose = state["last_pose"]
-        self._icp.last_delta = state["last_delta"]
-        self._icp.adaptive_threshold = state["threshold"]
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state` of the same options.
+
+        Raises:
+            RegistrationError: The state is damaged.
+        """
+        poses = [state[name] for name in ("last_pose", "last_delta")]
+        for pose in poses:
+            _pose(pose)
+        with _our_errors():
+            self._icp = _RangedKissIcp(_config(self._options), self._options)
+            if len(state["points"]):
+                self._icp.local_map.add_points(_points(state["points"]))
+        self._icp.last_pose, self._icp.last_delta = poses
+        self._icp.adaptive_threshold.restore(state["threshold"])
 
 
 class _AdaptiveThreshold:
-    """kiss-icp's adaptive threshold: rms error of the motion model. Its own class cannot be saved.
+    """kiss-icp's adaptive threshold: rms error of the motion model. The state of its own is hidden.
 
     Ref:
         Vizzo et al., "KISS-ICP: in defense of point-to-point ICP", RA-L 2023, section III-C.
@@ -183,6 +190,17 @@ class _AdaptiveThreshold:
         if error_m > self._min_motion_m:
             self._sum_m2 += error_m**2
             self._count += 1
+
+    def state(self) -> list[float]:
+        """Sum of the squared deviations, and their number."""
+        return [self._sum_m2, self._count]
+
+    def restore(self, state: list[float]) -> None:
+        """Continue from a `state`."""
+        sum_m2, count = state
+        if not (math.isfinite(sum_m2) and sum_m2 >= 0 and count >= 1):
+            raise RegistrationError("threshold of ICP is damaged", got=state)
+        self._sum_m2, self._count = float(sum_m2), int(count)
 
 
 class _RangedKissIcp(KissICP):  # type: ignore[misc]

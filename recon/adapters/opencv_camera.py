@@ -64,7 +64,9 @@ class OpenCvCamera:
         self, device: str, size: tuple[int, int] | None = None, rate_hz: float | None = None
     ) -> None:
         self.name, self.live = device, not Path(device).is_file()
-        number = int(device) if device.isdigit() else None
+        number = int(device) if device.isdecimal() else None
+        if Path(device).is_fifo() or Path(device).is_socket():  # opening one would wait for ever
+            raise SourceError("not a camera and not a regular file", where=device)
         log = cv2.utils.logging
         before = log.getLogLevel()
         log.setLogLevel(log.LOG_LEVEL_SILENT)  # a failure is raised as an error below

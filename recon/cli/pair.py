@@ -111,10 +111,10 @@ def pair(
         overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
         settings = load_config(config, overrides, PAIR_DEFAULTS)
         check_ndisp(settings, ndisp)
-        unit = settings.source.metres_per_unit if unit_m is None else unit_m
+        unit, most = settings.source.metres_per_unit, settings.readable_megapixels
         known = KnownCamera(focal, baseline, cx, cy)
         if calib is None:
-            given = read_uncalibrated_pair(left, right, known, truth)
+            given = read_uncalibrated_pair(left, right, known, truth, max_megapixels=most)
         elif known != KnownCamera():
             raise SettingsError(
                 "--focal, --baseline, --cx and --cy replace a calibration file",
@@ -123,7 +123,9 @@ def pair(
                 hint="give either",
             )
         else:
-            given = read_pair_input(left, right, calib, truth, metres_per_unit=unit)
+            given = read_pair_input(
+                left, right, calib, truth, metres_per_unit=unit_m or unit, max_megapixels=most
+            )
         viewer = choose_viewer(quiet=quiet, verbose=verbose)
         others = tuple(name for name in dict.fromkeys(formats or ()) if name != "ply")
         options = PairOptions("pair", out, threads, present_pair, viewer.on_stage, others)
@@ -171,8 +173,8 @@ def disparity(
         overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
         settings = load_config(config, overrides, PAIR_DEFAULTS)
         check_ndisp(settings, ndisp)
-        unit = settings.source.metres_per_unit
-        given = read_pair_input(left, right, calib, metres_per_unit=unit)
+        unit, most = settings.source.metres_per_unit, settings.readable_megapixels
+        given = read_pair_input(left, right, calib, metres_per_unit=unit, max_megapixels=most)
         viewer = choose_viewer(quiet=quiet, verbose=verbose)
         options = PairOptions("disparity", out, threads, present_disparity, viewer.on_stage)
         run = run_pair(given, settings, options)

@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
-from recon.formats.files import StrPath
+from recon.errors import FormatError
+from recon.formats.files import StrPath, reading
 
 _EXIF_IFD: Final = 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
@@ -46,11 +47,11 @@ def read_focal_length(path: StrPath, width_px: int, height_px: int) -> ExifFocal
         The focal length; None = the file does not say, or is no image.
     """
     try:
-        with Image.open(path) as image:
+        with reading(path), Image.open(path) as image:
             tags: Mapping[int, Any] = image.getexif().get_ifd(_EXIF_IFD)
-    except (OSError, UnidentifiedImageError, ValueError, SyntaxError):
+            return _by_sensor(tags, width_px) or _by_35mm(tags, width_px, height_px)
+    except FormatError:
         return None
-    return _by_sensor(tags, width_px) or _by_35mm(tags, width_px, height_px)
 
 
 def _by_sensor(tags: Mapping[int, Any], width_px: int) -> ExifFocal | None:

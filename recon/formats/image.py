@@ -14,11 +14,16 @@ from numpy.typing import NDArray
 
 from recon.errors import FormatError, OutputError, ShapeError
 from recon.formats.atomic import write_bytes
-from recon.formats.files import StrPath, read_bytes, reader
+from recon.formats.files import SMALL_FILE_BYTES, StrPath, read_bytes, reader, reading
+from recon.formats.image_header import image_size
 from recon.formats.image_integrity import check_image_bytes, is_tiff
 from recon.structures.arrays import UInt8
 
 FULL_WHITE: Final = 65535
+MAX_MEGAPIXELS: Final = 100.0
+"""Larger images are refused before they are decoded, unless more is asked for."""
+_PIXEL_BYTES: Final = 16
+"""More than a pixel takes in any file."""
 _LOG_LEVEL_LOCK: Final = Lock()
 _GREY_ONLY: Final = frozenset({".pgm"})
 _COLOUR_ONLY: Final = frozenset({".ppm"})
@@ -26,7 +31,9 @@ _EIGHT_BIT_ONLY: Final = frozenset({".jpg", ".jpeg"})
 _WRITABLE: Final = _GREY_ONLY | _COLOUR_ONLY | _EIGHT_BIT_ONLY | {".png", ".tif", ".tiff"}
 
 
-def read_image(path: StrPath, white: int = FULL_WHITE) -> UInt8:
+def read_image(
+    path: StrPath, white: int = FULL_WHITE, max_megapixels: float = MAX_MEGAPIXELS
+) -> UInt8:
     """Read an image for display or matching, as 8 bits.
 
     16-bit images are scaled to 8 bits, linearly. An alpha channel is dropped. The EXIF orientation
@@ -36,15 +43,16 @@ def read_image(path: StrPath, white: int = FULL_WHITE) -> UInt8:
         path: PNG, JPEG, PGM, PPM, BMP or TIFF, recognised by content.
         white: The 16-bit value that becomes 255, see `find_white`; the same for all images of a
             drive.
+        max_megapixels: Refuse larger images, in 10⁶ pixels.
 
     Returns:
         uint8 (H, W) if the file is grey, else (H, W, 3) RGB.
 
     Raises:
-        FormatError: The file is missing, empty, truncated, not an image, or has floating-point
-            pixels.
+        FormatError: The file is missing, empty, truncated, not an image, too large, or has
+            floating-point pixels.
     """
-    return eight_bits(read_levels(path), white)
+    return eight_bits(read_levels(path, max_megapixels), white)
 
 
 def eight_bits(levels: NDArray[Any], white: int = FULL_WHITE) -> UInt8:
@@ -65,7 +73,7 @@ def find_white(images: Iterable[NDArray[Any]]) -> int:
 
 
 @reader
-def read_levels(path: StrPath) -> NDArray[Any]:
+def read_levels(path: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> NDArray[Any]:
     """Read an image with its values as stored, such as a mask or a scaled disparity.
 
     Returns:
@@ -74,7 +82,8 @@ def read_levels(path: StrPath) -> NDArray[Any]:
     Raises:
         FormatError: As in `read_image`.
     """
-    return decode_levels(read_bytes(path), path)
+    content = read_bytes(path, int(max_megapixels * 1e6 * _PIXEL_BYTES) + SMALL_FILE_BYTES)
+    return decode_levels(content, path, max_megapixels)
 
 
 def decode_image(content: bytes, where: StrPath) -> UInt8:
@@ -86,13 +95,17 @@ def decode_image(content: bytes, where: StrPath) -> UInt8:
     return eight_bits(decode_levels(content, where))
 
 
-def decode_levels(content: bytes, path: StrPath) -> NDArray[Any]:
+def decode_levels(
+    content: bytes, path: StrPath, max_megapixels: float = MAX_MEGAPIXELS
+) -> NDArray[Any]:
     """Like `read_levels`, from the bytes of a file.
 
     Raises:
         FormatError: As in `read_image`.
     """
-    check_image_bytes(content, path)
+    with reading(path):
+        _check_size(image_size(content), path, max_megapixels)
+        check_image_bytes(content, path)
     try:
         with silent_opencv() if is_tiff(content) else nullcontext():
             image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
@@ -108,6 +121,18 @@ def decode_levels(content: bytes, path: StrPath) -> NDArray[Any]:
             expected="8 or 16 bits",
         )
     return image if image.ndim == 2 else swap_red_and_blue(image[:, :, :3])
+
+
+def _check_size(size: tuple[int, int] | None, path: StrPath, max_megapixels: float) -> None:
+    """Refuse an image by the size in its header: a small file can hold very many pixels."""
+    if size is not None and size[0] * size[1] > max_megapixels * 1e6:
+        raise FormatError(
+            "image has too many pixels",
+            where=path,
+            got=f"{size[0]}x{size[1]}",
+            expected=f"at most {max_megapixels:g} million",
+            hint="make it smaller; --set source.max_megapixels= allows more",
+        )
 
 
 def read_grey_levels(path: StrPath) -> NDArray[Any]:

@@ -39,7 +39,7 @@ def write_tree(path: str | PathLike[str], tree: Mapping[str, Any]) -> None:
         file.writestr(_TEXT, text)
         for number, array in enumerate(arrays):
             with file.open(f"{number}.npy", "w", force_zip64=True) as stream:
-                np.lib.format.write_array(stream, np.ascontiguousarray(array), allow_pickle=False)
+                np.lib.format.write_array(stream, _in_order(array), allow_pickle=False)
 
 
 @reader
@@ -54,6 +54,11 @@ def read_tree(path: str | PathLike[str]) -> dict[str, Any]:
     if not isinstance(tree, dict):
         raise FormatError("the state is not a tree", where=path)
     return tree
+
+
+def _in_order(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """The array in its own order of axes: products of matrices round differently in another."""
+    return array if array.flags.f_contiguous else np.ascontiguousarray(array)
 
 
 def _without_arrays(value: Any, arrays: list[np.ndarray[Any, Any]]) -> Any:

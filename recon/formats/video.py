@@ -13,7 +13,7 @@ import cv2
 
 from recon.errors import FormatError
 from recon.formats.files import StrPath, reader
-from recon.formats.image import silent_opencv, swap_red_and_blue
+from recon.formats.image import MAX_MEGAPIXELS, silent_opencv, swap_red_and_blue
 from recon.structures.arrays import UInt8
 
 VIDEOS: Final = frozenset(
@@ -87,6 +87,9 @@ def open_video(path: StrPath) -> VideoFile:
         promised = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         rate_hz = capture.get(cv2.CAP_PROP_FPS)
         size = [int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)]
+        if size[0] * size[1] > MAX_MEGAPIXELS * 1e6:
+            got, expected = f"{size[0]}x{size[1]}", f"at most {MAX_MEGAPIXELS:g} million"
+            raise FormatError("video has too many pixels", where=file, got=got, expected=expected)
         if not capture.grab() or not rate_hz > 0:
             raise FormatError("video has no frame that can be decoded", where=file)
     frames = _count(file)

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from recon.geometry.se3 import invert
 from recon.odometry.agreement import Sight, explain_motion
-from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
+from recon.odometry.protocol import (
+    Odometry,
+    OdometryFrame,
+    OdometryHealth,
+    OdometryResult,
+    pose_in,
+    tree_of,
+)
 from recon.odometry.settings import TrustSettings
+from recon.structures import Disparity
 from recon.structures.arrays import Float64
 
 
@@ -52,6 +61,28 @@ class CheckedOdometry:
         doubts = self._doubts(result.health, state.sight, frame, T_before_now)
         notes = (*result.health.notes, *doubts)
         return replace(result, health=replace(result.health, ok=not doubts, notes=notes))
+
+    def state(self) -> dict[str, Any]:
+        """Everything that later poses depend on."""
+        last = self._state
+        if last is None:
+            return {"odometry": self._odometry.state(), "last": None}
+        return {
+            "odometry": self._odometry.state(),
+            "last": {
+                "left": last.sight.left,
+                "disparity": tree_of(last.sight.disparity),
+                "T_world_camera": last.T_world_camera,
+            },
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`."""
+        self._odometry.restore(state["odometry"])
+        last, self._state = state["last"], None
+        if last is not None:
+            sight = Sight(last["left"], Disparity(**last["disparity"]))
+            self._state = CheckedState(sight, pose_in(last, "T_world_camera"))
 
     def _doubts(
         self, health: OdometryHealth, before: Sight, frame: OdometryFrame, T_before_now: Float64

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,13 @@ from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.gate import Correction, Verdict, icp_covariance, icp_may_help, judge
 from recon.odometry.points import select_points
 from recon.odometry.prior import MotionPrior
-from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
+from recon.odometry.protocol import (
+    OdometryFrame,
+    OdometryHealth,
+    OdometryResult,
+    finite_in,
+    pose_in,
+)
 from recon.odometry.settings import FusedSettings, VisualSettings
 from recon.odometry.surfaces import describe_surfaces, fit_surfaces
 from recon.odometry.visual import VisualEstimate, VisualOdometry
@@ -92,6 +99,30 @@ class FusedOdometry:
         self._T_visual = prior.visual.result.T_world_camera
         self._T_world_camera = result.T_world_camera
         return result
+
+    def state(self) -> dict[str, Any]:
+        """Everything that later poses depend on."""
+        return {
+            "visual": self._visual.state(),
+            "icp": self._icp.state(),
+            "T_visual": self._T_visual,
+            "T_world_camera": self._T_world_camera,
+            "offset": self._offset,
+            "icp_covariance": self._icp_covariance,
+            "counts": [self._measured, self._lost, self._frames],
+            "mapped": self._mapped,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`."""
+        self._visual.restore(state["visual"])
+        self._icp.restore(state["icp"])
+        self._T_visual = pose_in(state, "T_visual")
+        self._T_world_camera = pose_in(state, "T_world_camera")
+        self._offset = finite_in(state, "offset", (6,))
+        self._icp_covariance = finite_in(state, "icp_covariance", (6, 6))
+        self._measured, self._lost, self._frames = map(int, state["counts"])
+        self._mapped = bool(state["mapped"])
 
     def _icp_may_help(self, prior: _Prior) -> bool:
         """Whether ICP, if as certain as the last time, would change the prior."""

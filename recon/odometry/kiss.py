@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from recon.adapters.kiss_icp import KissIcp, KissIcpOptions
 from recon.geometry.se3 import invert
 from recon.odometry.points import all_points
-from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
+from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.odometry.settings import KissSettings
 from recon.structures.arrays import Float64
 
@@ -42,6 +44,15 @@ class KissOdometry:
         alignment = self._icp.register(points.xyz)
         health = OdometryHealth(icp_points=len(alignment.source), accepted=True)
         return self._keep(alignment.T_world_camera, health)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that later poses depend on."""
+        return {"icp": self._icp.state(), "poses": [{"T": pose} for pose in self._poses]}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`."""
+        self._icp.restore(state["icp"])
+        self._poses = [pose_in(pose, "T") for pose in state["poses"]]
 
     def _keep(self, T_world_camera: Float64, health: OdometryHealth) -> OdometryResult:
         self._poses = [*self._poses[-1:], T_world_camera]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from recon.errors import RegistrationError
 from recon.geometry.se3 import invert
-from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
+from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.structures import Trajectory
 
 
@@ -42,3 +44,11 @@ class KnownPoses:
             self._T_first_world = invert(self._poses[index])
             self._begun = True
         return OdometryResult(self._T_first_world @ self._poses[index], OdometryHealth())
+
+    def state(self) -> dict[str, Any]:
+        """Everything that later poses depend on."""
+        return {"T_first_world": self._T_first_world, "begun": self._begun}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`."""
+        self._T_first_world, self._begun = pose_in(state, "T_first_world"), bool(state["begun"])

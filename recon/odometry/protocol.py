@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from recon.errors import ShapeError
 from recon.structures import Disparity, RectifiedPair
-from recon.structures.arrays import Float64, freeze
+from recon.structures.arrays import Float64, freeze, frozen_array
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +86,47 @@ class OdometryResult:
 class Odometry(Protocol):
     """Tracks the camera from frame to frame; holds state, so frames must come in order.
 
-    It can be pickled: a drive resumed from the copy gives the same poses as without a break.
+    A drive that is resumed from its state gives the same poses as without a break.
     """
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
         """Register the next frame. On a poor or empty one the health says so; poses never jump."""
         ...
+
+    def state(self) -> dict[str, Any]:
+        """Everything that later poses depend on, as a tree of arrays and plain values."""
+        ...
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state` of an odometry with the same settings.
+
+        Raises:
+            ReconError: The state is damaged; so may any `LookupError`, `TypeError` or `ValueError`.
+        """
+        ...
+
+
+def tree_of(value: DataclassInstance) -> dict[str, Any]:
+    """The fields of a dataclass by name, as part of a state."""
+    return {field.name: getattr(value, field.name) for field in fields(value)}
+
+
+def pose_in(state: dict[str, Any], name: str) -> Float64:
+    """A pose of a state: float64 (4, 4), finite.
+
+    Raises:
+        ShapeError: It is something else.
+    """
+    return finite_in(state, name, (4, 4))
+
+
+def finite_in(state: dict[str, Any], name: str, shape: tuple[int | None, ...]) -> Float64:
+    """Numbers of a state: float64 of some shape, finite, writable.
+
+    Raises:
+        ShapeError: They are something else.
+    """
+    values: Float64 = state[name]
+    if not np.isfinite(frozen_array(name, values, np.float64, shape)).all():
+        raise ShapeError(f"{name} is not finite")
+    return values

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.motion import Motion
 from recon.odometry.pose import enough_agree, locate_camera
 from recon.odometry.prior import MotionPrior
-from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
+from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in, tree_of
 from recon.odometry.settings import VisualSettings
 from recon.odometry.tracking import follow, sample_disparity
 from recon.odometry.window import TrackWindow, adjust, misfits, pose_information, reprojection
@@ -116,6 +117,28 @@ class VisualOdometry:
         motion = state.motion.moved(T_world_camera, time_s)
         self._state = VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
         return self._estimate(seen, frame.pair.camera)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that later poses depend on."""
+        last = self._state
+        if last is None:
+            return {"last": None}
+        parts = {name: tree_of(getattr(last, name)) for name in ("window", "disparity", "motion")}
+        return {"last": {**parts, "left": last.left, "seen_s": last.seen_s}}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`."""
+        last, self._state = state["last"], None
+        if last is not None:
+            for name in ("T_world_camera", "T_before_camera"):
+                pose_in(last["motion"], name)
+            self._state = VisualState(
+                TrackWindow(**last["window"]),
+                last["left"],
+                Disparity(**last["disparity"]),
+                Motion(**last["motion"]),
+                float(last["seen_s"]),
+            )
 
     def _begin(self, frame: OdometryFrame, motion: Motion) -> VisualState:
         """A new window that starts at a pose."""

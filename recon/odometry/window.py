@@ -14,7 +14,7 @@ from recon.geometry.se3 import apply, as_transform, invert
 from recon.kernels import bundle
 from recon.odometry.settings import WindowSettings
 from recon.structures import RectifiedCamera
-from recon.structures.arrays import Bool, Float64
+from recon.structures.arrays import Bool, Float64, frozen_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +31,15 @@ class TrackWindow:
     T_world_camera: Float64
     uvd: Float64
     xyz_world: Float64
+
+    def __post_init__(self) -> None:
+        poses, points = len(self.T_world_camera), len(self.xyz_world)
+        for name, shape in (
+            ("T_world_camera", (None, 4, 4)),
+            ("uvd", (poses, points, 3)),
+            ("xyz_world", (points, 3)),
+        ):
+            frozen_array(f"TrackWindow.{name}", getattr(self, name), np.float64, shape)
 
     @property
     def seen(self) -> Bool:

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import os
-import pickle
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 from pydantic import Field
 
-from recon.errors import FormatError
+from recon.errors import FormatError, ReconError
+from recon.formats.files import reading
 from recon.formats.tree_file import read_tree, write_tree
 from recon.settings import Settings
-from recon.structures.arrays import UInt8
 
 _HEAD_BYTES: Final = 4096
 ANEW: Final = "start the run anew, without --resume"
-#: Modules that a checkpoint may load: unpickling any other could run foreign code.
-_SAFE: Final = ("recon.", "numpy")
 
 
 class CheckpointSettings(Settings):
@@ -54,59 +49,17 @@ class Checkpoint:
         """
         write_tree(self._path, state)
 
-    def load(self) -> dict[str, Any]:
-        """Read the state.
-
-        Raises:
-            FormatError: The file is damaged.
-        """
-        try:
-            return read_tree(self._path)
-        except FormatError as error:
-            raise FormatError(error.what, where=error.where, got=error.got, hint=ANEW) from error
-
     def restore(self, use: Callable[[dict[str, Any]], None]) -> None:
-        """Pass the state to ``use``, which resumes from it.
+        """Read the state and pass it to ``use``, which resumes from it.
 
         Raises:
             FormatError: The file is damaged, or holds something else.
         """
-        state = self.load()
         try:
-            use(state)
-        except (KeyError, TypeError, ValueError) as error:
-            raise FormatError(
-                "the file holds no state of this run", where=self._path, got=error, hint=ANEW
-            ) from error
-
-
-def pack_object(value: object) -> UInt8:
-    """uint8 (N,), a stateful object of this project as bytes; `unpack_object` restores it."""
-    return np.frombuffer(pickle.dumps(value, protocol=5), np.uint8)
-
-
-def unpack_object(content: UInt8) -> Any:
-    """Restore the object given to `pack_object`.
-
-    Raises:
-        FormatError: The bytes are damaged, or contain an object of another package.
-    """
-    try:
-        return _OurUnpickler(io.BytesIO(content.tobytes())).load()
-    except (pickle.UnpicklingError, EOFError, AttributeError, ImportError, IndexError) as error:
-        raise FormatError("the state of the odometry cannot be read", got=error) from error
-
-
-class _OurUnpickler(pickle.Unpickler):
-    """Unpickles classes of this project and numpy arrays, nothing else."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        """The class or function of a name, if it is allowed."""
-        found = super().find_class(module, name)
-        ours = module.startswith(_SAFE) and (isinstance(found, type) or module.startswith("numpy"))
-        if not ours:
-            raise pickle.UnpicklingError(f"{module}.{name} is not part of a state")
-        return found
+            with reading(self._path):
+                use(read_tree(self._path))
+        except ReconError as error:
+            raise FormatError(error.what, where=error.where, got=error.got, hint=ANEW) from error
 
 
 def quick_fingerprint(files: Iterable[Path]) -> dict[str, Any]:

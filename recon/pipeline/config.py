@@ -38,6 +38,8 @@ from recon.sources.settings import SourceSettings
 from recon.synthetic import StreetSettings
 
 _MOST_DOTS: Final = 10
+_BYTES_PER_PIXEL: Final = 18
+"""Two colour images, and the disparity with its confidence and deviation: the least of a pair."""
 NO_FILTER: Final = FilterSettings(voxel_m=None)
 NO_ISLANDS: Final = FilterSettings(voxel_m=None, radius_m=0.3, radius_neighbours=2)
 
@@ -75,6 +77,12 @@ class ReconConfig(Settings):
     mesh: MeshSettings = MeshSettings()
     street: StreetSettings = StreetSettings()
     paper: PaperSettings = PaperSettings()
+
+    @property
+    def readable_megapixels(self) -> float:
+        """Largest image to read, in 10⁶ pixels: as set, and small enough for the memory limit."""
+        limit_mb, most = self.memory.limit_mb, self.source.max_megapixels
+        return most if limit_mb is None else min(most, limit_mb / _BYTES_PER_PIXEL)
 
     def with_matcher(self, matcher: str | Matcher | None) -> ReconConfig:
         """The configuration with another matcher, by name or as an object; None = unchanged.

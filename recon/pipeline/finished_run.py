@@ -10,11 +10,17 @@ from typing import Any, Final
 import numpy as np
 
 from recon.errors import FormatError, SettingsError
+from recon.formats.files import read_text, reader, reading
 from recon.pipeline.config import ReconConfig, load_config
 from recon.pipeline.run_directory import RECORD
 from recon.structures import RectifiedCamera
 from recon.structures.arrays import Float64, freeze
 
+RECORD_BYTES: Final = 1 << 26
+"""Larger than any record: it lists the files of a run."""
+_FARTHEST_M: Final = 1e5
+"""From the first camera to the map's origin: farther than any drive."""
+_RIGID_TOLERANCE: Final = 1e-6
 CONFIG: Final = "config.yaml"
 GRID: Final = "map/grid.yaml"
 OCTOMAP: Final = "map/octomap.ot"
@@ -58,10 +64,13 @@ def open_run(folder: Path) -> FinishedRun:
         FormatError: The folder does not contain a finished run, or one without maps.
         SettingsError: Its configuration is not valid in this version.
     """
-    record = _read_record(folder / RECORD)
-    T_map_world = _matrix(record.get("T_map_world"))
-    if T_map_world is None:
+    path = folder / RECORD
+    record = _read_record(path)
+    if "T_map_world" not in record:
         raise FormatError("the run made no map: its record has no T_map_world", where=folder)
+    with reading(path):
+        T_map_world = np.array(record["T_map_world"], dtype=np.float64)
+    check_rigid("T_map_world", T_map_world, path)
     mapped_by = record.get(MAPPED_BY, record.get("command"))
     untrusted = record.get(UNTRUSTED, [])
     if not isinstance(untrusted, list) or not all(type(n) is int for n in untrusted):
@@ -110,24 +119,35 @@ def refuse_as_target(run: Path, out: Path | None) -> None:
         raise SettingsError("the results would replace the run", where=out, hint="another --out")
 
 
-def _matrix(value: Any) -> Float64 | None:
-    """A finite 4×4 matrix, or None if the value is not one."""
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    return matrix if matrix.shape == (4, 4) and np.isfinite(matrix).all() else None
+def check_rigid(name: str, T: Float64, where: Path | None = None) -> None:
+    """Check a pose that is read from a run: one that is none would spoil or exhaust a map.
+
+    Raises:
+        FormatError: It is not a rigid transform, or implausibly far away.
+    """
+    if not (
+        T.shape == (4, 4)
+        and np.isfinite(T).all()
+        and np.abs(T[:3, 3]).max() <= _FARTHEST_M
+        and np.array_equal(T[3], [0, 0, 0, 1])
+        and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), rtol=0, atol=_RIGID_TOLERANCE)
+        and np.linalg.det(T[:3, :3]) > 0
+    ):
+        raise FormatError(
+            f"{name} is not a rigid transform of a map",
+            where=where,
+            got=T.tolist(),
+            expected=f"a rotation and at most {_FARTHEST_M:g} m",
+        )
 
 
+@reader
 def _read_record(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FormatError(
             "folder does not contain a finished run", where=path.parent, expected=f"a {path.name}"
         )
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise FormatError("record of the run cannot be read", where=path) from error
+    record = json.loads(read_text(path, RECORD_BYTES))
     if not isinstance(record, dict):
         raise FormatError("record of the run cannot be read", where=path)
     return record

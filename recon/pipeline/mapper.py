@@ -11,8 +11,8 @@ import numpy as np
 from recon.geometry.transform import transform_cloud
 from recon.mapping import SubmapBuilder, estimate_ground, fusion_range_m, map_axes, thin_rays
 from recon.odometry import Odometry, OdometryFrame, OdometryHealth
-from recon.pipeline.checkpoint import pack_object, unpack_object
 from recon.pipeline.config import ReconConfig
+from recon.pipeline.finished_run import check_rigid
 from recon.pipeline.frame import ReconstructedFrame
 from recon.pipeline.frame_log import FrameLog
 from recon.pipeline.lookahead import OneBehind
@@ -126,7 +126,7 @@ class Mapper:
         """Everything that later results depend on, as a tree of arrays and plain values."""
         self._behind.settle()
         return {
-            "odometry": pack_object(self._odometry),
+            "odometry": self._odometry.state(),
             "builder": None if self._builder is None else self._builder.state(),
             "submaps": self.submaps.state(),
             "rays": self._rays.state(),
@@ -136,9 +136,10 @@ class Mapper:
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a `state`."""
-        self._odometry = unpack_object(state["odometry"])
+        self._odometry.restore(state["odometry"])
         self.submaps.restore(state["submaps"])
         self._rays.restore(state["rays"])
+        check_rigid("T_map_world", state["T_map_world"])
         self.T_map_world = state["T_map_world"]
         self._frames.restore(state["frames"])
         if state["builder"] is not None:

@@ -11,6 +11,7 @@ import numpy as np
 from recon.errors import CalibrationError, FormatError
 from recon.formats.disparity_png import read_disparity_png
 from recon.formats.exif import read_focal_length
+from recon.formats.image import MAX_MEGAPIXELS
 from recon.formats.middlebury import stand_in_camera
 from recon.formats.pfm import read_pfm
 from recon.pipeline.pair_run import PairInput
@@ -39,7 +40,12 @@ class KnownCamera:
 
 
 def read_uncalibrated_pair(
-    left: Path, right: Path, known: KnownCamera, truth: Path | None = None
+    left: Path,
+    right: Path,
+    known: KnownCamera,
+    truth: Path | None = None,
+    *,
+    max_megapixels: float = MAX_MEGAPIXELS,
 ) -> PairInput:
     """Read a rectified pair without a calibration file.
 
@@ -48,6 +54,7 @@ def read_uncalibrated_pair(
         right: Right image.
         known: What is known of its camera.
         truth: See `read_pair_input`.
+        max_megapixels: See `read_pair_input`.
 
     Returns:
         The pair, with notes on what its camera was taken from.
@@ -57,7 +64,7 @@ def read_uncalibrated_pair(
         FormatError: A file is missing, damaged or of the wrong size.
         SourceError: The images differ in size.
     """
-    given = read_pair_input(left, right, None, truth)
+    given = read_pair_input(left, right, None, truth, max_megapixels=max_megapixels)
     height_px, width_px = given.pair.left.shape[:2]
     focal_px, basis = known.focal_px, ""
     if focal_px is None:
@@ -94,6 +101,7 @@ def read_pair_input(
     truth: Path | None = None,
     *,
     metres_per_unit: float = 1.0,
+    max_megapixels: float = MAX_MEGAPIXELS,
 ) -> PairInput:
     """Read two images with their calibration and ground truth.
 
@@ -104,12 +112,19 @@ def read_pair_input(
             and depth is not wanted.
         truth: True disparity of the rectified left image, PFM or 16-bit PNG.
         metres_per_unit: Unit of the translation in an OpenCV file; other formats define theirs.
+        max_megapixels: Refuse larger images, in 10⁶ pixels.
 
     Raises:
         FormatError: A file is missing, damaged or of the wrong size.
         SourceError: The images differ in size.
     """
-    source = FilesSource(left, right, calibration, metres_per_unit=metres_per_unit)
+    source = FilesSource(
+        left,
+        right,
+        calibration,
+        metres_per_unit=metres_per_unit,
+        max_megapixels=max_megapixels,
+    )
     (pair,) = source
     return PairInput(
         pair=pair,

@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from recon.errors import MemoryLimitError, OutputError, SettingsError
+from recon.errors import FormatError, MemoryLimitError, OutputError, SettingsError
 from recon.formats.atomic import write_text
+from recon.formats.files import read_text
 from recon.pipeline.checkpoint import quick_fingerprint
 from recon.pipeline.config import ReconConfig, load_config
+from recon.pipeline.finished_run import RECORD_BYTES
 from recon.pipeline.machine import versions
 from recon.pipeline.memory import memory_overrides
 from recon.pipeline.run_directory import RECORD, STARTED, RunDirectory, state_folder
@@ -132,7 +134,8 @@ def open_requested(request: MapRequest, config: ReconConfig) -> StereoSource:
     """
     if request.source is None:
         raise SettingsError("there is no source to map", hint="name SOURCE")
-    return open_source(request.source, request.kind, config.source)
+    settings = config.source.model_copy(update={"max_megapixels": config.readable_megapixels})
+    return open_source(request.source, request.kind, settings)
 
 
 def identity_of(
@@ -219,14 +222,24 @@ def read_started(folder: Path) -> dict[str, Any]:
     """
     path = state_folder(folder) / STARTED
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return _checked(json.loads(read_text(path, RECORD_BYTES)))
+    except (FormatError, ValueError, LookupError, TypeError, RecursionError) as error:
         finished = (folder / RECORD).is_file()
         hint = "it is finished; without --resume it runs again" if finished else _START_ANEW
         raise OutputError(_NOTHING, where=folder, hint=hint) from error
-    if not isinstance(content, dict):
-        raise OutputError(_NOTHING, where=folder, hint=_START_ANEW)
-    return content
+
+
+def _checked(started: Any) -> dict[str, Any]:
+    """What a run was started with, if it has the form that `begin_or_resume` writes.
+
+    Raises:
+        TypeError: A part has another type; a `LookupError` if it is missing.
+    """
+    parts = (started["identity"], started["identity"]["config"], started["arguments"])
+    plain = all(isinstance(part, dict) for part in parts)
+    if not plain or not all(isinstance(v, str | bool | None) for v in parts[-1].values()):
+        raise TypeError("not what a run is started with")
+    return {"identity": parts[0], "arguments": parts[-1]}
 
 
 def _refuse_others(now: Mapping[str, Any], then: Mapping[str, Any], folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -53,6 +54,10 @@ class CaptureFolder:
     ) -> None:
         os.fsync(self._list)
         os.close(self._list)
+        if kind is not None and self.frames == 0:
+            (self.folder / FRAMES).unlink()
+            with suppress(OSError):  # it holds a preview
+                self.folder.rmdir()
 
     def add(self, pair: CapturedPair) -> None:
         """Write both images, then their line in the list.

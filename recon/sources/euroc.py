@@ -48,7 +48,9 @@ def open_euroc(folder: Path, settings: SourceSettings) -> PictureSource:
     views = [root / (settings.left or "cam0"), root / (settings.right or "cam1")]
     lists = [_read_list(view) for view in views]
     frames, roll = pair_listed(lists, settings, root)
-    rig, calibration_files = _read_rig(root, settings, views, picture_size(frames[0].left))
+    rig, calibration_files = _read_rig(
+        root, settings, views, picture_size(frames[0].left, settings)
+    )
     truth, note = _read_truth(root, views[0], np.array([frame.timestamp_s for frame in frames]))
     return PictureSource(
         name=folder.resolve().name,

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Final
 
 from recon.errors import SourceError
 from recon.formats.calibration import read_calibration
 from recon.formats.files import StrPath
-from recon.formats.image import eight_bits, find_white, read_levels
+from recon.formats.image import MAX_MEGAPIXELS, eight_bits, find_white, read_levels
 from recon.formats.kitti import kitti_cameras_of
 from recon.formats.middlebury import stand_in_camera
 from recon.structures import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
 from recon.structures.arrays import UInt8
+
+LEAST_SIDE_PX: Final = 16
+"""Smaller than this, an image does not hold the windows that are compared."""
 
 
 class FilesSource:
@@ -24,6 +28,7 @@ class FilesSource:
         calibration: Any calibration file that `read_calibration` supports; None = the images are
             rectified, and a placeholder camera is used, valid only for matching.
         metres_per_unit: Unit of the translation in an OpenCV file.
+        max_megapixels: Refuse larger images, in 10⁶ pixels.
 
     Raises:
         SourceError: The images differ in size.
@@ -38,10 +43,11 @@ class FilesSource:
         calibration: StrPath | None,
         *,
         metres_per_unit: float = 1.0,
+        max_megapixels: float = MAX_MEGAPIXELS,
     ) -> None:
         given = (left, right, calibration)
         self._files = tuple(Path(path) for path in given if path is not None)
-        self._pair = read_pair(left, right)
+        self._pair = read_pair(left, right, max_megapixels)
         height_px, width_px = self._pair.left.shape[:2]
         self._calibration = (
             stand_in_camera(width_px, height_px)
@@ -91,7 +97,7 @@ class FilesSource:
         yield from (self._pair,)[start:]
 
 
-def read_pair(left: StrPath, right: StrPath) -> StereoPair:
+def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> StereoPair:
     """Read the two images of a pair; if only one is in colour, the other is converted.
 
     16-bit images are scaled to 8 bits, both alike, by the brightest pixel.
@@ -100,7 +106,7 @@ def read_pair(left: StrPath, right: StrPath) -> StereoPair:
         SourceError: The images differ in size.
         FormatError: An image is missing or damaged.
     """
-    levels = [read_levels(path) for path in (left, right)]
+    levels = [read_levels(path, max_megapixels) for path in (left, right)]
     white = find_white(levels)
     pictures = [eight_bits(each, white) for each in levels]
     sizes = [f"{picture.shape[1]}x{picture.shape[0]}" for picture in pictures]
@@ -110,6 +116,13 @@ def read_pair(left: StrPath, right: StrPath) -> StereoPair:
             where=right,
             got=f"left {sizes[0]}, right {sizes[1]}",
             hint="both cameras must record the same size",
+        )
+    if min(pictures[0].shape[:2]) < LEAST_SIDE_PX:
+        raise SourceError(
+            "images are too small to be matched",
+            where=left,
+            got=sizes[0],
+            expected=f"at least {LEAST_SIDE_PX} pixels a side",
         )
     return join_pair(pictures[0], pictures[1], name=Path(left).name)
 

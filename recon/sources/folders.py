@@ -77,7 +77,7 @@ def open_folders(folder: Path, settings: SourceSettings) -> PictureSource:
     found = _pair(folder, settings)
     stamps_s, clock = _times(found, settings)
     first = found.pairs[0][0]
-    rig, texts = read_rig(settings, folder, picture_size(first), kitti_cameras_of(first))
+    rig, texts = read_rig(settings, folder, picture_size(first, settings), kitti_cameras_of(first))
     truth, note = read_tum_truth(folder, stamps_s)
     return PictureSource(
         name=folder.resolve().name,

@@ -157,7 +157,7 @@ def _read_rig(
     folder: Path, settings: SourceSettings, cameras: tuple[int, int], picture: Path
 ) -> tuple[Rig, tuple[Path, ...]]:
     """Read the calibration; its file need not contain the image size."""
-    path, size = folder / "calib.txt", picture_size(picture)
+    path, size = folder / "calib.txt", picture_size(picture, settings)
     if settings.calibration is not None:
         return read_rig(settings, folder, size, cameras)
     if not path.exists():

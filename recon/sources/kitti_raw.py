@@ -40,7 +40,9 @@ def open_kitti_raw(folder: Path, settings: SourceSettings) -> PictureSource:
     cameras = choose_cameras(folder, "image_{:02d}")
     views = [folder / f"image_{camera:02d}" for camera in cameras]
     frames, roll = pair_listed([_read_list(v) for v in views], settings, folder)
-    rig, calibration_files = _read_rig(folder, settings, cameras, picture_size(frames[0].left))
+    rig, calibration_files = _read_rig(
+        folder, settings, cameras, picture_size(frames[0].left, settings)
+    )
     rectified = "rectified" if isinstance(rig, RectifiedCamera) else "not rectified"
     return PictureSource(
         name=folder.resolve().name,

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from recon.errors import SourceError
-from recon.formats.image import FULL_WHITE, find_white, read_image, read_levels
+from recon.formats.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
 from recon.sources.files import join_pair
 from recon.sources.pairing import Roll, check_most, natural_key, pair_stamps
 from recon.sources.settings import SourceSettings
@@ -108,14 +108,24 @@ class PictureSource:
     @cached_property
     def white(self) -> int:
         """The 16-bit value that becomes white in all images; from a sample of both cameras."""
-        if not self.pictures or read_levels(self.pictures[0].left).dtype == np.uint8:
+        most = self._most_megapixels
+        if not self.pictures or read_levels(self.pictures[0].left, most).dtype == np.uint8:
             return FULL_WHITE
         chosen = np.unique(np.linspace(0, len(self.pictures) - 1, _WHITE_SAMPLE).astype(int))
         frames = [self.pictures[index] for index in chosen]
-        return find_white(read_levels(p) for frame in frames for p in (frame.left, frame.right))
+        return find_white(
+            read_levels(p, most) for frame in frames for p in (frame.left, frame.right)
+        )
+
+    @property
+    def _most_megapixels(self) -> float:
+        """Largest image to read; a calibration was accepted for images of its size."""
+        rig = self.calibration
+        camera = rig if isinstance(rig, RectifiedCamera) else rig.left
+        return max(MAX_MEGAPIXELS, camera.width_px * camera.height_px / 1e6)
 
     def _read(self, path: Path) -> UInt8:
-        image = read_image(path, self.white)
+        image = read_image(path, self.white, self._most_megapixels)
         check_size(self.calibration, image.shape[1], image.shape[0], path)
         return image
 
@@ -185,13 +195,13 @@ def _existing(path: Path) -> Path | None:
     return path if path.is_file() else None
 
 
-def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file.
+def picture_size(path: Path, settings: SourceSettings) -> tuple[int, int]:
+    """Width and height of an image file, which must not be larger than the settings allow.
 
     Raises:
         FormatError: The file is missing or damaged.
     """
-    height_px, width_px = read_image(path).shape[:2]
+    height_px, width_px = read_levels(path, settings.max_megapixels).shape[:2]
     return width_px, height_px
 
 

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from recon.formats.image import MAX_MEGAPIXELS
 from recon.settings import Settings
 
 
@@ -24,6 +25,12 @@ class SourceSettings(Settings):
     calibration: str | None = Field(
         default=None,
         description="Calibration file to use instead of that of the source. none = its own.",
+    )
+    max_megapixels: float = Field(
+        default=MAX_MEGAPIXELS,
+        gt=0,
+        description="Largest image that is read, in 10⁶ pixels; larger ones are refused before "
+        "they are decoded.",
     )
     metres_per_unit: float = Field(
         default=1.0,

@@ -35,7 +35,7 @@ def open_tum(folder: Path, settings: SourceSettings) -> PictureSource:
     paths = _find_lists(folder, settings)
     lists = [_read_list(path) for path in paths]
     frames, roll = pair_listed(lists, settings, folder)
-    rig, texts = read_rig(settings, folder, picture_size(frames[0].left))
+    rig, texts = read_rig(settings, folder, picture_size(frames[0].left, settings))
     truth, note = read_tum_truth(folder, np.array([frame.timestamp_s for frame in frames]))
     return PictureSource(
         name=folder.resolve().name,

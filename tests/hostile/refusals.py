@@ -36,6 +36,7 @@ def run(*arguments: str | Path) -> Ended:
     """Run a command inside this process, which takes no time to start."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
+        warnings.simplefilter("ignore", ResourceWarning)  # of whatever ran before
         result = CliRunner().invoke(app, [os.fspath(argument) for argument in arguments])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception

@@ -14,7 +14,7 @@ from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource, write_kitti
 from recon.synthetic import StreetSettings
 
-DRIVE = {"frames": 5, "width_px": 192, "height_px": 72, "focal_px": 110.0}
+DRIVE = {"frames": 6, "width_px": 256, "height_px": 96, "focal_px": 150.0}
 STATE = Path(".partial") / ".state"
 
 
