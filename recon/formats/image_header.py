@@ -20,11 +20,14 @@ _TIFF_SHORT: Final = 3
 
 
 def image_size(content: bytes) -> tuple[int, int] | None:
-    """Width and height that the header of an image file states; None if it states none.
+    """Width and height that the header of an image file states; None if it states none."""
+    try:
+        return _stated_size(content)
+    except struct.error:  # truncated, which the decoder reports
+        return None
 
-    Raises:
-        struct.error: The header is truncated.
-    """
+
+def _stated_size(content: bytes) -> tuple[int, int] | None:
     if content.startswith(_PNG):
         width, height = struct.unpack_from(">II", content, 16)
         return width, height

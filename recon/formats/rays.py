@@ -23,6 +23,7 @@ _MAGIC: Final = b"recon rays 1\n\0\0\0"
 _HEADER: Final = struct.Struct("<16s3d")
 _FRAME: Final = struct.Struct("<2I")
 _RAY_BYTES: Final = 10
+_FARTHEST_M: Final = 1e5
 
 
 class RayWriter:
@@ -89,6 +90,10 @@ class RayFile:
         if len(header) != _HEADER.size or not header.startswith(_MAGIC):
             raise FormatError("not a ray file of a run", where=path)
         self.grain = RayGrain(*_HEADER.unpack(header)[1:])
+        sizes_m = (self.grain.cell_m, self.grain.unit_m, self.grain.max_range_m)
+        # Not above the range; this is false for NaN as well.
+        if not (min(sizes_m) > 0 and max(sizes_m) <= self.grain.max_range_m <= _FARTHEST_M):
+            raise FormatError("sizes of the rays are impossible", where=path, got=sizes_m)
 
     def __len__(self) -> int:
         """Number of frames.

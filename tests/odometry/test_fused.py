@@ -1,11 +1,12 @@
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from recon.formats.tree_file import read_tree, write_tree
 from recon.geometry.se3 import invert
 from recon.odometry.fused import FusedOdometry
 from recon.odometry.protocol import OdometryFrame, OdometryResult
@@ -78,11 +79,15 @@ def test_a_sure_prior_asks_icp_now_and_then(
 
 
 @pytest.mark.parametrize("name", ["visual", "kiss", "fused"])
-def test_a_saved_odometry_goes_on_to_the_bit(name: str, street: tuple[OdometryFrame, ...]) -> None:
+def test_a_saved_odometry_goes_on_to_the_bit(
+    name: str, street: tuple[OdometryFrame, ...], tmp_path: Path
+) -> None:
     unbroken = make_odometry(name)
     for frame in street[:6]:
         unbroken.register(frame)
-    saved = copy.deepcopy(unbroken)
+    write_tree(tmp_path / "state.zip", unbroken.state())
+    saved = make_odometry(name)
+    saved.restore(read_tree(tmp_path / "state.zip"))
     for frame in street[6:]:
         ours, theirs = saved.register(frame), unbroken.register(frame)
         np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
