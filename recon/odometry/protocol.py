@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from recon.errors import ShapeError
 from recon.structures import Disparity, RectifiedPair
 from recon.structures.arrays import Float64, freeze, frozen_array
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +103,7 @@ class Odometry(Protocol):
         ...
 
 
-def tree_of(value: DataclassInstance) -> dict[str, Any]:
+def tree_of(value: Any) -> dict[str, Any]:
     """The fields of a dataclass by name, as part of a state."""
     return {field.name: getattr(value, field.name) for field in fields(value)}
 

@@ -1,0 +1,208 @@
+"""Valid files of every kind that recon reads, their readers, and ways to damage bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from hypothesis import strategies as st
+
+from recon.formats.calibration import read_calibration
+from recon.formats.disparity_png import read_disparity_png
+from recon.formats.euroc import read_euroc_camera, read_euroc_truth
+from recon.formats.frames_csv import read_frames
+from recon.formats.image import read_image
+from recon.formats.mesh import read_mesh, write_mesh
+from recon.formats.nav2 import read_nav2, write_nav2
+from recon.formats.octomap import read_octomap, write_octomap
+from recon.formats.pfm import read_pfm, write_pfm
+from recon.formats.ply import read_ply, read_ply_pieces, write_ply
+from recon.formats.rays import RayFile, RayWriter
+from recon.formats.trajectory import read_trajectory
+from recon.formats.tree_file import read_tree, write_tree
+from recon.formats.video import open_video
+from recon.formats.yaml_file import read_yaml
+from recon.mapping import OccupancySettings, ray_grain
+from recon.pipeline.config import load_config
+from recon.sources.times import read_dates, read_stamped_names
+from recon.structures import (
+    OccupancyGrid,
+    OccupancyVoxels,
+    PointCloud,
+    RayCloud,
+    TriangleMesh,
+)
+from tests.hostile.calibrations import CAMERA_INFO, VALID
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file: how a valid one is written, and how it is read to its end."""
+
+    name: str
+    write: Callable[[Path], Any]
+    read: Callable[[Path], Any]
+
+
+def _rng() -> np.random.Generator:
+    """Equal numbers at every call: a file must be the same each time it is written."""
+    return np.random.default_rng(7)
+
+
+def _text(content: str) -> Callable[[Path], Any]:
+    return lambda path: path.write_text(content)
+
+
+def _cloud() -> PointCloud:
+    rng = _rng()
+    xyz = rng.normal(size=(20, 3)).astype(np.float32)
+    rgb = rng.integers(0, 255, (20, 3)).astype(np.uint8)
+    return PointCloud(xyz, rgb=rgb, confidence=np.full(20, 0.5, np.float32), frame="map")
+
+
+def _mesh() -> TriangleMesh:
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]], np.int32)
+    return TriangleMesh(corners, faces)
+
+
+def _octomap(suffix: str) -> Callable[[Path], Any]:
+    keys = _rng().integers(-20, 20, (50, 3)).astype(np.int32)
+    keys = np.unique(keys, axis=0)
+    odds = np.where(np.arange(len(keys)) % 2, 0.8, -0.4).astype(np.float32)
+
+    def write(path: Path) -> None:
+        write_octomap(path.with_suffix(""), OccupancyVoxels(keys, odds, 0.1))
+        path.with_suffix(suffix).replace(path)
+
+    return write
+
+
+def _grid(path: Path) -> None:
+    cells = np.array([[0, 100, -1], [0, 0, 100]], np.int8)
+    write_nav2(path.with_suffix(""), OccupancyGrid(cells, 0.1, (0.0, 0.0)))
+
+
+def _rays(path: Path) -> None:
+    writer = RayWriter(path, ray_grain(OccupancySettings()))
+    for count in (3, 0, 5):
+        ones = np.ones(count, np.uint8)
+        places = np.ones((count, 3), np.int16)
+        writer.append(RayCloud(places, ones.astype(np.float16), ones, ones, 0.001))
+    writer.close()
+
+
+def _video(path: Path) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 16))
+    for image in _rng().integers(0, 255, (3, 16, 32, 3), np.uint8):
+        writer.write(image)
+    writer.release()
+
+
+def _read_video(path: Path) -> None:
+    video = open_video(path)
+    list(video.pick(range(video.frames)))
+
+
+def _calibration(kind: str) -> Kind:
+    name, text = VALID[kind]
+
+    def write(path: Path) -> None:
+        path.write_text(text)
+        if kind == "camera-info":
+            left = path.with_name(path.name.replace("right", "left"))
+            left.write_text(CAMERA_INFO.replace("SHIFT", "0"))
+
+    return Kind(name, write, lambda path: read_calibration(path, 48, 32))
+
+
+_IMAGE: Final = _rng().integers(0, 255, (9, 13, 3), np.uint8)
+_SENSOR: Final = """\
+T_BS: {cols: 4, rows: 4, data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
+intrinsics: [50.0, 50.0, 24.0, 16.0]
+resolution: [48, 32]
+distortion_model: radial-tangential
+distortion_coefficients: [0.0, 0.0, 0.0, 0.0]
+"""
+
+KINDS: Final[dict[str, Kind]] = {
+    **{f"calibration {kind}": _calibration(kind) for kind in VALID},
+    "euroc sensor": Kind("sensor.yaml", _text(_SENSOR), read_euroc_camera),
+    "euroc truth": Kind(
+        "data.csv", _text("#t\n1,0,0,0,1,0,0,0\n2,0,0,1,1,0,0,0\n"), read_euroc_truth
+    ),
+    "kitti poses": Kind("poses.txt", _text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3), read_trajectory),
+    "tum poses": Kind("tum.txt", _text("0 0 0 0 0 0 0 1\n1 0 0 1 0 0 0 1\n"), read_trajectory),
+    "frames": Kind("frames.csv", _text("# a\nl/0.png,r/0.png,0.0,0.0\n"), read_frames),
+    "stamps": Kind(
+        "data.csv",
+        _text("1403636579763555584,a.png\n"),
+        lambda p: read_stamped_names(p, unit_s=1e-9),
+    ),
+    "dates": Kind("timestamps.txt", _text("2011-09-26 13:02:25.964389445\n" * 2), read_dates),
+    "settings": Kind("c.yaml", _text("matching: {sad: {window_px: 9}}\n"), load_config),
+    "yaml": Kind("y.yaml", _text("a: [1, 2]\nb: &b {c: 1.5}\nd: *b\n"), read_yaml),
+    "png": Kind("i.png", lambda p: cv2.imwrite(str(p), _IMAGE), read_image),
+    "jpg": Kind("i.jpg", lambda p: cv2.imwrite(str(p), _IMAGE), read_image),
+    "tiff": Kind("i.tiff", lambda p: cv2.imwrite(str(p), _IMAGE), read_image),
+    "bmp": Kind("i.bmp", lambda p: cv2.imwrite(str(p), _IMAGE), read_image),
+    "ppm": Kind("i.ppm", lambda p: cv2.imwrite(str(p), _IMAGE), read_image),
+    "pgm, ascii": Kind("i.pgm", _text("P2 3 2 255\n1 2 3 4 5 6\n"), read_image),
+    "disparity png": Kind(
+        "d.png",
+        lambda p: cv2.imwrite(str(p), _IMAGE[:, :, 0].astype(np.uint16) * 9),
+        read_disparity_png,
+    ),
+    "pfm": Kind("d.pfm", lambda p: write_pfm(p, np.ones((4, 5), np.float32)), read_pfm),
+    "ply": Kind("c.ply", lambda p: write_ply(p, _cloud()), read_ply),
+    "ply, ascii": Kind("c.ply", lambda p: write_ply(p, _cloud(), ascii=True), read_ply),
+    "ply, in pieces": Kind(
+        "c.ply", lambda p: write_ply(p, _cloud()), lambda p: list(read_ply_pieces(p, 7))
+    ),
+    "mesh ply": Kind("m.ply", lambda p: write_mesh(p, _mesh()), read_mesh),
+    "octomap ot": Kind("o.ot", _octomap(".ot"), read_octomap),
+    "octomap bt": Kind("o.bt", _octomap(".bt"), read_octomap),
+    "nav2": Kind("g.yaml", _grid, read_nav2),
+    "nav2 image": Kind("g.pgm", _grid, lambda p: read_nav2(p.with_suffix(".yaml"))),
+    "rays": Kind("rays.bin", _rays, lambda p: [len(RayFile(p)), list(RayFile(p))]),
+    "checkpoint": Kind(
+        "s.zip", lambda p: write_tree(p, {"a": np.ones((2, 3)), "b": [1, None, "x"]}), read_tree
+    ),
+    "video": Kind("v.avi", _video, _read_video),
+}
+
+#: Pieces that parsers stumble over, to be put anywhere.
+TOKENS: Final = (
+    *(b"\0", b"\xff", b"\r\n", b"\n\n", b"\xef\xbb\xbf", b"\xff\xfe", b" ", b"-", b"9" * 40),
+    *(b"9" * 5000, b"nan", b"inf", b"-1", b"1e999", b"1e-300", b"[" * 300, b"{" * 300, b"- " * 300),
+    *(b"&a [*a]", b"!!int x", b"2020-13-45", b"%YAML:1.0\n", b"#", b"'", b'"', b"%", b"\\", b"*"),
+    *(b"\x7f\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x80\x00\x00\x00", "\u00b2\u0661".encode()),
+)
+
+
+def damage(draw: st.DrawFn, content: bytes) -> bytes:
+    """Draw a damaged copy of a file's content: some cuts, insertions, changes and swaps."""
+    data = bytearray(content)
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, len(data)))
+        length = draw(st.integers(1, 64))
+        match draw(st.sampled_from(["cut", "drop", "insert", "flip", "repeat", "swap", "noise"])):
+            case "cut":
+                del data[at:]
+            case "drop":
+                del data[at : at + length]
+            case "insert":
+                data[at:at] = draw(st.sampled_from(TOKENS))
+            case "flip" if at < len(data):
+                data[at] ^= 1 << draw(st.integers(0, 7))
+            case "repeat":
+                data[at:at] = bytes(data[at : at + length]) * draw(st.integers(1, 20))
+            case "swap":
+                data[at : at + 4] = data[at : at + 4][::-1]
+            case "noise":
+                data[at : at + length] = draw(st.binary(min_size=length, max_size=length))
+    return bytes(data)
