@@ -4,6 +4,7 @@ SHELL := /bin/bash
 
 BIN := .venv/bin
 READY := .venv/.ready
+COMPILED := .venv/.compiled
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
@@ -12,23 +13,28 @@ PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-setup: $(READY) ## system libraries, .venv and the package with its tested versions
+setup: $(COMPILED) ## system libraries, .venv, the package with its tested versions, compiled kernels
 
 $(READY): pyproject.toml constraints.txt scripts/setup.sh
 	@scripts/setup.sh
 	@touch $@
 
-demo: $(READY) ## map a synthetic street drive into outputs/demo/
+$(COMPILED): $(READY) $(wildcard recon/kernels/*.py)
+	@echo "setup: compiling the kernels, about a minute"
+	@printf 'setup: %s\n' "$$($(BIN)/recon doctor --compile)"
+	@touch $@
+
+demo: $(COMPILED) ## map a synthetic street drive into outputs/demo/
 	$(BIN)/recon demo
 
-test: $(READY) ## fast tests, with style, types and import contracts; real data where RECON_DATA is set
+test: $(COMPILED) ## fast tests, with style, types and import contracts; real data where RECON_DATA is set
 	NUMBA_DISABLE_JIT=1 $(PYTEST) -q tests/kernels
 	$(PYTEST) -m "not slow"
 
-test-all: $(READY) ## every test
+test-all: $(COMPILED) ## every test
 	$(PYTEST)
 
-fuzz: $(READY) ## search at random for failing examples; MINUTES=30, SEED=… repeats a round
+fuzz: $(COMPILED) ## search at random for failing examples; MINUTES=30, SEED=… repeats a round
 	@scripts/fuzz.sh
 
 check: lint test ## what CI runs, with the quick answers first
@@ -39,7 +45,7 @@ lint: $(READY) ## style, formatting, types and import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(READY) ## speed of the matchers beside OpenCV's, as JSON
+bench: $(COMPILED) ## speed of the matchers beside OpenCV's, as JSON
 	@$(BIN)/python benchmarks/matching.py --json
 
 format: $(READY) ## put the code into the project's style

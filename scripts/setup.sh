@@ -91,4 +91,3 @@ ensure_package() {
 ensure_system
 ensure_venv
 ensure_package
-say "ready"

@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
 from recon.cli.options import Json, Quiet
 from recon.cli.session import print_json, session
 
 
-def doctor(json: Json = False, quiet: Quiet = False) -> None:
+def doctor(
+    compile_: Annotated[
+        bool,
+        typer.Option("--compile", help="Compile the kernels now, instead of checking anything."),
+    ] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
     """Check the installation: Python, packages, system libraries, memory, folders.
 
-    Exits with 1 if something is missing that runs need.
+    Exits with 1 if something is missing that runs need. With --compile, the
+    kernels are compiled, which the first command that needs them does otherwise.
 
     Examples:
       recon doctor
       recon doctor --json
+      recon doctor --compile
     """
+    if compile_:
+        _compile(json=json, quiet=quiet)
+        return
     with session(quiet=quiet):
         from dataclasses import asdict
 
@@ -32,3 +46,16 @@ def doctor(json: Json = False, quiet: Quiet = False) -> None:
         print_checks(checks)
     if missing:
         raise typer.Exit(1)
+
+
+def _compile(*, json: bool, quiet: bool) -> None:
+    with session(quiet=quiet):
+        from recon.pipeline.warm_up import compile_kernels
+
+        done = compile_kernels()
+    if json:
+        print_json({"kernels": done.kernels, "seconds": round(done.seconds, 1)})
+    elif done.kernels:
+        typer.echo(f"{done.kernels} kernels compiled in {done.seconds:.0f} s, and kept")
+    else:
+        typer.echo("the kernels are compiled already")

@@ -19,6 +19,7 @@ from typing import Any, NoReturn, TextIO
 import typer
 
 from recon.errors import ReconError
+from recon.kernels.cache import when_compiling
 
 INTERRUPTED = 130
 BUG = 3
@@ -30,12 +31,14 @@ def session(*, quiet: bool = False) -> Iterator[None]:
 
     Any other exception is a bug: one line with the file that has its traceback, and exit code 3.
     Meanwhile file descriptor 1 is redirected to standard error, so that the output of native
-    libraries cannot get into that of ``--json``; with ``quiet`` that output is dropped.
+    libraries cannot get into that of ``--json``; with ``quiet`` that output is dropped, and it is
+    not shown that kernels are being compiled.
     """
     for stream in (sys.stdout, sys.stderr):
         _escape_what_is_not_unicode(stream)
     try:
-        with _standard_output_kept_clean(quiet):
+        notice = _CompilingNotice(quiet)
+        with _standard_output_kept_clean(quiet), when_compiling(notice.tell):
             yield
     except (typer.Exit, typer.Abort, typer.BadParameter):
         raise
@@ -75,6 +78,19 @@ def report_bug(error: BaseException) -> None:
         where = "(no folder for temporary files can be written; set TMPDIR for the traceback)"
     what = " ".join(f"{type(error).__name__}: {error}".split())[:200]
     typer.echo(f"error: internal error ({what}), please report: {where}", err=True)
+
+
+class _CompilingNotice:
+    """Says on a terminal, once, why a command waits for the compiler."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._silent = quiet or not sys.stderr.isatty()
+
+    def tell(self, kernel: str) -> None:
+        del kernel
+        if not self._silent:
+            self._silent = True
+            typer.echo("compiling kernels, once after an installation: a minute or so …", err=True)
 
 
 def print_json(content: Mapping[str, Any]) -> None:

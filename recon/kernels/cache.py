@@ -10,11 +10,30 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
 _SOURCES: Final = Path(__file__).parent
 _PREFIX: Final = "kernels-"
+_LISTENERS: Final[list[Callable[[str], None]]] = []
+
+
+@contextmanager
+def when_compiling(tell: Callable[[str], None]) -> Iterator[None]:
+    """Call ``tell`` with the name of each kernel that is about to be compiled, in any thread."""
+    _LISTENERS.append(tell)
+    try:
+        yield
+    finally:
+        _LISTENERS.remove(tell)
+
+
+def announce(kernel: str) -> None:
+    """Tell those who listen that a kernel is not in the cache and is about to be compiled."""
+    for tell in tuple(_LISTENERS):
+        tell(kernel)
 
 
 def cache_parent() -> Path:

@@ -1,32 +1,20 @@
-"""How kernels are compiled, and who is told."""
+"""How kernels are compiled."""
 
 from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any, Final, Literal, TypeVar, overload
 
 from numba import config, njit
 from numba.core.caching import FunctionCache
 
-from recon.kernels.cache import cache_folder, cache_parent
+from recon.kernels.cache import announce, cache_folder, cache_parent
 
 KernelT = TypeVar("KernelT", bound=Callable[..., Any])
 
 _CACHE: Final = str(cache_folder(cache_parent()))
-_LISTENERS: Final[list[Callable[[str], None]]] = []
-
-
-@contextmanager
-def when_compiling(tell: Callable[[str], None]) -> Iterator[None]:
-    """Call ``tell`` with the name of each kernel that is about to be compiled, in any thread."""
-    _LISTENERS.append(tell)
-    try:
-        yield
-    finally:
-        _LISTENERS.remove(tell)
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]
@@ -39,8 +27,7 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         found = super().load_overload(sig, target_context)
         if found is None:
-            for tell in tuple(_LISTENERS):
-                tell(self._py_func.__name__)
+            announce(self._py_func.__name__)
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:

@@ -13,8 +13,8 @@ import pytest
 
 import recon
 from recon.kernels import cache, voxels
-from recon.kernels.cache import cache_folder, cache_parent
-from recon.kernels.compiled import kernel, when_compiling
+from recon.kernels.cache import cache_folder, cache_parent, when_compiling
+from recon.kernels.compiled import kernel
 
 compiled = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="kernels are not compiled")
 
