@@ -1,0 +1,108 @@
+"""What README and docs show runs, from the pages themselves."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer.main
+
+from recon.cli import app
+from tests.docs.blocks import PAGES, ROOT, Block, blocks_of, commands_in
+from tests.docs.stand_ins import prepare
+
+BLOCKS = [block for page in PAGES for block in blocks_of(page)]
+SHELL = [block for block in BLOCKS if block.language == "sh"]
+RUNNING = sorted({block.page for block in BLOCKS if block.language in ("sh", "python")})
+
+SHOWN = {"text", "yaml", "json", "toml"}
+"""Languages of blocks that are output, trees of files, diagrams or configuration."""
+
+NOT_RUN = {
+    r"make \w": "the tests themselves are run by it",
+    r"git clone": "needs a network",
+    r"source .venv/bin/activate": "the tests run in an environment that is active",
+    r"recon capture 0 2": "needs two cameras; tests/pipeline/test_capture.py records from videos",
+}
+"""Beginnings of shell lines that are checked but not run, and why."""
+
+every_shell_block = pytest.mark.parametrize("block", SHELL, ids=str)
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=str)
+def test_a_block_says_whether_it_runs(block: Block) -> None:
+    assert block.language in {"sh", "python", *SHOWN}
+
+
+@every_shell_block
+def test_a_shell_block_is_shell(block: Block) -> None:
+    done = subprocess.run(
+        ["bash", "-n"], input=block.text, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@every_shell_block
+def test_its_commands_are_those_of_the_program(block: Block) -> None:
+    for name, *arguments in commands_in(block.text):
+        if name == "recon":
+            command = typer.main.get_command(app)
+            words = list(arguments)
+            while hasattr(command, "commands"):
+                command = command.commands[words.pop(0)]
+            command.make_context("recon", words)  # fails where an option does not exist
+
+
+def test_nothing_is_left_out_without_need() -> None:
+    lines = [line for block in SHELL for line in block.text.splitlines()]
+    unused = [start for start in NOT_RUN if not any(re.match(start, line) for line in lines)]
+    assert unused == []
+
+
+def runnable(script: str) -> str:
+    return "\n".join(
+        line for line in script.splitlines() if not any(re.match(s, line) for s in NOT_RUN)
+    )
+
+
+def as_command(block: Block) -> list[str]:
+    if block.language == "python":
+        return [sys.executable, "-c", block.text]
+    return ["bash", "-e", "-c", runnable(block.text)]
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> dict[str, str]:
+    """A home of its own, and this `recon` among the programs."""
+    program = tmp_path / "bin" / "recon"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m recon "$@"\n')
+    program.chmod(0o755)
+    return {
+        **os.environ,
+        "HOME": str(tmp_path / "home"),
+        "PATH": f"{program.parent}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(ROOT),
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", RUNNING)
+def test_the_blocks_of_a_page_run_in_order(
+    page: str, tmp_path: Path, environment: dict[str, str]
+) -> None:
+    """In a folder with small stand-ins for the files that they name."""
+    blocks = [block for block in BLOCKS if block.page == page and block.language not in SHOWN]
+    folder = tmp_path / "work"
+    folder.mkdir()
+    prepare("\n".join(map(runnable, (block.text for block in blocks))), folder, tmp_path / "home")
+    for block in blocks:
+        done = subprocess.run(
+            as_command(block), cwd=folder, env=environment, capture_output=True, text=True,
+            check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{block}:\n{block.text}\n{done.stdout}\n{done.stderr}"
