@@ -90,7 +90,9 @@ class _CompilingNotice:
         del kernel
         if not self._silent:
             self._silent = True
-            typer.echo("compiling kernels, once after an installation: a minute or so …", err=True)
+            typer.echo(
+                "compiling kernels, once after an installation: about two minutes …", err=True
+            )
 
 
 def print_json(content: Mapping[str, Any]) -> None:

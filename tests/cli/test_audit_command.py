@@ -45,7 +45,7 @@ def spoiled(drive: Drive, **turn_deg: float) -> Drive:
 
 
 def test_a_good_drive_is_announced_measured_and_found_good(good: Path) -> None:
-    done = recon("audit", good)
+    done = recon("audit", good, "--verbose")
     assert done.exit_code == 0
     assert '"description": "KITTI odometry drive' in done.stderr
     assert done.stdout.rstrip().endswith("verdict: good")

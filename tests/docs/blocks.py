@@ -53,10 +53,13 @@ def commands_in(script: str) -> Iterator[list[str]]:
         lexer = shlex.shlex(line, posix=True, punctuation_chars=True)
         lexer.whitespace_split = True
         words: list[str] = []
+        redirected = False
         for word in [*lexer, ";"]:
             if word in _ENDS_OF_COMMANDS:
                 if words:
                     yield words
-                words = []
+                words, redirected = [], False
+            elif word == ">" or redirected:
+                redirected = True
             else:
                 words.append(word)

@@ -1,30 +1,42 @@
 """Small rendered files that stand in for those that the pages name.
 
-To make the blocks of a new page run, name here what they read: the key is what a block calls it,
-``~`` is the home folder, and the function writes it.
+To make the blocks of a new page run, add to `STAND_INS` what they read: how a block mentions it,
+and the function that writes it.
 """
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from recon.formats.image import write_image
+from recon.formats.pfm import write_pfm
 from recon.formats.ply import write_ply
+from recon.formats.recon_yaml import write_recon_calibration
+from recon.formats.trajectory import write_tum
+from recon.geometry.se3 import invert
+from recon.pipeline.config import load_config
+from recon.pipeline.map_run import MapOptions, run_map
 from recon.sources.synthetic import SyntheticSource, write_kitti
 from recon.structures import PointCloud, RectifiedCamera
 from recon.structures.board import parse_board
 from recon.synthetic.boards import board_rig, place_boards, render_views
-from recon.synthetic.planes import slanted_pair, step_pair
+from recon.synthetic.planes import slanted_pair
 from recon.synthetic.settings import StreetSettings
+from tests.docs.blocks import ROOT
 from tests.flow.test_newcomer import BOARD, take_pictures
 from tests.flow.test_paper import write_scene
+from tests.matching.plugins import install_plugin
 from tests.sources import drives
+from tests.sources.bags import Recording, write_bag
 
+SCENES = ("ArtL", "Jadeplant", "Pipes", "Teddy")
 CAMERA = """  camera_model: pinhole
   intrinsics: [{f}, {f}, {cx}, {cy}]
   distortion_model: radtan
@@ -87,24 +99,70 @@ def camchain(path: Path) -> None:
 
 
 def bag(path: Path) -> None:
-    from tests.sources.bags import Recording, write_bag
+    """Images, their cameras, and odometry of a body at the left camera."""
+    pairs, camera = drives.rendered(10, width_px=256, height_px=96, focal_px=150.0)
+    write_bag(pairs, camera, path.parent, Recording(kind="ros1", odometry=body_path(len(pairs))))
 
-    pairs, camera = drives.rendered(8, width_px=256, height_px=96, focal_px=150.0)
-    write_bag(pairs, camera, path.parent, Recording(kind="ros1"))
+
+def body_path(frames: int) -> np.ndarray:
+    """T_odom_base of the street's camera in body axes (x forward, y left, z up)."""
+    truth = street().truth
+    assert truth is not None
+    assert truth.trajectory is not None
+    T_base_camera = np.eye(4)
+    T_base_camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    poses = truth.trajectory.T_world_camera[:frames]
+    return T_base_camera @ poses @ invert(T_base_camera)
 
 
 def recording(folder: Path) -> None:
-    """What `recon capture` leaves."""
-    pairs, camera = drives.rendered(8, width_px=256, height_px=96, focal_px=150.0)
-    drives.write_folders(pairs, camera, folder)
+    """What `recon capture --calib` leaves."""
+    pairs, camera = drives.rendered(10, width_px=256, height_px=96, focal_px=150.0)
+    for pair in pairs:
+        for side in ("left", "right"):
+            write_image(folder / side / f"{pair.index:06d}.png", getattr(pair, side))
+    write_recon_calibration(folder / "calibration.yaml", camera)
+
+
+def path_of_truth(path: Path) -> None:
+    truth = street().truth
+    assert truth is not None
+    assert truth.trajectory is not None
+    write_tum(path, truth.trajectory)
+
+
+def disparity(path: Path) -> None:
+    """As large as the images."""
+    write_pfm(path, np.full((96, 256), 5.0, np.float32))
+
+
+def results(folder: Path) -> None:
+    """Disparities of another program for the scenes below."""
+    folder.mkdir(parents=True)
+    for name in SCENES:
+        write_pfm(folder / f"{name}.pfm", np.full((80, 120), 10.0, np.float32))
+
+
+def finished_run(folder: Path) -> None:
+    config = load_config(overrides=["audit.quick=false"])
+    run_map(street(), config, MapOptions(out=folder, mesh=False))
+
+
+def plugin(site: Path) -> None:
+    """The matcher of docs/walk-research.md, as pip would install it."""
+    page = (ROOT / "docs" / "walk-research.md").read_text()
+    (source,) = re.findall(r"```python\n([^`]*class BlockMatcher.*?)```", page, re.DOTALL)
+    site.mkdir()
+    points = {"block": "block_matcher:BlockMatcher"}
+    install_plugin(site, "block-matcher", {"block_matcher.py": source}, points)
 
 
 def scenes(folder: Path) -> None:
     """Those of the paper, in Middlebury's layout."""
     camera = RectifiedCamera(180.0, 55.0, 40.0, 65.0, 0.2, 120, 80, 24)
-    write_scene(folder / "ArtL", step_pair(camera, 1.3, 2.0, 20.0, seed=1))
-    write_scene(folder / "Jadeplant", slanted_pair(camera, 1.6, (0.3, 0.0), seed=2))
-    write_scene(folder / "Pipes", slanted_pair(camera, 1.5, (0.0, -0.2), seed=3))
+    for number, name in enumerate(SCENES):
+        pair = slanted_pair(camera, 1.5, (0.1 * number, -0.1), seed=number)
+        write_scene(folder / name, pair)
 
 
 def board_images(pattern: Path) -> None:
@@ -133,31 +191,63 @@ def board_videos(left: Path) -> None:
     drives.write_video(left.with_name("both.mp4"), [np.hstack(pair) for pair in views], "mp4v")
 
 
-STAND_INS: dict[str, Callable[[Path], None]] = {
-    "im0.png": image(0),
-    "im1.png": image(1),
-    "calib.txt": kitti_calibration,
-    "left*.png": board_images,
-    "left/ right/": board_folders,
-    "left.mp4": board_videos,
-    "~/kitti/sequences/06": drive,
-    "~/kitti/poses/06.txt": poses,
-    "~/long": drive,
-    "DRIVE": drive_with_truth,
-    "drive.bag": bag,
-    "camchain.yaml": camchain,
-    "lidar.ply": lidar,
-    "~/MiddEval3/trainingQ": scenes,
-    "MiddEval3/trainingQ": scenes,
-    "rides/today": recording,
-    "drive --calib": recording,
-}
+@dataclass(frozen=True)
+class StandIn:
+    """A file or folder that a page needs.
+
+    Attributes:
+        mention: What is in the text of a page that needs it.
+        write: Writes it.
+        path: Where, from the folder in which blocks run, or ``~`` for the home folder; None = as
+            mentioned.
+    """
+
+    mention: str
+    write: Callable[[Path], None]
+    path: str | None = None
+
+    def place(self, folder: Path, home: Path) -> Path:
+        name = self.path or self.mention
+        return home / name[2:] if name.startswith("~/") else folder / name
+
+
+STAND_INS = (
+    StandIn("im0.png", image(0)),
+    StandIn("im1.png", image(1)),
+    StandIn("left.png right.png --", image(0), "left.png"),
+    StandIn("left.png right.png --", image(1), "right.png"),
+    StandIn("calib.txt", kitti_calibration),
+    StandIn("disp0GT.pfm", disparity),
+    StandIn("left*.png", board_images),
+    StandIn("left/ right/", board_folders, "left"),
+    StandIn("board/left board/right", board_folders, "board/left"),
+    StandIn("left.mp4", board_videos),
+    StandIn("~/kitti/sequences/06", drive),
+    StandIn("~/kitti/poses/06.txt", poses),
+    StandIn("~/long", drive),
+    StandIn("DRIVE", drive_with_truth),
+    StandIn("recon map drive ", recording, "drive"),
+    StandIn("drive.bag", bag),
+    StandIn("camchain.yaml", camchain),
+    StandIn("groundtruth.txt", path_of_truth),
+    StandIn("lidar.ply", lidar),
+    StandIn("scan.ply", lidar),
+    StandIn("~/MiddEval3/trainingQ", scenes),
+    StandIn("MiddEval3/trainingQ", scenes),
+    StandIn("results/mine", results),
+    StandIn("results/baseline", results),
+    StandIn("pip install ./block-matcher", plugin, "site"),
+    StandIn("rides/today", recording),
+    StandIn(
+        "recon occupancy outputs/kitti06 --resolution 0.1 --max", finished_run, "outputs/kitti06"
+    ),
+)
 
 
 def prepare(page: str, folder: Path, home: Path) -> None:
-    """Write what the blocks of a page name."""
-    for name, write in STAND_INS.items():
-        if name in page:
-            place = home / name[2:] if name.startswith("~/") else folder / name.split()[0]
+    """Write what the blocks of a page mention."""
+    for stand_in in STAND_INS:
+        place = stand_in.place(folder, home)
+        if stand_in.mention in page and not place.exists():
             place.parent.mkdir(parents=True, exist_ok=True)
-            write(place)
+            stand_in.write(place)

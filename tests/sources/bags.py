@@ -35,6 +35,8 @@ class Recording:
     info: bool = True
     stamped: bool = True
     encoding: str = "mono8"
+    odometry: np.ndarray | None = None
+    """T_odom_base of each pair, (N, 4, 4), on ``/odom``."""
 
     @property
     def name(self) -> str:
@@ -147,8 +149,10 @@ def write_bag(
     """Left and right messages are not adjacent: the right one is recorded a frame later."""
     with recorder(folder, how) as bag:
         late: list[tuple[int, Any]] = []
-        for pair in pairs:
+        for number, pair in enumerate(pairs):
             stamp = EPOCH_S * 10**9 + round(pair.timestamp_s * 1e9)
+            if how.odometry is not None:
+                bag.write("/odom", stamp, bag.odometry(stamp, how.odometry[number]))
             for topic, P in zip(how.topics, projections(camera), strict=True):
                 if how.info:
                     name = topic.removesuffix("/compressed").rsplit("/", 1)[0] + "/camera_info"
