@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from recon.formats.pfm import write_pfm
 from recon.formats.ply import write_ply
 from recon.formats.recon_yaml import write_recon_calibration
 from recon.formats.trajectory import write_tum
-from recon.geometry.se3 import invert
+from recon.geometry.se3 import invert, make_transform
 from recon.pipeline.config import load_config
 from recon.pipeline.map_run import MapOptions, run_map
 from recon.sources.synthetic import SyntheticSource, write_kitti
@@ -30,7 +30,7 @@ from recon.synthetic.boards import board_rig, place_boards, render_views
 from recon.synthetic.planes import slanted_pair
 from recon.synthetic.settings import StreetSettings
 from tests.docs.blocks import ROOT
-from tests.flow.test_newcomer import BOARD, take_pictures
+from tests.flow.test_newcomer import BOARD, photograph, take_pictures
 from tests.flow.test_paper import write_scene
 from tests.matching.plugins import install_plugin
 from tests.sources import drives
@@ -116,8 +116,9 @@ def body_path(frames: int) -> np.ndarray:
 
 
 def recording(folder: Path) -> None:
-    """What `recon capture --calib` leaves."""
-    pairs, camera = drives.rendered(10, width_px=256, height_px=96, focal_px=150.0)
+    """What `recon capture --calib` leaves; slow enough to be mapped by every second frame."""
+    size = {"width_px": 256, "height_px": 96, "focal_px": 150.0}
+    pairs, camera = drives.rendered(12, speed_m_per_frame=0.4, **size)
     for pair in pairs:
         for side in ("left", "right"):
             write_image(folder / side / f"{pair.index:06d}.png", getattr(pair, side))
@@ -125,10 +126,12 @@ def recording(folder: Path) -> None:
 
 
 def path_of_truth(path: Path) -> None:
+    """On the clock of the bag."""
     truth = street().truth
     assert truth is not None
     assert truth.trajectory is not None
-    write_tum(path, truth.trajectory)
+    path_s = truth.trajectory.timestamps_s + drives.EPOCH_S
+    write_tum(path, replace(truth.trajectory, timestamps_s=path_s))
 
 
 def disparity(path: Path) -> None:
@@ -183,6 +186,17 @@ def board_folders(left: Path) -> None:
             write_image(left.parent / side / f"{number:02d}.png", picture)
 
 
+def drive_of_that_rig(folder: Path) -> None:
+    """A few steps through a room, seen by the cameras that see the board."""
+    rig = board_rig("radtan", 480, 360)
+    for number in range(4):
+        T_world_left = make_transform(np.eye(3), np.array([0.0, 0.0, 0.05 * number]))
+        poses = {"left": T_world_left, "right": T_world_left @ invert(rig.T_right_left)}
+        for side, T_world_camera in poses.items():
+            image = photograph(getattr(rig, side), T_world_camera)
+            write_image(folder / side / f"{number:02d}.png", image)
+
+
 def board_videos(left: Path) -> None:
     """Each view stands still for a few frames."""
     views = [pair for pair in board_views() for _ in range(6)]
@@ -226,6 +240,7 @@ STAND_INS = (
     StandIn("~/kitti/poses/06.txt", poses),
     StandIn("~/long", drive),
     StandIn("DRIVE", drive_with_truth),
+    StandIn("recon audit drive --calib rig.yaml", drive_of_that_rig, "drive"),
     StandIn("recon map drive ", recording, "drive"),
     StandIn("drive.bag", bag),
     StandIn("camchain.yaml", camchain),
