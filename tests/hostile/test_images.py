@@ -19,7 +19,8 @@ from recon.formats.pfm import read_pfm, write_pfm
 from tests.hostile.calibrations import OURS
 from tests.hostile.refusals import assert_refused, refusal, run
 
-pytestmark = pytest.mark.timeout(60)
+# The first match may have to compile.
+pytestmark = pytest.mark.timeout(300)
 
 
 def chunk(name: bytes, content: bytes) -> bytes:

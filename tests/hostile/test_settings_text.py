@@ -11,7 +11,8 @@ from recon.pipeline.config import load_config
 from tests.hostile.calibrations import CONTENT, NUMBERS, deep, expanding
 from tests.hostile.refusals import assert_refused, refusal, run
 
-pytestmark = pytest.mark.timeout(60)
+# The first match may have to compile.
+pytestmark = pytest.mark.timeout(300)
 
 
 def refused(path: Path | None, overrides: list[str], *words: str) -> None:
