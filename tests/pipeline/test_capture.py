@@ -25,6 +25,8 @@ from recon.structures import RectifiedCamera, StereoPair
 from tests.sources import drives
 
 CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)
+SMALL_CAMERA = RectifiedCamera(10.0, 5.5, 3.5, 5.5, 0.5, 12, 8)
+"""Of the images of `FakeCamera`."""
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +114,7 @@ def test_a_frame_lost_by_one_camera_is_dropped_of_the_other(tmp_path: Path) -> N
     summary = record(cameras, tmp_path, CaptureSettings(warm_up=0, frames=8), None, never)
     assert summary["skew_max_ms"] == pytest.approx(2)
     assert summary["gaps"] == 1
-    drives.write_calib(tmp_path, CAMERA)
+    drives.write_calib(tmp_path, SMALL_CAMERA)
     stamps = [frame.timestamp_s for frame in open_source(tmp_path).pictures]  # type: ignore[attr-defined]
     np.testing.assert_allclose(stamps, [t for t in times if round(10 * t) not in {3, 4}])
 
@@ -132,7 +134,7 @@ def test_a_camera_that_goes_silent_is_told_and_what_was_recorded_stays(tmp_path:
     cameras = (FakeCamera("l", times), FakeCamera("/dev/video2", times[:4]))
     with pytest.raises(SourceError, match="/dev/video2: camera gives no more frames"):
         record(cameras, tmp_path, NO_WARM_UP, None, never)
-    drives.write_calib(tmp_path, CAMERA)
+    drives.write_calib(tmp_path, SMALL_CAMERA)
     assert len(open_source(tmp_path)) == 4
 
 
