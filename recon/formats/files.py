@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -111,12 +112,12 @@ def read_bytes(path: StrPath, at_most: int | None = None) -> bytes:
         FormatError: The file does not exist, cannot be read, is empty or too large.
     """
     with Path(path).open("rb") as file:
-        content = file.read(-1 if at_most is None else at_most + 1)
+        if at_most is not None and os.fstat(file.fileno()).st_size > at_most:
+            expected = f"at most {at_most / 1e6:.0f} MB"
+            raise FormatError("file is too large for its kind", where=path, expected=expected)
+        content = file.read()
     if not content:
         raise FormatError("file is empty", where=path)
-    if at_most is not None and len(content) > at_most:
-        expected = f"at most {at_most / 1e6:.0f} MB"
-        raise FormatError("file is too large for its kind", where=path, expected=expected)
     return content
 
 

@@ -71,9 +71,9 @@ def test_a_run_whose_truth_is_not_known_is_refused(run: Path, tmp_path: Path) ->
     ("lost", "words"),
     [
         ("run.json", "not contain a finished run"),
-        ("map/octomap.ot", "OctoMap"),
-        ("map/grid.yaml", "YAML"),
-        ("map/grid.pgm", "image"),
+        ("map/octomap.ot", "octomap.ot: file does not exist"),
+        ("map/grid.yaml", "grid.yaml: file does not exist"),
+        ("map/grid.pgm", "grid.pgm: file does not exist"),
     ],
 )
 def test_a_folder_without_its_files_is_refused(

@@ -24,7 +24,9 @@ from recon.structures import PointCloud
 from recon.synthetic import StreetSettings
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
-STREET = StreetSettings(frames=12, width_px=128, height_px=48, focal_px=73.0)
+STREET = StreetSettings(
+    frames=12, width_px=256, height_px=96, focal_px=150.0, speed_m_per_frame=0.5
+)
 
 
 @pytest.mark.parametrize(

@@ -174,7 +174,7 @@ def test_sixteen_bit_images_of_a_drive_share_one_white(tmp_path: Path) -> None:
 def test_both_images_of_one_pair_share_one_white(tmp_path: Path) -> None:
     paths = [tmp_path / "left.png", tmp_path / "right.png"]
     for path, brightest in zip(paths, (900, 1000), strict=True):
-        levels = np.linspace(0, brightest, 48).reshape(6, 8)
+        levels = np.linspace(0, brightest, 24 * 32).reshape(24, 32)
         write_image(path, np.rint(levels).astype(np.uint16))
     pair = read_pair_input(paths[0], paths[1], None).pair
     assert (int(pair.left.max()), int(pair.right.max())) == (224, 249)
