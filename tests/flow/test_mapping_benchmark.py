@@ -19,7 +19,9 @@ BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "mapping.py"
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     drive = tmp_path_factory.mktemp("drive")
-    street = StreetSettings(frames=4, width_px=192, height_px=72, focal_px=110.0)
+    street = StreetSettings(
+        frames=4, width_px=256, height_px=96, focal_px=150.0, speed_m_per_frame=0.4
+    )
     write_kitti(SyntheticSource(street), drive)
     options = ["--json", "--rays", "3000", "--rounds", "1", "--drive", str(drive)]
     command = [sys.executable, str(BENCHMARK), *options]
