@@ -25,9 +25,10 @@ import numpy as np
 
 from recon.formats.atomic import write_text
 from recon.formats.trajectory import write_kitti_poses
-from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.sources.synthetic import SyntheticSource
 from recon.structures import Trajectory
 from recon.synthetic import StreetSettings
+from tests.scenery.kitti import write_kitti
 
 FRAMES = (1000, 4000)
 LIBRARIES_FRAMES = 8

@@ -10,7 +10,7 @@ import pytest
 from recon.calibration import Sighting, View
 from recon.structures import StereoCalibration
 from recon.structures.board import CalibrationBoard, parse_board
-from recon.synthetic.boards import BoardView, board_rig, place_boards
+from tests.scenery.boards import BoardView, board_rig, place_boards
 
 MakeViews = Callable[..., tuple[StereoCalibration, list[View]]]
 

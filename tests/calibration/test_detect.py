@@ -10,7 +10,7 @@ from recon.calibration import check_charuco, check_chessboard, find_board, grown
 from recon.errors import CalibrationError, SettingsError
 from recon.structures.arrays import UInt8
 from recon.structures.board import parse_board
-from recon.synthetic.boards import BoardView, board_rig, place_boards, render_views
+from tests.scenery.boards import BoardView, board_rig, place_boards, render_views
 
 CHARUCO = "charuco:8x6:30mm:22mm:5x5_100"
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,8 +11,10 @@ import pytest
 import typer
 
 from recon.cli.session import session
-from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.sources.synthetic import SyntheticSource
 from recon.synthetic import StreetSettings
+from tests.hostile.refusals import Ended, assert_refused, run, run_apart
+from tests.scenery.kitti import write_kitti
 
 
 @pytest.fixture(scope="module")
@@ -36,19 +36,10 @@ def drive(good_drive: Path, tmp_path: Path) -> Path:
     return copy
 
 
-def recon(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "recon", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-
-
-def assert_one_line(done: subprocess.CompletedProcess[str], *words: str) -> None:
-    lines = [line for line in done.stderr.splitlines() if not line.startswith("{")]
-    assert done.returncode == 1, done.stderr
-    assert done.stdout == ""
-    assert len(lines) == 1, done.stderr
-    assert lines[0].startswith("error: ")
-    for word in words:
-        assert word in lines[0]
+def assert_one_line(done: Ended, *words: str) -> None:
+    """Assert a refusal without as much as a warning beside it."""
+    assert_refused(done, *words)
+    assert len([line for line in done.err.splitlines() if not line.startswith("{")]) == 1, done.err
 
 
 def right_pictures(drive: Path) -> list[Path]:
@@ -126,14 +117,20 @@ FAULTS: dict[str, Callable[[Path], str]] = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_faulty_drive_is_refused(drive: Path, tmp_path: Path, fault: str) -> None:
     word = FAULTS[fault](drive)
-    done = recon("map", drive, "--out", tmp_path / "out", "--json")
+    done = run("map", drive, "--out", tmp_path / "out", "--json")
     assert_one_line(done, word)
     assert not (tmp_path / "out").exists()
 
 
+def test_a_process_that_refuses_a_drive_ends_with_one(drive: Path, tmp_path: Path) -> None:
+    """The other tests run commands inside of this process."""
+    word = lose_the_baseline(drive)
+    assert_one_line(run_apart("map", drive, "--out", tmp_path / "out", "--json"), word)
+
+
 def test_an_unwritable_output_folder_is_refused(drive: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder")
-    done = recon("map", drive, "--out", tmp_path / "file" / "out", "--json")
+    done = run("map", drive, "--out", tmp_path / "file" / "out", "--json")
     assert_one_line(done, str(tmp_path / "file"))
     assert (tmp_path / "file").read_text() == "no folder"
 
@@ -141,7 +138,7 @@ def test_an_unwritable_output_folder_is_refused(drive: Path, tmp_path: Path) -> 
 def test_nan_in_known_poses_is_refused(drive: Path, tmp_path: Path) -> None:
     poses = tmp_path / "poses.txt"
     poses.write_text("nan 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
-    done = recon("map", drive, "--poses", poses, "--out", tmp_path / "out")
+    done = run("map", drive, "--poses", poses, "--out", tmp_path / "out")
     assert_one_line(done, "poses.txt")
     assert not (tmp_path / "out").exists()
 
@@ -149,7 +146,7 @@ def test_nan_in_known_poses_is_refused(drive: Path, tmp_path: Path) -> None:
 def test_too_few_known_poses_are_refused(drive: Path, tmp_path: Path) -> None:
     poses = tmp_path / "poses.txt"
     poses.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
-    done = recon("map", drive, "--poses", poses, "--out", tmp_path / "out")
+    done = run("map", drive, "--poses", poses, "--out", tmp_path / "out")
     assert_one_line(done, "pose")
     assert not (tmp_path / "out").exists()
 
@@ -163,7 +160,7 @@ def test_too_few_known_poses_are_refused(drive: Path, tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_setting_is_refused(drive: Path, tmp_path: Path, option: str, word: str) -> None:
-    done = recon("map", drive, "--out", tmp_path / "out", "--set", option)
+    done = run("map", drive, "--out", tmp_path / "out", "--set", option)
     assert_one_line(done, word)
     assert not (tmp_path / "out").exists()
 
@@ -171,26 +168,26 @@ def test_a_wrong_setting_is_refused(drive: Path, tmp_path: Path, option: str, wo
 def test_a_pair_of_two_sizes_is_refused(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "left.png"), np.zeros((40, 60), np.uint8))
     cv2.imwrite(str(tmp_path / "right.png"), np.zeros((40, 50), np.uint8))
-    done = recon("disparity", tmp_path / "left.png", tmp_path / "right.png")
+    done = run("disparity", tmp_path / "left.png", tmp_path / "right.png")
     assert_one_line(done, "60x40", "50x40")
 
 
 def test_a_cloud_that_is_none_is_refused(tmp_path: Path) -> None:
     (tmp_path / "cloud.ply").write_text("ply\nformat ascii 1.0\nelement vertex 3\n")
-    done = recon("mesh", tmp_path / "cloud.ply", "--out", tmp_path / "out")
+    done = run("mesh", tmp_path / "cloud.ply", "--out", tmp_path / "out")
     assert_one_line(done, "cloud.ply")
     assert not (tmp_path / "out").exists()
 
 
 def test_evaluating_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
     (tmp_path / "ref.ply").write_text("ply\n")
-    done = recon("evaluate", "map", tmp_path, tmp_path / "ref.ply", "--json")
+    done = run("evaluate", "map", tmp_path, tmp_path / "ref.ply", "--json")
     assert_one_line(done, str(tmp_path))
 
 
 def test_wrong_usage_exits_with_two(tmp_path: Path) -> None:
-    assert recon("map").returncode == 2
-    assert recon("map", tmp_path, "--no-such-option").returncode == 2
+    assert run("map").code == 2
+    assert run("map", tmp_path, "--no-such-option").code == 2
 
 
 def prior_without_times(path: Path) -> str:
@@ -222,7 +219,7 @@ def test_a_prior_that_tells_nothing(
 ) -> None:
     word = write(tmp_path / "prior.txt")
     out = tmp_path / "out"
-    done = recon("map", good_drive, "--prior", tmp_path / "prior.txt", "--out", out, "--quiet")
+    done = run("map", good_drive, "--prior", tmp_path / "prior.txt", "--out", out, "--quiet")
     assert_one_line(done, word)
     assert not out.exists()
 

@@ -23,16 +23,17 @@ from recon.formats.trajectory import write_tum
 from recon.geometry.se3 import invert, make_transform
 from recon.pipeline.config import load_config
 from recon.pipeline.map_run import MapOptions, run_map
-from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.sources.synthetic import SyntheticSource
 from recon.structures import PointCloud, RectifiedCamera
 from recon.structures.board import parse_board
-from recon.synthetic.boards import board_rig, place_boards, render_views
-from recon.synthetic.planes import slanted_pair
 from recon.synthetic.settings import StreetSettings
 from tests.docs.blocks import ROOT
 from tests.flow.test_newcomer import BOARD, photograph, take_pictures
 from tests.flow.test_paper import write_scene
 from tests.matching.plugins import install_plugin
+from tests.scenery.boards import board_rig, place_boards, render_views
+from tests.scenery.kitti import write_kitti
+from tests.scenery.planes import slanted_pair
 from tests.sources import drives
 from tests.sources.bags import Recording, write_bag
 

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.sources.synthetic import SyntheticSource
 from recon.synthetic.settings import StreetSettings
+from tests.scenery.kitti import write_kitti
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

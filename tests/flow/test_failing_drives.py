@@ -22,9 +22,10 @@ from recon.odometry import OdometryFrame, OdometryResult, make_odometry
 from recon.pipeline.config import load_config
 from recon.pipeline.map_run import MapOptions, MapRun, run_map
 from recon.sources import open_source
-from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.sources.synthetic import SyntheticSource
 from recon.structures import RectifiedCamera, RectifiedPair, Trajectory
 from recon.synthetic import StreetSettings
+from tests.scenery.kitti import write_kitti
 
 CAMERA = RectifiedCamera(
     focal_px=260.0,

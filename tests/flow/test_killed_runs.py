@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.sources.synthetic import SyntheticSource
 from recon.synthetic import StreetSettings
+from tests.scenery.kitti import write_kitti
 
 STREET = StreetSettings(frames=24, width_px=192, height_px=72, focal_px=110.0)
 SETTINGS = ["checkpoints.every_frames=5", "submaps.length_m=4", "submaps.tile_m=12.8"]

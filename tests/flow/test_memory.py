@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.sources.synthetic import SyntheticSource
 from recon.synthetic import StreetSettings
+from tests.scenery.kitti import write_kitti
 
 STREET = StreetSettings(
     frames=100,

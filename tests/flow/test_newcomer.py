@@ -18,7 +18,7 @@ from recon.geometry.se3 import apply
 from recon.rectification import RectificationSettings, plan_turns
 from recon.structures import CameraIntrinsics, StereoCalibration
 from recon.structures.board import parse_board
-from recon.synthetic.boards import Lens, board_rig, place_boards, render_views
+from tests.scenery.boards import Lens, board_rig, place_boards, render_views
 
 BOARD = "chess:9x6:25mm"
 # Two walls that meet in a corner, in the left camera's axes: normal and distance.

@@ -18,7 +18,7 @@ from recon.formats.ply import read_ply
 from recon.pipeline.config import PAIR_DEFAULTS, load_config
 from recon.pipeline.paper_run import PaperOptions, headline, run_paper
 from recon.structures import RectifiedCamera
-from recon.synthetic.planes import PlanePair, slanted_pair, step_pair
+from tests.scenery.planes import PlanePair, slanted_pair, step_pair
 
 WIDTH_PX, HEIGHT_PX, NDISP = 120, 80, 24
 PER_METHOD = {"disparity.pfm", "depth.pfm", "disparity_colour.png", "cloud.ply", "cloud_ascii.ply"}

@@ -16,7 +16,7 @@ from recon.formats.opencv_yaml import write_opencv_calibration
 from recon.geometry.se3 import apply
 from recon.rectification import RectificationSettings, plan_turns
 from recon.structures import StereoCalibration
-from recon.synthetic.boards import Lens, board_rig
+from tests.scenery.boards import Lens, board_rig
 
 XYZ = np.random.default_rng(0).uniform((-0.6, -0.4, 1.5), (0.6, 0.4, 4.0), (60, 3))
 

@@ -12,9 +12,10 @@ from recon.formats.image import write_image
 from recon.pipeline.config import load_config
 from recon.pipeline.demo_source import demo_source
 from recon.pipeline.map_run import MapOptions, run_map
-from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.sources.synthetic import SyntheticSource
 from recon.synthetic import StreetSettings
 from tests.hostile.runs import DRIVE, interrupt_run
+from tests.scenery.kitti import write_kitti
 
 
 @pytest.fixture

@@ -11,8 +11,9 @@ from recon.pipeline.map_run import MapOptions, run_map
 from recon.pipeline.observer import FrameResult
 from recon.pipeline.resume import MapRequest
 from recon.sources import open_source
-from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.sources.synthetic import SyntheticSource
 from recon.synthetic import StreetSettings
+from tests.scenery.kitti import write_kitti
 
 DRIVE = {"frames": 6, "width_px": 256, "height_px": 96, "focal_px": 150.0}
 STATE = Path(".partial") / ".state"

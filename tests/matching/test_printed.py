@@ -13,7 +13,7 @@ from recon.matching import MATCHERS, Matcher
 from recon.matching.printed import PrintedMatcher, PrintedSettings
 from recon.structures import Reason, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import Float32, UInt8
-from recon.synthetic.planes import fronto_parallel_pair
+from tests.scenery.planes import fronto_parallel_pair
 
 
 def camera_for(width_px: int, height_px: int, ndisp: int | None = None) -> RectifiedCamera:

@@ -19,7 +19,7 @@ from recon.reports import present_calibration
 from recon.sources.picture_pairs import pair_pictures
 from recon.structures import StereoCalibration
 from recon.structures.board import parse_board
-from recon.synthetic.boards import board_rig, place_boards, render_views
+from tests.scenery.boards import board_rig, place_boards, render_views
 from tests.sources.drives import write_video
 
 BOARD = parse_board("chess:9x6:25mm")

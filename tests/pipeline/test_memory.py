@@ -19,9 +19,10 @@ from recon.pipeline.memory import MemorySettings, memory_overrides, parse_size_m
 from recon.pipeline.resume import MapRequest, plan_map
 from recon.pipeline.submap_store import SubmapStore
 from recon.sources import open_source
-from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.sources.synthetic import SyntheticSource
 from recon.structures import PointCloud
 from recon.synthetic import StreetSettings
+from tests.scenery.kitti import write_kitti
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
 STREET = StreetSettings(

@@ -17,7 +17,7 @@ from recon.reports import present_rectify
 from recon.sources.synthetic import SyntheticSource
 from recon.structures import RectifiedCamera
 from recon.synthetic import StreetSettings
-from recon.synthetic.boards import board_rig
+from tests.scenery.boards import board_rig
 
 SMALL = StreetSettings(frames=2, width_px=480, height_px=240, focal_px=280.0)
 WARP = np.array([[1.0, 0.04, -12], [-0.05, 1.02, 9], [4e-5, -3e-5, 1]])

@@ -34,7 +34,8 @@ from pathlib import Path
 from recon.cli import app
 from recon.formats.image import write_image
 from recon.kernels.cache import when_compiling
-from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.sources.synthetic import SyntheticSource
+from tests.scenery.kitti import write_kitti
 from recon.synthetic.settings import StreetSettings
 
 drive, compiled = Path(sys.argv[1]), []

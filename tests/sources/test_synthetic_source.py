@@ -9,8 +9,9 @@ import pytest
 from recon.errors import OutputError
 from recon.sources.kitti import open_kitti
 from recon.sources.protocol import StereoSource
-from recon.sources.synthetic import SyntheticSource, write_kitti
+from recon.sources.synthetic import SyntheticSource
 from recon.synthetic.settings import StreetSettings
+from tests.scenery.kitti import write_kitti
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 
 from recon.errors import SettingsError
 from recon.structures import RectifiedCamera
-from recon.synthetic.planes import Plane, fronto_parallel_pair, plane_pair, slanted_pair, step_pair
+from tests.scenery.planes import Plane, fronto_parallel_pair, plane_pair, slanted_pair, step_pair
 
 CAMERA = RectifiedCamera(200.0, 99.5, 49.5, 99.5, 0.5, 200, 100)
 

@@ -7,7 +7,7 @@ from recon.adapters.opencv_lens import project
 from recon.errors import CalibrationError
 from recon.geometry.se3 import apply
 from recon.structures.board import parse_board
-from recon.synthetic.boards import BoardRenderer, board_rig, place_boards, render_views
+from tests.scenery.boards import BoardRenderer, board_rig, place_boards, render_views
 
 BOARD = parse_board("chess:6x4:30mm")
 

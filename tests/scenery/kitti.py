@@ -1,0 +1,62 @@
+"""A rendered drive as files in the layout of KITTI."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from recon.formats.atomic import write_text
+from recon.formats.files import StrPath
+from recon.formats.image import write_image
+from recon.formats.trajectory import write_kitti_poses
+from recon.sources.synthetic import SyntheticSource
+from recon.structures import RectifiedCamera
+from recon.structures.arrays import UInt8
+
+_BT601 = np.array([0.299, 0.587, 0.114])
+
+
+def write_kitti(source: SyntheticSource, folder: StrPath, *, grey: bool = True) -> None:
+    """Write a drive as a KITTI odometry sequence.
+
+    ::
+
+        folder/
+          image_0/ image_1/   grey (optional)
+          image_2/ image_3/   colour
+          calib.txt  times.txt  poses.txt
+
+    Args:
+        source: The drive.
+        folder: Output folder, created if missing.
+        grey: Also write the grey images.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    target = Path(folder)
+    for pair in source:
+        name = f"{pair.index:06d}.png"
+        for camera, image in enumerate((pair.left, pair.right)):
+            write_image(target / f"image_{camera + 2}" / name, image)
+            if grey:
+                write_image(target / f"image_{camera}" / name, _grey(image))
+    write_text(target / "calib.txt", _calibration_text(source.calibration))
+    times = source.trajectory.timestamps_s
+    write_text(target / "times.txt", "".join(f"{time_s:.6e}\n" for time_s in times))
+    write_kitti_poses(target / "poses.txt", source.trajectory)
+
+
+def _grey(image: UInt8) -> UInt8:
+    return np.asarray(np.rint(image @ _BT601), dtype=np.uint8)
+
+
+def _calibration_text(camera: RectifiedCamera) -> str:
+    """P0 and P2 of the left, P1 and P3 of the right camera; grey and colour coincide."""
+    left = np.hstack([camera.matrix, np.zeros((3, 1))])
+    right = left.copy()
+    right[0, 2] = camera.cx_right_px
+    right[0, 3] = -camera.focal_px * camera.baseline_m
+    rows = (" ".join(f"{value:.12e}" for value in P.ravel()) for P in (left, right, left, right))
+    return "".join(f"P{number}: {row}\n" for number, row in enumerate(rows))
