@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +17,10 @@ from recon.cli import app
 from recon.formats.disparity_png import write_disparity_png
 from recon.formats.image import read_image
 from recon.formats.pfm import write_pfm
+from tests.hostile import refusals
 
 HEIGHT, WIDTH, NEAR, FAR = 48, 96, 12, 4
 MATCHERS = "sad,opencv-bm,opencv-sgbm"
-
-
-def recon(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "recon", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
 
 
 def noise(seed: int, shape: tuple[int, int]) -> np.ndarray:
@@ -89,12 +83,12 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path, str]:
     """All scenes with three matchers: what was printed, the folder, the errors' stream."""
     out = tmp_path_factory.mktemp("out") / "run"
-    done = recon(
+    done = refusals.run(
         "evaluate", "middlebury", scenes, "--matcher", MATCHERS, "--out", out, "--json",
         "--truth", scenes / "MiddEval3" / "trainingQ", "--parallel", "2",
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout), out, done.stderr
+    assert done.code == 0, done.err
+    return json.loads(done.out), out, done.err
 
 
 def test_every_matcher_has_all_scenes_and_their_weighted_mean(
@@ -179,12 +173,12 @@ def test_tables_maps_and_pictures_are_written(run: tuple[dict[str, Any], Path, s
 def test_figures_do_not_depend_on_what_runs_beside(
     scenes: Path, run: tuple[dict[str, Any], Path, str], tmp_path: Path
 ) -> None:
-    done = recon(
+    done = refusals.run(
         "evaluate", "middlebury", scenes / "MiddEval3" / "trainingQ", "--out", tmp_path / "run",
         "--json", "--quiet", "--threads", "1",
     )  # fmt: skip
-    assert done.stderr == ""
-    alone = json.loads(done.stdout)["matchers"]["sad"]["scenes"]["Vintage"]["nonocc"]
+    assert done.err == ""
+    alone = json.loads(done.out)["matchers"]["sad"]["scenes"]["Vintage"]["nonocc"]
     assert alone == run[0]["matchers"]["sad"]["scenes"]["MiddEval3/trainingQ/Vintage"]["nonocc"]
 
 
@@ -241,9 +235,11 @@ def test_one_map_is_compared_in_either_format(tmp_path: Path) -> None:
     estimate[1, 0] = np.nan
     write_disparity_png(tmp_path / "gt.png", truth)
     write_pfm(tmp_path / "est.pfm", estimate)
-    done = recon("evaluate", "disparity", tmp_path / "est.pfm", tmp_path / "gt.png", "--json")
-    assert done.returncode == 0, done.stderr
-    figures = json.loads(done.stdout)
+    done = refusals.run(
+        "evaluate", "disparity", tmp_path / "est.pfm", tmp_path / "gt.png", "--json"
+    )
+    assert done.code == 0, done.err
+    figures = json.loads(done.out)
     assert figures["pixels"] == 40
     assert figures["invalid"] == pytest.approx(2.5)
     assert figures["sparse"]["bad"]["2"] == figures["sparse"]["d1"] == pytest.approx(12.5)
@@ -253,8 +249,8 @@ def test_one_map_is_compared_in_either_format(tmp_path: Path) -> None:
     mask[1:] = 255
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     masked = ("--mask", tmp_path / "mask.png", "--json")
-    done = recon("evaluate", "disparity", tmp_path / "est.pfm", tmp_path / "gt.png", *masked)
-    assert json.loads(done.stdout)["sparse"]["bad"]["0.5"] == 0
+    done = refusals.run("evaluate", "disparity", tmp_path / "est.pfm", tmp_path / "gt.png", *masked)
+    assert json.loads(done.out)["sparse"]["bad"]["0.5"] == 0
 
 
 def test_the_confidence_of_one_map_is_judged_where_a_file_is_given(tmp_path: Path) -> None:
@@ -292,8 +288,10 @@ def test_a_pair_is_matched_by_the_matcher_that_is_named(scenes: Path, tmp_path: 
     medians = {}
     for name in ("sad", "opencv-sgbm"):
         out = tmp_path / name
-        done = recon("disparity", *pictures, "--matcher", name, "--ndisp", "16", "--out", out)
-        assert done.returncode == 0, done.stderr
+        done = refusals.run(
+            "disparity", *pictures, "--matcher", name, "--ndisp", "16", "--out", out
+        )
+        assert done.code == 0, done.err
         assert f"matcher: {name}" in (out / "config.yaml").read_text()
         medians[name] = json.loads((out / "summary.json").read_text())["disparity_median_px"]
     assert medians["sad"] == pytest.approx(FAR, abs=0.2)

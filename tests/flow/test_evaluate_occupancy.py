@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -18,6 +16,7 @@ from recon.formats.nav2 import read_nav2
 from recon.pipeline.evaluate_occupancy import compare_occupancy
 from recon.pipeline.summary import plain
 from recon.reports.colour import GRID_ERRORS, GRID_NOT_COUNTED
+from tests.hostile import refusals
 
 
 @pytest.fixture
@@ -39,11 +38,9 @@ def test_more_frames_must_have_seen_what_is_compared(run: Path) -> None:
 
 def test_the_command_prints_json_and_draws_what_is_wrong(run: Path, tmp_path: Path) -> None:
     picture = tmp_path / "compared.png"
-    arguments = ["evaluate", "occupancy", str(run), "--json", "--picture", str(picture)]
-    command = [sys.executable, "-m", "recon", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    printed = json.loads(done.stdout)
+    done = refusals.run("evaluate", "occupancy", run, "--json", "--picture", picture)
+    assert done.code == 0, done.err
+    printed = json.loads(done.out)
     assert printed == json.loads((run / "summary.json").read_text())["occupancy"]
 
     colours = cv2.imread(str(picture))[..., ::-1].reshape(-1, 3)

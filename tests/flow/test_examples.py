@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
+import runpy
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,24 +24,29 @@ def kitti_drive(tmp_path: Path) -> Path:
     return folder
 
 
-def _run(name: str, *arguments: str) -> str:
-    command = [sys.executable, str(EXAMPLES / name), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Run an example as the program that it is; what it prints."""
+
+    def run_example(name: str, *arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", [name, *arguments])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run_example
 
 
-def test_one_pair_gives_a_cloud(tmp_path: Path) -> None:
-    output = _run("01_one_pair.py", str(tmp_path))
+def test_one_pair_gives_a_cloud(run: Callable[..., str], tmp_path: Path) -> None:
+    output = run("01_one_pair.py", str(tmp_path))
 
     assert "% of the pixels have a disparity" in output
     assert (tmp_path / "cloud.ply").stat().st_size > 0
 
 
-def test_a_drive_gives_maps(tmp_path: Path, kitti_drive: Path) -> None:
+def test_a_drive_gives_maps(run: Callable[..., str], tmp_path: Path, kitti_drive: Path) -> None:
     folder = tmp_path / "run"
 
-    output = _run("02_map_a_drive.py", str(kitti_drive), str(folder))
+    output = run("02_map_a_drive.py", str(kitti_drive), str(folder))
 
     assert "position error" in output
     for name in ("trajectory_kitti.txt", "map/cloud.ply", "map/grid.yaml", "map/octomap.bt"):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +17,7 @@ from recon.pipeline import frame
 from recon.pipeline.evaluate_occupancy import compare_occupancy
 from recon.pipeline.occupancy_run import OccupancyRequest, run_occupancy
 from recon.structures import OCCUPIED
+from tests.hostile.refusals import assert_refused, run
 
 
 def _remake(run: Path, out: Path, *overrides: str, **changes: Any) -> dict[str, Any]:
@@ -148,26 +147,18 @@ def test_the_run_itself_and_other_files_are_never_replaced(
 
 def test_the_command_prints_json_and_says_what_is_wrong(small_demo: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "recon", "occupancy", str(small_demo), "--out", str(out)]
-    good = subprocess.run(
-        [*command, "--json", "--resolution", "0.5", "--min-height", "0.5"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert good.returncode == 0, good.stderr
-    assert json.loads(good.stdout) == json.loads((out / "summary.json").read_text())
+    command = ("occupancy", small_demo, "--out", out)
+    good = run(*command, "--json", "--resolution", "0.5", "--min-height", "0.5")
+    assert good.code == 0, good.err
+    assert json.loads(good.out) == json.loads((out / "summary.json").read_text())
     record = json.loads((out / "run.json").read_text())
     assert record["command"] == "occupancy"
     assert record["mapped_by"] == "demo"
     assert set(record["files"]) == {
         p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()
     }
-    bad = subprocess.run(
-        [*command, "--resolution", "0.01"], capture_output=True, text=True, check=False
-    )
-    assert bad.returncode == 1
-    assert bad.stderr.count("\n") == 1
-    assert bad.stderr.startswith("error: ")
+    bad = run(*command, "--resolution", "0.01")
+    assert_refused(bad)
+    assert bad.err.count("\n") == 1
     # The earlier result stays.
     assert json.loads((out / "summary.json").read_text())["resolution_m"] == 0.5

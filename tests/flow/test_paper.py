@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +15,7 @@ from recon.formats.ply import read_ply
 from recon.pipeline.config import PAIR_DEFAULTS, load_config
 from recon.pipeline.paper_run import PaperOptions, headline, run_paper
 from recon.structures import RectifiedCamera
+from tests.hostile import refusals
 from tests.scenery.planes import PlanePair, slanted_pair, step_pair
 
 WIDTH_PX, HEIGHT_PX, NDISP = 120, 80, 24
@@ -58,19 +56,13 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def recon(*arguments: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "recon", "paper", *map(str, arguments)]
-    env = {k: v for k, v in os.environ.items() if k != "RECON_DATA"} | environment
-    return subprocess.run(command, capture_output=True, text=True, check=False, env=env)
-
-
 @pytest.fixture(scope="module")
 def run(scenes: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     out = tmp_path_factory.mktemp("paper") / "run"
     options = ("--as-printed", "--set", "paper.patches_px=[3,7,11]", "--json")
-    done = recon(scenes, *options, "--out", out)
-    assert done.returncode == 0, done.stderr
-    return out, json.loads(done.stdout)
+    done = refusals.run("paper", scenes, *options, "--out", out)
+    assert done.code == 0, done.err
+    return out, json.loads(done.out)
 
 
 def test_every_product_is_there(run: tuple[Path, dict[str, Any]]) -> None:
@@ -182,19 +174,20 @@ def test_a_scene_without_truth_is_reconstructed_and_told(scenes: Path, tmp_path:
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(file.read_bytes())
     options = ("--set", "paper.patches_px=[5]", "--out", tmp_path / "out", "--json")
-    done = recon(copy, *options)
-    assert done.returncode == 0, done.stderr
-    summary = json.loads(done.stdout)
+    done = refusals.run("paper", copy, *options)
+    assert done.code == 0, done.err
+    summary = json.loads(done.out)
     assert summary["experiments"]["2"]["methods"]["corrected"]["disparity"] is None
     assert len(summary["warnings"]) == 1
 
 
 @pytest.mark.parametrize("given", [True, False])
-def test_missing_scenes_are_told_in_one_line(tmp_path: Path, given: bool) -> None:
+def test_missing_scenes_are_told_in_one_line(
+    tmp_path: Path, given: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RECON_DATA", raising=False)
     arguments = (tmp_path / "nothing",) if given else ()
-    done = recon(*arguments, "--out", tmp_path / "out", "--json")
-    assert done.returncode == 1
-    assert done.stdout == ""
-    assert len(done.stderr.splitlines()) == 1
-    assert ("nothing" if given else "RECON_DATA") in done.stderr
+    done = refusals.run("paper", *arguments, "--out", tmp_path / "out", "--json")
+    refusals.assert_refused(done, "nothing" if given else "RECON_DATA")
+    assert len(done.err.splitlines()) == 1
     assert not (tmp_path / "out").exists()
