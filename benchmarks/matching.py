@@ -125,10 +125,9 @@ def add_noise(image: UInt8, rng: np.random.Generator) -> UInt8:
 
 def ours(pair: RectifiedPair, threads: int) -> dict[str, Run]:
     """`sad`, `sad` without its second, slanted window (StereoBM has none), and `sgm`."""
-    window = {"window_px": WINDOW_PX, "window_height_px": WINDOW_PX}
     matchers = {
-        "sad": SadMatcher(SadSettings(**window), threads),
-        "sad-upright": SadMatcher(SadSettings(window_slant=0, **window), threads),
+        "sad": SadMatcher(SadSettings(window_px=WINDOW_PX), threads),
+        "sad-upright": SadMatcher(SadSettings(window_px=WINDOW_PX, window_slant=0), threads),
         "sgm": SgmMatcher(SgmSettings(), threads),
     }
     return {name: partial(matcher.match, pair) for name, matcher in matchers.items()}

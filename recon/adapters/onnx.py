@@ -43,6 +43,14 @@ class OnnxNetwork:
                 "onnxruntime cannot load the network", where=path, got=_first_line(error)
             ) from error
 
+    @property
+    def input_shapes(self) -> tuple[tuple[int | None, ...], ...]:
+        """The shape of each input as the network declares it; None = a size that is free."""
+        return tuple(
+            tuple(length if isinstance(length, int) else None for length in one.shape)
+            for one in self._session.get_inputs()
+        )
+
     def run(self, inputs: Sequence[Float32]) -> list[Float32]:
         """Run the network once.
 
@@ -71,7 +79,7 @@ class OnnxNetwork:
                 "the network cannot process these images",
                 where=self._path,
                 got=_first_line(error),
-                hint="check the image size and the channels that it expects",
+                hint="check the size that it expects: matching.onnx.width_px and height_px",
             ) from error
         return [np.asarray(output, dtype=np.float32) for output in outputs]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import cv2
 import numpy as np
@@ -12,39 +12,33 @@ from typing_extensions import Self
 
 from recon.adapters.onnx import OnnxNetwork
 from recon.errors import MatchingError, SettingsError
-from recon.matching.unrated import UnratedSettings, unrated_disparity
+from recon.matching.unrated import unrated_disparity
+from recon.settings import Settings
 from recon.structures import Disparity, Reason, RectifiedPair
 from recon.structures.arrays import Float32, UInt8
 
 _WHITE: Final = 255.0
 
+_MULTIPLE_PX: Final = 32
+"""Where the size is free, images are widened to multiples of this: what networks with five halvings
+of the size need."""
 
-class OnnxSettings(UnratedSettings):
-    """Settings of the ONNX matcher: what the network expects, and what it gives."""
+
+class OnnxSettings(Settings):
+    """Settings of the ONNX matcher: what the network expects, and what it gives.
+
+    The number of inputs and their channels are read from the network.
+    """
 
     model: Path | None = Field(default=None, description="The network, an .onnx file.")
     width_px: int | None = Field(
         default=None,
         ge=1,
-        description="Width that the network takes; pictures are resized. None: any.",
+        description="Width at which the network matches; images are resized. none = its own, or "
+        "that of the images, widened to a multiple of 32. Smaller is faster.",
     )
     height_px: int | None = Field(
-        default=None,
-        ge=1,
-        description="Height that the network takes; with width_px or not at all.",
-    )
-    multiple_px: int = Field(
-        default=32,
-        ge=1,
-        description="Where the size is free, pictures are widened at the right and the bottom to "
-        "multiples of this.",
-    )
-    channels: Literal[1, 3] = Field(
-        default=3, description="Channels of each picture; matching works on grey, so 3 are equal."
-    )
-    inputs: Literal["separate", "stacked"] = Field(
-        default="separate",
-        description="Left and right as two tensors (1, C, H, W), or as one (1, 2·C, H, W).",
+        default=None, ge=1, description="Height at which it matches; with width_px or not at all."
     )
     mean: tuple[float, ...] = Field(
         default=(0.0,), description="Taken from grey levels in [0, 1]; one number, or per channel."
@@ -63,8 +57,8 @@ class OnnxSettings(UnratedSettings):
     def _is_consistent(self) -> Self:
         if (self.width_px is None) != (self.height_px is None):
             raise ValueError("width_px and height_px are given together or not at all")
-        if any(len(numbers) not in {1, self.channels} for numbers in (self.mean, self.std)):
-            raise ValueError("mean and std have one number, or one for each channel")
+        if any(len(numbers) not in {1, 3} for numbers in (self.mean, self.std)):
+            raise ValueError("mean and std have one number, or one for each of three channels")
         if not all(number > 0 for number in self.std):
             raise ValueError("std must be above 0")
         return self
@@ -92,13 +86,17 @@ class OnnxMatcher:
             FormatError: The network cannot be loaded.
             MatchingError: It does not fit the pictures, or gives no disparity map.
         """
-        s = self._settings
-        pictures = [_tensor(_fitted(image, s), s) for image in (pair.left, pair.right)]
-        stacked = [np.concatenate(pictures, axis=1)] if s.inputs == "stacked" else pictures
-        values = self._disparity_of(self._loaded().run(stacked))
-        found = _unfitted(values, pair.left.shape, s)
+        s, network = self._settings, self._loaded()
+        declared = network.input_shapes
+        # One input takes both images, one behind the other: (1, 2·C, H, W).
+        stacked = len(declared) == 1
+        channels, size = _channels(declared[0], stacked), _size(declared[0], s)
+        images = [_tensor(_fitted(image, size), channels, s) for image in (pair.left, pair.right)]
+        inputs = [np.concatenate(images, axis=1)] if stacked else images
+        values = self._disparity_of(network.run(inputs))
+        found = _unfitted(values, pair.left.shape, size)
         reason = np.where(np.isfinite(found), Reason.VALID, Reason.AMBIGUOUS).astype(np.uint8)
-        return unrated_disparity(found, reason, pair, s)
+        return unrated_disparity(found, reason, pair)
 
     def _loaded(self) -> OnnxNetwork:
         if self._network is None:
@@ -127,21 +125,35 @@ class OnnxMatcher:
         return np.asarray(np.where(np.isfinite(values), values, np.nan), dtype=np.float32)
 
 
-def _fitted(image: UInt8, s: OnnxSettings) -> UInt8:
-    """The picture at the size that the network takes."""
+def _channels(declared: tuple[int | None, ...], stacked: bool) -> int:
+    """The channels of one image by the shape of an input; where that leaves them free, 3."""
+    channels = declared[1] if len(declared) == 4 else None
+    if channels is None:
+        return 3
+    return max(1, channels // 2) if stacked else channels
+
+
+def _size(declared: tuple[int | None, ...], s: OnnxSettings) -> tuple[int, int] | None:
+    """Width and height that images are resized to; None = they keep theirs."""
     if s.width_px is not None and s.height_px is not None:
-        shrinks = s.width_px < image.shape[1]
-        way = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        return np.asarray(cv2.resize(image, (s.width_px, s.height_px), interpolation=way))
-    below, beside = (-length % s.multiple_px for length in image.shape)
+        return s.width_px, s.height_px
+    height, width = declared[2:] if len(declared) == 4 else (None, None)
+    return None if width is None or height is None else (width, height)
+
+
+def _fitted(image: UInt8, size: tuple[int, int] | None) -> UInt8:
+    """The image at the size that the network takes."""
+    if size is not None:
+        way = cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR
+        return np.asarray(cv2.resize(image, size, interpolation=way))
+    below, beside = (-length % _MULTIPLE_PX for length in image.shape)
     return np.asarray(cv2.copyMakeBorder(image, 0, below, 0, beside, cv2.BORDER_REPLICATE))
 
 
-def _unfitted(values: Float32, shape: tuple[int, ...], s: OnnxSettings) -> Float32:
-    """The disparity at the size of the picture, in its pixels."""
+def _unfitted(values: Float32, shape: tuple[int, ...], size: tuple[int, int] | None) -> Float32:
+    """The disparity at the size of the image, in its pixels."""
     height, width = shape
-    fixed = s.width_px is not None
-    inner = (height, width) if fixed else tuple(n + -n % s.multiple_px for n in shape)
+    inner = (height, width) if size else tuple(n + -n % _MULTIPLE_PX for n in shape)
     if values.shape != inner:
         factor = np.float32(inner[1] / values.shape[1])
         resized = cv2.resize(values, inner[::-1], interpolation=cv2.INTER_LINEAR)
@@ -149,10 +161,20 @@ def _unfitted(values: Float32, shape: tuple[int, ...], s: OnnxSettings) -> Float
     return values[:height, :width]
 
 
-def _tensor(image: UInt8, s: OnnxSettings) -> Float32:
-    """float32 (1, C, H, W), normalised."""
+def _tensor(image: UInt8, channels: int, s: OnnxSettings) -> Float32:
+    """float32 (1, C, H, W), normalised.
+
+    Raises:
+        SettingsError: Mean or std have more numbers than the network has channels.
+    """
+    if max(len(s.mean), len(s.std)) > channels:
+        raise SettingsError(
+            "mean and std have more numbers than the network has channels",
+            got=max(len(s.mean), len(s.std)),
+            expected=f"1 or {channels}",
+        )
     mean, std = (
         np.array(numbers, dtype=np.float32).reshape(-1, 1, 1) for numbers in (s.mean, s.std)
     )
-    levels = np.repeat(image[None].astype(np.float32) / np.float32(_WHITE), s.channels, axis=0)
+    levels = np.repeat(image[None].astype(np.float32) / np.float32(_WHITE), channels, axis=0)
     return np.asarray((levels - mean) / std, dtype=np.float32)[None]

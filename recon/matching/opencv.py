@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from recon.errors import MatchingError
-from recon.matching.search import OddInt, SearchSettings, UniquenessPercent
-from recon.matching.unrated import UnratedSettings, unrated_disparity
+from recon.matching.search import LEFT_RIGHT_PX, OddInt, SearchSettings
+from recon.matching.unrated import unrated_disparity
 from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import UInt8
 
@@ -32,33 +32,30 @@ _MODES: Final = {
     "hh": cv2.STEREO_SGBM_MODE_HH,
     "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
 }
-_PREFILTERS: Final = {
-    "sobel": cv2.STEREO_BM_PREFILTER_XSOBEL,
-    "normalised": cv2.STEREO_BM_PREFILTER_NORMALIZED_RESPONSE,
-}
+_BM_PREFILTER_CAP: Final = 31
+_BM_TEXTURE_THRESHOLD: Final = 10
+"""Least sum of prefiltered values in the window; OpenCV's default, as the cap."""
+
+_SGBM_PREFILTER_CAP: Final = 63
+_SMALL_PENALTY, _LARGE_PENALTY = 8, 32
+"""P1 and P2 per pixel of the block, as OpenCV's documentation suggests."""
+
+_UNIQUENESS_PERCENT: Final = 5
+"""By how much the second best cost must exceed the best; OpenCV suggests 5 to 15."""
+
+_SPECKLE_PX: Final = 50
+"""Regions of at most so many pixels are removed, as of our matchers."""
+
+_SPECKLE_STEP_PX: Final = 1
 
 
-class OpencvSettings(SearchSettings, UnratedSettings):
+class OpencvSettings(SearchSettings):
     """What both of OpenCV's matchers have."""
 
-    ndisp: int | None = Field(
-        default=None,
-        ge=1,
-        le=4096,
-        description="Number of disparities searched, rounded up to a multiple of 16. None: what "
-        "the calibration says, or else a tenth of the image width.",
-    )
-    uniqueness_percent: UniquenessPercent = 5
-    speckle_size_px: int = Field(
-        default=50,
-        ge=0,
-        le=1_000_000,
-        description="Regions of at most so many pixels are removed; 0 = keep all.",
-    )
     pad: bool = Field(
         default=False,
-        description="Widen the pictures by repeating their edges, so that every pixel is searched "
-        "as far as the right picture reaches. False: OpenCV as it comes, without a strip at the "
+        description="Widen the images by repeating their edges, so that every pixel is searched "
+        "as far as the right image reaches. false = OpenCV as it comes, without a strip at the "
         "left as wide as the range, which scoring then fills by a guess.",
     )
 
@@ -67,15 +64,6 @@ class OpencvBmSettings(OpencvSettings):
     """Settings of ``cv2.StereoBM``."""
 
     block_px: OddInt = Field(default=9, ge=5, le=255, description="Width of the window; odd.")
-    prefilter: Literal["sobel", "normalised"] = Field(
-        default="sobel", description="What is compared."
-    )
-    prefilter_cap: int = Field(
-        default=31, ge=1, le=63, description="Prefiltered values are clipped to plus or minus this."
-    )
-    texture_threshold: int = Field(
-        default=10, ge=0, description="Least sum of prefiltered values in the window."
-    )
 
 
 class OpencvSgbmSettings(OpencvSettings):
@@ -83,16 +71,8 @@ class OpencvSgbmSettings(OpencvSettings):
 
     block_px: OddInt = Field(default=3, ge=1, le=51, description="Width of the window; odd.")
     mode: Literal["hh", "3way", "sgbm"] = Field(
-        default="hh", description="8 paths over the whole picture, 3 paths in strips, or 5 paths."
-    )
-    prefilter_cap: int = Field(
-        default=63, ge=1, le=127, description="Gradients are clipped to plus or minus this."
-    )
-    small_step_cost: int | None = Field(
-        default=None, ge=1, description="OpenCV's P1. None: 8 times the block's pixels."
-    )
-    large_step_cost: int | None = Field(
-        default=None, ge=2, description="OpenCV's P2. None: 32 times the block's pixels."
+        default="hh",
+        description="8 paths over the whole image, 3 paths in strips (fastest), or 5 paths.",
     )
 
 
@@ -119,11 +99,11 @@ class OpencvBmMatcher:
         ndisp = _range(s, pair.camera)
         engine = cv2.StereoBM.create(ndisp, s.block_px)
         engine.setMinDisparity(s.min_disparity_px)
-        engine.setPreFilterType(_PREFILTERS[s.prefilter])
-        engine.setPreFilterCap(s.prefilter_cap)
-        engine.setTextureThreshold(s.texture_threshold)
-        engine.setUniquenessRatio(s.uniqueness_percent)
-        engine.setDisp12MaxDiff(s.left_right_or_none)
+        engine.setPreFilterType(cv2.STEREO_BM_PREFILTER_XSOBEL)
+        engine.setPreFilterCap(_BM_PREFILTER_CAP)
+        engine.setTextureThreshold(_BM_TEXTURE_THRESHOLD)
+        engine.setUniquenessRatio(_UNIQUENESS_PERCENT)
+        engine.setDisp12MaxDiff(LEFT_RIGHT_PX)
         return _match(pair, engine, s, _Margins.around(s, ndisp))
 
 
@@ -151,11 +131,11 @@ class OpencvSgbmMatcher:
             minDisparity=s.min_disparity_px,
             numDisparities=ndisp,
             blockSize=s.block_px,
-            P1=s.small_step_cost or 8 * pixels,
-            P2=s.large_step_cost or 32 * pixels,
-            disp12MaxDiff=s.left_right_or_none,
-            preFilterCap=s.prefilter_cap,
-            uniquenessRatio=s.uniqueness_percent,
+            P1=_SMALL_PENALTY * pixels,
+            P2=_LARGE_PENALTY * pixels,
+            disp12MaxDiff=LEFT_RIGHT_PX,
+            preFilterCap=_SGBM_PREFILTER_CAP,
+            uniquenessRatio=_UNIQUENESS_PERCENT,
             mode=_MODES[s.mode],
         )
         return _match(pair, engine, s, _Margins.around(s, ndisp))
@@ -207,13 +187,9 @@ def _match(pair: RectifiedPair, engine: Any, s: OpencvSettings, margins: _Margin
     unknown = (s.min_disparity_px - 1) * _STEPS
     values = fixed / np.float32(_STEPS)
     reason = np.where(fixed > unknown, Reason.VALID, Reason.AMBIGUOUS).astype(np.uint8)
-    found = unrated_disparity(values, reason, pair, s)
-    if not s.speckle_size_px:
-        return found
+    found = unrated_disparity(values, reason, pair)
     kept = np.where(found.valid, fixed, np.int16(unknown))
-    cv2.filterSpeckles(
-        kept, unknown, s.speckle_size_px, round(min(s.speckle_range_px, _LIMIT_PX) * _STEPS)
-    )
+    cv2.filterSpeckles(kept, unknown, _SPECKLE_PX, _SPECKLE_STEP_PX * _STEPS)
     return found.reject(kept == unknown, Reason.SPECKLE)
 
 

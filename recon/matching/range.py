@@ -35,13 +35,11 @@ class AutoRangeMatcher:
     Args:
         matcher: The matcher; it must take its range from the camera.
         minimum_px: The first disparity that it searches.
-        usual: Whether the range is just `usual_ndisp`, for a matcher that cannot choose it.
     """
 
-    def __init__(self, matcher: Matcher, minimum_px: int = 0, *, usual: bool = False) -> None:
+    def __init__(self, matcher: Matcher, minimum_px: int = 0) -> None:
         self._matcher = matcher
         self._minimum_px = minimum_px
-        self._usual = usual
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair.
@@ -50,8 +48,7 @@ class AutoRangeMatcher:
             MatchingError: As of the matcher inside.
         """
         if pair.camera.ndisp is None:
-            width = pair.camera.width_px
-            ndisp = usual_ndisp(width) if self._usual else estimate_ndisp(pair, self._minimum_px)
+            ndisp = estimate_ndisp(pair, self._minimum_px)
             pair = replace(pair, camera=replace(pair.camera, ndisp=ndisp))
         return self._matcher.match(pair)
 
@@ -98,6 +95,6 @@ def _shrunk(image: UInt8, factor: int, size: tuple[int, int]) -> UInt8:
 
 def _trusted_disparities(small: RectifiedPair) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
     """float32 (N,), disparities in pixels of the small pair."""
-    settings = SadSettings(window_px=7, window_height_px=7, uniqueness_percent=10, average_px=1)
+    settings = SadSettings(window_px=7, uniqueness_percent=10, average_px=1)
     found = SadMatcher(settings, threads=1).match(small)
     return found.values[found.valid & (found.confidence >= _CONFIDENCE)]

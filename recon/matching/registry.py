@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from pydantic import Field, InstanceOf, field_serializer
 
@@ -47,12 +47,6 @@ class MatchingSettings(Settings):
         description="Name of the matcher: sad, sgm, opencv-bm, opencv-sgbm, onnx, or one that an "
         "installed package registers; in Python also a matcher of your own.",
     )
-    range: Literal["auto", "usual"] = Field(
-        default="auto",
-        description="How far to search where neither the matcher's `ndisp` nor the calibration "
-        "says it: as far as each pair needs, but at least the usual tenth of the image width; or "
-        "just that tenth.",
-    )
     sad: SadSettings = Field(default_factory=SadSettings, description="Of the matcher `sad`.")
     sgm: SgmSettings = Field(default_factory=SgmSettings, description="Of the matcher `sgm`.")
     opencv_bm: OpencvBmSettings = Field(
@@ -87,11 +81,11 @@ def make_matcher(
         check_matcher(matcher)
         made = load_registered(matcher) if isinstance(matcher, str) else matcher
         checked = CheckedMatcher(made, name_of(matcher))
-        return AutoRangeMatcher(checked, usual=settings.range == "usual")
+        return AutoRangeMatcher(checked)
     own = getattr(settings, field_of(matcher))
     made = MATCHERS[matcher](own, threads)
     # A matcher without the setting searches no range; one that is set needs no guess.
-    if settings.range == "usual" or getattr(own, "ndisp", 0) is not None:
+    if getattr(own, "ndisp", 0) is not None:
         return made
     return AutoRangeMatcher(made, own.min_disparity_px)
 
@@ -133,7 +127,7 @@ def searched_ndisp(
     own = settings_of(matcher, settings)
     if not isinstance(own, SearchSettings):
         return None
-    if settings.range == "auto" and own.ndisp is None and pair.camera.ndisp is None:
+    if own.ndisp is None and pair.camera.ndisp is None:
         return estimate_ndisp(pair, own.min_disparity_px)
     return own.ndisp_for(pair.camera)
 

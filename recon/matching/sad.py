@@ -5,19 +5,14 @@ from __future__ import annotations
 import math
 import os
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Final
 
-import cv2
-import numpy as np
-from pydantic import Field, model_validator
-from typing_extensions import Self
+from pydantic import Field
 
 from recon.kernels.half_windows import Search
 from recon.kernels.refine import Rules
 from recon.kernels.tiles import Tiles, offer_supported
-from recon.matching.fill import fill_holes
 from recon.matching.gradients import clipped_gradients, texture
 from recon.matching.half_size import (
     LEAST_NDISP,
@@ -31,7 +26,6 @@ from recon.matching.half_size import (
 )
 from recon.matching.search import (
     MeasuredSettings,
-    MinTexture,
     OddInt,
     UniquenessPercent,
     finish,
@@ -41,13 +35,26 @@ from recon.matching.strips import StripSearch, in_strips
 from recon.structures import Disparity, RectifiedCamera, RectifiedPair
 from recon.structures.arrays import UInt8
 
+_GRADIENT_CAP: Final = 31
+"""Gradients (Sobel units) are clipped to plus or minus this before they are compared."""
+
+_COST_CAP: Final = 20
+"""Largest cost of one pixel; limits what an outlier or an edge can do. Times the pixels of both
+halves of the widest window it is below 65535, as the kernel wants."""
+
+_LEAST_SUPPORT: Final = 0.03
+"""Least share of a tile's matches at half size that eight disparities must have to be searched."""
+
 
 class SadSettings(MeasuredSettings):
     """Settings of the SAD matcher."""
 
-    window_px: OddInt = Field(default=11, ge=1, le=61, description="Width of the window; odd.")
-    window_height_px: OddInt = Field(
-        default=11, ge=1, le=61, description="Height of the window; odd."
+    window_px: OddInt = Field(
+        default=11,
+        ge=1,
+        le=55,
+        description="Edge of the square window; odd. Smaller keeps thin things and sharp edges, "
+        "larger is denser where texture is weak.",
     )
     window_slant: float = Field(
         default=1 / 3,
@@ -57,46 +64,19 @@ class SadSettings(MeasuredSettings):
         "at each pixel; 0 = none. On level ground it is baseline / camera height. Its upper and "
         "its lower half are moved against each other by whole disparities, so it is rounded.",
     )
-    prefilter: Literal["sobel", "none"] = Field(
-        default="sobel", description="What is compared: horizontal gradients, or grey levels."
-    )
-    prefilter_cap: int = Field(
-        default=31,
-        ge=1,
-        le=127,
-        description="Gradients (Sobel units) are clipped to plus or minus this.",
-    )
-    cost_cap: int = Field(
-        default=20,
-        ge=1,
-        le=255,
-        description="Largest cost of one pixel; limits what an outlier or an edge can do.",
-    )
     uniqueness_percent: UniquenessPercent = 2
-    min_texture: MinTexture = 0.1
+    min_texture: float = Field(
+        default=0.1,
+        ge=0.0,
+        le=255.0,
+        description="Least mean horizontal gradient in the window, grey levels per pixel. Raise it "
+        "where noise of a dark or plain surface is matched.",
+    )
     half_size_first: bool = Field(
         default=True,
-        description="Match the pictures at half size first, and search each tile only among the "
-        "disparities found there.",
+        description="Match the images at half size first, and search each tile only among the "
+        "disparities found there. Off takes twice the time and may find thinner things.",
     )
-    least_support: float = Field(
-        default=0.03,
-        ge=0.0,
-        le=1.0,
-        description="Least share of a tile's matches at half size that eight disparities must "
-        "have to be searched there.",
-    )
-    median_px: Literal[0, 3, 5] = Field(
-        default=0,
-        description="Each disparity becomes the median of a square of this width around it, holes "
-        "filled for that from the row; 0 = as measured.",
-    )
-
-    @model_validator(mode="after")
-    def _costs_fit(self) -> Self:
-        if self.window_px * (self.window_height_px + 1) * self.cost_cap >= 65535:
-            raise ValueError("window_px x (window_height_px + 1) x cost_cap must stay below 65535")
-        return self
 
 
 class SadMatcher:
@@ -113,9 +93,8 @@ class SadMatcher:
     def __init__(self, settings: SadSettings, threads: int | None = None) -> None:
         self._settings = settings
         self._threads = max(1, threads or os.cpu_count() or 1)
-        prefilter = partial(_prefiltered, settings=settings)
-        self._full = StripSearch(prefilter, self._threads)
-        self._half = StripSearch(prefilter, self._threads)
+        self._full = StripSearch(_prefiltered, self._threads)
+        self._half = StripSearch(_prefiltered, self._threads)
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair.
@@ -126,11 +105,10 @@ class SadMatcher:
         search, rules = self._plan(pair.camera)
         s = self._settings
         with ThreadPoolExecutor(self._threads) as pool:
-            enough = partial(texture, pair, (s.window_px, s.window_height_px), s.min_texture)
+            enough = partial(texture, pair, (s.window_px, s.window_px), s.min_texture)
             tiles = self._tiles(pool, pair, search)
             refined = self._full.find(pool, (pair.left, pair.right), search, tiles, rules, enough)
-            found = finish(refined, s, pool, self._threads)
-        return _smoothed(found, s.median_px)
+            return finish(refined, s, pool, self._threads)
 
     def _tiles(self, pool: Executor, pair: RectifiedPair, search: Search) -> Tiles:
         """Which candidates are offered where."""
@@ -143,7 +121,7 @@ class SadMatcher:
         whole, rules = undivided(halved, shape), half_rules(halved)
         found = self._half.find(pool, views, halved, whole, rules, asked)
         tiles = divided(search, pair.left.shape)
-        wanted = support(self._settings.least_support)
+        wanted = support(_LEAST_SUPPORT)
         values, minimum, ndisp = found.values, search.minimum, search.ndisp
 
         def offer(rows: range) -> None:
@@ -155,25 +133,13 @@ class SadMatcher:
     def _plan(self, camera: RectifiedCamera) -> tuple[Search, Rules]:
         s = self._settings
         ndisp = s.ndisp_within(camera)
-        radius, rows_radius = s.window_px // 2, s.window_height_px // 2
+        radius = s.window_px // 2
         # The middles of the two halves lie half a radius above and below the pixel.
-        lean = math.floor(s.window_slant * rows_radius / 2 + 0.5)
-        search = Search(ndisp, s.min_disparity_px, radius, rows_radius, s.cost_cap, lean)
-        return search, rules_of(s, ndisp, s.window_px * s.window_height_px)
+        lean = math.floor(s.window_slant * radius / 2 + 0.5)
+        search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, lean)
+        return search, rules_of(s, ndisp, s.window_px**2, min_texture=s.min_texture)
 
 
-def _smoothed(disparity: Disparity, median_px: int) -> Disparity:
-    """The disparity with medians for values; what has none gets none."""
-    if median_px == 0 or not disparity.valid.any():
-        return disparity
-    filled = np.nan_to_num(fill_holes(disparity.values))
-    medians = cv2.medianBlur(filled, median_px)
-    values = np.where(disparity.valid, medians, np.float32(np.nan))
-    return replace(disparity, values=values)
-
-
-def _prefiltered(image: UInt8, rows: range, settings: SadSettings) -> UInt8:
+def _prefiltered(image: UInt8, rows: range) -> UInt8:
     """What the windows compare in N rows: uint8 (N, W)."""
-    if settings.prefilter == "none":
-        return image[rows.start : rows.stop]
-    return clipped_gradients(image, settings.prefilter_cap, rows)
+    return clipped_gradients(image, _GRADIENT_CAP, rows)

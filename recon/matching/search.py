@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final
 
 import numpy as np
 from pydantic import AfterValidator, Field
 
 from recon.errors import MatchingError
 from recon.kernels.opposite import average_opposite
-from recon.kernels.refine import EQUIANGULAR, NO_FIT, ODDS, PARABOLA, Refined, Rules, reject
+from recon.kernels.refine import EQUIANGULAR, ODDS, Refined, Rules, reject
 from recon.kernels.speckle import find_speckles
 from recon.matching.strips import in_strips
 from recon.settings import Settings
 from recon.structures import Disparity, Reason, RectifiedCamera
 from recon.structures.arrays import Float32
 
-_FITS: Final = {"none": NO_FIT, "equiangular": EQUIANGULAR, "parabola": PARABOLA}
-"""The codes of `MeasuredSettings.subpixel`."""
+FIT: Final = EQUIANGULAR
+"""How the minimum is placed between whole disparities: the best of the fits for sums of absolute
+differences, whose minimum is pointed."""
+
+LEFT_RIGHT_PX: Final = 1
+"""Largest difference between the disparities of the left and the right view."""
+
+_SIGMA_FLOOR_PX: Final = 0.1
+"""Smallest standard deviation that a disparity is given: noise is not all that makes it wrong."""
+
+_SPECKLE_STEP_PX: Final = 1.0
+"""Largest step of disparity between neighbours of one region."""
 
 _SAME_SURFACE_PX: Final = 1.0
 """Neighbours that differ by more are not averaged: between them may be a step of depth."""
@@ -38,52 +48,29 @@ UniquenessPercent = Annotated[
     Field(
         ge=0,
         le=100,
-        description="By how much the second best cost must exceed the best; 0 = no check.",
-    ),
-]
-MinTexture = Annotated[
-    float,
-    Field(
-        ge=0.0,
-        le=255.0,
-        description="Least mean horizontal gradient in the window, grey levels per pixel.",
+        description="By how much the second best cost must exceed the best; 0 = no check. Raise it "
+        "where repeated structures (fences, tiles) leave wrong matches.",
     ),
 ]
 
 
 class SearchSettings(Settings):
-    """Which disparities are searched, and which of those found are kept."""
+    """Which disparities are searched."""
 
     min_disparity_px: int = Field(
-        default=0, ge=-4096, le=4096, description="First disparity searched; may be negative."
+        default=0,
+        ge=-4096,
+        le=4096,
+        description="First disparity searched; negative for cameras that converge.",
     )
     ndisp: int | None = Field(
         default=None,
         ge=3,
         le=4096,
-        description="Number of disparities searched. None: what the calibration says, or else a "
-        "tenth of the image width, rounded up to a multiple of 16.",
+        description="Number of disparities searched (OpenCV: rounded up to a multiple of 16). "
+        "none = what the calibration says, or else as far as each pair needs. Time and memory "
+        "grow with it; what is nearer than its last disparity is not found.",
     )
-    uniqueness_percent: UniquenessPercent = 0
-    left_right_px: int | None = Field(
-        default=1,
-        ge=0,
-        le=255,
-        description="Largest difference between the left and the right view; None = no check.",
-    )
-    speckle_size_px: int = Field(
-        default=50, ge=0, description="Regions of fewer pixels are removed; 0 = keep all."
-    )
-    speckle_range_px: float = Field(
-        default=1.0,
-        gt=0.0,
-        description="Largest step of disparity between neighbours of one region.",
-    )
-
-    @property
-    def left_right_or_none(self) -> int:
-        """``left_right_px``, negative for no check, as kernels and OpenCV take it."""
-        return -1 if self.left_right_px is None else self.left_right_px
 
     def ndisp_for(self, camera: RectifiedCamera) -> int:
         """Number of disparities to search in the pictures of a camera."""
@@ -110,27 +97,30 @@ class SearchSettings(Settings):
 class MeasuredSettings(SearchSettings):
     """Settings of the matchers with sub-pixel disparities and uncertainties of their own."""
 
-    subpixel: Literal["equiangular", "parabola", "none"] = Field(
-        default="equiangular", description="How the minimum is placed between whole disparities."
-    )
-    min_texture: MinTexture = 0.0
-    sigma_floor_px: float = Field(
-        default=0.1,
-        gt=0.0,
-        le=2.0,
-        description="Smallest standard deviation that a disparity is given.",
+    uniqueness_percent: UniquenessPercent = 0
+    speckle_size_px: int = Field(
+        default=50,
+        ge=0,
+        description="Regions of fewer pixels are removed; 0 = keep all. Grows with the square of "
+        "the image width.",
     )
     average_px: OddInt = Field(
         default=7,
         ge=1,
         le=31,
         description="Each disparity becomes the mean of the pairs of opposite neighbours, in a "
-        "square of this width, that lie on its surface; odd. 1 = as measured.",
+        "square of this width, that lie on its surface; odd. 1 = as measured: noisier, for "
+        "comparisons.",
     )
 
 
 def rules_of(
-    settings: MeasuredSettings, ndisp: int, window_pixels: int, odds: float = ODDS
+    settings: MeasuredSettings,
+    ndisp: int,
+    window_pixels: int,
+    *,
+    min_texture: float = 0.0,
+    odds: float = ODDS,
 ) -> Rules:
     """What the checks ask for, by the settings.
 
@@ -138,17 +128,18 @@ def rules_of(
         settings: Of the matcher.
         ndisp: Number of disparities searched.
         window_pixels: As in `Rules`.
+        min_texture: `Rules.texture`.
         odds: As in `Rules`.
     """
     return Rules(
         ndisp=ndisp,
         minimum=settings.min_disparity_px,
-        fit=_FITS[settings.subpixel],
-        texture=settings.min_texture,
+        fit=FIT,
+        texture=min_texture,
         uniqueness=settings.uniqueness_percent,
-        left_right=settings.left_right_or_none,
+        left_right=LEFT_RIGHT_PX,
         window_pixels=window_pixels,
-        sigma_floor_px=settings.sigma_floor_px,
+        sigma_floor_px=_SIGMA_FLOOR_PX,
         odds=odds,
     )
 
@@ -163,8 +154,7 @@ def finish(refined: Refined, settings: MeasuredSettings, pool: Executor, threads
         threads: Strips of rows averaged at once. The result does not depend on it.
     """
     if settings.speckle_size_px >= 2:
-        largest_step, size = settings.speckle_range_px, settings.speckle_size_px
-        small = find_speckles(refined.values, largest_step, size)
+        small = find_speckles(refined.values, _SPECKLE_STEP_PX, settings.speckle_size_px)
         # A plain number: to look up what an enumeration is takes numba 0.2 ms.
         reject(small, int(Reason.SPECKLE), refined)
     if settings.average_px > 1:

@@ -40,82 +40,62 @@ _SIDE_OVERLAP: Final = 16
 """Columns that neighbouring bands share: horizontal and diagonal paths start there."""
 
 
+_GRADIENT_CAP: Final = 127
+"""Horizontal gradients (Sobel units) are clipped to plus or minus this."""
+
+_COST_CAP: Final = 14
+"""Largest difference of gradients that counts at one pixel."""
+
+_CENSUS_RADIUS: Final = 2
+"""Half the census, whose bits are added to the gradients."""
+
+_LARGEST_COST: Final = _COST_CAP + (2 * _CENSUS_RADIUS + 1) ** 2 - 1
+"""Largest cost of one pixel: of its gradient and of all bits of the census."""
+
+_DESCRIPTOR: Final = Descriptor(_GRADIENT_CAP, _CENSUS_RADIUS, _CENSUS_RADIUS)
+
+_EDGE_GREY_LEVELS: Final = 12
+"""Where the image changes by more along a path, large steps are cheaper: surfaces end there."""
+
+_EDGE_PENALTY_SHARE: Final = 0.25
+"""Share of the large penalty that is left there."""
+
+_OVERLAP_ROWS: Final = 4
+"""Rows that each strip of an image shares with its neighbours, for vertical paths to start in."""
+
+_MEMORY_BYTES: Final = 1536 << 20
+"""Strips are worked on at once as long as they need less than this together."""
+
+
 class SgmSettings(MeasuredSettings):
     """Settings of the semi-global matcher."""
 
-    window_px: OddInt = Field(default=5, ge=1, le=31, description="Width of the window; odd.")
-    window_height_px: OddInt = Field(
-        default=5, ge=1, le=31, description="Height of the window; odd."
-    )
-    prefilter_cap: int = Field(
-        default=127,
-        ge=1,
-        le=127,
-        description="Horizontal gradients (Sobel units) are clipped to plus or minus this.",
-    )
-    cost_cap: int = Field(
-        default=14,
-        ge=0,
-        le=127,
-        description="Largest difference of gradients that counts at one pixel; 0 = census alone.",
-    )
-    census_px: OddInt = Field(
+    window_px: OddInt = Field(
         default=5,
         ge=1,
-        le=9,
-        description="Width of the census, whose bits are added to the gradients; odd. 1 by 1 = "
-        "gradients alone.",
-    )
-    census_height_px: OddInt = Field(
-        default=5, ge=1, le=9, description="Height of the census; odd."
+        le=31,
+        description="Edge of the square window; odd. Larger suppresses noise and widens edges.",
     )
     small_penalty: float = Field(
         default=16.0,
         gt=0.0,
         le=255.0,
-        description="For a step of one disparity along a path, as a mean cost of one pixel.",
+        description="P1: for a step of one disparity along a path, as a mean cost of one pixel. "
+        "Smaller where most surfaces are slanted.",
     )
     large_penalty: float = Field(
         default=50.0,
         gt=0.0,
         le=1000.0,
-        description="For a larger step along a path, as a mean cost of one pixel.",
-    )
-    edge_grey_levels: int = Field(
-        default=12,
-        ge=0,
-        le=255,
-        description="Where the picture changes by more along a path, large steps are cheaper.",
-    )
-    edge_penalty_share: float = Field(
-        default=0.25, ge=0.0, le=1.0, description="Share of large_penalty that is left there."
-    )
-    overlap_rows: int = Field(
-        default=4,
-        ge=0,
-        le=1024,
-        description="Rows that each strip of a picture shares with its neighbours.",
-    )
-    memory_mb: int = Field(
-        default=1536,
-        ge=1,
-        description="Strips are worked on at once as long as they need less than this together.",
+        description="P2: for a larger step along a path, as a mean cost of one pixel. Larger is "
+        "smoother, and fills more of what is plain; smaller keeps thin things.",
     )
 
     @model_validator(mode="after")
-    def _costs_fit(self) -> Self:
-        if self.largest_cost == 0:
-            raise ValueError("cost_cap 0 needs a census of more than one pixel")
+    def _penalties_fit(self) -> Self:
         if self.small_penalty > self.large_penalty:
             raise ValueError("small_penalty must not exceed large_penalty")
-        if self.window_px * self.window_height_px * self.largest_cost > 65535:
-            raise ValueError("window_px x window_height_px x (cost_cap + census) exceeds 65535")
         return self
-
-    @property
-    def largest_cost(self) -> int:
-        """Largest cost of one pixel: of its gradient and of all bits of the census."""
-        return self.cost_cap + self.census_px * self.census_height_px - 1
 
 
 class SgmMatcher:
@@ -145,26 +125,26 @@ class SgmMatcher:
         """
         s = self._settings
         ndisp = s.ndisp_within(pair.camera)
-        window, descriptor, size = _window(s), _descriptor(s), pair.left.shape
+        window, size = _window(s), pair.left.shape
         paths = _paths(s, ndisp, window.levels)
         # A cost is about so many times the mean cost of a pixel.
-        rules = rules_of(s, ndisp, max(1, round(PARTS * window.levels)), _ODDS)
+        rules = rules_of(s, ndisp, max(1, round(PARTS * window.levels)), odds=_ODDS)
         results = self._results.lend(REFINED_BYTES * pair.left.size)
         refined = refined_in(results, *size)
 
         def prepare(strip: range) -> None:
             offsets = column_offsets(window, ndisp, s.min_disparity_px)
-            write_views(pair.right, descriptor, offsets, strip, views)
+            write_views(pair.right, _DESCRIPTOR, offsets, strip, views)
 
         def search(strip: range) -> None:
             with self._scratch.borrow(pair.camera.width_px, paths) as scratch:
                 semi_global_minima(views, window, paths, strip, scratch, minima)
-            enough = texture(pair, (s.window_px, s.window_height_px), s.min_texture, strip)
+            enough = texture(pair, (s.window_px, s.window_px), 0.0, strip)
             refine_minima(minima, enough, rules, strip.start, strip.stop, refined)
 
         strips, at_once = self._strips(pair.camera, paths)
         with (
-            self._planes.borrow(*size, descriptor.planes, window.radius, ndisp) as planes,
+            self._planes.borrow(*size, _DESCRIPTOR.planes, window.radius, ndisp) as planes,
             self._minima.borrow(*size) as minima,
             ThreadPoolExecutor(at_once) as pool,
         ):
@@ -179,24 +159,19 @@ class SgmMatcher:
         # An even number of strips keeps two cores busy to the end.
         rows = -(-height // (2 * -(-height // (2 * _STRIP_ROWS))))
         bytes_each = scratch_bytes(band_columns(camera.width_px, paths), paths)
-        at_once = min(self._threads, (self._settings.memory_mb << 20) // bytes_each)
+        at_once = min(self._threads, _MEMORY_BYTES // bytes_each)
         strips = [range(y, min(y + rows, height)) for y in range(0, height, rows)]
         return strips, max(1, at_once)
-
-
-def _descriptor(settings: SgmSettings) -> Descriptor:
-    s = settings
-    return Descriptor(s.prefilter_cap, s.census_height_px // 2, s.census_px // 2)
 
 
 def _window(settings: SgmSettings) -> Window:
     s = settings
     return scaled_window(
         radius=s.window_px // 2,
-        rows_radius=s.window_height_px // 2,
-        gradient_cap=s.cost_cap,
-        largest=s.largest_cost,
-        levels=_LEVELS / (s.largest_cost + s.small_penalty + s.large_penalty),
+        rows_radius=s.window_px // 2,
+        gradient_cap=_COST_CAP,
+        largest=_LARGEST_COST,
+        levels=_LEVELS / (_LARGEST_COST + s.small_penalty + s.large_penalty),
     )
 
 
@@ -209,8 +184,8 @@ def _paths(settings: SgmSettings, ndisp: int, levels: float) -> Paths:
         minimum=s.min_disparity_px,
         small=small,
         large=large,
-        large_at_edge=max(small, round(large * s.edge_penalty_share)),
-        edge=s.edge_grey_levels,
-        overlap=s.overlap_rows,
+        large_at_edge=max(small, round(large * _EDGE_PENALTY_SHARE)),
+        edge=_EDGE_GREY_LEVELS,
+        overlap=_OVERLAP_ROWS,
         side_overlap=_SIDE_OVERLAP,
     )

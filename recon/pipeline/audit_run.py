@@ -145,6 +145,6 @@ def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None
     own = settings_of(matching.matcher, matching)
     if not isinstance(own, SearchSettings):
         return None
-    if matching.range == "auto" and own.ndisp is None and camera.ndisp is None:
+    if own.ndisp is None and camera.ndisp is None:
         return None
     return own.min_disparity_px + own.ndisp_for(camera)

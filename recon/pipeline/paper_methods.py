@@ -196,8 +196,8 @@ def _matcher(method: str, patch_px: int, config: ReconConfig, threads: int | Non
     """The matcher of a method with the given patch size."""
     if method != CORRECTED:
         return PrintedMatcher(PrintedSettings(patch_px=patch_px, signed=method == AS_PRINTED))
-    window = {"window_px": patch_px, "window_height_px": patch_px}
-    return SadMatcher(SadSettings.parse({**config.matching.sad.model_dump(), **window}), threads)
+    settings = {**config.matching.sad.model_dump(), "window_px": patch_px}
+    return SadMatcher(SadSettings.parse(settings), threads)
 
 
 def _grey_pair(method: str, experiment: Experiment, config: ReconConfig) -> RectifiedPair:

@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from recon.formats.middlebury import read_middlebury_scene, stand_in_camera
-from recon.matching import MatchingSettings, SadSettings, make_matcher
+from recon.matching import (
+    MATCHERS,
+    MatchingSettings,
+    SadSettings,
+    make_matcher,
+    settings_of,
+)
 from recon.matching.range import AutoRangeMatcher, estimate_ndisp
 from recon.matching.search import usual_ndisp
 from recon.rectification import to_grey
@@ -62,12 +68,11 @@ def near_share(found: Disparity, disparity_px: int) -> float:
 @pytest.mark.parametrize("name", ["sad", "sgm", "opencv-bm", "opencv-sgbm"])
 def test_near_plane_is_found_only_with_the_automatic_range(name: str) -> None:
     padded = {key: {"pad": True} for key in ("opencv_bm", "opencv_sgbm")}
-    auto, usual = (
-        make_matcher(name, MatchingSettings.parse({"range": kind, **padded}), 1)
-        for kind in ("auto", "usual")
-    )
-    assert near_share(auto.match(plane(100)), 100) > 0.9
-    assert near_share(usual.match(plane(100)), 100) < 0.1
+    settings, pair = MatchingSettings.parse(padded), plane(100)
+    auto = make_matcher(name, settings, 1)
+    usual = MATCHERS[name](settings_of(name, settings), 1)
+    assert near_share(auto.match(pair), 100) > 0.9
+    assert near_share(usual.match(pair), 100) < 0.1
 
 
 def test_range_of_settings_or_calibration_is_kept() -> None:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from recon.errors import MatchingError, SettingsError
-from recon.matching import SadMatcher, SadSettings
+from recon.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA
+from recon.matching import SadMatcher, SadSettings, sad, search
 from recon.matching.search import usual_ndisp
 from recon.structures import Disparity, Reason, RectifiedPair
 from recon.structures.arrays import Float32, Float64
@@ -32,28 +33,37 @@ def test_whole_shift_is_found_exactly() -> None:
     assert (np.rint(values) == 9).all()
 
 
+@pytest.fixture
+def no_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Disparities stay whole."""
+    monkeypatch.setattr(search, "FIT", NO_FIT)
+
+
+@pytest.mark.usefixtures("no_fit")
 def test_whole_shift_without_fit_has_no_error_at_all() -> None:
     scene = noise(width=WIDTH + 9)
-    settings = SadSettings(ndisp=32, subpixel="none")
-    values = SadMatcher(settings).match(make_pair(scene[:, :WIDTH], scene[:, 9:])).values
+    values = SadMatcher(PLAIN).match(make_pair(scene[:, :WIDTH], scene[:, 9:])).values
     assert (inner(values) == 9).all()
 
 
+@pytest.mark.usefixtures("no_fit")
 @pytest.mark.parametrize("shift", [-6, -1, 0])
 def test_negative_disparities_are_found(shift: int) -> None:
     scene = noise(width=WIDTH + 16)
     left, right = scene[:, 8 : 8 + WIDTH], scene[:, 8 + shift : 8 + shift + WIDTH]
-    settings = SadSettings(min_disparity_px=-10, ndisp=20, subpixel="none")
+    settings = SadSettings(min_disparity_px=-10, ndisp=20)
     values = SadMatcher(settings).match(make_pair(left, right)).values
     assert (inner(values, margin=20) == shift).all()
 
 
 @pytest.mark.parametrize("shift", [5.25, 7.5, 10.8])
-@pytest.mark.parametrize("fit", ["equiangular", "parabola"])
-def test_fraction_of_a_pixel_is_recovered(shift: float, fit: str) -> None:
-    settings = SadSettings.parse({"ndisp": 32, "subpixel": fit})
+@pytest.mark.parametrize("fit", [EQUIANGULAR, PARABOLA])
+def test_fraction_of_a_pixel_is_recovered(
+    shift: float, fit: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(search, "FIT", fit)
     pair = warped_pair(np.full((HEIGHT, WIDTH), shift))
-    values = inner(SadMatcher(settings).match(pair).values)
+    values = inner(SadMatcher(PLAIN).match(pair).values)
     # A tenth of a pixel is what the fits reach on clean images; 0.25 is the mean without a fit.
     assert np.nanmedian(np.abs(values - shift)) < 0.1
     assert np.isfinite(values).mean() > 0.95
@@ -174,9 +184,10 @@ def test_tiny_pictures_give_a_map_of_their_size(shape: tuple[int, int]) -> None:
     assert not found.valid.any()
 
 
+@pytest.mark.usefixtures("no_fit")
 def test_range_wider_than_the_picture_is_searched_where_it_can_be() -> None:
     scene = noise(width=WIDTH + 9)
-    settings = SadSettings(min_disparity_px=-300, ndisp=600, subpixel="none")
+    settings = SadSettings(min_disparity_px=-300, ndisp=600)
     found = SadMatcher(settings).match(make_pair(scene[:, :WIDTH], scene[:, 9:]))
     assert (inner(found.values) == 9).mean() > 0.99
 
@@ -219,9 +230,9 @@ def test_usual_range_is_a_tenth_of_the_width(width: int, ndisp: int) -> None:
     ("values", "complaint"),
     [
         ({"window_px": 10}, "odd"),
-        ({"window_px": 61, "window_height_px": 61, "cost_cap": 20}, "65535"),
+        ({"window_px": 57}, "less than or equal to 55"),
         ({"window": 9}, "unknown setting"),
-        ({"left_right_px": -1}, "left_right_px"),
+        ({"uniqueness_percent": -1}, "uniqueness_percent"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(values: dict[str, int], complaint: str) -> None:
@@ -229,14 +240,8 @@ def test_settings_that_cannot_work_are_refused(values: dict[str, int], complaint
         SadSettings.parse(values)
 
 
-@pytest.mark.parametrize("median_px", [3, 5])
-def test_median_keeps_holes_and_steps_and_takes_outliers(median_px: int) -> None:
-    scene, _ = square_before_wall()
-    plain, smooth = (
-        SadMatcher(SadSettings(ndisp=32, median_px=m)).match(scene) for m in (0, median_px)
-    )
-    np.testing.assert_array_equal(plain.reason, smooth.reason)
-    np.testing.assert_array_equal(plain.confidence, smooth.confidence)
-    assert np.nanmedian(smooth.values[25:55, 80:110]) == pytest.approx(20, abs=0.1)
-    spread = [np.nanstd(found.values[25:55, 80:110]) for found in (plain, smooth)]
-    assert spread[1] <= spread[0]
+def test_costs_of_the_widest_window_fit_the_kernel() -> None:
+    widest = 55
+    with pytest.raises(SettingsError):
+        SadSettings.parse({"window_px": widest + 2})
+    assert widest * (widest + 1) * sad._COST_CAP < 65535

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from recon.errors import MatchingError, SettingsError
-from recon.matching import SgmMatcher, SgmSettings
+from recon.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA
+from recon.matching import SgmMatcher, SgmSettings, search
 from recon.structures import Disparity, Reason, RectifiedPair
 from recon.structures.arrays import Float64
 from tests.matching.pictures import HEIGHT, WIDTH, inner, make_pair, noise, warped_pair
@@ -28,10 +29,11 @@ def test_whole_shift_is_found_exactly() -> None:
 
 
 @pytest.mark.parametrize("shift", [-6, -1, 0])
-def test_negative_disparities_are_found(shift: int) -> None:
+def test_negative_disparities_are_found(shift: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search, "FIT", NO_FIT)
     scene = noise(width=WIDTH + 16)
     left, right = scene[:, 8 : 8 + WIDTH], scene[:, 8 + shift : 8 + shift + WIDTH]
-    settings = SgmSettings(min_disparity_px=-10, ndisp=20, subpixel="none")
+    settings = SgmSettings(min_disparity_px=-10, ndisp=20)
     values = SgmMatcher(settings).match(make_pair(left, right)).values
     assert (inner(values, margin=20) == shift).all()
 
@@ -44,14 +46,15 @@ def test_fraction_of_a_pixel_is_recovered(shift: float) -> None:
     assert np.isfinite(values).mean() > 0.95
 
 
-def test_equiangular_fit_is_the_best_of_the_fits() -> None:
+def test_equiangular_fit_is_the_best_of_the_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     pair = warped_pair(np.full((HEIGHT, WIDTH), 5.25))
+    assert search.FIT == EQUIANGULAR
     error = {}
-    for fit in ("equiangular", "parabola", "none"):
-        settings = SgmSettings.parse({"ndisp": 32, "subpixel": fit})
-        values = inner(SgmMatcher(settings).match(pair).values)
+    for fit in (EQUIANGULAR, PARABOLA, NO_FIT):
+        monkeypatch.setattr(search, "FIT", fit)
+        values = inner(SgmMatcher(PLAIN).match(pair).values)
         error[fit] = np.nanmedian(np.abs(values - 5.25))
-    assert error["equiangular"] < error["parabola"] < error["none"]
+    assert error[EQUIANGULAR] < error[PARABOLA] < error[NO_FIT]
 
 
 def test_slanted_plane_is_followed() -> None:
@@ -164,10 +167,8 @@ def test_range_outside_the_picture_is_an_error() -> None:
     "wrong",
     [
         {"window_px": 4},
-        {"census_px": 2},
-        {"cost_cap": 0, "census_px": 1, "census_height_px": 1},
         {"small_penalty": 70.0},
-        {"window_px": 31, "window_height_px": 31, "cost_cap": 127},
+        {"window_px": 33},
         {"large_penalty": 10.0},
     ],
 )
