@@ -15,7 +15,7 @@ from recon.formats.video import VIDEOS, VideoFile
 from recon.rectification import to_grey
 from recon.sources.picture_pairs import PicturePairs
 from recon.sources.settings import SourceSettings
-from recon.sources.video import open_videos, split_views, view_size
+from recon.sources.video import frames_of, open_videos, split_views, view_size
 from recon.structures.arrays import Bool, Float32, Float64, UInt8
 
 # Looks at a video per second: a hand holds a board still for longer than that.
@@ -47,7 +47,7 @@ def pick_views(
         path: Gives the path to write the file of a name to.
 
     Raises:
-        SourceError: The videos differ in number, rate or size of frames, or nothing stands still.
+        SourceError: The videos do not belong together, or nothing stands still.
         FormatError: A video is damaged.
         OutputError: A file cannot be written.
     """
@@ -55,7 +55,7 @@ def pick_views(
     if len(videos) == 1:
         view_size(videos[0], settings)  # checks that the frames can be halved
     every = max(1, round(videos[0].rate_hz / _LOOKS_HZ))
-    looks = range(0, videos[0].frames, every)
+    looks = range(0, frames_of(videos), every)
     small = np.stack([_shrunk(both) for both in _frames(videos, looks, settings)])
     chosen = [looks[number] for number in _choose(small)]
     if not chosen:

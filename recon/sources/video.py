@@ -18,6 +18,8 @@ from recon.structures import SequenceTruth, StereoPair, check_size
 from recon.structures.arrays import UInt8
 
 _STACKED: Final = frozenset({"top-bottom", "bottom-top"})
+_LONGER: Final = 0.05
+"""Share of a video that may have no partner, as one camera was stopped later than the other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +56,8 @@ class VideoSource:
 
     @property
     def left_out(self) -> int:
-        """0: every frame has both views."""
-        return 0
+        """Frames at the end of the longer video."""
+        return sum(self.roll.alone)
 
     def lines(self, count: int) -> list[int] | None:
         """The line of each frame in a file with one line per frame; see `Roll.lines`."""
@@ -119,13 +121,15 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
     """Open a file with both views, a left file (``settings.right`` is the other), or a folder.
 
     Raises:
-        SourceError: A file is missing, the two differ in number, rate or size of frames, or the
-            calibration is missing.
+        SourceError: A file is missing, the two differ much in number of frames, or in their rate or
+            size, or the calibration is missing.
         FormatError: A file is not a video, or is damaged.
         CalibrationError: The calibration cannot give depth.
     """
     videos = open_videos(_find_videos(path, settings))
-    roll = Roll([""] * videos[0].frames, range(videos[0].frames)).choose(settings, path)
+    frames = frames_of(videos)
+    alone = (videos[0].frames - frames, videos[-1].frames - frames)
+    roll = Roll([""] * frames, range(frames), alone).choose(settings, path)
     size = view_size(videos[0], settings) if len(videos) == 1 else _size(videos[0])
     home = path if path.is_dir() else path.resolve().parent
     rig, texts = read_rig(settings, home, size)
@@ -146,13 +150,18 @@ def open_videos(files: Sequence[Path]) -> tuple[VideoFile, ...]:
     """Open one video, or a left and a right one that belong together.
 
     Raises:
-        SourceError: The two differ in number, rate or size of frames.
+        SourceError: The two differ much in number of frames, or in their rate or size.
         FormatError: A file is missing, not a video, or damaged.
     """
     videos = tuple(open_video(file) for file in files)
     if len(videos) == 2:
         _check_alike(*videos)
     return videos
+
+
+def frames_of(videos: Sequence[VideoFile]) -> int:
+    """Number of frames that all the videos have."""
+    return min(video.frames for video in videos)
 
 
 def list_videos(folder: Path) -> list[str]:
@@ -215,11 +224,13 @@ def _find_videos(path: Path, settings: SourceSettings) -> list[Path]:
 
 
 def _check_alike(left: VideoFile, right: VideoFile) -> None:
-    for what, ours, theirs in (
-        ("numbers of frames", left.frames, right.frames),
-        ("sizes", "{}x{}".format(*_size(left)), "{}x{}".format(*_size(right))),
-        ("frame rates", round(left.rate_hz, 2), round(right.rate_hz, 2)),
-    ):
+    both: dict[str, tuple[object, object]] = {
+        "sizes": ("{}x{}".format(*_size(left)), "{}x{}".format(*_size(right))),
+        "frame rates": (round(left.rate_hz, 2), round(right.rate_hz, 2)),
+    }
+    if abs(left.frames - right.frames) > _LONGER * max(left.frames, right.frames):
+        both["numbers of frames"] = (left.frames, right.frames)
+    for what, (ours, theirs) in both.items():
         if ours != theirs:
             raise SourceError(
                 f"left and right videos have different {what}",

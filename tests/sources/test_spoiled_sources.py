@@ -12,6 +12,7 @@ from recon.errors import ReconError
 from recon.formats.image import write_image
 from recon.formats.video import VideoFile
 from recon.sources import SourceSettings, open_source
+from recon.sources.protocol import IncompleteSource
 from recon.sources.video import view_size
 from recon.structures import RectifiedCamera, StereoPair
 from tests.hostile.refusals import assert_refused, run
@@ -166,6 +167,22 @@ def test_videos_of_different_length_are_refused(drive: Drive, tmp_path: Path) ->
     drives.write_two_videos(pairs, camera, tmp_path)
     drives.write_video(tmp_path / "right.avi", [pair.right for pair in pairs[:-2]])
     fails(tmp_path, r"different numbers of frames \(got left 12, right 10\)")
+
+
+@pytest.mark.parametrize("shorter", ["left", "right"])
+def test_a_video_that_ends_a_little_earlier_is_mapped_as_far_as_it_goes(
+    drive: Drive, tmp_path: Path, shorter: str
+) -> None:
+    camera = drive[1]
+    pairs = [pair for pair in drive[0] for _ in range(2)]
+    drives.write_two_videos(pairs, camera, tmp_path)
+    views = [getattr(pair, shorter) for pair in pairs[:-1]]
+    drives.write_video(tmp_path / f"{shorter}.avi", views)
+    source = open_source(tmp_path)
+    assert isinstance(source, IncompleteSource)
+    assert source.left_out == 1
+    assert "1 right" in source.description or "1 left" in source.description
+    assert len(list(source)) == len(source) == 23
 
 
 def test_numbers_of_pictures_that_differ_are_refused_where_names_tell_nothing(
