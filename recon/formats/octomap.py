@@ -11,11 +11,10 @@ from typing import IO
 
 import numpy as np
 
-from recon.adapters.pyoctomap import decode_octomap
 from recon.errors import MappingError
 from recon.formats.atomic import atomic_path
 from recon.formats.files import reader
-from recon.formats.octomap_leaves import FULL_TREE, octomap_pieces
+from recon.formats.octomap_leaves import octomap_pieces
 from recon.formats.octree import (
     DEPTH,
     INNER,
@@ -178,24 +177,14 @@ def _check(voxels: OccupancyVoxels) -> None:
 
 @reader
 def read_octomap(path: str | PathLike[str]) -> OccupancyVoxels:
-    """Read a ``.bt`` or ``.ot`` file, according to its header; pruned leaves are expanded.
-
-    For a ``.bt`` file, the log-odds are OctoMap's values for occupied and free.
+    """Read an ``.ot`` file; pruned leaves are expanded.
 
     Raises:
-        FormatError: The file is missing or not an OctoMap.
+        FormatError: The file is missing, damaged or not an ``.ot`` file.
     """
-    if not _is_full(Path(path)):
-        return OccupancyVoxels(*decode_octomap(Path(path)))
     pieces = list(octomap_pieces(Path(path)))
     return OccupancyVoxels(
         np.concatenate([piece.keys for piece in pieces]),
         np.concatenate([piece.log_odds for piece in pieces]),
         pieces[0].resolution_m,
     )
-
-
-def _is_full(path: Path) -> bool:
-    """Whether a file has the header of an ``.ot``."""
-    with path.open("rb") as file:
-        return file.readline(200).strip() == FULL_TREE

@@ -34,7 +34,6 @@ PACKAGES: Final[Mapping[str, str]] = MappingProxyType(
         "open3d": "open3d",
         "kiss-icp": "kiss_icp",
         "pymeshlab": "pymeshlab",
-        "pyoctomap": "pyoctomap",
         "matplotlib": "matplotlib",
         "plotly": "plotly",
         "pydantic": "pydantic",

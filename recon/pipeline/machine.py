@@ -24,7 +24,6 @@ _RECORDED: Final = (
     "open3d",
     "kiss-icp",
     "pymeshlab",
-    "pyoctomap",
 )
 
 _STATUS: Final = Path("/proc/self/status")

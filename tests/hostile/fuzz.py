@@ -165,7 +165,6 @@ KINDS: Final[dict[str, Kind]] = {
     ),
     "mesh ply": Kind("m.ply", lambda p: write_mesh(p, _mesh()), read_mesh),
     "octomap ot": Kind("o.ot", _octomap(".ot"), read_octomap),
-    "octomap bt": Kind("o.bt", _octomap(".bt"), read_octomap),
     "nav2": Kind("g.yaml", _grid, read_nav2),
     "nav2 image": Kind("g.pgm", _grid, lambda p: read_nav2(p.with_suffix(".yaml"))),
     "rays": Kind("rays.bin", _rays, lambda p: [len(RayFile(p)), list(RayFile(p))]),
