@@ -1,0 +1,127 @@
+"""The SQLite file of a store: its tables, its transactions, and errors in our words."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from recon.errors import FormatError, OutputError
+
+FORMAT: Final = 1
+"""Number of the format; it grows with every change that older versions cannot read."""
+_OURS: Final = 0x7265636E  # "recn"
+_PAGE_BYTES: Final = 1 << 14
+_RECORDS: Final = """CREATE TABLE record (
+    id INTEGER PRIMARY KEY, kind TEXT NOT NULL, key TEXT NOT NULL, tree TEXT NOT NULL,
+    checksum INTEGER NOT NULL, UNIQUE (kind, key)
+)"""
+_ARRAYS: Final = """CREATE TABLE array (
+    record INTEGER NOT NULL, number INTEGER NOT NULL, dtype TEXT NOT NULL, shape TEXT NOT NULL,
+    layout TEXT NOT NULL, codec TEXT NOT NULL, content BLOB NOT NULL,
+    PRIMARY KEY (record, number)
+)"""
+_ROOM: Final = "check that the folder is writable and the disk is not full"
+
+
+def connect(path: Path | None, *, read_only: bool = False) -> sqlite3.Connection:
+    """A connection without transactions of its own; the lock of the store guards it."""
+    name: str | Path = "" if path is None else path
+    if path is not None and read_only:
+        name = f"{path.absolute().as_uri()}?mode=ro"
+    return sqlite3.connect(
+        name, timeout=0, isolation_level=None, check_same_thread=False, uri=read_only
+    )
+
+
+@contextmanager
+def closed_on_error(database: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
+    """Close a connection where the block that sets it up fails."""
+    try:
+        yield database
+    except BaseException:
+        database.close()
+        raise
+
+
+def make_tables(database: sqlite3.Connection) -> None:
+    """Make an empty file a store."""
+    database.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
+    database.execute("BEGIN")
+    database.execute(f"PRAGMA application_id = {_OURS}")
+    database.execute(f"PRAGMA user_version = {FORMAT}")
+    database.execute(_RECORDS)
+    database.execute(_ARRAYS)
+    database.execute("COMMIT")
+
+
+def begin_to_write(database: sqlite3.Connection) -> None:
+    """Begin a transaction that keeps other writers out."""
+    # Readers go on at the last commit while the next one is written.
+    database.execute("PRAGMA journal_mode = WAL")
+    database.execute("PRAGMA synchronous = FULL")
+    database.execute("BEGIN IMMEDIATE")
+
+
+def begin_to_read(database: sqlite3.Connection) -> None:
+    """Begin a transaction that sees the last commit, whatever is committed later."""
+    database.execute("BEGIN")
+    database.execute("SELECT count(*) FROM record LIMIT 1")
+
+
+def check_format(database: sqlite3.Connection, path: Path) -> None:
+    """Refuse files of other programs, of newer versions, and with tables of another make.
+
+    Raises:
+        FormatError: It is one of these.
+    """
+    try:
+        (ours,) = database.execute("PRAGMA application_id").fetchone()
+        (number,) = database.execute("PRAGMA user_version").fetchone()
+        tables = {sql for (sql,) in database.execute("SELECT sql FROM sqlite_master") if sql}
+    except sqlite3.DatabaseError as error:
+        if "lock" in str(error):
+            raise FormatError("another program is opening the map", where=path) from error
+        raise FormatError("not a map of recon, or damaged", where=path, got=str(error)) from error
+    if ours == _OURS and number > FORMAT:
+        raise FormatError(
+            "the map was written by a newer version of recon",
+            where=path,
+            got=f"format {number}",
+            expected=f"at most {FORMAT}",
+            hint="update recon",
+        )
+    if ours != _OURS or tables != {_RECORDS, _ARRAYS}:
+        raise FormatError("not a map of recon", where=path)
+
+
+@contextmanager
+def writing(path: Path | None) -> Iterator[None]:
+    """Turn errors of the database into ours.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    where = "temporary map" if path is None else path
+    try:
+        yield
+    except sqlite3.Error as error:
+        text = str(error)
+        if "locked" in text:
+            what, hint = "another program uses the map", "wait for it, or write to another one"
+        elif "full" in text:
+            what, hint = "the disk is full", "make room on it"
+        else:
+            what, hint = "cannot write the map", _ROOM
+        raise OutputError(what, where=where, got=text, hint=hint) from error
+    except OSError as error:
+        raise OutputError(
+            "cannot write the map", where=where, got=error.strerror, hint=_ROOM
+        ) from error
+
+
+def beside(path: Path) -> list[Path]:
+    """What SQLite keeps beside a file that is being written."""
+    return [path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal")]

@@ -1,0 +1,314 @@
+"""Records of a map in one file: trees of arrays and plain values, committed whole or not at all."""
+
+from __future__ import annotations
+
+import sqlite3
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from threading import RLock
+from types import TracebackType
+from typing import Any, Final
+
+from typing_extensions import Self
+
+from recon.errors import FormatError
+from recon.formats.files import reading
+from recon.map.arrays import PackedArray, from_text, pack, to_text, unpack
+from recon.map.cache import Cache
+from recon.map.database import (
+    begin_to_read,
+    begin_to_write,
+    beside,
+    check_format,
+    closed_on_error,
+    connect,
+    make_tables,
+    writing,
+)
+
+Key = int | tuple[int, ...]
+_CACHE_BYTES: Final = 100_000_000
+
+
+class Store:
+    """Records under a kind and a key, in one SQLite file.
+
+    What is put or deleted is on disk, and visible to other programs, when it is committed. A
+    program that is killed, or meets a full disk, leaves the last commit. One program writes at a
+    time; others may read meanwhile, and see what was committed when they opened it. Threads of a
+    program share a store.
+
+    Open one with `create`, `open` or `temporary`.
+
+    Attributes:
+        path: The file; None = a temporary one.
+        cache: What was read last, and whatever else is derived from the records.
+    """
+
+    def __init__(self, database: sqlite3.Connection, path: Path | None, cache_bytes: int) -> None:
+        self._database = database
+        self._lock = RLock()
+        self.path = path
+        self.cache = Cache(cache_bytes)
+
+    @classmethod
+    def create(cls, path: Path, *, cache_bytes: int = _CACHE_BYTES) -> Self:
+        """Begin a store; a file at ``path`` is replaced.
+
+        Raises:
+            OutputError: The file cannot be written.
+        """
+        with writing(path):
+            for stale in (path, *beside(path)):
+                stale.unlink(missing_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with closed_on_error(connect(path)) as database:
+                make_tables(database)
+                begin_to_write(database)
+        return cls(database, path, cache_bytes)
+
+    @classmethod
+    def open(cls, path: Path, *, read_only: bool = False, cache_bytes: int = _CACHE_BYTES) -> Self:
+        """Open a store at its last commit.
+
+        Raises:
+            FormatError: The file is missing, no store, of a newer format, or damaged.
+            OutputError: Another program writes to it, or it cannot be written.
+        """
+        with reading(path):
+            with path.open("rb"):  # a missing file, a folder, no permission
+                pass
+            database = connect(path, read_only=read_only)
+        with closed_on_error(database):
+            with reading(path):
+                check_format(database, path)
+                if read_only:
+                    begin_to_read(database)
+            if not read_only:
+                with writing(path):
+                    begin_to_write(database)
+        return cls(database, path, cache_bytes)
+
+    @classmethod
+    def temporary(cls, *, cache_bytes: int = _CACHE_BYTES) -> Self:
+        """Begin a store in a temporary file, which is gone when the store is closed."""
+        with writing(None), closed_on_error(connect(None)) as database:
+            database.execute("PRAGMA journal_mode = OFF")
+            make_tables(database)
+            database.execute("BEGIN")
+        return cls(database, None, cache_bytes)
+
+    def put(self, kind: str, key: Key, tree: Mapping[str, Any], *, compress: bool = False) -> None:
+        """Store a record, in place of an earlier one of that kind and key.
+
+        Args:
+            kind: Its kind, such as ``rays``.
+            key: Its number, or several.
+            tree: Mappings and lists of arrays, numbers (also NaN), texts and None. Tuples are read
+                back as lists.
+            compress: Whether its arrays are worth compressing.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        text, arrays = to_text(tree)
+        packed = [pack(array, compress=compress) for array in arrays]
+        self._insert(kind, _name(key), text, packed)
+
+    def get(self, kind: str, key: Key) -> dict[str, Any]:
+        """A record. Its arrays are read-only; it may be shared, so copy before changing it.
+
+        Raises:
+            FormatError: It is missing or damaged.
+        """
+        return self.cache.get((kind, key), lambda: self.read(kind, key))
+
+    def read(self, kind: str, key: Key) -> dict[str, Any]:
+        """A record read from the file, past the cache; for those that are read once.
+
+        Raises:
+            FormatError: It is missing or damaged.
+        """
+        name = _name(key)
+        with self._reading():
+            with self._lock:
+                text, checksum, rows = self._rows(kind, name)
+            packed = [_array(*row) for row in rows]
+            if _checksum(kind, name, text, packed) != checksum:
+                raise FormatError("a record of the map is damaged", got=f"{kind} {name}")
+            return from_text(text, lambda number: unpack(packed[number]))
+
+    def delete(self, kind: str, key: Key | None = None) -> None:
+        """Delete a record, or all of a kind; it need not exist.
+
+        Raises:
+            OutputError: The file cannot be written.
+        """
+        keys = self.keys(kind) if key is None else [key]
+        with self._lock, writing(self.path):
+            for each in keys:
+                self._remove(kind, _name(each))
+
+    def keys(self, kind: str) -> list[Key]:
+        """The keys of a kind, in order.
+
+        Raises:
+            FormatError: The file is damaged.
+        """
+        with self._lock, self._reading():
+            rows = self._database.execute("SELECT key FROM record WHERE kind = ?", (kind,))
+            found = [_key(name) for (name,) in rows]
+        return sorted(found, key=lambda key: key if isinstance(key, tuple) else (key,))
+
+    def kinds(self) -> list[str]:
+        """The kinds of which there are records, in order.
+
+        Raises:
+            FormatError: The file is damaged.
+        """
+        with self._lock, self._reading():
+            rows = self._database.execute("SELECT DISTINCT kind FROM record ORDER BY kind")
+            return [str(kind) for (kind,) in rows]
+
+    def has(self, kind: str, key: Key) -> bool:
+        """Whether there is such a record."""
+        query = "SELECT 1 FROM record WHERE kind = ? AND key = ?"
+        with self._lock, self._reading():
+            return self._database.execute(query, (kind, _name(key))).fetchone() is not None
+
+    def items(self, kind: str) -> Iterator[tuple[Key, dict[str, Any]]]:
+        """Read the records of a kind in the order of their keys, one at a time, past the cache.
+
+        Raises:
+            FormatError: One is damaged.
+        """
+        return ((key, self.read(kind, key)) for key in self.keys(kind))
+
+    def copy(self, kind: str, other: Store, keys: Iterable[Key] | None = None) -> None:
+        """Copy the records of a kind to another store, as they are, without unpacking them.
+
+        Raises:
+            FormatError: One is damaged.
+            OutputError: The other one cannot be written.
+        """
+        for key in self.keys(kind) if keys is None else keys:
+            with self._lock, self._reading():
+                text, _, rows = self._rows(kind, _name(key))
+                packed = [_array(*row) for row in rows]
+            other._insert(kind, _name(key), text, packed)
+
+    def commit(self) -> None:
+        """Make everything so far permanent, all of it or, after an error, nothing.
+
+        Raises:
+            OutputError: The disk is full, or cannot be written; the file keeps the last commit.
+        """
+        with self._lock, writing(self.path):
+            self._database.execute("COMMIT")
+            self._database.execute("BEGIN IMMEDIATE")
+
+    def refresh(self) -> None:
+        """See what others have committed since a store was opened to read.
+
+        Raises:
+            FormatError: The file is damaged.
+        """
+        with self._lock, self._reading():
+            self.cache.clear()
+            self._database.execute("ROLLBACK")
+            begin_to_read(self._database)
+
+    def close(self) -> None:
+        """Close the file; what was not committed is lost."""
+        with self._lock, suppress(sqlite3.Error):
+            self.cache.clear()
+            if self._database.in_transaction:
+                self._database.execute("ROLLBACK")
+            # One file, which can be read where nothing can be written; not while others read it.
+            with suppress(sqlite3.Error):
+                self._database.execute("PRAGMA journal_mode = DELETE")
+            self._database.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _insert(self, kind: str, name: str, text: str, packed: list[PackedArray]) -> None:
+        checksum = _checksum(kind, name, text, packed)
+        with self._lock, writing(self.path):
+            self._remove(kind, name)
+            row = self._database.execute(
+                "INSERT INTO record (kind, key, tree, checksum) VALUES (?, ?, ?, ?)",
+                (kind, name, text, checksum),
+            ).lastrowid
+            self._database.executemany(
+                "INSERT INTO array VALUES (?, ?, ?, ?, ?, ?, ?)",
+                (
+                    (
+                        row,
+                        number,
+                        a.dtype,
+                        ",".join(map(str, a.shape)),
+                        a.layout,
+                        a.codec,
+                        a.content,
+                    )
+                    for number, a in enumerate(packed)
+                ),
+            )
+
+    def _remove(self, kind: str, name: str) -> None:
+        query = "SELECT id FROM record WHERE kind = ? AND key = ?"
+        found = self._database.execute(query, (kind, name)).fetchone()
+        if found is not None:
+            self._database.execute("DELETE FROM array WHERE record = ?", found)
+            self._database.execute("DELETE FROM record WHERE id = ?", found)
+            self.cache.drop((kind, _key(name)))
+
+    def _rows(self, kind: str, name: str) -> tuple[str, int, list[tuple[Any, ...]]]:
+        """Text, checksum and arrays of a record."""
+        found = self._database.execute(
+            "SELECT id, tree, checksum FROM record WHERE kind = ? AND key = ?", (kind, name)
+        ).fetchone()
+        if found is None:
+            raise FormatError("the map lacks a record", got=f"{kind} {name}")
+        query = """SELECT dtype, shape, layout, codec, content FROM array
+            WHERE record = ? ORDER BY number"""
+        return found[1], found[2], self._database.execute(query, found[:1]).fetchall()
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        with reading("temporary map" if self.path is None else self.path):
+            yield
+
+
+def _name(key: Key) -> str:
+    return ",".join(map(str, key)) if isinstance(key, tuple) else str(key)
+
+
+def _key(name: str) -> Key:
+    numbers = tuple(map(int, name.split(",")))
+    return numbers if len(numbers) > 1 else numbers[0]
+
+
+def _array(dtype: str, shape: str, layout: str, codec: str, content: bytes) -> PackedArray:
+    lengths = tuple(map(int, shape.split(","))) if shape else ()
+    return PackedArray(dtype, lengths, layout, codec, content)
+
+
+def _checksum(kind: str, name: str, text: str, arrays: list[PackedArray]) -> int:
+    """CRC-32 of a record with all that describes it."""
+    found = zlib.crc32(f"{kind} {name} {text}".encode())
+    for array in arrays:
+        head = f"{array.dtype} {array.shape} {array.layout} {array.codec}"
+        found = zlib.crc32(array.content, zlib.crc32(head.encode(), found))
+    return found

@@ -1,0 +1,399 @@
+"""The store of a map: equal to a dictionary, whole after a kill, clear about bad files."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis.extra import numpy as some
+
+from recon.errors import FormatError, OutputError, ReconError
+from recon.map import Store
+from recon.map.cache import Cache
+
+KINDS = ("rays", "submap")
+TYPES = ("<f4", "<f8", "<i2", "<i8", "u1", "?", "<f2", ">f4")
+ARRAYS = st.sampled_from(TYPES).flatmap(
+    lambda dtype: some.arrays(
+        dtype, some.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=9)
+    )
+)
+PLAIN = st.none() | st.booleans() | st.integers(-(2**60), 2**60) | st.floats() | st.text(max_size=5)
+TREES = st.dictionaries(
+    st.text(max_size=5),
+    st.recursive(
+        ARRAYS | PLAIN,
+        lambda inner: (
+            st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
+        ),
+        max_leaves=5,
+    ),
+    max_size=4,
+)
+KEYS = st.integers(-3, 3) | st.tuples(st.integers(-2, 2), st.integers(-20, 20))
+STEPS = st.lists(
+    st.one_of(
+        st.tuples(st.just("put"), st.sampled_from(KINDS), KEYS, st.integers(0, 99), st.booleans()),
+        st.tuples(st.just("delete"), st.sampled_from(KINDS), KEYS),
+        st.tuples(st.just("read"), st.sampled_from(KINDS), KEYS),
+        st.tuples(st.just("commit")),
+        st.tuples(st.just("kill")),
+    ),
+    max_size=25,
+)
+
+
+def _record(seed: int) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    return {"seed": seed, "values": rng.normal(size=(seed, 3)), "none": None}
+
+
+def _same(one: Any, other: Any) -> bool:
+    if isinstance(one, np.ndarray):
+        alike = one.dtype.newbyteorder("=") == other.dtype.newbyteorder("=")
+        return (
+            alike
+            and one.shape == other.shape
+            and np.array_equal(one, other, equal_nan=one.dtype.kind == "f")
+        )
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(_same(one[k], other[k]) for k in one)
+    if isinstance(one, list):
+        return len(one) == len(other) and all(map(_same, one, other))
+    return type(one) is type(other) and (one == other or math.isnan(one))
+
+
+def _reopened(path: Path) -> Store:
+    """The store as another process finds it after a kill: a copy of all files, opened."""
+    copy = path.with_name("copy") / path.name
+    copy.parent.mkdir(exist_ok=True)
+    for stale in copy.parent.iterdir():
+        stale.unlink()
+    for file in path.parent.glob(f"{path.name}*"):
+        (copy.parent / file.name).write_bytes(file.read_bytes())
+    return Store.open(copy)
+
+
+@settings(max_examples=60)
+@given(steps=STEPS)
+def test_any_sequence_of_changes_commits_and_kills_equals_a_dictionary(
+    steps: list[tuple[Any, ...]], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("store") / "map.recon"
+    store, now, kept = Store.create(path, cache_bytes=500), {}, {}
+    for what, *args in steps:
+        if what == "put":
+            kind, key, seed, compress = args
+            store.put(kind, key, _record(seed), compress=compress)
+            now[kind, key] = seed
+        elif what == "delete":
+            store.delete(*args)
+            now.pop(tuple(args), None)
+        elif what == "read" and tuple(args) in now:
+            assert _same(store.get(*args), _record(now[tuple(args)]))
+        elif what == "commit":
+            store.commit()
+            kept = dict(now)
+        elif what == "kill":
+            killed = _reopened(path)
+            store.close()
+            store, path, now = killed, killed.path, dict(kept)
+    for kind in KINDS:
+        keys = store.keys(kind)
+        assert set(keys) == {key for known, key in now if known == kind}
+        ordered = [key if isinstance(key, tuple) else (key,) for key in keys]
+        assert ordered == sorted(ordered)
+        assert [_same(tree, _record(now[kind, key])) for key, tree in store.items(kind)] == [
+            True
+        ] * len(keys)
+    store.close()
+
+
+@settings(max_examples=100)
+@given(tree=TREES, compress=st.booleans())
+def test_any_tree_is_read_as_it_was_put(tree: dict[str, Any], compress: bool) -> None:
+    with Store.temporary() as store:
+        store.put("any", 1, tree, compress=compress)
+        assert _same(tree, store.read("any", 1))
+
+
+def test_large_arrays_shrink_and_keep_their_order_of_axes() -> None:
+    smooth = np.cumsum(np.ones((5000, 3), np.int16), axis=0, dtype=np.int16)
+    turned = np.asfortranarray(np.eye(4))
+    with Store.temporary() as store:
+        store.put("any", 1, {"smooth": smooth, "turned": turned}, compress=True)
+        back = store.get("any", 1)
+    assert np.array_equal(back["smooth"], smooth)
+    assert back["turned"].flags.f_contiguous
+    assert not back["smooth"].flags.writeable
+
+
+@pytest.mark.parametrize(
+    "value", [{1: 2}, {"a": object()}, {"a": np.array([object()])}, {"a": {1}}]
+)
+def test_what_no_file_can_hold_is_refused_before_anything_is_written(value: Any) -> None:
+    with Store.temporary() as store:
+        with pytest.raises(TypeError):
+            store.put("any", 1, value)
+        assert store.keys("any") == []
+
+
+def test_a_reader_sees_whole_commits_while_another_program_writes(tmp_path: Path) -> None:
+    path = tmp_path / "map.recon"
+    with Store.create(path) as writer:
+        writer.put("rays", 0, _record(1))
+        writer.commit()
+        with Store.open(path, read_only=True) as reader:
+            writer.put("rays", 0, _record(2))
+            writer.put("rays", 1, _record(3))
+            assert reader.keys("rays") == [0]
+            writer.commit()
+            assert _same(reader.get("rays", 0), _record(1))
+            assert reader.keys("rays") == [0]
+            reader.refresh()
+            assert _same(reader.get("rays", 0), _record(2))
+            assert reader.keys("rays") == [0, 1]
+
+
+def test_a_second_writer_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "map.recon"
+    with Store.create(path), pytest.raises(OutputError, match="another program uses the map"):
+        Store.open(path)
+
+
+def test_who_only_reads_cannot_write(tmp_path: Path) -> None:
+    Store.create(tmp_path / "map.recon").close()
+    store = Store.open(tmp_path / "map.recon", read_only=True)
+    with pytest.raises(OutputError, match="cannot write"):
+        store.put("rays", 0, {})
+    store.close()
+
+
+def test_a_closed_store_is_one_file_that_needs_no_other_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "map.recon"
+    with Store.create(path) as store:
+        store.put("rays", 0, _record(4))
+        store.commit()
+    assert [p.name for p in tmp_path.iterdir()] == ["map.recon"]
+    with Store.open(path, read_only=True) as store:
+        assert _same(store.get("rays", 0), _record(4))
+        assert [p.name for p in tmp_path.iterdir()] == ["map.recon"]
+
+
+def test_records_are_copied_as_they_are(tmp_path: Path) -> None:
+    with Store.create(tmp_path / "a") as one, Store.create(tmp_path / "b") as other:
+        for number in range(3):
+            one.put("rays", number, _record(number), compress=True)
+        one.copy("rays", other, [0, 2])
+        assert other.keys("rays") == [0, 2]
+        assert _same(other.get("rays", 2), _record(2))
+
+
+_WRITER = """
+import sys
+import numpy as np
+from pathlib import Path
+from recon.map import Store
+store = Store.create(Path(sys.argv[1]))
+for number in range(10_000):
+    store.put("rays", number, {"values": np.full(20_000, number)})
+    store.put("count", 0, {"count": number + 1})
+    store.commit()
+    print(number, flush=True)
+"""
+
+
+@pytest.mark.parametrize("seen", [0, 3, 9])
+def test_a_killed_program_leaves_its_last_commit(tmp_path: Path, seen: int) -> None:
+    path = tmp_path / "map.recon"
+    program = subprocess.Popen([sys.executable, "-c", _WRITER, str(path)], stdout=subprocess.PIPE)
+    assert program.stdout is not None
+    while int(program.stdout.readline()) < seen:
+        continue
+    program.send_signal(signal.SIGKILL)
+    program.wait()
+    with Store.open(path) as store:
+        count = store.get("count", 0)["count"]
+        assert store.keys("rays") == list(range(count))
+        assert count > seen
+        assert all((tree["values"] == key).all() for key, tree in store.items("rays"))
+
+
+_FULL = """
+import resource, sys
+import numpy as np
+from pathlib import Path
+from recon.errors import OutputError
+from recon.map import Store
+store = Store.create(Path(sys.argv[1]))
+store.put("rays", 0, {"values": np.arange(50_000)})
+store.commit()
+resource.setrlimit(resource.RLIMIT_FSIZE, (1_500_000,) * 2)
+try:
+    for number in range(1, 10):
+        store.put("rays", number, {"values": np.arange(50_000)})
+    store.commit()
+except OutputError as error:
+    print(error)
+store.close()
+"""
+
+
+def test_a_full_disk_at_a_commit_leaves_the_one_before(tmp_path: Path) -> None:
+    path = tmp_path / "map.recon"
+    command = [sys.executable, "-c", _FULL, str(path)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert str(path) in done.stdout
+    assert len(done.stdout.splitlines()) == 1
+    with Store.open(path) as store:
+        assert store.keys("rays") == [0]
+        assert np.array_equal(store.get("rays", 0)["values"], np.arange(50_000))
+        store.put("rays", 1, {})
+        store.commit()
+
+
+def test_a_newer_format_is_refused_with_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "map.recon"
+    Store.create(path).close()
+    database = sqlite3.connect(path)
+    database.execute("PRAGMA user_version = 99")
+    database.close()
+    with pytest.raises(FormatError, match=r"newer version of recon \(got format 99") as caught:
+        Store.open(path)
+    assert "\n" not in str(caught.value)
+
+
+def _text(path: Path) -> None:
+    path.write_text("rays of a drive\n" * 100)
+
+
+def _empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def _other(path: Path) -> None:
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE record (id)")
+    database.close()
+
+
+def _view(path: Path) -> None:
+    """A file that would read for ever."""
+    Store.create(path).close()
+    with sqlite3.connect(path) as database:
+        database.execute("DROP TABLE record")
+        database.execute(
+            "CREATE VIEW record AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id FROM n) "
+            "SELECT id, 'rays' AS kind, '0' AS key, '' AS tree, 0 AS checksum FROM n"
+        )
+    database.close()
+
+
+def _folder(path: Path) -> None:
+    path.mkdir()
+
+
+def _missing(path: Path) -> None:
+    pass
+
+
+def _pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize("make", [_text, _empty, _other, _view, _folder, _missing, _pipe])
+@pytest.mark.parametrize("read_only", [False, True])
+def test_files_of_others_are_refused_with_one_line(
+    tmp_path: Path, make: Any, read_only: bool
+) -> None:
+    path = tmp_path / "map.recon"
+    make(path)
+    with pytest.raises(FormatError) as caught:
+        Store.open(path, read_only=read_only)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@settings(max_examples=60)
+@given(place=st.floats(0, 1), bit=st.integers(0, 7), cut=st.booleans())
+def test_a_damaged_file_is_refused_or_gives_what_was_put(
+    place: float, bit: int, cut: bool, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("damaged") / "map.recon"
+    with Store.create(path) as store:
+        for number in range(5):
+            store.put("rays", number, _record(90 + number), compress=number % 2 == 0)
+        store.commit()
+    content = bytearray(path.read_bytes())
+    where = int(place * (len(content) - 1))
+    content[where] ^= 1 << bit
+    path.write_bytes(content[:where] if cut else content)
+    try:
+        with Store.open(path, read_only=True) as store:
+            for key in store.keys("rays"):
+                assert isinstance(key, int)
+                assert _same(store.read("rays", key), _record(90 + key))
+    except ReconError as error:
+        line = str(error)
+    else:
+        return
+    assert str(path) in line
+
+
+def test_a_missing_record_is_named(tmp_path: Path) -> None:
+    with Store.create(tmp_path / "map.recon") as store:
+        with pytest.raises(FormatError, match=r"lacks a record.*rays 7"):
+            store.get("rays", 7)
+        store.delete("rays", 7)
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot write the map"):
+        Store.create(tmp_path / "file" / "map.recon")
+
+
+@given(sizes=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 40)), max_size=40))
+def test_the_cache_stays_within_its_limit_and_returns_what_was_made(
+    sizes: list[tuple[int, int]],
+) -> None:
+    cache, made = Cache(1000), {}
+    for key, count in sizes:
+        size = made.get(key, count)
+        found = cache.get(key, lambda size=size: {"a": np.zeros(size)})
+        made[key] = len(found["a"])
+        assert len(found["a"]) == size
+        assert cache.nbytes <= 1000
+    for key in made:
+        cache.drop(key)
+    assert cache.nbytes == 0
+
+
+def test_values_used_last_stay_in_the_cache() -> None:
+    cache, made = Cache(2000), []
+
+    def make(key: str) -> np.ndarray[Any, Any]:
+        made.append(key)
+        return np.zeros(800, np.uint8)
+
+    for key in "abaca":
+        cache.get(key, lambda key=key: make(key))
+    assert made == ["a", "b", "c"]
+
+
+def test_a_record_that_is_put_again_is_not_read_from_the_cache() -> None:
+    with Store.temporary() as store:
+        store.put("rays", 0, _record(1))
+        store.get("rays", 0)
+        store.put("rays", 0, _record(2))
+        assert _same(store.get("rays", 0), _record(2))
