@@ -21,14 +21,14 @@ from typing import Any
 import cv2
 import numpy as np
 
+from recon.commands.config import load_config
+from recon.commands.demo_source import demo_source
+from recon.core.geometry import se3
+from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
+from recon.core.values.arrays import Float64, UInt8
 from recon.evaluation import evaluate_trajectory
-from recon.geometry import se3
-from recon.pipeline.config import load_config
-from recon.pipeline.demo_source import demo_source
-from recon.pipeline.sequence import map_sequence
+from recon.map.sequence import map_sequence
 from recon.sources import StereoSource, open_source
-from recon.structures import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
-from recon.structures.arrays import Float64, UInt8
 
 NOISE_DN = 4.0
 EXPOSURE_SHARE = 0.15

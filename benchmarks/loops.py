@@ -22,26 +22,26 @@ from unittest.mock import patch
 
 import numpy as np
 
+from recon.commands.config import ReconConfig, load_config
+from recon.core.geometry import se3
+from recon.core.geometry.alignment import fit_points
+from recon.core.geometry.transform import transform_cloud
+from recon.core.values import OCCUPIED, OccupancyGrid, PointCloud, StereoPair, Trajectory
+from recon.core.values.arrays import Float64
 from recon.evaluation import evaluate_map
-from recon.geometry import se3
-from recon.geometry.alignment import fit_points
-from recon.geometry.transform import transform_cloud
-from recon.mapping import (
+from recon.map import (
     add_floors,
     estimate_ground_surface,
     find_floors,
     flatten,
     fusion_range_m,
 )
+from recon.map.sequence import MappedSequence, map_sequence
+from recon.map.workspace import Workspace
 from recon.odometry import Odometry, OdometryFrame, OdometryResult, make_odometry
-from recon.pipeline.config import ReconConfig, load_config
-from recon.pipeline.sequence import MappedSequence, map_sequence
-from recon.pipeline.workspace import Workspace
-from recon.reports.plots import grid_figure, loops_figure
+from recon.report.plots import grid_figure, loops_figure
 from recon.sources.synthetic import SyntheticSource
-from recon.structures import OCCUPIED, OccupancyGrid, PointCloud, StereoPair, Trajectory
-from recon.structures.arrays import Float64
-from recon.synthetic.truth import true_surface
+from recon.street.truth import true_surface
 
 THRESHOLDS_M = (0.2, 0.4)
 BAND_M = (0.3, 2.0)
@@ -185,7 +185,7 @@ def mapped_with(
 
     work = Workspace()
     start = time.perf_counter()
-    with patch("recon.pipeline.sequence.make_odometry", drifting):
+    with patch("recon.map.sequence.make_odometry", drifting):
         mapped = map_sequence(source, config, workspace=work)
     seconds = {n: s for n, s in work.stopwatch.seconds.items() if "loops" in n}
     return mapped, seconds | {"all": time.perf_counter() - start}

@@ -27,15 +27,15 @@ import numpy as np
 import pyoctomap
 from numpy.typing import NDArray
 
-from recon.geometry.se3 import make_transform
-from recon.mapping import OccupancyBuilder, OccupancySettings
-from recon.pipeline.config import load_config
-from recon.pipeline.machine import available_cores
-from recon.pipeline.map_run import MapOptions, run_map
-from recon.reports import present_map
+from recon.commands.config import load_config
+from recon.commands.map import MapOptions, run_map
+from recon.core.geometry.se3 import make_transform
+from recon.core.values import PointCloud
+from recon.core.values.arrays import Float64
+from recon.map import OccupancyBuilder, OccupancySettings
+from recon.report import present_map
+from recon.run.machine import available_cores
 from recon.sources import open_source
-from recon.structures import PointCloud
-from recon.structures.arrays import Float64
 
 Int64 = NDArray[np.int64]
 RAYS = 100_000

@@ -22,12 +22,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recon.formats.middlebury import stand_in_camera
-from recon.matching import SadMatcher, SadSettings
-from recon.matching.sgm import SgmMatcher, SgmSettings
-from recon.pipeline.machine import peak_memory_mb
-from recon.structures import RectifiedPair
-from recon.structures.arrays import UInt8
+from recon.core.values import RectifiedPair
+from recon.core.values.arrays import UInt8
+from recon.io.middlebury.scene import stand_in_camera
+from recon.run.machine import peak_memory_mb
+from recon.stereo.match import SadMatcher, SadSettings
+from recon.stereo.match.sgm import SgmMatcher, SgmSettings
 
 SIZES = ((480, 640, 64), (375, 1242, 128), (994, 1482, 144))
 GROWTH = ((188, 621, 64), (375, 1242, 64), (375, 1242, 128), (375, 1242, 256), (750, 2484, 128))

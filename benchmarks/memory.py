@@ -23,11 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from recon.formats.atomic import write_text
-from recon.formats.trajectory import write_kitti_poses
+from recon.core.values import Trajectory
+from recon.io.atomic import write_text
+from recon.io.trajectory import write_kitti_poses
 from recon.sources.synthetic import SyntheticSource
-from recon.structures import Trajectory
-from recon.synthetic import StreetSettings
+from recon.street import StreetSettings
 from tests.scenery.kitti import write_kitti
 
 FRAMES = (1000, 4000)

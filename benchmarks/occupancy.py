@@ -16,11 +16,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from recon.pipeline.config import load_config
-from recon.pipeline.demo_source import demo_source
-from recon.pipeline.evaluate_occupancy import compare_occupancy
-from recon.pipeline.map_run import MapOptions, run_map
-from recon.pipeline.summary import plain
+from recon.commands.config import load_config
+from recon.commands.demo_source import demo_source
+from recon.commands.evaluate_occupancy import compare_occupancy
+from recon.commands.map import MapOptions, run_map
+from recon.run.summary import plain
 
 ASKED: Final = {
     "voxels.precision": 0.9,

@@ -17,35 +17,14 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from recon.errors import ReconError
-    from recon.evaluation import (
-        MiddleburyRules,
-        evaluate_depth,
-        evaluate_disparity,
-        evaluate_map,
-        evaluate_middlebury,
-        evaluate_trajectory,
-    )
-    from recon.formats.calibration import read_calibration
-    from recon.formats.image import read_image
-    from recon.formats.mesh import read_mesh, write_mesh
-    from recon.formats.middlebury import MiddleburyScene, read_middlebury_scene
-    from recon.formats.pfm import read_pfm, write_pfm
-    from recon.formats.ply import read_ply, write_ply
-    from recon.formats.trajectory import read_trajectory
-    from recon.matching import Matcher
-    from recon.meshing import reconstruct_mesh
-    from recon.pipeline.api import match, reconstruct
-    from recon.pipeline.audit_run import Audit, run_audit
-    from recon.pipeline.config import ReconConfig, load_config
-    from recon.pipeline.map_run import MapOptions, run_map
-    from recon.pipeline.middlebury_run import MiddleburyOptions, run_middlebury
-    from recon.pipeline.occupancy_run import OccupancyRequest, run_occupancy
-    from recon.pipeline.pair_run import PairInput, PairOptions, run_pair
-    from recon.pipeline.sequence import MappedSequence, map_sequence
-    from recon.sources import SourceSettings, StereoSource, open_source
-    from recon.sources.synthetic import SyntheticSource
-    from recon.structures import (
+    from recon.commands.api import match, reconstruct
+    from recon.commands.config import ReconConfig, load_config
+    from recon.commands.evaluate_middlebury import MiddleburyOptions, run_middlebury
+    from recon.commands.map import MapOptions, run_map
+    from recon.commands.occupancy import OccupancyRequest, run_occupancy
+    from recon.commands.pair import PairInput, PairOptions, run_pair
+    from recon.core.errors import ReconError
+    from recon.core.values import (
         CameraIntrinsics,
         Disparity,
         DisparityMetrics,
@@ -61,9 +40,30 @@ if TYPE_CHECKING:
         Trajectory,
         TriangleMesh,
     )
+    from recon.evaluation import (
+        MiddleburyRules,
+        evaluate_depth,
+        evaluate_disparity,
+        evaluate_map,
+        evaluate_middlebury,
+        evaluate_trajectory,
+    )
+    from recon.export.mesh import reconstruct_mesh
+    from recon.io.cameras.calibration import read_calibration
+    from recon.io.images.image import read_image
+    from recon.io.images.pfm import read_pfm, write_pfm
+    from recon.io.middlebury.scene import MiddleburyScene, read_middlebury_scene
+    from recon.io.models.mesh import read_mesh, write_mesh
+    from recon.io.models.ply import read_ply, write_ply
+    from recon.io.trajectory import read_trajectory
+    from recon.map.sequence import MappedSequence, map_sequence
+    from recon.rig.audit.run import Audit, run_audit
+    from recon.sources import SourceSettings, StereoSource, open_source
+    from recon.sources.synthetic import SyntheticSource
+    from recon.stereo.match import Matcher
 
 _HOMES = {
-    "recon.errors": ("ReconError",),
+    "recon.core.errors": ("ReconError",),
     "recon.evaluation": (
         "MiddleburyRules",
         "evaluate_depth",
@@ -72,26 +72,26 @@ _HOMES = {
         "evaluate_middlebury",
         "evaluate_trajectory",
     ),
-    "recon.formats.calibration": ("read_calibration",),
-    "recon.formats.image": ("read_image",),
-    "recon.formats.mesh": ("read_mesh", "write_mesh"),
-    "recon.formats.middlebury": ("MiddleburyScene", "read_middlebury_scene"),
-    "recon.formats.pfm": ("read_pfm", "write_pfm"),
-    "recon.formats.ply": ("read_ply", "write_ply"),
-    "recon.formats.trajectory": ("read_trajectory",),
-    "recon.matching": ("Matcher",),
-    "recon.meshing": ("reconstruct_mesh",),
-    "recon.pipeline.api": ("match", "reconstruct"),
-    "recon.pipeline.audit_run": ("Audit", "run_audit"),
-    "recon.pipeline.config": ("ReconConfig", "load_config"),
-    "recon.pipeline.map_run": ("MapOptions", "run_map"),
-    "recon.pipeline.middlebury_run": ("MiddleburyOptions", "run_middlebury"),
-    "recon.pipeline.occupancy_run": ("OccupancyRequest", "run_occupancy"),
-    "recon.pipeline.pair_run": ("PairInput", "PairOptions", "run_pair"),
-    "recon.pipeline.sequence": ("MappedSequence", "map_sequence"),
+    "recon.io.cameras.calibration": ("read_calibration",),
+    "recon.io.images.image": ("read_image",),
+    "recon.io.models.mesh": ("read_mesh", "write_mesh"),
+    "recon.io.middlebury.scene": ("MiddleburyScene", "read_middlebury_scene"),
+    "recon.io.images.pfm": ("read_pfm", "write_pfm"),
+    "recon.io.models.ply": ("read_ply", "write_ply"),
+    "recon.io.trajectory": ("read_trajectory",),
+    "recon.stereo.match": ("Matcher",),
+    "recon.export.mesh": ("reconstruct_mesh",),
+    "recon.commands.api": ("match", "reconstruct"),
+    "recon.rig.audit.run": ("Audit", "run_audit"),
+    "recon.commands.config": ("ReconConfig", "load_config"),
+    "recon.commands.map": ("MapOptions", "run_map"),
+    "recon.commands.evaluate_middlebury": ("MiddleburyOptions", "run_middlebury"),
+    "recon.commands.occupancy": ("OccupancyRequest", "run_occupancy"),
+    "recon.commands.pair": ("PairInput", "PairOptions", "run_pair"),
+    "recon.map.sequence": ("MappedSequence", "map_sequence"),
     "recon.sources": ("SourceSettings", "StereoSource", "open_source"),
     "recon.sources.synthetic": ("SyntheticSource",),
-    "recon.structures": (
+    "recon.core.values": (
         "CameraIntrinsics",
         "Disparity",
         "DisparityMetrics",

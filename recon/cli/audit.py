@@ -62,13 +62,13 @@ def audit(
       recon audit rides/today --out audited
     """
     with session(quiet=quiet):
-        from recon.pipeline.audit_run import mend_calibration, run_audit
-        from recon.pipeline.config import load_config, source_overrides
-        from recon.pipeline.run_directory import RunDirectory
-        from recon.reports import present_audit
-        from recon.reports.audit_table import audit_lines
+        from recon.cli.show import announce
+        from recon.cli.show.audit_table import audit_lines
+        from recon.commands.config import load_config, source_overrides
+        from recon.report import present_audit
+        from recon.rig.audit.run import mend_calibration, run_audit
+        from recon.run.directory import RunDirectory
         from recon.sources import open_source
-        from recon.viewers import announce
 
         asked = source_overrides(calib, left, right, tolerance, (start, end, stride))
         settings = load_config(config, [*(set_ or ()), *asked])

@@ -52,8 +52,8 @@ def board(
     if wanted is None or (pattern and same):
         raise typer.BadParameter("name one board, such as chess:9x6:25mm")
     with session(quiet=quiet):
-        from recon.reports.board_sheet import write_board
-        from recon.structures.board import parse_board
+        from recon.core.values.board import parse_board
+        from recon.report.board_sheet import write_board
 
         figures = write_board(out, parse_board(wanted), paper, dpi)
     print_json(figures) if json else print_figures("", figures)

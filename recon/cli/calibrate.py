@@ -97,11 +97,11 @@ def calibrate(
       recon calibrate both.mp4 --board chess:9x6:25mm
     """
     with session(quiet=quiet):
-        from recon.pipeline.calibrate_run import CalibrateOptions, run_calibration
-        from recon.pipeline.calibrate_summary import tell_depths
-        from recon.pipeline.config import load_config
-        from recon.reports import present_calibration
-        from recon.structures.board import parse_board
+        from recon.commands.calibrate import CalibrateOptions, run_calibration
+        from recon.commands.config import load_config
+        from recon.core.values.board import parse_board
+        from recon.report import present_calibration
+        from recon.rig.calibrate.summary import tell_depths
 
         # kalibr's lens model has two radial terms.
         fitting = ["calibration.radial_terms=2"] if form is Form.kalibr else []

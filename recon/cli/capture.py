@@ -46,8 +46,8 @@ def capture(
     """
     with session(quiet=quiet):
         from recon.cli.interrupt import until_interrupted
-        from recon.pipeline.capture_run import run_capture
-        from recon.pipeline.config import capture_overrides, load_config
+        from recon.commands.capture import run_capture
+        from recon.commands.config import capture_overrides, load_config
 
         asked = capture_overrides(size, rate, frames, seconds, preview)
         settings = load_config(config, [*(set_ or ()), *asked]).capture

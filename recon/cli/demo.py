@@ -35,11 +35,11 @@ def demo(
       recon demo --frames 60 --seed 3 --out outputs/street
     """
     with session(quiet=quiet):
-        from recon.pipeline.config import load_config
-        from recon.pipeline.demo_source import demo_source
-        from recon.pipeline.map_run import MapOptions, run_map
-        from recon.reports import present_map
-        from recon.viewers import choose_viewer
+        from recon.cli.show import choose_viewer
+        from recon.commands.config import load_config
+        from recon.commands.demo_source import demo_source
+        from recon.commands.map import MapOptions, run_map
+        from recon.report import present_map
 
         given = {"frames": frames, "seed": seed}
         overrides = [f"street.{key}={value}" for key, value in given.items() if value is not None]

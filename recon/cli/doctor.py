@@ -34,14 +34,14 @@ def doctor(
     with session(quiet=quiet):
         from dataclasses import asdict
 
-        from recon.pipeline.doctor import Check, examine
+        from recon.commands.doctor import Check, examine
 
         checks: list[Check] = examine()
     missing = [check for check in checks if check.needed and not check.ok]
     if json:
         print_json({"ok": not missing, "checks": [asdict(check) for check in checks]})
     else:
-        from recon.viewers.checks import print_checks
+        from recon.cli.show.checks import print_checks
 
         print_checks(checks)
     if missing:
@@ -50,7 +50,7 @@ def doctor(
 
 def _compile(*, json: bool, quiet: bool) -> None:
     with session(quiet=quiet):
-        from recon.pipeline.warm_up import compile_kernels
+        from recon.commands.warm_up import compile_kernels
 
         done = compile_kernels()
     if json:

@@ -42,7 +42,7 @@ def disparity(
       recon evaluate disparity disparity.pfm disp0GT.pfm --mask mask0nocc.png
     """
     with session(quiet=quiet):
-        from recon.pipeline.evaluate_run import compare_disparities
+        from recon.commands.evaluate_disparity import compare_disparities
 
         figures = compare_disparities(estimate, truth, mask, scale=scale, confidence=confidence)
     if json:

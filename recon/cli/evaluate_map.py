@@ -64,8 +64,8 @@ def map_(
       recon evaluate map outputs/map/latest lidar_map.ply --align-to poses.txt
     """
     with session(quiet=quiet):
-        from recon.pipeline.evaluate_map import MapFiles, run_evaluate_map
-        from recon.reports.map_errors import present_map_errors
+        from recon.commands.evaluate_map import MapFiles, run_evaluate_map
+        from recon.report.map_errors import present_map_errors
 
         files = MapFiles(
             run=run,

@@ -86,11 +86,11 @@ def middlebury(
     if json and latex:
         raise typer.BadParameter("--json and --latex exclude each other")
     with session(quiet=quiet):
-        from recon.pipeline.config import load_config
-        from recon.pipeline.middlebury_run import MiddleburyOptions, run_middlebury
-        from recon.reports.middlebury_pictures import draw_result, present_middlebury
-        from recon.reports.middlebury_tables import latex_tables, text_tables
-        from recon.viewers.scenes import choose_scene_viewer
+        from recon.cli.show.scenes import choose_scene_viewer
+        from recon.commands.config import load_config
+        from recon.commands.evaluate_middlebury import MiddleburyOptions, run_middlebury
+        from recon.report.middlebury_pictures import draw_result, present_middlebury
+        from recon.report.middlebury_tables import latex_tables, text_tables
 
         options = MiddleburyOptions(
             matchers=_names(matcher),

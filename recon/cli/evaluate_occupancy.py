@@ -31,10 +31,10 @@ def occupancy(
       recon evaluate occupancy outputs/demo/latest --picture compared.png
     """
     with session(quiet=quiet):
-        from recon.formats.image import write_image
-        from recon.pipeline.evaluate_occupancy import compare_occupancy
-        from recon.pipeline.summary import plain
-        from recon.reports.colour import colour_grid_errors
+        from recon.commands.evaluate_occupancy import compare_occupancy
+        from recon.io.images.image import write_image
+        from recon.report.colour import colour_grid_errors
+        from recon.run.summary import plain
 
         compared = compare_occupancy(run, least_frames)
         if picture is not None:

@@ -70,9 +70,9 @@ def trajectory(
       recon evaluate trajectory trajectory_tum.txt groundtruth.txt --align sim3
     """
     with session(quiet=quiet):
+        from recon.commands.evaluate_trajectory import TrajectoryFiles, run_evaluate_trajectory
         from recon.evaluation import TrajectoryRules
-        from recon.pipeline.evaluate_trajectory import TrajectoryFiles, run_evaluate_trajectory
-        from recon.reports.trajectory_report import present_trajectory
+        from recon.report.trajectory_report import present_trajectory
 
         asked = {
             "alignment": align.value,

@@ -102,14 +102,14 @@ def map_(
     if poses is not None and prior is not None:
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
     with session(quiet=quiet):
-        from recon.formats.trajectory import read_trajectory
-        from recon.pipeline.audit_run import quick_warnings
-        from recon.pipeline.config import matching_overrides, source_overrides
-        from recon.pipeline.map_run import MapOptions, run_map
-        from recon.pipeline.resume import MapRequest, open_requested, plan_map
-        from recon.reports import present_map
+        from recon.cli.show import announce, choose_viewer, warn
+        from recon.commands.config import matching_overrides, source_overrides
+        from recon.commands.map import MapOptions, run_map
+        from recon.commands.resume import MapRequest, open_requested, plan_map
+        from recon.io.trajectory import read_trajectory
+        from recon.report import present_map
+        from recon.rig.audit.run import quick_warnings
         from recon.sources import read_prior
-        from recon.viewers import announce, choose_viewer, warn
 
         method = [] if odometry is None else [f"odometry.method={odometry.value}"]
         views = source_overrides(calib, left, right, tolerance, (start, end, stride))

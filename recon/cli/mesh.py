@@ -39,9 +39,9 @@ def mesh(
       recon mesh outputs/map/latest --set mesh.target_faces=500000
     """
     with session(quiet=quiet):
-        from recon.pipeline.config import PAIR_DEFAULTS, load_config
-        from recon.pipeline.finished_run import is_pair_run
-        from recon.pipeline.mesh_run import MeshOptions, run_mesh
+        from recon.commands.config import PAIR_DEFAULTS, load_config
+        from recon.commands.finished_run import is_pair_run
+        from recon.commands.mesh import MeshOptions, run_mesh
 
         options = MeshOptions(out=out, formats=tuple(formats or ("ply",)), threads=threads)
         defaults = PAIR_DEFAULTS if source.is_dir() and is_pair_run(source) else None

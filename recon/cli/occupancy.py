@@ -45,7 +45,7 @@ def occupancy(
       recon occupancy outputs/map/latest --min-height 0.5 --max-height 3.2
     """
     with session(quiet=quiet):
-        from recon.pipeline.occupancy_run import OccupancyRequest, run_occupancy
+        from recon.commands.occupancy import OccupancyRequest, run_occupancy
 
         given = {
             "occupancy.resolution_m": resolution,

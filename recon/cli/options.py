@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.errors import SettingsError
+from recon.core.errors import SettingsError
 
 Out = Annotated[
     Path | None,

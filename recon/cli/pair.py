@@ -9,7 +9,7 @@ import typer
 
 from recon.cli.options import Config, Formats, Json, Matcher, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
-from recon.errors import SettingsError
+from recon.core.errors import SettingsError
 
 Left = Annotated[Path, typer.Argument(help="Left image.")]
 Right = Annotated[Path, typer.Argument(help="Right image.")]
@@ -93,20 +93,20 @@ def pair(
       recon pair left.png right.png --focal 721.5 --baseline 0.54
     """
     with session(quiet=quiet):
-        from recon.pipeline.config import (
+        from recon.cli.show import choose_viewer
+        from recon.commands.config import (
             PAIR_DEFAULTS,
             check_ndisp,
             load_config,
             matching_overrides,
         )
-        from recon.pipeline.pair_input import (
+        from recon.commands.pair import PairOptions, run_pair
+        from recon.commands.pair_input import (
             KnownCamera,
             read_pair_input,
             read_uncalibrated_pair,
         )
-        from recon.pipeline.pair_run import PairOptions, run_pair
-        from recon.reports import present_pair
-        from recon.viewers import choose_viewer
+        from recon.report import present_pair
 
         overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
         settings = load_config(config, overrides, PAIR_DEFAULTS)
@@ -159,16 +159,16 @@ def disparity(
       recon disparity raw_left.png raw_right.png --calib rig.yaml --matcher sgm
     """
     with session(quiet=quiet):
-        from recon.pipeline.config import (
+        from recon.cli.show import choose_viewer
+        from recon.commands.config import (
             PAIR_DEFAULTS,
             check_ndisp,
             load_config,
             matching_overrides,
         )
-        from recon.pipeline.pair_input import read_pair_input
-        from recon.pipeline.pair_run import PairOptions, run_pair
-        from recon.reports import present_disparity
-        from recon.viewers import choose_viewer
+        from recon.commands.pair import PairOptions, run_pair
+        from recon.commands.pair_input import read_pair_input
+        from recon.report import present_disparity
 
         overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
         settings = load_config(config, overrides, PAIR_DEFAULTS)

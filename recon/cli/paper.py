@@ -41,10 +41,10 @@ def paper(
       recon paper MiddEval3/trainingQ --as-printed --out outputs/paper-as-printed
     """
     with session(quiet=quiet):
-        from recon.pipeline.config import PAIR_DEFAULTS, load_config
-        from recon.pipeline.paper_run import PaperOptions, headline, run_paper
-        from recon.pipeline.paper_scenes import default_scenes_folder
-        from recon.reports import present_paper
+        from recon.commands.config import PAIR_DEFAULTS, load_config
+        from recon.commands.paper import PaperOptions, headline, run_paper
+        from recon.evaluation.paper.scenes import default_scenes_folder
+        from recon.report import present_paper
 
         overrides = [*(set_ or ()), *(["paper.as_printed=true"] if as_printed else ())]
         settings = load_config(config, overrides, PAIR_DEFAULTS)

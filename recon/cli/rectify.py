@@ -44,9 +44,9 @@ def rectify(
       recon rectify left.png right.png
     """
     with session(quiet=quiet):
-        from recon.pipeline.config import load_config
-        from recon.pipeline.rectify_run import RectifyOptions, run_rectify
-        from recon.reports import present_rectify
+        from recon.commands.config import load_config
+        from recon.commands.rectify import RectifyOptions, run_rectify
+        from recon.report import present_rectify
 
         options = RectifyOptions(calib, unit_m, out, threads, present_rectify)
         run = run_rectify(left, right, load_config(config, set_ or ()), options)

@@ -18,8 +18,8 @@ from typing import Any, NoReturn, TextIO
 
 import typer
 
-from recon.errors import ReconError
-from recon.kernels.cache import when_compiling
+from recon.core.errors import ReconError
+from recon.core.kernels.cache import when_compiling
 
 INTERRUPTED = 130
 BUG = 3

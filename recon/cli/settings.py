@@ -35,7 +35,7 @@ def settings(
     with session(quiet=quiet):
         from dataclasses import asdict
 
-        from recon.pipeline.settings_list import list_settings, settings_page
+        from recon.commands.settings_list import list_settings, settings_page
 
         groups = list_settings(name)
     if json:
@@ -43,6 +43,6 @@ def settings(
     elif markdown:
         typer.echo(settings_page(groups), nl=False)
     else:
-        from recon.viewers.settings_table import print_settings
+        from recon.cli.show.settings_table import print_settings
 
         print_settings(groups)

@@ -10,7 +10,7 @@ from recon.evaluation.confidence import (
 )
 from recon.evaluation.disparity import evaluate_depth, evaluate_disparity
 from recon.evaluation.map import evaluate_map, nearest_distances, register_cloud, within_reach
-from recon.evaluation.middlebury import MiddleburyRules, evaluate_middlebury
+from recon.evaluation.middlebury.rules import MiddleburyRules, evaluate_middlebury
 from recon.evaluation.occupancy import evaluate_occupancy, grid_on_truth
 from recon.evaluation.trajectory import (
     TrajectoryComparison,

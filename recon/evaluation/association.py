@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.errors import EvaluationError
-from recon.structures import Trajectory
-from recon.structures.arrays import Float64, Int32
+from recon.core.errors import EvaluationError
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64, Int32
 
 
 def associate(

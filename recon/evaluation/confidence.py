@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.errors import EvaluationError
-from recon.structures import Disparity, DisparityTruth
-from recon.structures.arrays import Bool, Float32, Float64, freeze
+from recon.core.errors import EvaluationError
+from recon.core.values import Disparity, DisparityTruth
+from recon.core.values.arrays import Bool, Float32, Float64, freeze
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,16 +8,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from recon.errors import EvaluationError
-from recon.geometry.triangulation import depth_from_disparity
-from recon.structures import (
+from recon.core.errors import EvaluationError
+from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.values import (
     DepthMetrics,
     Disparity,
     DisparityMetrics,
     DisparityTruth,
     RectifiedCamera,
 )
-from recon.structures.arrays import Bool, Float32, Float64, float_map
+from recon.core.values.arrays import Bool, Float32, Float64, float_map
 
 THRESHOLDS_PX: Final = (0.5, 1.0, 2.0, 4.0)
 _QUANTILES: Final = (50, 90, 95, 99)

@@ -6,11 +6,11 @@ from typing import Final
 
 import numpy as np
 
-from recon.adapters import open3d_clouds
-from recon.adapters.open3d_registration import icp
-from recon.errors import EvaluationError
-from recon.structures import MapMetrics, PointCloud, Trajectory
-from recon.structures.arrays import Bool, Float32, Float64
+from recon.core.errors import EvaluationError
+from recon.core.values import MapMetrics, PointCloud, Trajectory
+from recon.core.values.arrays import Bool, Float32, Float64
+from recon.evaluation.open3d_registration import icp
+from recon.stereo.cloud import open3d_clouds
 
 _BAND_PERCENT: Final = (0.1, 99.9)
 _BAND_M: Final = 0.2

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.errors import EvaluationError
-from recon.geometry import se3
-from recon.geometry.projection import project
-from recon.structures import (
+from recon.core.errors import EvaluationError
+from recon.core.geometry import se3
+from recon.core.geometry.projection import project
+from recon.core.values import (
     FREE,
     OCCUPIED,
     UNKNOWN,
@@ -28,7 +28,7 @@ from recon.structures import (
     OccupancyVoxels,
     VoxelMetrics,
 )
-from recon.structures.arrays import Bool, Int32
+from recon.core.values.arrays import Bool, Int32
 
 _TOLERANCE: Final = 1
 _BITS: Final = 21

@@ -6,10 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from recon.geometry.quaternion import quaternion_from_rotation
-from recon.geometry.se3 import exp_so3
-from recon.structures import Trajectory
-from recon.structures.arrays import Float64
+from recon.core.geometry.quaternion import quaternion_from_rotation
+from recon.core.geometry.se3 import exp_so3
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64
 
 # A path is straight if its width (rms) is at most this share of its length (rms).
 _STRAIGHT: Final = 0.05

@@ -8,13 +8,13 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import Field
 
-from recon.errors import EvaluationError
+from recon.core.errors import EvaluationError
+from recon.core.geometry.alignment import Similarity, fit_points
+from recon.core.geometry.se3 import angle_rad, invert
+from recon.core.settings import Settings
+from recon.core.values import LengthErrors, Trajectory, TrajectoryMetrics
+from recon.core.values.arrays import Float64, Int32
 from recon.evaluation.straight import open_roll_axis, without_roll
-from recon.geometry.alignment import Similarity, fit_points
-from recon.geometry.se3 import angle_rad, invert
-from recon.settings import Settings
-from recon.structures import LengthErrors, Trajectory, TrajectoryMetrics
-from recon.structures.arrays import Float64, Int32
 
 KITTI_LENGTHS_M: Final = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Segment lengths of the KITTI benchmark."""

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.errors import FormatError
+from recon.core.errors import FormatError
 
 RAW: Final = "raw"
 ZLIB: Final = "zlib"

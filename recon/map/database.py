@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from recon.errors import FormatError, OutputError
+from recon.core.errors import FormatError, OutputError
 
 FORMAT: Final = 1
 """Number of the format; it grows with every change that older versions cannot read."""

@@ -13,8 +13,8 @@ from typing import Any, Final
 
 from typing_extensions import Self
 
-from recon.errors import FormatError
-from recon.formats.files import reading
+from recon.core.errors import FormatError
+from recon.io.files import reading
 from recon.map.arrays import PackedArray, from_text, pack, to_text, unpack
 from recon.map.cache import Cache
 from recon.map.database import (

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.geometry.projection import project, unproject
-from recon.geometry.se3 import apply, invert
-from recon.geometry.triangulation import depth_from_disparity
+from recon.core.geometry.projection import project, unproject
+from recon.core.geometry.se3 import apply, invert
+from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.values import Disparity, RectifiedCamera
+from recon.core.values.arrays import Float64, UInt8
 from recon.odometry.settings import AgreementSettings
-from recon.structures import Disparity, RectifiedCamera
-from recon.structures.arrays import Float64, UInt8
 
 Int64 = NDArray[np.int64]
 

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from recon.geometry.se3 import invert
+from recon.core.geometry.se3 import invert
+from recon.core.values import Disparity
+from recon.core.values.arrays import Float64
 from recon.odometry.agreement import Sight, explain_motion
 from recon.odometry.protocol import (
     Odometry,
@@ -18,8 +20,6 @@ from recon.odometry.protocol import (
     tree_of,
 )
 from recon.odometry.settings import TrustSettings
-from recon.structures import Disparity
-from recon.structures.arrays import Float64
 
 
 @dataclass(frozen=True, eq=False)

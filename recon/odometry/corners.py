@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.values.arrays import Bool, Float32, UInt8
 from recon.odometry.settings import CornerSettings
-from recon.structures.arrays import Bool, Float32, UInt8
 
 
 def find_corners(grey: UInt8, taken_uv: Float32, settings: CornerSettings) -> Float32:

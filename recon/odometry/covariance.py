@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.structures.arrays import Float64
+from recon.core.values.arrays import Float64
 
 _LEAST_INFORMATION: Final = 1e-4
 """Added along every direction, so that one that nothing fixes gets 100 m or rad, not infinity."""

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from recon.adapters.kiss_icp import IcpAlignment, KissIcp, KissIcpOptions
-from recon.geometry.se3 import apply, as_step, as_transform, invert, orthonormalise
+from recon.core.geometry.se3 import apply, as_step, as_transform, invert, orthonormalise
+from recon.core.values import PointCloud
+from recon.core.values.arrays import Float64
 from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.gate import Correction, Verdict, icp_covariance, icp_may_help, judge
+from recon.odometry.kiss_icp import IcpAlignment, KissIcp, KissIcpOptions
 from recon.odometry.points import select_points
 from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import (
@@ -23,8 +25,6 @@ from recon.odometry.protocol import (
 from recon.odometry.settings import FusedSettings, VisualSettings
 from recon.odometry.surfaces import describe_surfaces, fit_surfaces
 from recon.odometry.visual import VisualEstimate, VisualOdometry
-from recon.structures import PointCloud
-from recon.structures.arrays import Float64
 
 
 @dataclass(frozen=True, eq=False)

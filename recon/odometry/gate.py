@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from recon.core.values.arrays import Float64
 from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.settings import GateSettings
 from recon.odometry.surfaces import Fit
-from recon.structures.arrays import Float64
 
 
 @dataclass(frozen=True, eq=False)

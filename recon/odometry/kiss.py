@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from recon.adapters.kiss_icp import KissIcp, KissIcpOptions
-from recon.geometry.se3 import invert
+from recon.core.geometry.se3 import invert
+from recon.core.values.arrays import Float64
+from recon.odometry.kiss_icp import KissIcp, KissIcpOptions
 from recon.odometry.points import all_points
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.odometry.settings import KissSettings
-from recon.structures.arrays import Float64
 
 
 class KissOdometry:

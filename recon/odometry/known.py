@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from recon.errors import RegistrationError
-from recon.geometry.se3 import invert
+from recon.core.errors import RegistrationError
+from recon.core.geometry.se3 import invert
+from recon.core.values import Trajectory
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
-from recon.structures import Trajectory
 
 
 class KnownPoses:

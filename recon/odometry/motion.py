@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from recon.geometry.se3 import exp_so3, invert, log_so3, make_transform, orthonormalise
-from recon.structures.arrays import Float64
+from recon.core.geometry.se3 import exp_so3, invert, log_so3, make_transform, orthonormalise
+from recon.core.values.arrays import Float64
 
 _LONGEST_GAP: Final = 20.0
 """In intervals: over a longer gap the motion is not extrapolated in time, but repeated once."""

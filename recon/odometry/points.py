@@ -5,12 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from recon.geometry.projection import unproject
-from recon.geometry.triangulation import depth_from_disparity, depth_sigma
+from recon.core.geometry.projection import unproject
+from recon.core.geometry.triangulation import depth_from_disparity, depth_sigma
+from recon.core.values import Disparity, PointCloud
+from recon.core.values.arrays import Bool, Float32, UInt8
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.settings import PointSettings
-from recon.structures import Disparity, PointCloud
-from recon.structures.arrays import Bool, Float32, UInt8
 
 
 def select_points(frame: OdometryFrame, settings: PointSettings) -> PointCloud:

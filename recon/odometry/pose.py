@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from recon.geometry.projection import project
-from recon.geometry.se3 import apply, invert, make_transform
+from recon.core.geometry.projection import project
+from recon.core.geometry.se3 import apply, invert, make_transform
+from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import Bool, Float64
 from recon.odometry.settings import PoseSettings
-from recon.structures import RectifiedCamera
-from recon.structures.arrays import Bool, Float64
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,12 +7,12 @@ from typing import Final
 
 import numpy as np
 
-from recon.errors import RegistrationError
-from recon.geometry.se3 import invert, make_transform, orthonormalise
+from recon.core.errors import RegistrationError
+from recon.core.geometry.se3 import invert, make_transform, orthonormalise
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64
 from recon.odometry.motion import part_of
 from recon.odometry.settings import PriorSettings
-from recon.structures import Trajectory
-from recon.structures.arrays import Float64
 
 _CAMERA_FROM_BODY: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Camera axes (x right, y down, z forward) of body axes (x forward, y left, z up)."""

@@ -9,15 +9,15 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from recon.errors import RegistrationError
-from recon.geometry.se3 import as_step, invert
+from recon.core.errors import RegistrationError
+from recon.core.geometry.se3 import as_step, invert
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64
 from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.settings import OdometrySettings, PriorSettings
 from recon.odometry.visual import VisualOdometry
-from recon.structures import Trajectory
-from recon.structures.arrays import Float64
 
 Axes = Literal["camera", "body"]
 

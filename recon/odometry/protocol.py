@@ -7,9 +7,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from recon.errors import ShapeError
-from recon.structures import Disparity, RectifiedPair
-from recon.structures.arrays import Float64, freeze, frozen_array
+from recon.core.errors import ShapeError
+from recon.core.values import Disparity, RectifiedPair
+from recon.core.values.arrays import Float64, freeze, frozen_array
 
 
 @dataclass(frozen=True, eq=False)

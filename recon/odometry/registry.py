@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from recon.errors import SettingsError
+from recon.core.errors import SettingsError
+from recon.core.values import Trajectory
 from recon.odometry.checked import CheckedOdometry
 from recon.odometry.fused import FusedOdometry
 from recon.odometry.kiss import KissOdometry
@@ -13,7 +14,6 @@ from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import Odometry
 from recon.odometry.settings import OdometrySettings
 from recon.odometry.visual import VisualOdometry
-from recon.structures import Trajectory
 
 ODOMETRIES: Final[dict[str, Callable[[OdometrySettings, MotionPrior | None], Odometry]]] = {
     "visual": lambda settings, prior: VisualOdometry(settings.visual, prior),

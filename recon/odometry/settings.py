@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from recon.settings import Settings
+from recon.core.settings import Settings
 
 
 class CornerSettings(Settings):

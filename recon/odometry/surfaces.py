@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.geometry.se3 import step_jacobian
-from recon.kernels.voxels import pack_keys
-from recon.structures.arrays import Bool, Float64
+from recon.core.geometry.se3 import step_jacobian
+from recon.core.kernels.voxels import pack_keys
+from recon.core.values.arrays import Bool, Float64
 
 MIN_POINTS = 10
 """Least number of points in a cell with a surface."""

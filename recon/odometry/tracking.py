@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from recon.adapters.opencv_features import exposed_as
+from recon.core.values import Disparity
+from recon.core.values.arrays import Bool, Float32, UInt8
 from recon.odometry.settings import TrackSettings
-from recon.structures import Disparity
-from recon.structures.arrays import Bool, Float32, UInt8
+from recon.stereo.rectify.opencv_features import exposed_as
 
 
 def follow(

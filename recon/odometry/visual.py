@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from recon.adapters.opencv_features import match_features
-from recon.geometry.projection import project, unproject
-from recon.geometry.se3 import apply, as_step, invert
-from recon.geometry.triangulation import depth_from_disparity
+from recon.core.geometry.projection import project, unproject
+from recon.core.geometry.se3 import apply, as_step, invert
+from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.values import Disparity, RectifiedCamera
+from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.odometry.corners import find_corners
 from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.motion import Motion
@@ -20,8 +21,7 @@ from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResul
 from recon.odometry.settings import VisualSettings
 from recon.odometry.tracking import follow, sample_disparity
 from recon.odometry.window import TrackWindow, adjust, misfits, pose_information, reprojection
-from recon.structures import Disparity, RectifiedCamera
-from recon.structures.arrays import Float32, Float64, UInt8
+from recon.stereo.rectify.opencv_features import match_features
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon.geometry.se3 import apply, as_transform, invert
-from recon.kernels import bundle
+from recon.core.geometry.se3 import apply, as_transform, invert
+from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import Bool, Float64, frozen_array
+from recon.odometry.kernels import bundle
 from recon.odometry.settings import WindowSettings
-from recon.structures import RectifiedCamera
-from recon.structures.arrays import Bool, Float64, frozen_array
 
 
 @dataclass(frozen=True, eq=False)

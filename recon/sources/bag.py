@@ -11,10 +11,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.adapters.rosbags import CAMERA_INFO, Bag, BagImage
-from recon.errors import FormatError, SourceError
-from recon.formats.image import decode_image
-from recon.formats.ros_image import pixels_of_ros_image
+from recon.core.errors import FormatError, SourceError
+from recon.core.values import SequenceTruth, StereoPair, check_size
+from recon.core.values.arrays import Float64, UInt8
+from recon.io.images.image import decode_image
+from recon.io.images.ros_image import pixels_of_ros_image
 from recon.sources.bag_rig import rig_of_messages
 from recon.sources.bag_topics import (
     camera_info_topic,
@@ -26,9 +27,8 @@ from recon.sources.bag_topics import (
 from recon.sources.files import join_pair
 from recon.sources.pairing import Roll, StampPairs, check_increasing, check_most, pair_stamps
 from recon.sources.rig import Rig, as_rectified, read_rig
+from recon.sources.rosbags import CAMERA_INFO, Bag, BagImage
 from recon.sources.settings import SourceSettings
-from recon.structures import SequenceTruth, StereoPair, check_size
-from recon.structures.arrays import Float64, UInt8
 
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
 _S: Final = 1e-9

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.adapters.rosbags import BagCameraInfo
-from recon.errors import CalibrationError
-from recon.formats.camera_info import check_shift, rig_of_camera_infos
-from recon.formats.files import reading
-from recon.formats.lens_models import ROS_MODELS, lens_of
+from recon.core.errors import CalibrationError
+from recon.core.values import CameraIntrinsics, RectifiedCamera
+from recon.io.cameras.camera_info import check_shift, rig_of_camera_infos
+from recon.io.cameras.lens_models import ROS_MODELS, lens_of
+from recon.io.files import reading
 from recon.sources.rig import Rig
-from recon.structures import CameraIntrinsics, RectifiedCamera
+from recon.sources.rosbags import BagCameraInfo
 
 
 def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rectified: bool) -> Rig:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import PurePosixPath
 
-from recon.adapters.rosbags import CAMERA_INFO, COMPRESSED, IMAGE, POSES, Bag
-from recon.errors import SourceError
+from recon.core.errors import SourceError
 from recon.sources.pairing import find_partners, partner_names
+from recon.sources.rosbags import CAMERA_INFO, COMPRESSED, IMAGE, POSES, Bag
 from recon.sources.settings import SourceSettings
 
 _PICTURES = (IMAGE, COMPRESSED)

@@ -19,17 +19,17 @@ from typing import Final
 
 import numpy as np
 
-from recon.errors import SourceError
-from recon.formats.euroc import NS, read_euroc_camera, read_euroc_truth
-from recon.geometry.se3 import invert
+from recon.core.errors import SourceError
+from recon.core.geometry.se3 import invert
+from recon.core.values import SequenceTruth, StereoCalibration, check_size
+from recon.core.values.arrays import Float64
+from recon.io.cameras.euroc import NS, read_euroc_camera, read_euroc_truth
 from recon.sources.pairing import check_increasing
 from recon.sources.pictures import PictureSource, pair_listed, picture_size
 from recon.sources.rig import Rig, as_rectified, find_calibration, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_stamped_names
 from recon.sources.truth import truth_at
-from recon.structures import SequenceTruth, StereoCalibration, check_size
-from recon.structures.arrays import Float64
 
 _TRUTH: Final = "state_groundtruth_estimate0"
 

@@ -6,14 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from recon.errors import SourceError
-from recon.formats.calibration import read_calibration
-from recon.formats.files import StrPath
-from recon.formats.image import MAX_MEGAPIXELS, eight_bits, find_white, read_levels
-from recon.formats.kitti import kitti_cameras_of
-from recon.formats.middlebury import stand_in_camera
-from recon.structures import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
-from recon.structures.arrays import UInt8
+from recon.core.errors import SourceError
+from recon.core.values import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
+from recon.core.values.arrays import UInt8
+from recon.io.cameras.calibration import read_calibration
+from recon.io.cameras.kitti import kitti_cameras_of
+from recon.io.files import StrPath
+from recon.io.images.image import MAX_MEGAPIXELS, eight_bits, find_white, read_levels
+from recon.io.middlebury.scene import stand_in_camera
 
 LEAST_SIDE_PX: Final = 16
 """Smaller than this, an image does not hold the windows that are compared."""

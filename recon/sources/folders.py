@@ -19,9 +19,10 @@ from typing import Final
 
 import numpy as np
 
-from recon.errors import SourceError
-from recon.formats.frames_csv import FRAMES, read_frames
-from recon.formats.kitti import kitti_cameras_of
+from recon.core.errors import SourceError
+from recon.core.values.arrays import Float64
+from recon.io.cameras.kitti import kitti_cameras_of
+from recon.io.frames_csv import FRAMES, read_frames
 from recon.sources.pairing import (
     Roll,
     check_increasing,
@@ -44,7 +45,6 @@ from recon.sources.rig import read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_times_of_pairs
 from recon.sources.truth import read_tum_truth
-from recon.structures.arrays import Float64
 
 DEFAULT_RATE_HZ: Final = 10.0
 _TIMES: Final = "times.txt"

@@ -18,12 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.errors import SourceError
-from recon.formats.files import StrPath
-from recon.formats.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset
-from recon.formats.kitti_raw import read_kitti_rig
-from recon.formats.trajectory import read_kitti_poses
-from recon.geometry.se3 import invert
+from recon.core.errors import SourceError
+from recon.core.geometry.se3 import invert
+from recon.core.values import SequenceTruth, Trajectory
+from recon.core.values.arrays import Float64
+from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset
+from recon.io.cameras.kitti_raw import read_kitti_rig
+from recon.io.files import StrPath
+from recon.io.trajectory import read_kitti_poses
 from recon.sources.pairing import Roll, natural_key
 from recon.sources.pictures import (
     PictureFrame,
@@ -35,8 +37,6 @@ from recon.sources.pictures import (
 from recon.sources.rig import Rig, as_rectified, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_times_of_pairs
-from recon.structures import SequenceTruth, Trajectory
-from recon.structures.arrays import Float64
 
 
 def open_kitti(

@@ -15,15 +15,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from recon.errors import SourceError
-from recon.formats.kitti_raw import read_kitti_rig
+from recon.core.errors import SourceError
+from recon.core.values import RectifiedCamera
+from recon.io.cameras.kitti_raw import read_kitti_rig
 from recon.sources.kitti import choose_cameras
 from recon.sources.pairing import check_increasing
 from recon.sources.pictures import PictureSource, list_pictures, pair_listed, picture_size
 from recon.sources.rig import Rig, as_rectified, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_dates
-from recon.structures import RectifiedCamera
 
 _CALIBRATION: Final = "calib_cam_to_cam.txt"
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from recon.errors import CalibrationError
-from recon.formats.files import StrPath
-from recon.formats.middlebury import MiddleburyScene, read_middlebury_scene
-from recon.structures import RectifiedCamera, SequenceTruth, StereoPair
+from recon.core.errors import CalibrationError
+from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair
+from recon.io.files import StrPath
+from recon.io.middlebury.scene import MiddleburyScene, read_middlebury_scene
 
 
 class MiddleburySource:

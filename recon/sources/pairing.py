@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from recon.errors import SourceError
+from recon.core.errors import SourceError
+from recon.core.values.arrays import Float64
 from recon.sources.settings import SourceSettings
-from recon.structures.arrays import Float64
 
 # Parts of names that mark the left camera, each with its counterpart for the right one.
 SIDES: Final = (

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from recon.errors import SourceError
+from recon.core.errors import SourceError
 from recon.sources.pairing import natural_key
 from recon.sources.pictures import PICTURES
 

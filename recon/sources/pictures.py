@@ -10,19 +10,19 @@ from typing import Final
 
 import numpy as np
 
-from recon.errors import SourceError
-from recon.formats.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
-from recon.sources.files import join_pair
-from recon.sources.pairing import Roll, check_most, natural_key, pair_stamps
-from recon.sources.settings import SourceSettings
-from recon.structures import (
+from recon.core.errors import SourceError
+from recon.core.values import (
     RectifiedCamera,
     SequenceTruth,
     StereoCalibration,
     StereoPair,
     check_size,
 )
-from recon.structures.arrays import Float64, UInt8
+from recon.core.values.arrays import Float64, UInt8
+from recon.io.images.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
+from recon.sources.files import join_pair
+from recon.sources.pairing import Roll, check_most, natural_key, pair_stamps
+from recon.sources.settings import SourceSettings
 
 PICTURES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 

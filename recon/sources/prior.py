@@ -9,16 +9,16 @@ from typing import Final
 
 import numpy as np
 
-from recon.adapters.rosbags import POSES, TRANSFORMS, Bag, BagPose
-from recon.errors import FormatError, SourceError
-from recon.formats.trajectory import read_tum
-from recon.geometry.quaternion import rotation_from_quaternion
-from recon.geometry.se3 import invert, make_transform
+from recon.core.errors import FormatError, SourceError
+from recon.core.geometry.quaternion import rotation_from_quaternion
+from recon.core.geometry.se3 import invert, make_transform
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64
+from recon.io.trajectory import read_tum
 from recon.sources.bag import BagSource
 from recon.sources.bag_topics import list_topics
 from recon.sources.protocol import StereoSource
-from recon.structures import Trajectory
-from recon.structures.arrays import Float64
+from recon.sources.rosbags import POSES, TRANSFORMS, Bag, BagPose
 
 _STATIC: Final = "tf_static"
 _ODOMETRY: Final = "odom"

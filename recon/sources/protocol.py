@@ -6,14 +6,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from recon.structures import (
+from recon.core.values import (
     OccupancyTruth,
     RectifiedCamera,
     SequenceTruth,
     StereoCalibration,
     StereoPair,
 )
-from recon.structures.arrays import Float64
+from recon.core.values.arrays import Float64
 
 
 @runtime_checkable

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from recon.errors import SourceError
-from recon.formats.files import StrPath, reading
-from recon.formats.frames_csv import FRAMES
-from recon.formats.middlebury_layout import find_layout
-from recon.formats.video import VIDEOS
+from recon.core.errors import SourceError
+from recon.io.files import StrPath, reading
+from recon.io.frames_csv import FRAMES
+from recon.io.images.video import VIDEOS
+from recon.io.middlebury.layout import find_layout
 from recon.sources.bag import BAGS, find_bags, open_bag
 from recon.sources.euroc import open_euroc
 from recon.sources.folders import find_views, open_folders

@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from recon.errors import SourceError
-from recon.formats.calibration import read_calibration
+from recon.core.errors import SourceError
+from recon.core.values import RectifiedCamera, StereoCalibration
+from recon.io.cameras.calibration import read_calibration
 from recon.sources.settings import SourceSettings
-from recon.structures import RectifiedCamera, StereoCalibration
 
 Rig = RectifiedCamera | StereoCalibration
 

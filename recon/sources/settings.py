@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from recon.formats.image import MAX_MEGAPIXELS
-from recon.settings import Settings
+from recon.core.settings import Settings
+from recon.io.images.image import MAX_MEGAPIXELS
 
 
 class SourceSettings(Settings):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.structures import (
+from recon.core.values import (
     DisparityTruth,
     OccupancyTruth,
     RectifiedCamera,
@@ -16,11 +16,11 @@ from recon.structures import (
     StereoPair,
     Trajectory,
 )
-from recon.structures.arrays import Float64
-from recon.synthetic.render import StreetCamera, SyntheticFrame
-from recon.synthetic.settings import StreetSettings
-from recon.synthetic.street import StreetWorld, build_street
-from recon.synthetic.truth import true_occupancy, true_surface
+from recon.core.values.arrays import Float64
+from recon.street.render import StreetCamera, SyntheticFrame
+from recon.street.settings import StreetSettings
+from recon.street.street import StreetWorld, build_street
+from recon.street.truth import true_occupancy, true_surface
 
 _BT601 = np.array([0.299, 0.587, 0.114])
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.errors import FormatError, SourceError
-from recon.formats.files import read_table, read_text, reader
+from recon.core.errors import FormatError, SourceError
+from recon.core.values.arrays import Float64
+from recon.io.files import read_table, read_text, reader
 from recon.sources.pairing import Roll
-from recon.structures.arrays import Float64
 
 
 @reader

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.formats.trajectory import read_tum
-from recon.geometry.interpolation import interpolate_poses
-from recon.geometry.se3 import invert
-from recon.structures import SequenceTruth, Trajectory
-from recon.structures.arrays import Float64
+from recon.core.geometry.interpolation import interpolate_poses
+from recon.core.geometry.se3 import invert
+from recon.core.values import SequenceTruth, Trajectory
+from recon.core.values.arrays import Float64
+from recon.io.trajectory import read_tum
 
 
 def truth_at(

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.errors import SourceError
+from recon.core.errors import SourceError
 from recon.sources.pairing import check_increasing, find_partners
 from recon.sources.pictures import PictureSource, is_picture, pair_listed, picture_size
 from recon.sources.rig import read_rig

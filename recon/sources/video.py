@@ -9,13 +9,13 @@ from typing import Final
 
 import numpy as np
 
-from recon.errors import FormatError, SourceError
-from recon.formats.video import VIDEOS, VideoFile, open_video
+from recon.core.errors import FormatError, SourceError
+from recon.core.values import SequenceTruth, StereoPair, check_size
+from recon.core.values.arrays import UInt8
+from recon.io.images.video import VIDEOS, VideoFile, open_video
 from recon.sources.pairing import Roll, find_partners
 from recon.sources.rig import Rig, read_rig
 from recon.sources.settings import SourceSettings
-from recon.structures import SequenceTruth, StereoPair, check_size
-from recon.structures.arrays import UInt8
 
 _STACKED: Final = frozenset({"top-bottom", "bottom-top"})
 _LONGER: Final = 0.05

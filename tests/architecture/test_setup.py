@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from recon.pipeline.doctor import SYSTEM_LIBRARIES
+from recon.commands.doctor import SYSTEM_LIBRARIES
 
 
 def test_doctor_looks_for_the_libraries_that_setup_installs(root: Path) -> None:

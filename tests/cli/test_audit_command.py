@@ -12,9 +12,9 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from recon.cli import app
+from recon.core.values import RectifiedCamera, StereoPair
 from recon.sources import SourceSettings, open_source
-from recon.structures import RectifiedCamera, StereoPair
-from tests.audit import faults
+from tests.rig.audit import faults
 from tests.sources import drives
 
 pytest.importorskip("rosbags", reason="extra ros")

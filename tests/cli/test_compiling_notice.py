@@ -7,7 +7,7 @@ import io
 import pytest
 
 from recon.cli.session import session
-from recon.kernels.cache import announce
+from recon.core.kernels.cache import announce
 
 
 class Terminal(io.StringIO):

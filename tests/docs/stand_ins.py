@@ -15,27 +15,27 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.formats.image import write_image
-from recon.formats.pfm import write_pfm
-from recon.formats.ply import write_ply
-from recon.formats.recon_yaml import write_recon_calibration
-from recon.formats.trajectory import write_tum
-from recon.geometry.se3 import invert, make_transform
-from recon.pipeline.config import load_config
-from recon.pipeline.map_run import MapOptions, run_map
+from recon.commands.config import load_config
+from recon.commands.map import MapOptions, run_map
+from recon.core.geometry.se3 import invert, make_transform
+from recon.core.values import PointCloud, RectifiedCamera
+from recon.core.values.board import parse_board
+from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.io.images.image import write_image
+from recon.io.images.pfm import write_pfm
+from recon.io.models.ply import write_ply
+from recon.io.trajectory import write_tum
 from recon.sources.synthetic import SyntheticSource
-from recon.structures import PointCloud, RectifiedCamera
-from recon.structures.board import parse_board
-from recon.synthetic.settings import StreetSettings
+from recon.street.settings import StreetSettings
 from tests.docs.blocks import ROOT
 from tests.flow.test_newcomer import BOARD, photograph, take_pictures
 from tests.flow.test_paper import write_scene
-from tests.matching.plugins import install_plugin
 from tests.scenery.boards import board_rig, place_boards, render_views
 from tests.scenery.kitti import write_kitti
 from tests.scenery.planes import slanted_pair
 from tests.sources import drives
 from tests.sources.bags import Recording, write_bag
+from tests.stereo.match.plugins import install_plugin
 
 SCENES = ("ArtL", "Jadeplant", "Pipes", "Teddy")
 CAMERA = """  camera_model: pinhole

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.errors import EvaluationError
+from recon.core.errors import EvaluationError
+from recon.core.values import Trajectory
 from recon.evaluation import associate
 from recon.evaluation.association import nearest_times
-from recon.structures import Trajectory
 
 TIMES = st.lists(st.floats(0, 100), min_size=1, max_size=30).map(np.sort)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.errors import EvaluationError
+from recon.core.errors import EvaluationError
+from recon.core.values import Disparity, DisparityTruth, Reason
 from recon.evaluation import measure_reliability, measure_sparsification
-from recon.structures import Disparity, DisparityTruth, Reason
 
 SHAPE = (200, 500)
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.errors import EvaluationError
+from recon.core.errors import EvaluationError
+from recon.core.values import PointCloud
 from recon.evaluation.map import evaluate_map, nearest_distances
-from recon.formats.ply import read_ply
-from recon.structures import PointCloud
+from recon.io.models.ply import read_ply
 
 
 def grid(offset_m: float = 0.0, step_m: float = 0.5, n: int = 20) -> np.ndarray:

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.errors import EvaluationError
+from recon.core.errors import EvaluationError
+from recon.core.values import DisparityTruth, RectifiedCamera
 from recon.evaluation import MiddleburyRules, evaluate_depth, evaluate_middlebury
-from recon.evaluation.middlebury import at_truth_size, scene_weight, weighted_mean
-from recon.structures import DisparityTruth, RectifiedCamera
+from recon.evaluation.middlebury.rules import at_truth_size, scene_weight, weighted_mean
 
 N = float("nan")
 

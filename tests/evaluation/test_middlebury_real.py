@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from recon.pipeline.config import load_config
-from recon.pipeline.middlebury_run import MiddleburyOptions, run_middlebury
+from recon.commands.config import load_config
+from recon.commands.evaluate_middlebury import MiddleburyOptions, run_middlebury
 
 pytestmark = pytest.mark.real
 

@@ -7,10 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.errors import EvaluationError
-from recon.evaluation import evaluate_occupancy
-from recon.mapping.axes import AXES_MAP_WORLD
-from recon.structures import (
+from recon.core.errors import EvaluationError
+from recon.core.values import (
     FREE,
     OCCUPIED,
     UNKNOWN,
@@ -19,6 +17,8 @@ from recon.structures import (
     OccupancyVoxels,
     RectifiedCamera,
 )
+from recon.evaluation import evaluate_occupancy
+from recon.map.axes import AXES_MAP_WORLD
 
 EDGE_M = 0.2
 # Half as wide as far: sees 10 m to each side at 20 m.

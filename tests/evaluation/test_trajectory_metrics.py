@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.errors import EvaluationError
+from recon.core.errors import EvaluationError
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.values import Trajectory
 from recon.evaluation.trajectory import (
     KITTI_LENGTHS_M,
     TrajectoryRules,
@@ -17,8 +19,6 @@ from recon.evaluation.trajectory import (
     evaluate_trajectory,
     segments_of,
 )
-from recon.geometry.se3 import exp_so3, make_transform
-from recon.structures import Trajectory
 
 
 def trajectory(poses: np.ndarray) -> Trajectory:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from recon.pipeline.config import load_config
-from recon.pipeline.demo_source import demo_source
-from recon.pipeline.map_run import MapOptions, run_map
+from recon.commands.config import load_config
+from recon.commands.demo_source import demo_source
+from recon.commands.map import MapOptions, run_map
 
 SMALL_STREET = {"frames": 12, "width_px": 256, "height_px": 96, "focal_px": 150.0}
 

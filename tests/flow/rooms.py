@@ -6,13 +6,13 @@ from functools import cached_property
 
 import numpy as np
 
-from recon.geometry.se3 import make_transform
+from recon.core.geometry.se3 import make_transform
+from recon.core.values.arrays import Float64
 from recon.sources.synthetic import SyntheticSource
-from recon.structures.arrays import Float64
-from recon.synthetic.settings import StreetSettings
-from recon.synthetic.shapes import boxes
-from recon.synthetic.soup import Material, Paint, merge
-from recon.synthetic.street import StreetWorld, rig
+from recon.street.settings import StreetSettings
+from recon.street.shapes import boxes
+from recon.street.soup import Material, Paint, merge
+from recon.street.street import StreetWorld, rig
 
 ROOM_M = (9.0, 8.0, 3.2)
 TABLE_M = ((3.6, 3.4, 0.0), (4.6, 4.4, 0.75))

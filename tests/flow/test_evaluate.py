@@ -14,9 +14,9 @@ import pytest
 from typer.testing import CliRunner
 
 from recon.cli import app
-from recon.formats.disparity_png import write_disparity_png
-from recon.formats.image import read_image
-from recon.formats.pfm import write_pfm
+from recon.io.images.disparity_png import write_disparity_png
+from recon.io.images.image import read_image
+from recon.io.images.pfm import write_pfm
 from tests.hostile import refusals
 
 HEIGHT, WIDTH, NEAR, FAR = 48, 96, 12, 4

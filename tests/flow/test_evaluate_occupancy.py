@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.errors import EvaluationError, FormatError
-from recon.formats.nav2 import read_nav2
-from recon.pipeline.evaluate_occupancy import compare_occupancy
-from recon.pipeline.summary import plain
-from recon.reports.colour import GRID_ERRORS, GRID_NOT_COUNTED
+from recon.commands.evaluate_occupancy import compare_occupancy
+from recon.core.errors import EvaluationError, FormatError
+from recon.io.occupancy.nav2 import read_nav2
+from recon.report.colour import GRID_ERRORS, GRID_NOT_COUNTED
+from recon.run.summary import plain
 from tests.hostile import refusals
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from recon.sources.synthetic import SyntheticSource
-from recon.synthetic.settings import StreetSettings
+from recon.street.settings import StreetSettings
 from tests.scenery.kitti import write_kitti
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

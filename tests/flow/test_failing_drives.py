@@ -15,16 +15,16 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.errors import CalibrationError, MappingError
-from recon.geometry.se3 import exp_so3, make_transform
-from recon.matching import make_matcher
+from recon.commands.config import load_config
+from recon.commands.map import MapOptions, MapRun, run_map
+from recon.core.errors import CalibrationError, MappingError
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.values import RectifiedCamera, RectifiedPair, Trajectory
 from recon.odometry import OdometryFrame, OdometryResult, make_odometry
-from recon.pipeline.config import load_config
-from recon.pipeline.map_run import MapOptions, MapRun, run_map
 from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource
-from recon.structures import RectifiedCamera, RectifiedPair, Trajectory
-from recon.synthetic import StreetSettings
+from recon.stereo.match import make_matcher
+from recon.street import StreetSettings
 from tests.scenery.kitti import write_kitti
 
 CAMERA = RectifiedCamera(

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from recon.sources.synthetic import SyntheticSource
-from recon.synthetic import StreetSettings
+from recon.street import StreetSettings
 from tests.scenery.kitti import write_kitti
 
 STREET = StreetSettings(frames=24, width_px=192, height_px=72, focal_px=110.0)

@@ -11,16 +11,16 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from recon.formats.trajectory import read_tum
-from recon.pipeline.config import load_config
-from recon.pipeline.frame import FrameReconstructor
-from recon.pipeline.map_run import MapOptions, MapRun, run_map
-from recon.pipeline.observer import FrameResult
-from recon.reports import present_map
+from recon.commands.config import load_config
+from recon.commands.map import MapOptions, MapRun, run_map
+from recon.core.values import SequenceTruth, StereoPair
+from recon.io.trajectory import read_tum
+from recon.map.observer import FrameResult
+from recon.report import present_map
 from recon.sources.synthetic import SyntheticSource
-from recon.structures import SequenceTruth, StereoPair
-from recon.synthetic import StreetSettings
-from recon.synthetic.settings import CORNER_M
+from recon.stereo.frame import FrameReconstructor
+from recon.street import StreetSettings
+from recon.street.settings import CORNER_M
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from recon.sources.synthetic import SyntheticSource
-from recon.synthetic import StreetSettings
+from recon.street import StreetSettings
 from tests.scenery.kitti import write_kitti
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "mapping.py"

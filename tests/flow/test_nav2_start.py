@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 import yaml
 
-from recon.formats.trajectory import read_tum
-from recon.geometry.se3 import invert
-from recon.pipeline.config import load_config
-from recon.pipeline.demo_source import demo_source
-from recon.pipeline.map_run import MapOptions, run_map
-from recon.pipeline.occupancy_run import OccupancyRequest, run_occupancy
+from recon.commands.config import load_config
+from recon.commands.demo_source import demo_source
+from recon.commands.map import MapOptions, run_map
+from recon.commands.occupancy import OccupancyRequest, run_occupancy
+from recon.core.geometry.se3 import invert
+from recon.core.values import Trajectory
+from recon.io.trajectory import read_tum
 from recon.sources import StereoSource
 from recon.sources.kitti import open_kitti
-from recon.structures import Trajectory
 from tests.flow.rooms import RoomSource
 
 FOOTPRINT_M = 0.3

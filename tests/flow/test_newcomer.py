@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from recon.adapters.opencv_lens import unproject
 from recon.cli import app
-from recon.formats.image import write_image
-from recon.formats.ply import read_ply
-from recon.geometry.se3 import apply
-from recon.rectification import RectificationSettings, plan_turns
-from recon.structures import CameraIntrinsics, StereoCalibration
-from recon.structures.board import parse_board
+from recon.core.geometry.se3 import apply
+from recon.core.values import CameraIntrinsics, StereoCalibration
+from recon.core.values.board import parse_board
+from recon.io.images.image import write_image
+from recon.io.models.ply import read_ply
+from recon.stereo.rectify import RectificationSettings, plan_turns
+from recon.stereo.rectify.lens import unproject
 from tests.scenery.boards import Lens, board_rig, place_boards, render_views
 
 BOARD = "chess:9x6:25mm"

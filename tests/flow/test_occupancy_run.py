@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.errors import FormatError, OutputError, ReconError, SettingsError
-from recon.formats.nav2 import read_nav2
-from recon.formats.octomap import read_octomap
-from recon.pipeline import frame
-from recon.pipeline.evaluate_occupancy import compare_occupancy
-from recon.pipeline.occupancy_run import OccupancyRequest, run_occupancy
-from recon.structures import OCCUPIED
+from recon.commands.evaluate_occupancy import compare_occupancy
+from recon.commands.occupancy import OccupancyRequest, run_occupancy
+from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
+from recon.core.values import OCCUPIED
+from recon.io.occupancy.nav2 import read_nav2
+from recon.io.occupancy.octomap import read_octomap
+from recon.stereo import frame
 from tests.hostile.refusals import assert_refused, run
 
 

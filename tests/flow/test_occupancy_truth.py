@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from recon.pipeline.config import load_config
-from recon.pipeline.demo_source import demo_source
-from recon.pipeline.map_run import MapOptions, run_map
-from recon.structures import OccupancyMetrics
+from recon.commands.config import load_config
+from recon.commands.demo_source import demo_source
+from recon.commands.map import MapOptions, run_map
+from recon.core.values import OccupancyMetrics
 
 STREETS = {
     "curve": ["street.seed=1"],

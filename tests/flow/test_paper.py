@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.formats.image import write_image
-from recon.formats.pfm import read_pfm, write_pfm
-from recon.formats.ply import read_ply
-from recon.pipeline.config import PAIR_DEFAULTS, load_config
-from recon.pipeline.paper_run import PaperOptions, headline, run_paper
-from recon.structures import RectifiedCamera
+from recon.commands.config import PAIR_DEFAULTS, load_config
+from recon.commands.paper import PaperOptions, headline, run_paper
+from recon.core.values import RectifiedCamera
+from recon.io.images.image import write_image
+from recon.io.images.pfm import read_pfm, write_pfm
+from recon.io.models.ply import read_ply
 from tests.hostile import refusals
 from tests.scenery.planes import PlanePair, slanted_pair, step_pair
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from recon.pipeline.config import load_config
-from recon.pipeline.map_run import MapOptions, run_map
+from recon.commands.config import load_config
+from recon.commands.map import MapOptions, run_map
 from recon.sources.synthetic import SyntheticSource
-from recon.synthetic import StreetSettings
+from recon.street import StreetSettings
 
 STREET = StreetSettings(frames=6, width_px=320, height_px=120, focal_px=180.0)
 

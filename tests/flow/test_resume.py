@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from recon.errors import FormatError, OutputError, SettingsError
-from recon.formats.tree_file import write_tree
-from recon.pipeline.config import ReconConfig, load_config
-from recon.pipeline.map_run import MapOptions, MapRun, run_map
-from recon.pipeline.observer import FrameResult
+from recon.commands.config import ReconConfig, load_config
+from recon.commands.map import MapOptions, MapRun, run_map
+from recon.core.errors import FormatError, OutputError, SettingsError
+from recon.io.tree_file import write_tree
+from recon.map.observer import FrameResult
 from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource
-from recon.synthetic import StreetSettings
+from recon.street import StreetSettings
 from tests.scenery.kitti import write_kitti
 
 STREET = StreetSettings(frames=24, width_px=192, height_px=72, focal_px=110.0)

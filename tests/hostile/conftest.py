@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.formats.image import write_image
-from recon.pipeline.config import load_config
-from recon.pipeline.demo_source import demo_source
-from recon.pipeline.map_run import MapOptions, run_map
+from recon.commands.config import load_config
+from recon.commands.demo_source import demo_source
+from recon.commands.map import MapOptions, run_map
+from recon.io.images.image import write_image
 from recon.sources.synthetic import SyntheticSource
-from recon.synthetic import StreetSettings
+from recon.street import StreetSettings
 from tests.hostile.runs import DRIVE, interrupt_run
 from tests.scenery.kitti import write_kitti
 

@@ -11,31 +11,31 @@ import cv2
 import numpy as np
 from hypothesis import strategies as st
 
-from recon.formats.calibration import read_calibration
-from recon.formats.disparity_png import read_disparity_png
-from recon.formats.euroc import read_euroc_camera, read_euroc_truth
-from recon.formats.frames_csv import read_frames
-from recon.formats.image import read_image
-from recon.formats.mesh import read_mesh, write_mesh
-from recon.formats.nav2 import read_nav2, write_nav2
-from recon.formats.octomap import read_octomap, write_octomap
-from recon.formats.pfm import read_pfm, write_pfm
-from recon.formats.ply import read_ply, read_ply_pieces, write_ply
-from recon.formats.rays import RayFile, RayWriter
-from recon.formats.trajectory import read_trajectory
-from recon.formats.tree_file import read_tree, write_tree
-from recon.formats.video import open_video
-from recon.formats.yaml_file import read_yaml
-from recon.mapping import OccupancySettings, ray_grain
-from recon.pipeline.config import load_config
-from recon.sources.times import read_dates, read_stamped_names
-from recon.structures import (
+from recon.commands.config import load_config
+from recon.core.values import (
     OccupancyGrid,
     OccupancyVoxels,
     PointCloud,
     RayCloud,
     TriangleMesh,
 )
+from recon.io.cameras.calibration import read_calibration
+from recon.io.cameras.euroc import read_euroc_camera, read_euroc_truth
+from recon.io.frames_csv import read_frames
+from recon.io.images.disparity_png import read_disparity_png
+from recon.io.images.image import read_image
+from recon.io.images.pfm import read_pfm, write_pfm
+from recon.io.images.video import open_video
+from recon.io.models.mesh import read_mesh, write_mesh
+from recon.io.models.ply import read_ply, read_ply_pieces, write_ply
+from recon.io.occupancy.nav2 import read_nav2, write_nav2
+from recon.io.occupancy.octomap import read_octomap, write_octomap
+from recon.io.rays import RayFile, RayWriter
+from recon.io.trajectory import read_trajectory
+from recon.io.tree_file import read_tree, write_tree
+from recon.io.yaml_file import read_yaml
+from recon.map import OccupancySettings, ray_grain
+from recon.sources.times import read_dates, read_stamped_names
 from tests.hostile.calibrations import CAMERA_INFO, VALID
 
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import recon
 from recon.cli import app
-from recon.errors import ReconError
+from recon.core.errors import ReconError
 
 
 @dataclass(frozen=True)

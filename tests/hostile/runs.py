@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from recon.pipeline.config import load_config
-from recon.pipeline.map_run import MapOptions, run_map
-from recon.pipeline.observer import FrameResult
-from recon.pipeline.resume import MapRequest
+from recon.commands.config import load_config
+from recon.commands.map import MapOptions, run_map
+from recon.commands.resume import MapRequest
+from recon.map.observer import FrameResult
 from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource
-from recon.synthetic import StreetSettings
+from recon.street import StreetSettings
 from tests.scenery.kitti import write_kitti
 
 DRIVE = {"frames": 6, "width_px": 256, "height_px": 96, "focal_px": 150.0}

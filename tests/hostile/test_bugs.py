@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from recon.matching import registry
+from recon.stereo.match import registry
 from tests.hostile.refusals import run
 
 

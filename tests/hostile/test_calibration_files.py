@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from recon.formats.calibration import read_calibration
-from recon.formats.files import SMALL_FILE_BYTES
+from recon.io.cameras.calibration import read_calibration
+from recon.io.files import SMALL_FILE_BYTES
 from tests.hostile.calibrations import (
     CONTENT,
     KALIBR,

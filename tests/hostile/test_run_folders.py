@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 import pytest
 
-from recon.formats.tree_file import read_tree, write_tree
-from recon.pipeline.run_directory import STARTED
+from recon.io.tree_file import read_tree, write_tree
+from recon.run.directory import STARTED
 from tests.hostile.calibrations import deep
 from tests.hostile.refusals import assert_refused, run
 from tests.hostile.runs import STATE

@@ -7,7 +7,7 @@ from typing import Final
 
 import pytest
 
-from recon.pipeline.config import load_config
+from recon.commands.config import load_config
 from tests.hostile.calibrations import CONTENT, NUMBERS, deep, expanding
 from tests.hostile.refusals import assert_refused, refusal, run
 

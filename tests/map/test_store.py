@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis.extra import numpy as some
 
-from recon.errors import FormatError, OutputError, ReconError
+from recon.core.errors import FormatError, OutputError, ReconError
 from recon.map import Store
 from recon.map.cache import Cache
 
@@ -233,7 +233,7 @@ _FULL = """
 import resource, sys
 import numpy as np
 from pathlib import Path
-from recon.errors import OutputError
+from recon.core.errors import OutputError
 from recon.map import Store
 store = Store.create(Path(sys.argv[1]))
 store.put("rays", 0, {"values": np.arange(50_000)})

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.geometry.se3 import exp_so3, make_transform
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.odometry.protocol import OdometryFrame
-from recon.structures import Disparity, Reason, RectifiedCamera, RectifiedPair
 
 CAMERA = RectifiedCamera(
     focal_px=260.0,

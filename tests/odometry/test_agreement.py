@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.geometry.se3 import exp_so3, invert, make_transform
+from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.odometry.agreement import Agreement, Sight, explain_motion, noise_sigma
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.settings import AgreementSettings

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from recon.geometry.se3 import make_transform
+from recon.core.geometry.se3 import make_transform
 from recon.odometry.checked import CheckedOdometry
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
 from recon.odometry.settings import TrustSettings

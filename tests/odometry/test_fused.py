@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.formats.tree_file import read_tree, write_tree
-from recon.geometry.se3 import invert
+from recon.core.geometry.se3 import invert
+from recon.io.tree_file import read_tree, write_tree
 from recon.odometry.fused import FusedOdometry
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.registry import make_odometry

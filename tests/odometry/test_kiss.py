@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from recon.geometry.se3 import invert
+from recon.core.geometry.se3 import invert
 from recon.odometry.kiss import KissOdometry
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.settings import KissSettings

@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from recon.errors import RegistrationError
-from recon.geometry.se3 import invert
+from recon.core.errors import RegistrationError
+from recon.core.geometry.se3 import invert
+from recon.core.values import Trajectory
 from recon.odometry.known import KnownPoses
 from recon.odometry.protocol import Odometry, OdometryFrame
-from recon.structures import Trajectory
 
 See = Callable[..., OdometryFrame]
 

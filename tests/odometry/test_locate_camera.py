@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.geometry.projection import project, unproject
-from recon.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
-from recon.geometry.triangulation import depth_from_disparity
+from recon.core.geometry.projection import project, unproject
+from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
+from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import Float64
 from recon.odometry.pose import locate_camera
 from recon.odometry.settings import PoseSettings
-from recon.structures import RectifiedCamera
-from recon.structures.arrays import Float64
 
 CAMERA = RectifiedCamera(360.0, 320.0, 120.0, 320.0, 0.54, 640, 240)
 T_TRUE = make_transform(exp_so3(np.array([0.002, 0.01, -0.003])), np.array([-0.03, -0.02, 1.0]))

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.geometry.se3 import exp_so3, make_transform
+from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.odometry.motion import Motion, part_of
 
 STEP = make_transform(exp_so3(np.array([0.0, 0.03, 0.01])), np.array([0.1, 0.0, 1.2]))

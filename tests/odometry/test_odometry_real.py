@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+from recon.core.values import RectifiedCamera, RectifiedPair, Trajectory, TrajectoryMetrics
 from recon.evaluation.trajectory import evaluate_trajectory
-from recon.matching.registry import make_matcher
 from recon.odometry.protocol import OdometryFrame, OdometryHealth
 from recon.odometry.registry import make_odometry
-from recon.structures import RectifiedCamera, RectifiedPair, Trajectory, TrajectoryMetrics
+from recon.stereo.match.registry import make_matcher
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 

@@ -4,7 +4,7 @@ import typing
 
 import pytest
 
-from recon.errors import SettingsError
+from recon.core.errors import SettingsError
 from recon.odometry.protocol import Odometry
 from recon.odometry.registry import ODOMETRIES, make_odometry
 from recon.odometry.settings import OdometryName, OdometrySettings

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from recon.core.values import RectifiedCamera
 from recon.odometry.points import all_points, consistent, select_points, textured
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.settings import PointSettings
-from recon.structures import RectifiedCamera
 
 See = Callable[..., OdometryFrame]
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.errors import RegistrationError, SettingsError
-from recon.geometry.se3 import exp_so3, invert, make_transform
+from recon.core.errors import RegistrationError, SettingsError
+from recon.core.geometry.se3 import exp_so3, invert, make_transform
+from recon.core.values import Trajectory
 from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.registry import make_odometry
 from recon.odometry.settings import OdometrySettings, PriorSettings
-from recon.structures import Trajectory
 
 See = Callable[..., OdometryFrame]
 

@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from recon.errors import RegistrationError
-from recon.geometry.se3 import exp_so3, invert, make_transform
+from recon.core.errors import RegistrationError
+from recon.core.geometry.se3 import exp_so3, invert, make_transform
+from recon.core.values import Trajectory
 from recon.odometry.prior_axes import find_axes, first_moving
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.settings import OdometrySettings
-from recon.structures import Trajectory
 
 See = Callable[..., OdometryFrame]
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.geometry.se3 import apply, as_transform
+from recon.core.geometry.se3 import apply, as_transform
 from recon.odometry.surfaces import NOISE_M, describe_surfaces, fit_surfaces
 
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.geometry.se3 import angle_rad, exp_so3, invert, make_transform
+from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
+from recon.core.values import RectifiedPair
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.settings import VisualSettings
 from recon.odometry.visual import VisualOdometry
-from recon.structures import RectifiedPair
 
 See = Callable[..., OdometryFrame]
 

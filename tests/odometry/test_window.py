@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.geometry.projection import project
-from recon.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
+from recon.core.geometry.projection import project
+from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
+from recon.core.values import RectifiedCamera
 from recon.odometry.settings import WindowSettings
 from recon.odometry.window import (
     TrackWindow,
@@ -13,7 +14,6 @@ from recon.odometry.window import (
     pose_information,
     reprojection,
 )
-from recon.structures import RectifiedCamera
 
 SETTINGS = WindowSettings(iterations=30, min_gain=1e-9)
 

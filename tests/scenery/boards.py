@@ -9,13 +9,13 @@ from typing import Final, Literal
 
 import numpy as np
 
-from recon.adapters.opencv_boards import dark_rectangles
-from recon.adapters.opencv_lens import project, unproject
-from recon.errors import CalibrationError
-from recon.geometry.se3 import apply, exp_so3, make_transform
-from recon.structures import CameraIntrinsics, LensModel, StereoCalibration
-from recon.structures.arrays import Float64, UInt8
-from recon.structures.board import CalibrationBoard
+from recon.core.errors import CalibrationError
+from recon.core.geometry.se3 import apply, exp_so3, make_transform
+from recon.core.values import CameraIntrinsics, LensModel, StereoCalibration
+from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.board import CalibrationBoard
+from recon.rig.opencv_boards import dark_rectangles
+from recon.stereo.rectify.lens import project, unproject
 
 Lens = Literal["radtan", "rational", "fisheye"]
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.formats.atomic import write_text
-from recon.formats.files import StrPath
-from recon.formats.image import write_image
-from recon.formats.trajectory import write_kitti_poses
+from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import UInt8
+from recon.io.atomic import write_text
+from recon.io.files import StrPath
+from recon.io.images.image import write_image
+from recon.io.trajectory import write_kitti_poses
 from recon.sources.synthetic import SyntheticSource
-from recon.structures import RectifiedCamera
-from recon.structures.arrays import UInt8
 
 _BT601 = np.array([0.299, 0.587, 0.114])
 

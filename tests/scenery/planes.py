@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from recon.errors import SettingsError
-from recon.geometry.triangulation import disparity_from_depth
-from recon.kernels.noise import fractal_noise
-from recon.structures import DisparityTruth, RectifiedCamera, RectifiedPair
-from recon.structures.arrays import Bool, Float64, UInt8
-from recon.synthetic.view import View, stereo_views
+from recon.core.errors import SettingsError
+from recon.core.geometry.triangulation import disparity_from_depth
+from recon.core.values import DisparityTruth, RectifiedCamera, RectifiedPair
+from recon.core.values.arrays import Bool, Float64, UInt8
+from recon.street.kernels.noise import fractal_noise
+from recon.street.view import View, stereo_views
 
 _CONTRAST_DN = 90.0
 _OCTAVES = 6

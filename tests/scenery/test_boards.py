@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.adapters.opencv_lens import project
-from recon.errors import CalibrationError
-from recon.geometry.se3 import apply
-from recon.structures.board import parse_board
+from recon.core.errors import CalibrationError
+from recon.core.geometry.se3 import apply
+from recon.core.values.board import parse_board
+from recon.stereo.rectify.lens import project
 from tests.scenery.boards import BoardRenderer, board_rig, place_boards, render_views
 
 BOARD = parse_board("chess:6x4:30mm")

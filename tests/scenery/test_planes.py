@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.errors import SettingsError
-from recon.structures import RectifiedCamera
+from recon.core.errors import SettingsError
+from recon.core.values import RectifiedCamera
 from tests.scenery.planes import Plane, fronto_parallel_pair, plane_pair, slanted_pair, step_pair
 
 CAMERA = RectifiedCamera(200.0, 99.5, 49.5, 99.5, 0.5, 200, 100)

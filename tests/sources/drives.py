@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import yaml
 
-from recon.formats.image import write_image
+from recon.core.values import RectifiedCamera, StereoPair
+from recon.io.images.image import write_image
 from recon.sources.synthetic import SyntheticSource
-from recon.structures import RectifiedCamera, StereoPair
-from recon.synthetic import StreetSettings
+from recon.street import StreetSettings
 
 RATE_HZ = 10.0
 EPOCH_S = 1_600_000_000

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.errors import ReconError
-from recon.formats.image import write_image
-from recon.geometry.se3 import make_transform
-from recon.pipeline.config import load_config, source_overrides
-from recon.pipeline.sequence import map_sequence
+from recon.commands.config import load_config, source_overrides
+from recon.core.errors import ReconError
+from recon.core.geometry.se3 import make_transform
+from recon.core.values import RectifiedCamera, StereoPair, Trajectory
+from recon.io.images.image import write_image
+from recon.map.sequence import map_sequence
 from recon.sources import IncompleteSource, SourceSettings, StampedSource, open_source
-from recon.structures import RectifiedCamera, StereoPair, Trajectory
 from tests.sources import drives
 from tests.sources.test_stray_frames import LAYOUTS, images
 

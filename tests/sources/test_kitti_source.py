@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.errors import CalibrationError, FormatError, ReconError, SourceError
-from recon.formats.image import write_image
-from recon.formats.trajectory import read_kitti_poses
+from recon.core.errors import CalibrationError, FormatError, ReconError, SourceError
+from recon.io.images.image import write_image
+from recon.io.trajectory import read_kitti_poses
 from recon.sources.kitti import open_kitti
 from recon.sources.protocol import StereoSource
 from recon.sources.settings import SourceSettings

@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.adapters.rosbags import BagCameraInfo
-from recon.errors import ReconError
-from recon.formats.image import write_image
-from recon.formats.kalibr import write_kalibr
-from recon.formats.ros_image import pixels_of_ros_image
-from recon.geometry.se3 import make_transform
+from recon.core.errors import ReconError
+from recon.core.geometry.se3 import make_transform
+from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
+from recon.io.cameras.kalibr import write_kalibr
+from recon.io.images.image import write_image
+from recon.io.images.ros_image import pixels_of_ros_image
 from recon.sources import SourceSettings, open_source
 from recon.sources.bag_rig import rig_of_messages
 from recon.sources.pairing import find_partners, natural_key, pair_stamps, stamp_of_name
-from recon.structures import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
+from recon.sources.rosbags import BagCameraInfo
 from tests.sources import drives
 
 CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)

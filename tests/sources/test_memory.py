@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recon.core.values import RectifiedCamera, StereoPair
 from recon.sources import open_source
-from recon.structures import RectifiedCamera, StereoPair
 from tests.sources import drives
 
 pytest.importorskip("rosbags", reason="extra ros")

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.errors import CalibrationError, FormatError, ReconError, SourceError
-from recon.formats.image import write_image
+from recon.core.errors import CalibrationError, FormatError, ReconError, SourceError
+from recon.io.images.image import write_image
 from recon.sources.files import FilesSource, read_pair
 from recon.sources.middlebury import MiddleburySource
 from recon.sources.protocol import StereoSource

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from recon.errors import SourceError
+from recon.core.errors import SourceError
 from recon.sources.picture_pairs import list_pictures, pair_pictures
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.errors import ReconError
-from recon.geometry.se3 import exp_so3, invert, make_transform
+from recon.core.errors import ReconError
+from recon.core.geometry.se3 import exp_so3, invert, make_transform
+from recon.core.values import RectifiedCamera
 from recon.sources import open_source, read_prior
-from recon.structures import RectifiedCamera
 from tests.sources import drives
 
 pytest.importorskip("rosbags", reason="extra ros")

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.pipeline.config import load_config
-from recon.pipeline.sequence import map_sequence
-from recon.pipeline.workspace import Workspace
+from recon.commands.config import load_config
+from recon.core.values import RectifiedCamera, StereoPair
+from recon.core.values.arrays import Float64
+from recon.map.sequence import map_sequence
+from recon.map.workspace import Workspace
 from recon.sources import StereoSource, open_source, recognise_source
-from recon.structures import RectifiedCamera, StereoPair
-from recon.structures.arrays import Float64
 from tests.sources import drives
 
 pytest.importorskip("rosbags", reason="extra ros")

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.errors import ReconError
-from recon.formats.image import write_image
-from recon.formats.video import VideoFile
+from recon.core.errors import ReconError
+from recon.core.values import RectifiedCamera, StereoPair
+from recon.io.images.image import write_image
+from recon.io.images.video import VideoFile
 from recon.sources import SourceSettings, open_source
 from recon.sources.protocol import IncompleteSource
 from recon.sources.video import view_size
-from recon.structures import RectifiedCamera, StereoPair
 from tests.hostile.refusals import assert_refused, run
 from tests.sources import drives
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.errors import SourceError
-from recon.formats.frames_csv import FRAMES, CapturedFrame
-from recon.formats.image import write_image
+from recon.core.errors import SourceError
+from recon.core.values import RectifiedCamera, StereoPair
+from recon.io.frames_csv import FRAMES, CapturedFrame
+from recon.io.images.image import write_image
 from recon.sources import IncompleteSource, StampedSource, open_source
-from recon.structures import RectifiedCamera, StereoPair
 from tests.sources import drives
 
 CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)

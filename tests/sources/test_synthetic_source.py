@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.errors import OutputError
+from recon.core.errors import OutputError
 from recon.sources.kitti import open_kitti
 from recon.sources.protocol import StereoSource
 from recon.sources.synthetic import SyntheticSource
-from recon.synthetic.settings import StreetSettings
+from recon.street.settings import StreetSettings
 from tests.scenery.kitti import write_kitti
 
 

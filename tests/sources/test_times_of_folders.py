@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.formats.image import write_image
+from recon.core.values import RectifiedCamera
+from recon.io.images.image import write_image
 from recon.sources import SourceSettings, StampedSource, open_source
-from recon.structures import RectifiedCamera
 from tests.sources import drives
 
 CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)

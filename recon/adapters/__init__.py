@@ -1,1 +1,0 @@
-"""One file per heavy library: arrays in, arrays out, its exceptions converted to ours."""

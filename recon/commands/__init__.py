@@ -1,0 +1,1 @@
+"""One story per command of the program, as functions of the library."""

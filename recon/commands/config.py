@@ -1,0 +1,198 @@
+"""The configuration: settings of all stages, from YAML files and the command line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from recon.core.errors import FormatError, SettingsError
+from recon.core.settings import merge
+from recon.evaluation.paper.settings import PaperConfig
+from recon.export.mesh import MeshSettings
+from recon.io.files import SMALL_FILE_BYTES, read_text
+from recon.io.yaml_file import parse_yaml
+from recon.map.settings import DriveSettings
+from recon.rig.audit.settings import AuditedSettings
+from recon.rig.calibrate import CalibrationSettings
+from recon.rig.capture import CaptureSettings
+from recon.rig.uncalibrated import UncalibratedSettings
+from recon.sources.settings import SourceSettings
+from recon.stereo.cloud import ANY_SCALE
+from recon.stereo.match import MatchingSettings, name_of, settings_of
+from recon.street import StreetSettings
+
+_MOST_DOTS: Final = 10
+_BYTES_PER_PIXEL: Final = 18
+"""Two colour images, and the disparity with its confidence and deviation: the least of a pair."""
+
+
+class ReconConfig(DriveSettings, AuditedSettings, PaperConfig):
+    """Everything that determines a result; written beside each result as ``config.yaml``."""
+
+    source: SourceSettings = SourceSettings()
+    capture: CaptureSettings = CaptureSettings()
+    calibration: CalibrationSettings = CalibrationSettings()
+    uncalibrated: UncalibratedSettings = UncalibratedSettings()
+    mesh: MeshSettings = MeshSettings()
+    street: StreetSettings = StreetSettings()
+
+    @property
+    def readable_megapixels(self) -> float:
+        """Largest image to read, in 10⁶ pixels: as set, and small enough for the memory limit."""
+        limit_mb, most = self.memory.limit_mb, self.source.max_megapixels
+        return most if limit_mb is None else min(most, limit_mb / _BYTES_PER_PIXEL)
+
+
+PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
+    "cloud": {"max_range_m": None, "max_relative_sigma": None},
+    "filters": ANY_SCALE.model_dump(),
+    "mesh": {"point_weight": 16.0},
+}
+"""Defaults of a single pair that differ from a drive: the scale of its scene is unknown."""
+
+
+def load_config(
+    path: Path | None = None,
+    overrides: Sequence[str] = (),
+    defaults: Mapping[str, Any] | None = None,
+) -> ReconConfig:
+    """Build the configuration; what comes later wins: defaults, file, overrides.
+
+    Args:
+        path: A YAML file with any part of the configuration, such as a run's ``config.yaml``.
+        overrides: ``key=value`` texts with dotted keys, such as ``matching.sad.window_px=9``.
+        defaults: Defaults of a command that differ from those of the stages.
+
+    Raises:
+        SettingsError: The file cannot be read, a key is unknown, or a value is out of range.
+    """
+    given = merge(defaults or {}, {} if path is None else _read_yaml(path))
+    values = given
+    for text in overrides:
+        values = merge(values, _parse_override(text))
+    try:
+        return ReconConfig.parse(values)
+    except SettingsError:
+        if path is not None:
+            ReconConfig.parse(given, where=str(path))  # blames the file if it is invalid by itself
+        raise
+
+
+def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> list[str]:
+    """Overrides for the matcher and its disparity range; None = unchanged."""
+    chosen = [] if matcher is None else [f"matching.matcher={matcher}"]
+    fields = MatchingSettings.model_fields
+    ranged = [
+        name
+        for name, field in fields.items()
+        if "ndisp" in getattr(field.annotation, "model_fields", ())
+    ]
+    return chosen + ([] if ndisp is None else [f"matching.{name}.ndisp={ndisp}" for name in ranged])
+
+
+def check_ndisp(config: ReconConfig, ndisp: int | None) -> None:
+    """Check that the matcher obeys a number of disparities given by itself; None = none given.
+
+    Raises:
+        SettingsError: The matcher has no such setting.
+    """
+    matcher = config.matching.matcher
+    if ndisp is not None and not hasattr(settings_of(matcher, config.matching), "ndisp"):
+        raise SettingsError(
+            "the matcher has no such setting", where="--ndisp", got=f"matcher {name_of(matcher)!r}"
+        )
+
+
+def source_overrides(
+    calib: Path | None,
+    left: str | None,
+    right: str | None,
+    tolerance_s: float | None,
+    frames: tuple[int | None, int | None, int | None] = (None, None, None),
+) -> list[str]:
+    """Overrides for facts that the files of a source do not contain; None = unchanged.
+
+    Args:
+        calib: Calibration file.
+        left: Folder or topic of the left camera.
+        right: That of the right one.
+        tolerance_s: Largest difference within a pair.
+        frames: First frame, frame at which to stop, and stride.
+    """
+    given = {
+        "calibration": None if calib is None else str(calib),
+        "left": left,
+        "right": right,
+        "tolerance_s": tolerance_s,
+        **dict(zip(("start", "end", "stride"), frames, strict=True)),
+    }
+    # Quoted, since a topic or folder may be named 0 or null.
+    return [
+        f"source.{key}={json.dumps(value)}" for key, value in given.items() if value is not None
+    ]
+
+
+def capture_overrides(
+    size: str | None,
+    rate_hz: float | None,
+    frames: int | None,
+    seconds: float | None,
+    preview_every: int | None,
+) -> list[str]:
+    """Overrides for a recording; None = unchanged.
+
+    Raises:
+        SettingsError: The size is not of the form 1280x720.
+    """
+    width, cross, height = (size or "").partition("x")
+    if size is not None and not (cross and width.isdigit() and height.isdigit()):
+        raise SettingsError("cannot read this size", got=size, expected="WIDTHxHEIGHT: 1280x720")
+    given = {
+        "width_px": width or None,
+        "height_px": height or None,
+        "rate_hz": rate_hz,
+        "frames": frames,
+        "seconds": seconds,
+        "preview_every": preview_every,
+    }
+    return [f"capture.{key}={value}" for key, value in given.items() if value is not None]
+
+
+def dump_config(config: ReconConfig) -> str:
+    """The configuration as YAML; `load_config` restores the same configuration."""
+    return str(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
+
+
+def _read_yaml(path: Path) -> Mapping[str, Any]:
+    if path.is_file() and path.stat().st_size == 0:
+        return {}
+    try:
+        content = parse_yaml(read_text(path, SMALL_FILE_BYTES), path)
+    except FormatError as error:
+        raise SettingsError(error.what, where=error.where, got=error.got) from error
+    if content is None:
+        return {}
+    if not isinstance(content, Mapping):
+        raise SettingsError(
+            "configuration is not a mapping", where=path, got=type(content).__name__
+        )
+    return content
+
+
+def _parse_override(text: str) -> dict[str, Any]:
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip() or key.count(".") > _MOST_DOTS:
+        raise SettingsError(
+            "cannot read this setting", where="--set", got=repr(text), expected="key=value"
+        )
+    try:
+        nested: Any = parse_yaml(value, "--set")
+    except FormatError as error:
+        raise SettingsError(f"value of {key!r} is not YAML", where="--set", got=value) from error
+    for part in reversed(key.strip().split(".")):
+        nested = {part: nested}
+    return dict(nested)

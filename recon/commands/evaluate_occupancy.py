@@ -1,0 +1,61 @@
+"""`recon evaluate occupancy` without its command line: compare a run with ground truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from recon.commands.demo_source import demo_source
+from recon.commands.finished_run import GRID, OCTOMAP, FinishedRun, open_run
+from recon.core.errors import EvaluationError
+from recon.core.values import OccupancyGrid, OccupancyMetrics, OccupancyTruth
+from recon.evaluation import evaluate_occupancy
+from recon.evaluation.occupancy_truth import LEAST_FRAMES, known_occupancy
+from recon.io.occupancy.nav2 import read_nav2
+from recon.io.occupancy.octomap import read_octomap
+from recon.sources import KnowsOccupancy
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyComparison:
+    """The occupancy of a run and its ground truth.
+
+    Attributes:
+        metrics: The figures.
+        grid: The 2-D grid of the run.
+        truth: Ground truth, in the cells of the run.
+    """
+
+    metrics: OccupancyMetrics
+    grid: OccupancyGrid
+    truth: OccupancyTruth
+
+
+def compare_occupancy(folder: Path, least_frames: int = LEAST_FRAMES) -> OccupancyComparison:
+    """Compare ``map/octomap.ot`` and ``map/grid.*`` of a run with ground truth.
+
+    Args:
+        folder: A run of a rendered street: of ``recon demo``, or of ``recon occupancy`` on one.
+        least_frames: Number of frames that must have seen a cell for it to be compared.
+
+    Raises:
+        FormatError: The folder does not contain a finished run, or a map is missing or damaged.
+        EvaluationError: The run has no ground truth, or no cell was seen often enough.
+    """
+    run = open_run(folder)
+    source = _source_that_knows(run)
+    voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
+    truth = known_occupancy(source, run.config, run.T_map_world, least_frames)
+    return OccupancyComparison(evaluate_occupancy(voxels, grid, truth), grid, truth)
+
+
+def _source_that_knows(run: FinishedRun) -> KnowsOccupancy:
+    if run.mapped_by != "demo":
+        raise EvaluationError(
+            "the true occupancy of this run is not known",
+            where=run.folder,
+            got=f"a run of recon {run.mapped_by}",
+            expected="a run of recon demo, whose street can be rendered again",
+            hint="recon evaluate map compares a run with a reference cloud",
+        )
+    return demo_source(run.config)

@@ -1,0 +1,275 @@
+"""Resuming an interrupted run, after checking that its inputs and settings are unchanged."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from recon.commands.config import ReconConfig, load_config
+from recon.commands.finished_run import RECORD_BYTES
+from recon.core.errors import FormatError, MemoryLimitError, OutputError, SettingsError
+from recon.core.values import Trajectory
+from recon.io.atomic import write_text
+from recon.io.files import read_text
+from recon.map.checkpoint import quick_fingerprint
+from recon.run.directory import RECORD, STARTED, RunDirectory, state_folder
+from recon.run.machine import versions
+from recon.run.memory import memory_overrides
+from recon.sources import StereoSource, open_source
+
+_OTHER: Final = {
+    "config": "other settings",
+    "source": "another source",
+    "poses": "other poses",
+    "prior": "another prior",
+    "versions": "other versions",
+}
+_NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_MEMORY: Final = "memory"
+_NOTHING: Final = "there is no unfinished run to resume"
+_START_ANEW: Final = "start it without --resume"
+
+
+@dataclass(frozen=True)
+class MapRequest:
+    """The command line of `recon map`, apart from settings.
+
+    Attributes:
+        source: Path of the source; None = that of the run that is resumed.
+        kind: Kind of the source; None = inferred from its files.
+        poses: File of known poses.
+        prior: File of the camera's motion from another sensor, or a topic of the source.
+        mesh: Whether to reconstruct a surface.
+        out: Result folder; None = a new one.
+        resume: Folder of an unfinished run to resume.
+        memory_limit: Memory limit of the run, such as ``2G``.
+    """
+
+    source: Path | None
+    kind: str | None = None
+    poses: Path | None = None
+    prior: str | None = None
+    mesh: bool = True
+    out: Path | None = None
+    resume: Path | None = None
+    memory_limit: str | None = None
+
+    def arguments(self) -> dict[str, Any]:
+        """The arguments needed to resume the run."""
+        return {
+            "source": None if self.source is None else str(self.source.resolve()),
+            "kind": self.kind,
+            "poses": None if self.poses is None else str(self.poses.resolve()),
+            "prior": _place(self.prior),
+            "mesh": self.mesh,
+        }
+
+
+def plan_map(
+    request: MapRequest, config: Path | None, overrides: Sequence[str]
+) -> tuple[MapRequest, ReconConfig]:
+    """Complete a request and its configuration from the run that is resumed.
+
+    Raises:
+        SettingsError: A setting is invalid, or contradicts the resumed run.
+        OutputError: There is no run to resume.
+    """
+    if request.resume is not None:
+        return _plan_resumed(request, request.resume, config, overrides)
+    return request, load_config(config, [*overrides, *memory_overrides(request.memory_limit)])
+
+
+def _plan_resumed(
+    request: MapRequest, folder: Path, config: Path | None, overrides: Sequence[str]
+) -> tuple[MapRequest, ReconConfig]:
+    started = read_started(folder)
+    known = started["arguments"]
+    settings = ReconConfig.parse(started["identity"]["config"], where=str(folder))
+    limit = memory_overrides(request.memory_limit)
+    asked = load_config(config, [*overrides, *limit])
+    if config is not None or overrides:
+        _refuse_others({"config": asked.model_dump(mode="json")}, started["identity"], folder)
+    if asked.memory.limit_mb is not None:
+        settings = settings.model_copy(update={_MEMORY: asked.memory})
+    if request.out is not None and request.out.resolve() != folder.resolve():
+        raise SettingsError(
+            "--out and --resume name different folders", got=request.out, expected=folder
+        )
+    if not request.mesh and known.get("mesh"):
+        raise SettingsError("the run was started with a mesh", where=folder, hint="drop --no-mesh")
+    request = replace(
+        request,
+        source=request.source or _path(known.get("source")),
+        kind=request.kind or known.get("kind"),
+        poses=request.poses or _path(known.get("poses")),
+        prior=request.prior or known.get("prior"),
+        mesh=bool(known.get("mesh")),
+        out=folder,
+    )
+    return request, settings
+
+
+def _place(name: str | None) -> str | None:
+    """The absolute path of a file; other names, such as topics, unchanged."""
+    return str(Path(name).resolve()) if name is not None and Path(name).is_file() else name
+
+
+def _path(text: str | None) -> Path | None:
+    return None if text is None else Path(text)
+
+
+def open_requested(request: MapRequest, config: ReconConfig) -> StereoSource:
+    """Open the source of a planned request.
+
+    Raises:
+        SettingsError: The request names no source.
+        ReconError: The source cannot give pairs.
+    """
+    if request.source is None:
+        raise SettingsError("there is no source to map", hint="name SOURCE")
+    settings = config.source.model_copy(update={"max_megapixels": config.readable_megapixels})
+    return open_source(request.source, request.kind, settings)
+
+
+def identity_of(
+    source: StereoSource,
+    config: ReconConfig,
+    known_poses: Trajectory | None,
+    prior: Trajectory | None = None,
+) -> dict[str, Any]:
+    """Everything that must be unchanged for a resumed run to give the same result."""
+    return {
+        "config": config.model_dump(mode="json"),
+        "source": {"frames": len(source), **quick_fingerprint(source.files)},
+        "poses": _digest(known_poses),
+        "prior": _digest(prior),
+        "versions": versions(),
+    }
+
+
+def _digest(path: Trajectory | None) -> str | None:
+    """SHA-256 of the poses and timestamps; None = no trajectory."""
+    if path is None:
+        return None
+    return hashlib.sha256(path.T_world_camera.tobytes() + path.timestamps_s.tobytes()).hexdigest()
+
+
+def begin_or_resume(
+    directory: RunDirectory, identity: Mapping[str, Any], arguments: Mapping[str, Any]
+) -> None:
+    """Store what a run is started with; for a resumed run, first check that it is unchanged.
+
+    Raises:
+        SettingsError: The run was started with other inputs or settings.
+        OutputError: The state cannot be written, or there is no run to resume.
+    """
+    if directory.resumes:
+        started = read_started(directory.folder)
+        _refuse_others(identity, started["identity"], directory.folder)
+        arguments = arguments or started["arguments"]
+    content = {"identity": dict(identity), "arguments": dict(arguments)}
+    write_text(directory.state(STARTED), json.dumps(content, ensure_ascii=False))
+
+
+@contextmanager
+def tell_how_to_resume(directory: RunDirectory) -> Iterator[None]:
+    """Add a hint on how to resume to errors after which the run can be resumed.
+
+    Raises:
+        OutputError: The disk is full, or the folder can no longer be written.
+        MemoryLimitError: Memory is exhausted.
+    """
+    try:
+        yield
+    except (OutputError, MemoryLimitError, OSError, MemoryError, KeyboardInterrupt) as error:
+        told = _with_hint(error, directory.folder) if directory.resumable else None
+        if told is None:
+            raise
+        raise told from error
+
+
+def _with_hint(error: BaseException, folder: Path) -> BaseException | None:
+    """The error with a hint on how to resume; None if it is raised unchanged."""
+    hint = f"recon map --resume {shlex.quote(str(folder))} goes on from there"
+    if isinstance(error, KeyboardInterrupt):
+        return KeyboardInterrupt(hint)
+    if isinstance(error, OutputError):
+        return OutputError(error.what, where=error.where, got=error.got, hint=hint)
+    if isinstance(error, MemoryLimitError):
+        more = f"{hint} with a larger --memory-limit"
+        return MemoryLimitError(
+            error.what, where=error.where, got=error.got, expected=error.expected, hint=more
+        )
+    if isinstance(error, MemoryError):
+        return MemoryLimitError("out of memory", hint=f"{hint}; give it a --memory-limit")
+    if isinstance(error, OSError) and error.errno in _NO_ROOM:
+        return OutputError("the disk is full", where=error.filename, got=error.strerror, hint=hint)
+    return None
+
+
+def read_started(folder: Path) -> dict[str, Any]:
+    """Read what an unfinished run was started with.
+
+    Raises:
+        OutputError: The folder holds no unfinished run.
+    """
+    path = state_folder(folder) / STARTED
+    try:
+        return _checked(json.loads(read_text(path, RECORD_BYTES)))
+    except (FormatError, ValueError, LookupError, TypeError, RecursionError) as error:
+        finished = (folder / RECORD).is_file()
+        hint = "it is finished; without --resume it runs again" if finished else _START_ANEW
+        raise OutputError(_NOTHING, where=folder, hint=hint) from error
+
+
+def _checked(started: Any) -> dict[str, Any]:
+    """What a run was started with, if it has the form that `begin_or_resume` writes.
+
+    Raises:
+        TypeError: A part has another type; a `LookupError` if it is missing.
+    """
+    parts = (started["identity"], started["identity"]["config"], started["arguments"])
+    plain = all(isinstance(part, dict) for part in parts)
+    if not plain or not all(isinstance(v, str | bool | None) for v in parts[-1].values()):
+        raise TypeError("not what a run is started with")
+    return {"identity": parts[0], "arguments": parts[-1]}
+
+
+def _refuse_others(now: Mapping[str, Any], then: Mapping[str, Any], folder: Path) -> None:
+    """Refuse to resume with inputs or settings that differ."""
+    # Through JSON, like the stored values, so that tuples equal lists.
+    for part, value in json.loads(json.dumps(dict(now))).items():
+        after, before = _without_limit(value), _without_limit(then.get(part))
+        if after == before:
+            continue
+        key, got, expected = _first_difference(after, before, part)
+        raise SettingsError(
+            f"the run was started with {_OTHER[part]}",
+            where=folder,
+            got=f"{key} = {got}",
+            expected=expected,
+            hint="resume with what it was started with, or start anew without --resume",
+        )
+
+
+def _without_limit(part: Any) -> Any:
+    """A part of an identity without the memory limit, which a resumed run may change."""
+    if not isinstance(part, dict):
+        return part
+    return {name: value for name, value in part.items() if name != _MEMORY}
+
+
+def _first_difference(now: Any, then: Any, key: str) -> tuple[str, Any, Any]:
+    """Dotted key and the two values of the first leaf that differs."""
+    if isinstance(now, dict) and isinstance(then, dict):
+        for name in [*now, *(then.keys() - now.keys())]:
+            if now.get(name) != then.get(name):
+                return _first_difference(now.get(name), then.get(name), f"{key}.{name}")
+    return key, now, then

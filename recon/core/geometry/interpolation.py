@@ -1,0 +1,42 @@
+"""Interpolation of poses."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.core.geometry.se3 import exp_so3, log_so3, make_transform
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64
+
+
+def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
+    """Poses at given times, interpolated between the poses before and after each.
+
+    Args:
+        trajectory: At least one pose.
+        stamps_s: float64 (N,); outside the time range of the trajectory, its first or last pose
+            is returned.
+
+    Returns:
+        float64 (N, 4, 4).
+    """
+    times = trajectory.timestamps_s
+    after = np.clip(np.searchsorted(times, stamps_s), 1, max(1, len(times) - 1))
+    after = np.minimum(after, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    span = np.where(times[after] > times[before], times[after] - times[before], 1.0)
+    shares = np.clip((stamps_s - times[before]) / span, 0.0, 1.0)
+    poses = trajectory.T_world_camera
+    return np.stack(
+        [
+            pose_between(poses[i], poses[j], float(share))
+            for i, j, share in zip(before, after, shares, strict=True)
+        ]
+    )
+
+
+def pose_between(first: Float64, second: Float64, share: float) -> Float64:
+    """The pose (4, 4) at a fraction (0 to 1) of the way from one pose to another."""
+    turn = log_so3(first[:3, :3].T @ second[:3, :3])
+    position = (1 - share) * first[:3, 3] + share * second[:3, 3]
+    return make_transform(first[:3, :3] @ exp_so3(share * turn), position)

@@ -1,0 +1,113 @@
+"""Rigid transforms as 4×4 matrices. ``T_a_b`` maps points of frame b to frame a."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.values.arrays import Float64
+
+
+def make_transform(rotation: NDArray[Any], translation_m: NDArray[Any]) -> Float64:
+    """A 4×4 transform from a rotation (3, 3) and a translation (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    T[:3, 3] = np.asarray(translation_m).reshape(3)
+    return T
+
+
+def invert(T: NDArray[Any]) -> Float64:
+    """Inverse of one rigid transform (4, 4) or of a stack (…, 4, 4)."""
+    rotation = np.swapaxes(T[..., :3, :3], -1, -2)
+    inverse = np.zeros(T.shape)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, T[..., :3, 3])
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def apply(T: NDArray[Any], xyz: NDArray[Any]) -> NDArray[Any]:
+    """Transform points (N, 3); the result keeps the floating dtype of ``xyz``."""
+    moved = xyz @ T[:3, :3].T.astype(xyz.dtype) + T[:3, 3].astype(xyz.dtype)
+    return np.asarray(moved)
+
+
+def rotate(T: NDArray[Any], directions: NDArray[Any]) -> NDArray[Any]:
+    """Rotate directions (N, 3), such as normals."""
+    return np.asarray(directions @ T[:3, :3].T.astype(directions.dtype))
+
+
+def angle_rad(T: NDArray[Any]) -> Float64:
+    """Rotation angle of one transform or of a stack, in [0, π]."""
+    # atan2 is accurate near 0 and π, where acos of the trace loses half of the digits.
+    R = T[..., :3, :3]
+    axis = np.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]],
+        axis=-1,
+    )
+    sine = 0.5 * np.linalg.norm(axis, axis=-1)
+    cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0)
+    return np.asarray(np.arctan2(sine, cosine))
+
+
+def hat(w: NDArray[Any]) -> Float64:
+    """Cross-product matrix of a vector (3,)."""
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+def exp_so3(w: NDArray[Any]) -> Float64:
+    """Rotation matrix of a rotation vector (3,), radians (Rodrigues)."""
+    angle = float(np.linalg.norm(w))
+    K = hat(np.asarray(w, dtype=np.float64))
+    if angle < 1e-8:
+        return np.eye(3) + K + 0.5 * K @ K
+    a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+    return np.eye(3) + a * K + b * K @ K
+
+
+def log_so3(R: NDArray[Any]) -> Float64:
+    """Rotation vector (3,), radians, of a rotation matrix; inverse of `exp_so3` up to an angle π.
+
+    At π the sign of the axis is ambiguous; either may be returned.
+    """
+    sine_axis = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine, cosine = float(np.linalg.norm(sine_axis)), 0.5 * (float(np.trace(R)) - 1.0)
+    if cosine > 0.0:
+        return sine_axis * (math.asin(min(sine, 1.0)) / sine if sine > 1e-12 else 1.0)
+    # Near π the sine vanishes; R + Rᵀ still determines the axis, but not its sign.
+    outer = 0.5 * (R + R.T) - cosine * np.eye(3)
+    column = outer[:, int(np.argmax(np.diag(outer)))]
+    axis = column / np.linalg.norm(column)
+    sign = -1.0 if axis @ sine_axis < 0.0 else 1.0
+    return np.asarray(sign * math.atan2(sine, cosine) * axis)
+
+
+def as_step(T: NDArray[Any]) -> Float64:
+    """A rigid transform as a step: translation and rotation vector, radians; float64 (6,)."""
+    return np.concatenate([T[:3, 3], log_so3(T[:3, :3])])
+
+
+def as_transform(step: NDArray[Any]) -> Float64:
+    """The rigid transform (4, 4) of a step; inverse of `as_step`."""
+    return make_transform(exp_so3(step[3:]), step[:3])
+
+
+def step_jacobian(xyz: NDArray[Any]) -> Float64:
+    """Jacobian (N, 3, 6) of points (N, 3) for a step of their frame: ``[I | -hat(xyz)]``."""
+    J = np.zeros((len(xyz), 3, 6))
+    J[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    x, y, z = xyz.T
+    J[:, 0, 4], J[:, 0, 5] = z, -y
+    J[:, 1, 3], J[:, 1, 5] = -z, x
+    J[:, 2, 3], J[:, 2, 4] = y, -x
+    return J
+
+
+def orthonormalise(T: NDArray[Any]) -> Float64:
+    """The rigid transform nearest to ``T``: its rotation part is made orthonormal by SVD."""
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    U[:, -1] *= np.sign(np.linalg.det(U @ Vt))
+    return make_transform(U @ Vt, T[:3, 3])

@@ -1,0 +1,71 @@
+"""How kernels are compiled."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Callable
+from typing import Any, Final, Literal, TypeVar, overload
+
+from numba import config, njit
+from numba.core.caching import FunctionCache
+
+from recon.core.kernels.cache import announce, cache_folder, cache_parent
+
+KernelT = TypeVar("KernelT", bound=Callable[..., Any])
+
+_CACHE: Final = str(cache_folder(cache_parent()))
+
+
+class _KernelCache(FunctionCache):  # type: ignore[misc]
+    """numba's cache of one kernel, which one process at a time writes.
+
+    Two that add machine code for different types at once would choose the same file, and the index
+    of one would name the code of the other: a later run would call code for the wrong types.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = super().load_overload(sig, target_context)
+        if found is None:
+            announce(self._py_func.__name__)
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        self._impl.locator.ensure_cache_path()
+        folder = os.open(self.cache_path, os.O_RDONLY)
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX)
+            super().save_overload(sig, data)
+        finally:
+            os.close(folder)
+
+
+@overload
+def kernel(function: KernelT) -> KernelT: ...
+
+
+@overload
+def kernel(
+    *, inline: Literal["always", "never"] = ..., error_model: Literal["python", "numpy"] = ...
+) -> Callable[[KernelT], KernelT]: ...
+
+
+def kernel(function: Any = None, **options: str) -> Any:
+    """Compile a function to run without the interpreter lock, and cache the machine code.
+
+    Args:
+        function: What is compiled.
+        **options: ``inline`` and ``error_model`` of `numba.njit`.
+    """
+    if function is None:
+        return lambda function: kernel(function, **options)
+    kept = config.CACHE_DIR
+    # numba takes the folder while it decorates; functions of other packages keep theirs.
+    config.CACHE_DIR = _CACHE
+    try:
+        compiled = njit(nogil=True, **options)(function)
+        if compiled is not function:  # it is where NUMBA_DISABLE_JIT is set
+            compiled._cache = _KernelCache(function)  # as `enable_caching` does
+        return compiled
+    finally:
+        config.CACHE_DIR = kept

@@ -1,0 +1,311 @@
+"""A hash of voxels, and sums over the points that fall into each.
+
+Three cell indices are packed into one int64 and looked up in an open-addressing table (linear
+probing, capacity a power of two, at most half full). The table gives a row number; the data of a
+voxel are in arrays at that row, in the order in which voxels were first seen, so the result does
+not depend on the hash. Tables and arrays grow by doubling: adding a point takes constant time on
+average, however large the map is.
+
+The twins in plain Python are in `recon.core.kernels.voxels_reference`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.kernels.compiled import kernel
+
+KEY_BITS: Final = 21
+KEY_LIMIT: Final = 1 << (KEY_BITS - 1)
+"""Cell indices lie in ``[-KEY_LIMIT, KEY_LIMIT)``: 100 km to each side at 0.1 m."""
+EMPTY: Final = -1
+_MASK: Final = (1 << KEY_BITS) - 1
+_MIN_CAPACITY: Final = 1 << 10
+
+Store = TypeVar("Store", bound=tuple[NDArray[Any], ...])
+"""A named tuple of a hash, packed cells, what is stored under each, and the rows in use."""
+
+
+class VoxelSums(NamedTuple):
+    """What is summed up per voxel; one row each.
+
+    Attributes:
+        table: int64 (C, 2), hash from packed cell to row (`make_table`).
+        keys: int64 (R,), packed cells.
+        sums: float32 (R, 4 + C): sum of weights; weighted sums of the offset from the voxel's
+            centre (x, y, z, metres) and of the C values of each point.
+        information: float32 (R,), sum over frames of the largest weight in each frame.
+        best: float32 (R,), the largest weight in frame ``last``.
+        frames: int32 (R,), number of frames that saw the voxel.
+        last: int32 (R,), the frame that saw it last; -1 = none.
+        used: int64 (1,), number of rows in use.
+    """
+
+    table: NDArray[np.int64]
+    keys: NDArray[np.int64]
+    sums: NDArray[np.float32]
+    information: NDArray[np.float32]
+    best: NDArray[np.float32]
+    frames: NDArray[np.int32]
+    last: NDArray[np.int32]
+    used: NDArray[np.int64]
+
+
+class VoxelPoints(NamedTuple):
+    """The points of one frame.
+
+    Attributes:
+        xyz: (N, 3), finite, with cells inside ``KEY_LIMIT``.
+        weights: float32 (N,); points with a weight of 0 or less are left out.
+        values: float32 (N, C), numbers to average, such as colours.
+    """
+
+    xyz: NDArray[np.floating]
+    weights: NDArray[np.float32]
+    values: NDArray[np.float32]
+
+
+def make_table(rows: int) -> NDArray[np.int64]:
+    """An empty hash for up to ``rows`` entries.
+
+    Returns:
+        int64 (C, 2), C a power of two: packed cell and row of each entry; a cell of `EMPTY` marks
+        an unused place.
+    """
+    capacity = _MIN_CAPACITY
+    while capacity < 2 * rows:
+        capacity *= 2
+    return np.full((capacity, 2), EMPTY, np.int64)
+
+
+def make_sums(rows: int, values: int) -> VoxelSums:
+    """Empty rows for voxels whose points carry ``values`` numbers each."""
+    return VoxelSums(
+        table=make_table(rows),
+        keys=np.zeros(rows, np.int64),
+        sums=np.zeros((rows, 4 + values), np.float32),
+        information=np.zeros(rows, np.float32),
+        best=np.zeros(rows, np.float32),
+        frames=np.zeros(rows, np.int32),
+        last=np.full(rows, -1, np.int32),
+        used=np.zeros(1, np.int64),
+    )
+
+
+def reserve_sums(voxels: VoxelSums, rows: int) -> VoxelSums:
+    """As `reserve`, for sums."""
+    return reserve(voxels, rows, partial(make_sums, values=voxels.sums.shape[1] - 4))
+
+
+def reserve(store: Store, rows: int, make: Callable[[int], Store]) -> Store:
+    """The store if it has ``rows`` rows, else a copy with so many, or twice as many as before.
+
+    Args:
+        store: What may be full.
+        rows: How many rows are needed.
+        make: Makes an empty store with a number of rows.
+    """
+    have, used = len(store[1]), int(store[-1][0])
+    if rows <= have:
+        return store
+    larger = make(max(rows, 2 * have))
+    for source, target in zip(store[1:-1], larger[1:-1], strict=True):
+        target[:used] = source[:used]
+    larger[-1][0] = used
+    enter_keys(larger[0], larger[1][:used])
+    return larger
+
+
+def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
+    """int32 (N, 3) cell indices of packed cells (N,)."""
+    parts = [(keys >> shift) & _MASK for shift in (2 * KEY_BITS, KEY_BITS, 0)]
+    return np.asarray(np.stack(parts, axis=1) - KEY_LIMIT, dtype=np.int32)
+
+
+def pack_keys(cells: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+    """int64 (N,) packed cells of cell indices (N, 3)."""
+    i, j, k = cells.astype(np.int64).T + KEY_LIMIT
+    return np.asarray((i << (2 * KEY_BITS)) | (j << KEY_BITS) | k)
+
+
+@kernel
+def pack_key(i: int, j: int, k: int) -> int:
+    """One int64 of three cell indices in ``[-KEY_LIMIT, KEY_LIMIT)``; never negative."""
+    high = (i + KEY_LIMIT) << (2 * KEY_BITS)
+    return high | ((j + KEY_LIMIT) << KEY_BITS) | (k + KEY_LIMIT)
+
+
+@kernel
+def unpack_key(key: int) -> tuple[int, int, int]:
+    """The three cell indices of a packed cell."""
+    i, j, k = key >> (2 * KEY_BITS), (key >> KEY_BITS) & _MASK, key & _MASK
+    return i - KEY_LIMIT, j - KEY_LIMIT, k - KEY_LIMIT
+
+
+@kernel
+def _place(key: int, mask: int) -> int:
+    """Where the search for a packed cell begins."""
+    # Two rounds of multiplicative hashing; 32-bit factors keep the products inside an int64.
+    mixed = ((key >> 32) * 0x9E3779B1 ^ key) & 0x7FFFFFFF
+    return ((mixed * 0x85EBCA6B) >> 22) & mask
+
+
+@kernel
+def find_or_add(table: NDArray[np.int64], key: int, next_row: int) -> int:
+    """Row of a packed cell; where it is new it is entered with ``next_row``.
+
+    The hash must have an unused place.
+    """
+    mask = len(table) - 1
+    place = _place(key, mask)
+    while table[place, 0] != EMPTY:
+        if table[place, 0] == key:
+            return int(table[place, 1])
+        place = (place + 1) & mask
+    table[place, 0] = key
+    table[place, 1] = next_row
+    return next_row
+
+
+@kernel
+def find(table: NDArray[np.int64], key: int) -> int:
+    """Row of a packed cell, or `EMPTY` where it is not in the hash."""
+    mask = len(table) - 1
+    place = _place(key, mask)
+    while table[place, 0] != EMPTY:
+        if table[place, 0] == key:
+            return int(table[place, 1])
+        place = (place + 1) & mask
+    return EMPTY
+
+
+@kernel
+def find_or_append(
+    table: NDArray[np.int64], keys: NDArray[np.int64], used: NDArray[np.int64], key: int
+) -> int:
+    """Row of a packed cell; where it is new it gets the next row, which must exist."""
+    row: int = find_or_add(table, key, used[0])
+    if row == used[0]:
+        keys[row] = key
+        used[0] += 1
+    return row
+
+
+@kernel
+def enter_keys(table: NDArray[np.int64], keys: NDArray[np.int64]) -> None:
+    """Enter the cells of rows 0 … N - 1 into an empty hash."""
+    for row in range(len(keys)):
+        find_or_add(table, keys[row], row)
+
+
+def add_points(voxels: VoxelSums, points: VoxelPoints, edge: float, frame: int) -> VoxelSums:
+    """Add the points of one frame to the voxels that they fall into.
+
+    Args:
+        voxels: The rows; written, or replaced by larger ones where they are full.
+        points: The points; as many values each as the rows have.
+        edge: Edge of a voxel, in the unit of the points.
+        frame: Number of the frame; frames come in order.
+
+    Returns:
+        The rows that hold the result.
+    """
+    done = 0
+    while True:
+        # Plain tuples: numba's cache on disk would remember the classes by name, and break when
+        # one is renamed.
+        done = _add_points(tuple(voxels), tuple(points), edge, frame, done)
+        if done == len(points.xyz):
+            return voxels
+        voxels = reserve_sums(voxels, len(voxels.keys) + 1)
+
+
+@kernel
+def _add_points(
+    voxels: tuple[NDArray[Any], ...],
+    points: tuple[NDArray[Any], ...],
+    edge: float,
+    frame: int,
+    start: int,
+) -> int:
+    """Add points from ``start`` on; return the first that finds no memory left."""
+    table, keys, sums, information, best, frames, last, used = voxels
+    xyz, weights, values = points
+    columns, rows = values.shape[1], used[0]
+    for n in range(start, len(xyz)):
+        w = weights[n]
+        if not w > 0:
+            continue
+        if rows == len(keys):
+            used[0] = rows
+            return n
+        x, y, z = xyz[n, 0] / edge, xyz[n, 1] / edge, xyz[n, 2] / edge
+        i, j, k = math.floor(x), math.floor(y), math.floor(z)
+        key = pack_key(i, j, k)
+        row = find_or_add(table, key, rows)
+        if row == rows:
+            keys[row] = key
+            rows += 1
+        sums[row, 0] += w
+        sums[row, 1] += w * np.float32((x - i - 0.5) * edge)
+        sums[row, 2] += w * np.float32((y - j - 0.5) * edge)
+        sums[row, 3] += w * np.float32((z - k - 0.5) * edge)
+        for c in range(columns):
+            sums[row, 4 + c] += w * values[n, c]
+        if last[row] != frame:
+            last[row] = frame
+            frames[row] += 1
+            best[row] = 0
+        if w > best[row]:
+            information[row] += w - best[row]
+            best[row] = w
+    used[0] = rows
+    return len(xyz)
+
+
+def add_rows(
+    voxels: VoxelSums,
+    keys: NDArray[np.int64],
+    sums: NDArray[np.float32],
+    information: NDArray[np.float32],
+    frames: NDArray[np.int32],
+) -> VoxelSums:
+    """Add what other frames summed up per voxel.
+
+    Args:
+        voxels: The rows; written, or replaced by larger ones where they are full.
+        keys: int64 (N,), packed cells, each once.
+        sums: float32 (N, 4 + C), as in `VoxelSums`.
+        information: float32 (N,).
+        frames: int32 (N,), of frames that are not in ``voxels``.
+
+    Returns:
+        The rows that hold the result.
+    """
+    voxels = reserve_sums(voxels, int(voxels.used[0]) + len(keys))
+    _add_rows(tuple(voxels), keys, sums, information, frames)
+    return voxels
+
+
+@kernel
+def _add_rows(
+    voxels: tuple[NDArray[Any], ...],
+    new_keys: NDArray[np.int64],
+    new_sums: NDArray[np.float32],
+    new_information: NDArray[np.float32],
+    new_frames: NDArray[np.int32],
+) -> None:
+    """The loop of `add_rows`; there is room for every row."""
+    table, keys, sums, information, _, frames, _, used = voxels
+    for n in range(len(new_keys)):
+        row = find_or_append(table, keys, used, new_keys[n])
+        for c in range(sums.shape[1]):
+            sums[row, c] += new_sums[n, c]
+        information[row] += new_information[n]
+        frames[row] += new_frames[n]

@@ -1,0 +1,89 @@
+"""Open3D's ray casting (Embree): first triangle hit by a ray, and visibility tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from recon.core.errors import ShapeError
+from recon.core.values.arrays import Bool, Float32, Float64, Int32
+
+_NO_HIT = np.uint32(0xFFFFFFFF)
+
+
+class RayScene:
+    """A set of triangles for ray casting.
+
+    Open3D computes in single precision and returns only the triangle; for an exact distance,
+    intersect the ray with the plane of that triangle in double precision.
+
+    Args:
+        triangles: (F, 3, 3) corners, metres.
+        threads: Number of threads; 0 = one per core. The result does not depend on it.
+
+    Raises:
+        ShapeError: There is no triangle, or a corner is not finite.
+    """
+
+    def __init__(self, triangles: NDArray[Any], threads: int = 0) -> None:
+        corners = np.asarray(triangles)
+        if corners.ndim != 3 or corners.shape[1:] != (3, 3) or not len(corners):
+            raise ShapeError("triangles have the wrong shape", got=corners.shape, expected="F×3×3")
+        if not np.isfinite(corners).all():
+            raise ShapeError("a corner of a triangle is not finite")
+        self._threads = threads
+        self._scene = o3d.t.geometry.RaycastingScene()
+        vertices = np.ascontiguousarray(corners.reshape(-1, 3), dtype=np.float32)
+        faces = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
+        self._scene.add_triangles(
+            o3d.core.Tensor.from_numpy(vertices), o3d.core.Tensor.from_numpy(faces)
+        )
+
+    def first_hit(self, origin: Float64, directions: NDArray[Any]) -> Int32:
+        """The first triangle on each ray.
+
+        Args:
+            origin: (3,), common origin of the rays.
+            directions: (N, 3), of any nonzero length.
+
+        Returns:
+            int32 (N,), index of the triangle; -1 = the ray hits nothing.
+        """
+        hits = self._scene.cast_rays(_rays(origin, directions), nthreads=self._threads)
+        faces = hits["primitive_ids"].numpy()
+        return np.where(faces == _NO_HIT, -1, faces.astype(np.int64)).astype(np.int32)
+
+    def distance(self, points: NDArray[Any]) -> Float32:
+        """Distance of each point (N, 3) to the nearest triangle: float32 (N,), metres."""
+        wanted = o3d.core.Tensor.from_numpy(np.array(points, dtype=np.float32))
+        found = self._scene.compute_distance(wanted, nthreads=self._threads)
+        return np.asarray(found.numpy(), dtype=np.float32)
+
+    def blocked(
+        self, origins: NDArray[Any], reaches: NDArray[Any], near: float = 0.0, far: float = 1.0
+    ) -> Bool:
+        """Whether a triangle intersects the segment from ``origin`` to ``origin + reach``.
+
+        Args:
+            origins: (3,) or (N, 3), metres.
+            reaches: (N, 3), metres.
+            near: Fraction of the reach at which the segment begins.
+            far: Fraction of the reach at which it ends; below 1 ignores the surface it ends on.
+
+        Returns:
+            bool (N,).
+        """
+        rays = _rays(origins, reaches)
+        hit = self._scene.test_occlusions(rays, tnear=near, tfar=far, nthreads=self._threads)
+        return np.asarray(hit.numpy(), dtype=np.bool_)
+
+
+def _rays(origins: NDArray[Any], directions: NDArray[Any]) -> Any:
+    """Open3D's (N, 6) single-precision rays."""
+    rays = np.empty((len(directions), 6), dtype=np.float32)
+    rays[:, :3] = origins
+    rays[:, 3:] = directions
+    return o3d.core.Tensor.from_numpy(rays)

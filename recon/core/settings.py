@@ -1,0 +1,125 @@
+"""Base class of every stage's settings: frozen, validated, unknown keys rejected."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from types import UnionType
+from typing import Any, Union, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic.fields import FieldInfo
+from typing_extensions import Self
+
+from recon.core.errors import SettingsError
+
+
+class Settings(BaseModel):
+    """Immutable settings of one stage.
+
+    Subclasses give each field a default, a unit in its name and a ``Field(description=…)``
+    with its bounds. Equal settings give equal results: environment variables have no effect.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, values: Any) -> Any:
+        """Read the word none as YAML's null; give parts of a group what its default has."""
+        if not isinstance(values, Mapping):
+            return values
+        fields = cls.model_fields
+        return {k: _complete(fields[k], v) if k in fields else v for k, v in values.items()}
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """Show only what differs from its default."""
+        for name, value in super().__repr_args__():
+            field = type(self).model_fields.get(name or "")
+            if field is None or value != field.get_default(call_default_factory=True):
+                yield name, value
+
+    @classmethod
+    def parse(cls, values: Mapping[str, Any], *, where: str | None = None) -> Self:
+        """Build settings from plain values.
+
+        Args:
+            values: Nested mapping, as read from YAML.
+            where: The file or option that the values came from, for the error message.
+
+        Raises:
+            SettingsError: A key is unknown or a value out of range; the first one is named.
+        """
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            raise settings_error(error, where=where, names=[*setting_names(cls)]) from error
+
+
+def merge(base: Mapping[str, Any], update: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested mappings merged; other values of ``update`` replace those of ``base``."""
+    merged = dict(base)
+    for key, value in update.items():
+        below = merged.get(key)
+        if isinstance(value, Mapping):
+            merged[key] = merge(below if isinstance(below, Mapping) else {}, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _complete(field: FieldInfo, value: Any) -> Any:
+    if value == "none" and can_be_none(field):
+        return None
+    if isinstance(value, Mapping) and isinstance(field.default, Settings):
+        # A group may stand with other defaults than its class: keep those that are not given.
+        return merge(field.default.model_dump(), value)
+    return value
+
+
+def can_be_none(field: FieldInfo) -> bool:
+    """Whether None is a value of a field; its text is then ``none``, or YAML's ``null``."""
+    return type(None) in alternatives(field.annotation)
+
+
+def alternatives(annotation: Any) -> tuple[Any, ...]:
+    """The types that a union allows; of any other type, itself."""
+    return get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+
+
+def setting_names(settings: type[BaseModel]) -> Iterator[str]:
+    """The dotted names of all settings of a model, including nested models."""
+    for name, field in settings.model_fields.items():
+        yield name
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from (f"{name}.{below}" for below in setting_names(field.annotation))
+
+
+def settings_error(
+    error: ValidationError, *, where: str | None = None, names: Sequence[str] = ()
+) -> SettingsError:
+    """Describe pydantic's first error in one line.
+
+    Args:
+        error: The error of pydantic.
+        where: The file or option, for the error message.
+        names: Dotted names of all settings, to suggest one for an unknown name.
+    """
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"]) or "settings"
+    if first["type"] == "extra_forbidden":
+        return SettingsError(
+            f"unknown setting {key!r}", where=where, hint=suggest_names(key, names)
+        )
+    # Our own message, without the prefix that pydantic adds.
+    said = first.get("ctx", {}).get("error", first["msg"])
+    return SettingsError(f"setting {key!r}: {said}", where=where, got=repr(first.get("input")))
+
+
+def suggest_names(unknown: str, names: Sequence[str]) -> str:
+    """Suggest settings of that name elsewhere, or with a similar name."""
+    last = unknown.rpartition(".")[2]
+    meant = [name for name in names if name.rpartition(".")[2] == last]
+    meant = meant or difflib.get_close_matches(unknown, names, n=3, cutoff=0.8)
+    listed = "`recon settings` lists them all"
+    return f"did you mean {' or '.join(meant[:4])}? {listed}" if meant else listed

@@ -1,0 +1,112 @@
+"""Validation of array fields: dtype and shape are checked, and the array becomes read-only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from recon.core.errors import ShapeError
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+Int32 = NDArray[np.int32]
+Bool = NDArray[np.bool_]
+
+
+def frozen_array(
+    name: str, value: Any, dtype: DTypeLike, shape: tuple[int | None, ...]
+) -> NDArray[Any]:
+    """Check an array and return a read-only view of it.
+
+    Args:
+        name: Name used in the error message.
+        value: Array to check; never converted, so float64 in place of float32 is an error.
+        dtype: Required dtype.
+        shape: Required shape; ``None`` stands for any length.
+
+    Raises:
+        ShapeError: ``value`` is not an array, or has the wrong dtype or shape.
+    """
+    expected = f"{np.dtype(dtype).name} {_shape_text(shape)}"
+    if not isinstance(value, np.ndarray):
+        raise ShapeError(f"{name} is not an array", got=type(value).__name__, expected=expected)
+    fits = len(value.shape) == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, value.shape, strict=True)
+    )
+    if value.dtype != np.dtype(dtype) or not fits:
+        raise ShapeError(
+            f"{name} has the wrong dtype or shape",
+            got=f"{value.dtype.name} {value.shape}",
+            expected=expected,
+        )
+    view: NDArray[Any] = value.view()
+    view.flags.writeable = False
+    return view
+
+
+def freeze(instance: object, name: str, dtype: DTypeLike, shape: tuple[int | None, ...]) -> None:
+    """Check a field of a frozen dataclass and replace it by a read-only view; None is accepted."""
+    value = getattr(instance, name)
+    if value is not None:
+        label = f"{type(instance).__name__}.{name}"
+        object.__setattr__(instance, name, frozen_array(label, value, dtype, shape))
+
+
+def float_map(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None) -> Float32:
+    """Convert what a caller gives to a map of floats.
+
+    Args:
+        name: Name used in the error message.
+        values: Anything that numpy takes for an array of real numbers. Masked elements of a
+            masked array become NaN.
+        shape: (H, W) that it must have unless it is a single number; None = any (H, W).
+
+    Returns:
+        float32 (H, W), or () for a single number where ``shape`` is given.
+
+    Raises:
+        ShapeError: It is not an array of real numbers, or has another shape.
+    """
+    try:
+        given = values if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
+    except ValueError as error:  # rows of different lengths
+        raise ShapeError(f"{name} is not an array", got=error) from error
+    if given.dtype.kind not in "fiu":
+        raise ShapeError(f"{name} is not an array of real numbers", got=f"dtype {given.dtype}")
+    fits = given.ndim == 2 if shape is None else given.shape in ((), shape)
+    if not fits or given.size == 0:
+        expected = "(H, W)" if shape is None else f"{shape}, or one number"
+        raise ShapeError(f"{name} has the wrong shape", got=given.shape, expected=expected)
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite
+        floats = given.astype(np.float32)
+    return np.asarray(np.ma.filled(floats, np.nan) if np.ma.isMaskedArray(floats) else floats)
+
+
+def size_text(image: NDArray[Any]) -> str:
+    """The size of an image or map as it is read aloud: width x height."""
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+def map_text(values: Float32, unit: str = "px") -> str:
+    """Range and share of the finite values of a map, for a ``repr``."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return "0 %"
+    share = 100 * finite.size / values.size
+    return f"{finite.min():.4g} to {finite.max():.4g} {unit}, {share:.1f} %"
+
+
+def extent_text(xyz: NDArray[Any]) -> str:
+    """Range of points (N, 3) along each axis in metres, for a ``repr``."""
+    if not len(xyz):
+        return "empty"
+    ends = zip("xyz", xyz.min(axis=0), xyz.max(axis=0), strict=True)
+    return ", ".join(f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in ends) + " m"
+
+
+def _shape_text(shape: tuple[int | None, ...]) -> str:
+    names = iter("NMKL")
+    return "(" + ", ".join(next(names) if n is None else str(n) for n in shape) + ")"

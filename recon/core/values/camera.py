@@ -1,0 +1,230 @@
+"""Camera models: raw cameras with lens distortion, and rectified stereo cameras."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from os import PathLike
+from typing import Final, Literal
+
+import numpy as np
+
+from recon.core.errors import CalibrationError
+from recon.core.values.arrays import Float64, freeze
+
+LensModel = Literal["pinhole", "fisheye"]
+
+LARGEST_CENTRE_OFFSET: Final = 0.25
+"""Offset of a principal point from the image centre, relative to the image size, above which the
+calibration is hardly of these images: at half the calibrated size it is 0.5."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraIntrinsics:
+    """A raw camera: its matrix and lens distortion.
+
+    Attributes:
+        matrix: float64 (3, 3), the camera matrix in pixels; pixel centres are at integers.
+        distortion: float64 (N,). Pinhole: OpenCV's order (k1 k2 p1 p2 k3 …), empty = none;
+            fisheye: always four (k1 k2 k3 k4).
+        width_px: Image width.
+        height_px: Image height.
+        model: ``pinhole`` projects by the tangent of the angle to the optical axis, ``fisheye``
+            by the angle itself (also called equidistant, or Kannala-Brandt).
+    """
+
+    matrix: Float64
+    distortion: Float64
+    width_px: int
+    height_px: int
+    model: LensModel = "pinhole"
+
+    def __post_init__(self) -> None:
+        freeze(self, "matrix", np.float64, (3, 3))
+        freeze(self, "distortion", np.float64, (None,))
+        if not (np.isfinite(self.matrix).all() and np.isfinite(self.distortion).all()):
+            raise CalibrationError("camera matrix or distortion is not finite")
+        if min(self.matrix[0, 0], self.matrix[1, 1]) <= 0:
+            raise CalibrationError("focal length is not positive", got=f"{self.matrix[0, 0]:g} px")
+        if self.model == "fisheye" and self.distortion.size != 4:
+            raise CalibrationError(
+                "a fisheye camera has four distortion coefficients", got=self.distortion.size
+            )
+
+    def __repr__(self) -> str:
+        (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
+        lens = ", ".join(f"{k:.4g}" for k in self.distortion)
+        return (
+            f"CameraIntrinsics({self.width_px}x{self.height_px}, fx {fx:.6g}, fy {fy:.6g}, "
+            f"cx {cx:.6g}, cy {cy:.6g} px, {self.model} [{lens}])"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class StereoCalibration:
+    """Two raw cameras and their relative pose.
+
+    Attributes:
+        left: The left camera.
+        right: The right camera.
+        T_right_left: float64 (4, 4); ``xyz_right = apply(T_right_left, xyz_left)``, metres
+            (OpenCV's ``R`` and ``T``).
+    """
+
+    left: CameraIntrinsics
+    right: CameraIntrinsics
+    T_right_left: Float64
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_right_left", np.float64, (4, 4))
+        rotation = self.T_right_left[:3, :3]
+        if not np.isfinite(self.T_right_left).all():
+            raise CalibrationError("pose of the right camera is not finite")
+        # 1e-3: calibration files often print no more than six digits.
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+            raise CalibrationError("rotation of the right camera is not orthonormal")
+        if self.baseline_m <= 0:
+            raise CalibrationError("baseline is zero", got="0 m", expected="> 0 m")
+
+    def __repr__(self) -> str:
+        return f"StereoCalibration(baseline {self.baseline_m:.6g} m, {self.left}, {self.right})"
+
+    @property
+    def baseline_m(self) -> float:
+        """Distance between the two camera centres."""
+        return float(np.linalg.norm(self.T_right_left[:3, 3]))
+
+
+@dataclass(frozen=True)
+class RectifiedCamera:
+    """A rectified stereo camera: rows aligned, one focal length, x axes along the baseline.
+
+    Attributes:
+        focal_px: Focal length of both views.
+        cx_px: Column of the principal point of the left view.
+        cy_px: Row of the principal point of both views.
+        cx_right_px: Column of the principal point of the right view.
+        baseline_m: Distance between the camera centres.
+        width_px: Image width.
+        height_px: Image height.
+        ndisp: Number of disparities to search, as given by the calibration file, or None.
+    """
+
+    focal_px: float
+    cx_px: float
+    cy_px: float
+    cx_right_px: float
+    baseline_m: float
+    width_px: int
+    height_px: int
+    ndisp: int | None = None
+
+    def __post_init__(self) -> None:
+        numbers = (self.focal_px, self.cx_px, self.cy_px, self.cx_right_px, self.baseline_m)
+        if not all(math.isfinite(number) for number in numbers):
+            raise CalibrationError("calibration holds a number that is not finite", got=numbers)
+        if self.focal_px <= 0:
+            raise CalibrationError("focal length is not positive", got=f"{self.focal_px:g} px")
+        if self.baseline_m <= 0:
+            raise CalibrationError(
+                "baseline is not positive",
+                got=f"{self.baseline_m:g} m",
+                expected="> 0 m",
+                hint="check that left and right are not swapped",
+            )
+        if min(self.width_px, self.height_px) < 1:
+            raise CalibrationError("image size is empty", got=f"{self.width_px}x{self.height_px}")
+
+    @property
+    def doffs_px(self) -> float:
+        """``cx_right - cx_left``: the disparity of a point at infinity, negated."""
+        return self.cx_right_px - self.cx_px
+
+    @property
+    def field_of_view_deg(self) -> float:
+        """Horizontal field of view of the left view, degrees."""
+        left = math.atan((self.cx_px + 0.5) / self.focal_px)
+        return math.degrees(left + math.atan((self.width_px - 0.5 - self.cx_px) / self.focal_px))
+
+    @property
+    def matrix(self) -> Float64:
+        """float64 (3, 3) pinhole matrix of the left view."""
+        f, cx, cy = self.focal_px, self.cx_px, self.cy_px
+        return np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+
+    def resized(self, width_px: int, height_px: int) -> RectifiedCamera:
+        """The camera of the same view at another image size; the baseline does not change.
+
+        Pixel centres are at integers, so a principal point scales as ``(c + 0.5)·s - 0.5``.
+        Middlebury multiplies ``c`` and ``doffs`` by ``s``: the same for ``doffs``, but up to half
+        a pixel off for ``c``.
+        """
+        s = width_px / self.width_px
+        return replace(
+            self,
+            focal_px=self.focal_px * s,
+            cx_px=(self.cx_px + 0.5) * s - 0.5,
+            cy_px=(self.cy_px + 0.5) * height_px / self.height_px - 0.5,
+            cx_right_px=(self.cx_right_px + 0.5) * s - 0.5,
+            width_px=width_px,
+            height_px=height_px,
+            ndisp=None if self.ndisp is None else math.ceil(self.ndisp * s),
+        )
+
+
+def check_size(
+    calibration: RectifiedCamera | StereoCalibration,
+    width_px: int,
+    height_px: int,
+    where: str | PathLike[str] | None,
+) -> None:
+    """Check that images have the size of their calibration; every use of a calibration does.
+
+    Args:
+        calibration: The calibration.
+        width_px: Width of the images.
+        height_px: Height of the images.
+        where: Calibration file or image, for the error message.
+
+    Raises:
+        CalibrationError: They have another size.
+    """
+    camera = calibration if isinstance(calibration, RectifiedCamera) else calibration.left
+    if (width_px, height_px) != (camera.width_px, camera.height_px):
+        raise other_size(width_px, height_px, f"{camera.width_px}x{camera.height_px}", where)
+
+
+def other_size(
+    width_px: int, height_px: int, expected: str, where: str | PathLike[str] | None
+) -> CalibrationError:
+    """The error for images that have another size than their calibration."""
+    return CalibrationError(
+        "images have another size than the calibration",
+        where=where,
+        got=f"{width_px}x{height_px}",
+        expected=expected,
+        hint="use images as they were calibrated (not resized, cropped or rotated), or a "
+        "calibration of these images",
+    )
+
+
+def check_unsized(
+    centre_px: tuple[float, float], width_px: int, height_px: int, where: str | PathLike[str]
+) -> None:
+    """Check a calibration from a file that does not state its image size against the images.
+
+    Raises:
+        CalibrationError: The principal point is so far off their centre that the calibration must
+            be of another size.
+    """
+    offsets = (centre_px[0] / width_px - 0.5, centre_px[1] / height_px - 0.5)
+    if max(map(abs, offsets)) > LARGEST_CENTRE_OFFSET:
+        raise CalibrationError(
+            "the calibration is of another size",
+            where=where,
+            got=f"principal point at ({centre_px[0]:g}, {centre_px[1]:g}) of "
+            f"{width_px}x{height_px} pixels",
+            expected="near the centre",
+            hint="use images as they were calibrated; a cropped image needs a calibration file "
+            "that stores the size",
+        )

@@ -1,0 +1,72 @@
+"""Occupancy maps: sparse 3-D voxels, and the 2-D grid used for path planning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.values.arrays import Float32, Float64, Int32, freeze, size_text
+
+FREE: Final = 0
+OCCUPIED: Final = 100
+UNKNOWN: Final = -1
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyVoxels:
+    """The observed voxels of a 3-D map; voxels that are not listed are unknown.
+
+    Attributes:
+        keys: int32 (N, 3); voxel ``k`` spans ``[k, k + 1) · resolution_m`` on each axis of the map.
+        log_odds: float32 (N,), natural logarithm; above 0 = occupied.
+        resolution_m: Edge length of a voxel.
+    """
+
+    keys: Int32
+    log_odds: Float32
+    resolution_m: float
+
+    def __post_init__(self) -> None:
+        freeze(self, "keys", np.int32, (None, 3))
+        freeze(self, "log_odds", np.float32, (len(self.keys),))
+
+    def __repr__(self) -> str:
+        occupied = int(np.sum(self.log_odds > 0))
+        sizes = f"{len(self)} voxels of {self.resolution_m:g} m, {occupied} occupied"
+        return f"OccupancyVoxels({sizes})"
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    @property
+    def centres_m(self) -> Float64:
+        """float64 (N, 3), centres of the voxels, map axes."""
+        return (self.keys.astype(np.float64) + 0.5) * self.resolution_m
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyGrid:
+    """A 2-D occupancy grid in map axes, with the conventions of ROS.
+
+    Attributes:
+        cells: int8 (rows, columns): FREE, OCCUPIED or UNKNOWN; row 0 has the smallest y,
+            column 0 the smallest x.
+        resolution_m: Cell size.
+        origin_m: (x, y) of the outer corner of cell (0, 0).
+    """
+
+    cells: NDArray[np.int8]
+    resolution_m: float
+    origin_m: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        freeze(self, "cells", np.int8, (None, None))
+
+    def __repr__(self) -> str:
+        named = (("occupied", OCCUPIED), ("free", FREE))
+        shares = [f"{100 * np.mean(self.cells == cell):.1f} % {name}" for name, cell in named]
+        size = f"{size_text(self.cells)} cells of {self.resolution_m:g} m"
+        return f"OccupancyGrid({size}, {', '.join(shares)}, origin {self.origin_m} m)"

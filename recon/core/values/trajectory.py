@@ -1,0 +1,54 @@
+"""Trajectories: the pose of the left camera in each frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon.core.errors import ShapeError
+from recon.core.values.arrays import Float64, freeze
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses of the left camera.
+
+    Attributes:
+        T_world_camera: float64 (N, 4, 4), metres;
+            ``xyz_world = apply(T_world_camera, xyz_camera)``.
+        timestamps_s: float64 (N,), not decreasing.
+    """
+
+    T_world_camera: Float64
+    timestamps_s: Float64
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_world_camera", np.float64, (None, 4, 4))
+        freeze(self, "timestamps_s", np.float64, (len(self.T_world_camera),))
+        broken = ~np.isfinite(self.T_world_camera).all(axis=(1, 2))
+        if broken.any():
+            raise ShapeError("pose is not finite", where=f"pose {int(np.argmax(broken))}")
+
+    def __repr__(self) -> str:
+        seconds = self.timestamps_s[-1] - self.timestamps_s[0] if len(self) else 0.0
+        return f"Trajectory({len(self)} poses, {self.path_length_m:.4g} m, {seconds:.4g} s)"
+
+    def __len__(self) -> int:
+        return len(self.T_world_camera)
+
+    @property
+    def positions_m(self) -> Float64:
+        """float64 (N, 3), the camera centres."""
+        return self.T_world_camera[:, :3, 3]
+
+    @property
+    def distances_m(self) -> Float64:
+        """float64 (N,), path length from the first pose to each pose."""
+        steps = np.linalg.norm(np.diff(self.positions_m, axis=0), axis=1)
+        return np.concatenate([np.zeros(min(1, len(self))), np.cumsum(steps)])
+
+    @property
+    def path_length_m(self) -> float:
+        """Length of the whole path."""
+        return float(self.distances_m[-1]) if len(self) else 0.0

@@ -1,0 +1,1 @@
+"""The Middlebury stereo benchmark: scenes, scores and results of other programs."""

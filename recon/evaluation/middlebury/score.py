@@ -1,0 +1,91 @@
+"""The figures of one result and of all scenes together, as ``summary.json`` holds them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any, Final
+
+import numpy as np
+
+from recon.core.values import DisparityMetrics
+from recon.core.values.arrays import Float32
+from recon.evaluation import evaluate_depth, evaluate_middlebury
+from recon.evaluation.middlebury.rules import by_the_rules, weighted_mean
+from recon.evaluation.middlebury.scenes import ScoredScene
+from recon.stereo.match import fill_holes
+
+MASKS: Final = {"nonocc": False, "all": True}
+"""Pixels that are scored: those seen by both cameras, or occluded ones as well."""
+
+Figures = dict[str, Any]
+
+
+def dense_map(values: Float32) -> Float32:
+    """A map without holes: float32 (H, W).
+
+    Holes that cannot be filled get disparity 0, which is wrong nearly everywhere, so that no
+    matcher gains by leaving pixels out.
+    """
+    filled = fill_holes(values)
+    return np.where(np.isfinite(filled), filled, np.float32(0))
+
+
+def score_result(scene: ScoredScene, values: Float32) -> Figures:
+    """The figures of a result, by mask.
+
+    Args:
+        scene: The scene.
+        values: float32 (h, w), pixels; NaN = none.
+
+    Raises:
+        EvaluationError: The size of the result does not match the ground truth.
+    """
+    maps = {"dense": dense_map(values), "sparse": values}
+    return {mask: _of_mask(scene, maps, occluded=occluded) for mask, occluded in MASKS.items()}
+
+
+def weighted_figures(scenes: Mapping[str, Figures]) -> Figures:
+    """The mean of each figure over scenes, with the benchmark's weights.
+
+    Args:
+        scenes: Nested figures by scene name. A figure that any scene lacks is left out.
+    """
+    first, *others = scenes.values()
+    shared = [key for key in first if all(key in other for other in others)]
+    return {key: _weighted({name: one[key] for name, one in scenes.items()}) for key in shared}
+
+
+def named_figures(metrics: DisparityMetrics) -> Figures:
+    """Figures named as in the benchmark's table, in pixels and per cent."""
+    return {
+        "bad": {f"{limit:g}": share for limit, share in metrics.bad.items()},
+        "avgerr": metrics.avgerr_px,
+        "rms": metrics.rms_px,
+        **{f"a{percent}": error for percent, error in metrics.quantiles_px.items()},
+    }
+
+
+def _weighted(values: Mapping[str, Any]) -> Any:
+    if isinstance(next(iter(values.values())), dict):
+        return weighted_figures(values)
+    return weighted_mean(values)
+
+
+def _of_mask(scene: ScoredScene, maps: Mapping[str, Float32], *, occluded: bool) -> Figures:
+    figures: Figures = {}
+    for name, values in maps.items():
+        metrics = evaluate_middlebury(values, scene.truth, scene.rules, occluded=occluded)
+        figures[name] = named_figures(metrics) | _depth(scene, values, occluded=occluded)
+        # The sparse map comes last: its holes are what the matcher did not find.
+        figures["invalid"] = metrics.invalid
+    return figures
+
+
+def _depth(scene: ScoredScene, values: Float32, *, occluded: bool) -> Figures:
+    """Errors in metres, where the scene has a calibration."""
+    if scene.truth_camera is None:
+        return {}
+    compared = by_the_rules(values, scene.truth.values.shape, scene.rules)
+    metrics = evaluate_depth(compared, scene.truth, scene.truth_camera, occluded=occluded)
+    return {"depth": asdict(metrics)}

@@ -1,0 +1,1 @@
+"""What leaves a map: one module per product."""

@@ -1,0 +1,260 @@
+"""Screened Poisson reconstruction of a cloud, trimmed to where there is data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field
+
+from recon.core.errors import MeshingError
+from recon.core.settings import Settings
+from recon.core.values import PointCloud, TriangleMesh
+from recon.core.values.arrays import Bool, Float32, Int32
+from recon.export.mesh.pymeshlab import screened_poisson
+from recon.export.mesh.surgery import drop_small_components, keep_vertices, vertex_normals
+from recon.io.models import open3d_meshes
+from recon.stereo.cloud import open3d_clouds
+
+_MIN_POINTS = 50
+MIN_DEPTH = 4
+_SPACING_NEIGHBOURS = 7
+_SPACING_SAMPLES = 20_000
+#: MeshLab's octree is this much wider than the cloud.
+OCTREE_SCALE = 1.1
+Point = tuple[float, float, float]
+
+
+class MeshSettings(Settings):
+    """How a surface is reconstructed and trimmed."""
+
+    depth: int | None = Field(
+        default=None,
+        ge=4,
+        le=12,
+        description="Octree depth; null = chosen by cell_spacings, up to max_depth.",
+    )
+    cell_spacings: float = Field(
+        default=1.5,
+        gt=0,
+        le=20,
+        description="Widest octree cell, in point spacings; noise in smaller ones becomes ripples.",
+    )
+    max_depth: int = Field(
+        default=10, ge=4, le=12, description="Largest depth that is chosen automatically."
+    )
+    samples_per_node: float = Field(
+        default=1.5, ge=1, le=50, description="Points that an octree cell should hold."
+    )
+    point_weight: float = Field(
+        default=4.0, ge=0, description="Weight of the points against their normals."
+    )
+    trim_density_quantile: float = Field(
+        default=0.01, ge=0, lt=1, description="Share of the vertices cut off as least supported."
+    )
+    max_distance_spacings: float | None = Field(
+        default=2.0,
+        gt=0,
+        description="Farthest a vertex may lie from the points, in local point spacings; "
+        "null = keep all.",
+    )
+    min_component_faces: int = Field(
+        default=100, ge=1, description="Connected pieces with fewer faces are dropped."
+    )
+    target_faces: int | None = Field(
+        default=None, ge=4, description="Simplify to about so many faces; null = do not."
+    )
+    normals_neighbours: int = Field(
+        default=20, ge=3, le=1000, description="Neighbours for normals where the cloud has none."
+    )
+    tile_m: float = Field(
+        default=50.0, gt=0, description="Edge of the tiles in which the map of a drive is meshed."
+    )
+    overlap_m: float = Field(
+        default=3.0,
+        ge=0,
+        description="Margin around a tile whose points its surface is fitted to as well.",
+    )
+    seam_m: float = Field(
+        default=0.15, ge=0, description="Widest gap that is closed where two tiles meet."
+    )
+    free_space: bool = Field(
+        default=True,
+        description="Remove surfaces in space that the cameras of a drive saw to be free.",
+    )
+
+
+def reconstruct_mesh(
+    cloud: PointCloud,
+    settings: MeshSettings,
+    viewpoint_m: Point | None = None,
+    wrong: Callable[[Float32], Bool] | None = None,
+) -> TriangleMesh:
+    """Reconstruct the surface that a cloud was sampled from.
+
+    A Poisson surface is closed: it bridges every gap with a bulge. Parts that are farther from
+    the points than the point spacing, or weakly supported, are removed, so that holes in the
+    data stay holes in the mesh.
+
+    Args:
+        cloud: Points, with normals if possible; vertices take their colours.
+        settings: Settings of the reconstruction.
+        viewpoint_m: The position that the points were seen from, in the frame of the cloud; used
+            only if the cloud has no normals. None = normals are only made consistent, and may
+            all be flipped.
+        wrong: Returns which vertices (V, 3) cannot be on a surface; None = unknown.
+
+    Returns:
+        The mesh, with outward unit normals, and colours if the cloud has any.
+
+    Raises:
+        MeshingError: The points are too few, coincident or collinear; Poisson failed; or
+            trimming left no face.
+
+    Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
+    """
+    cloud = oriented(usable(cloud), settings, viewpoint_m)
+    depth = settings.depth or _fitting_depth(cloud.xyz, settings)
+    return trimmed_surface(cloud, settings, Octree(depth), wrong)
+
+
+@dataclass(frozen=True)
+class Octree:
+    """The grid that a surface is computed on.
+
+    Attributes:
+        depth: Its edge has 2^depth cells.
+        scale: Its edge, as a multiple of the longest side of the cloud.
+    """
+
+    depth: int
+    scale: float = OCTREE_SCALE
+
+
+def trimmed_surface(
+    cloud: PointCloud,
+    settings: MeshSettings,
+    octree: Octree,
+    wrong: Callable[[Float32], Bool] | None = None,
+) -> TriangleMesh:
+    """The Poisson surface of a cloud with normals, without what no points support.
+
+    Args:
+        cloud: Finite points with unit normals, in coordinates that are equally precise everywhere.
+        settings: Settings of the reconstruction.
+        octree: Resolution of the surface.
+        wrong: Returns which vertices (V, 3) cannot be on a surface; None = unknown.
+
+    Raises:
+        MeshingError: Poisson failed, or trimming left no face.
+    """
+    vertices, faces, density = screened_poisson(
+        cloud.xyz,
+        _required(cloud.normals),
+        depth=octree.depth,
+        scale=octree.scale,
+        samples_per_node=settings.samples_per_node,
+        point_weight=settings.point_weight,
+    )
+    supported = density >= np.quantile(density, settings.trim_density_quantile)
+    if settings.max_distance_spacings is not None:
+        supported &= _near_data(vertices, cloud.xyz, settings.max_distance_spacings)
+    if wrong is not None:
+        supported &= ~wrong(vertices)
+    vertices, faces = keep_vertices(vertices, faces, supported)
+    vertices, faces = drop_small_components(vertices, faces, settings.min_component_faces)
+    if settings.target_faces is not None and len(faces) > settings.target_faces:
+        vertices, faces = open3d_meshes.decimate(vertices, faces, settings.target_faces)
+    return TriangleMesh(
+        vertices=vertices,
+        faces=faces,
+        normals=vertex_normals(vertices, faces),
+        rgb=None if cloud.rgb is None else cloud.rgb[_nearest_points(vertices, cloud.xyz)],
+    )
+
+
+def usable(cloud: PointCloud) -> PointCloud:
+    """The finite points of a cloud, if they can span a surface.
+
+    Raises:
+        MeshingError: The points are too few, coincident or collinear.
+    """
+    finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
+    if finite.sum() < _MIN_POINTS:
+        raise MeshingError(
+            "too few points for a surface",
+            got=int(finite.sum()),
+            expected=f"at least {_MIN_POINTS} finite points",
+        )
+    cloud = cloud.select(finite)
+    centred = cloud.xyz.astype(np.float64) - cloud.xyz.mean(axis=0, dtype=np.float64)
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred)), 0))
+    # float32 coordinates resolve about 1e-5 of the extent.
+    farthest = float(np.abs(cloud.xyz).max())
+    if spread[1] <= 1e-5 * max(spread[2], farthest):
+        distant = spread[1] > 1e-5 * spread[2] and spread[1] > 0
+        raise MeshingError(
+            "all points lie in one place or on one line",
+            got=f"{len(cloud)} points, up to {farthest:.3g} m from the origin",
+            hint="subtract an offset from all coordinates" if distant else None,
+        )
+    return cloud
+
+
+def oriented(cloud: PointCloud, settings: MeshSettings, viewpoint_m: Point | None) -> PointCloud:
+    """The points that have a normal, or all points with estimated normals."""
+    if cloud.normals is not None:
+        # NaN fails the comparison, so it counts as no normal.
+        known = np.asarray(np.linalg.norm(cloud.normals, axis=1) > 0.5)
+        if known.sum() >= _MIN_POINTS:
+            return cloud.select(known)
+    normals = open3d_clouds.estimate_normals(cloud.xyz, settings.normals_neighbours)
+    if viewpoint_m is None:
+        normals = open3d_clouds.agree_normals(cloud.xyz, normals, settings.normals_neighbours)
+    else:
+        away = np.einsum("ij,ij->i", normals, np.asarray(viewpoint_m) - cloud.xyz) < 0
+        normals = np.where(away[:, None], -normals, normals)
+    return replace(cloud, normals=normals)
+
+
+def _required(normals: Float32 | None) -> Float32:
+    if normals is None:
+        raise MeshingError("the cloud has no normals")
+    return normals
+
+
+def widest_cell(xyz: Float32, settings: MeshSettings) -> float:
+    """Widest octree cell that the settings allow, in the unit of the points."""
+    step = max(1, len(xyz) // _SPACING_SAMPLES)
+    return settings.cell_spacings * float(np.median(_spacing(xyz[::step], xyz)))
+
+
+def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
+    """The smallest octree depth whose cells are no wider than the settings allow."""
+    cell_m = widest_cell(xyz, settings)
+    extent_m = float(np.ptp(xyz, axis=0).max()) * OCTREE_SCALE
+    if cell_m * 2**settings.max_depth <= extent_m:
+        return settings.max_depth
+    return int(np.clip(math.ceil(math.log2(extent_m / cell_m)), MIN_DEPTH, settings.max_depth))
+
+
+def _spacing(some_xyz: Float32, xyz: Float32) -> Float32:
+    """float32 (N,): distance of points of a cloud to their neighbours in it."""
+    return open3d_clouds.nearest(some_xyz, xyz, _SPACING_NEIGHBOURS)[1][:, -1]
+
+
+def _near_data(vertices: Float32, xyz: Float32, spacings: float) -> Bool:
+    """bool (V,): vertices within ``spacings`` local point spacings of the nearest point."""
+    index, distance_m = open3d_clouds.nearest(vertices, xyz)
+    near, where = np.unique(index[:, 0], return_inverse=True)
+    local_m = _spacing(xyz[near], xyz)
+    # A lone point is far from its neighbours, and must not support a large patch of surface.
+    local_m = np.minimum(local_m, 2 * np.median(local_m))
+    return np.asarray(distance_m[:, 0] <= spacings * local_m[where])
+
+
+def _nearest_points(vertices: Float32, xyz: Float32) -> Int32:
+    """int32 (V,): the point nearest to each vertex."""
+    return open3d_clouds.nearest(vertices, xyz)[0][:, 0]

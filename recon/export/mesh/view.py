@@ -1,0 +1,142 @@
+"""The surface of one stereo pair, as finely resolved as the pair was measured.
+
+The points of a pair are a pixel apart, which is millimetres close by and decimetres far away. An
+octree of equal cells in metres is too coarse for the one or too fine for the other, and a single
+wrong match far away makes all its cells larger. So the surface is computed in image coordinates:
+column, row and disparity.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from recon.core.raycasting import RayScene
+from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
+from recon.core.values.arrays import Bool, Float32
+from recon.export.mesh.poisson import (
+    MIN_DEPTH,
+    OCTREE_SCALE,
+    MeshSettings,
+    Octree,
+    oriented,
+    trimmed_surface,
+    usable,
+    widest_cell,
+)
+from recon.export.mesh.surgery import vertex_normals
+
+COVERED_WITHIN: Final = 0.005
+"""A point is covered if the mesh is no farther from it than this share of its depth."""
+_DISPARITY_STEP: Final = 2.0
+"""Pixels that a pixel of disparity counts for: what is trimmed as farther than two pixel spacings
+from the points (2.8 pixels) is then a step of 1.4 pixels of disparity or more."""
+_MOST_CELLS: Final = 60_000
+"""Cells that the surface may cross, about. The time of Poisson grows with them, 20 s for so many;
+images of more than a quarter of a megapixel get larger cells."""
+_COVERAGE_SAMPLES: Final = 100_000
+
+
+def reconstruct_view(
+    cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings
+) -> TriangleMesh:
+    """Reconstruct the surface that one stereo pair sees.
+
+    Args:
+        cloud: The points of the pair in camera axes, with normals if possible.
+        camera: The rectified camera that measured them.
+        settings: Settings of the reconstruction. Spacings are pixels here.
+
+    Returns:
+        The mesh in camera axes, with unit normals towards the camera, and colours if the cloud
+        has any.
+
+    Raises:
+        MeshingError: The points give no surface; see `reconstruct_mesh`.
+
+    Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
+    """
+    cloud = usable(cloud.select(cloud.xyz[:, 2] > 0))
+    cloud = oriented(cloud, settings, viewpoint_m=(0.0, 0.0, 0.0))
+    space = _ImageSpace(camera.focal_px, camera.baseline_m)
+    seen = space.of_cloud(cloud)
+    low, high = seen.xyz.min(axis=0), seen.xyz.max(axis=0)
+
+    def outside(vertices: Float32) -> Bool:
+        beside = ((vertices < low) | (vertices > high))[:, :2].any(axis=1)
+        # As disparities approach zero, depths approach infinity.
+        return np.asarray(beside | (vertices[:, 2] > high[2] / 2))
+
+    mesh = trimmed_surface(seen, settings, _octree(seen.xyz, settings), outside)
+    vertices = space.metres(mesh.vertices)
+    return replace(mesh, vertices=vertices, normals=vertex_normals(vertices, mesh.faces))
+
+
+def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
+    """Share of the points of a pair that are covered by its mesh, from 0 to 1.
+
+    Args:
+        mesh: The mesh in camera axes, with at least one face.
+        cloud: The points in camera axes, at least one; of more than 100,000, every n-th is used.
+    """
+    xyz = cloud.xyz[:: math.ceil(len(cloud) / _COVERAGE_SAMPLES)]
+    distance_m = RayScene(mesh.vertices[mesh.faces]).distance(xyz)
+    return float(np.mean(distance_m <= COVERED_WITHIN * xyz[:, 2]))
+
+
+@dataclass(frozen=True)
+class _ImageSpace:
+    """Column, row and negative disparity from the principal point and infinity, in pixels.
+
+    The mapping is projective, so planes stay planes, and it preserves orientation.
+
+    Attributes:
+        focal_px: Focal length.
+        baseline_m: Distance between the camera centres.
+    """
+
+    focal_px: float
+    baseline_m: float
+
+    @property
+    def _range(self) -> float:
+        """Third coordinate times depth, negated."""
+        return _DISPARITY_STEP * self.focal_px * self.baseline_m
+
+    def of_cloud(self, cloud: PointCloud) -> PointCloud:
+        """A cloud in camera axes and its normals, in image coordinates."""
+        x, y, z = cloud.xyz.T.astype(np.float64)
+        xyz = np.stack([self.focal_px * x / z, self.focal_px * y / z, -self._range / z], axis=1)
+        if cloud.normals is None:
+            return replace(cloud, xyz=xyz.astype(np.float32))
+        # A normal is transformed by the transposed Jacobian of the way back to metres; its columns
+        # are the motions of the point per pixel of each image coordinate.
+        along = cloud.normals.astype(np.float64)
+        depthwards = np.einsum("ij,ij->i", along, cloud.xyz) / self._range
+        pulled = np.stack([along[:, 0] / self.focal_px, along[:, 1] / self.focal_px, depthwards], 1)
+        pulled /= np.linalg.norm(pulled, axis=1, keepdims=True)
+        return replace(cloud, xyz=xyz.astype(np.float32), normals=pulled.astype(np.float32))
+
+    def metres(self, vertices: Float32) -> Float32:
+        """float32 (V, 3): camera axes from image coordinates."""
+        column, row, disparity = vertices.T.astype(np.float64)
+        z = -self._range / disparity
+        xyz = np.stack([column * z / self.focal_px, row * z / self.focal_px, z], axis=1)
+        return np.asarray(xyz, dtype=np.float32)
+
+
+def _octree(xyz: Float32, settings: MeshSettings) -> Octree:
+    """Octree whose cells are as wide as the settings allow, for an image of any size."""
+    if settings.depth is not None:
+        return Octree(settings.depth)
+    extent = float(np.ptp(xyz, axis=0).max())
+    # A spacing, the distance to the sixth neighbour, is the diagonal of the pixel of a point.
+    cells = len(xyz) / (2 * settings.cell_spacings**2)
+    cell = widest_cell(xyz, settings) * max(1.0, math.sqrt(cells / _MOST_CELLS))
+    cell = max(cell, extent / 2**settings.max_depth)  # not 0 where points coincide
+    depth = math.ceil(math.log2(OCTREE_SCALE * extent / cell))
+    depth = min(max(depth, MIN_DEPTH), settings.max_depth)
+    return Octree(depth, max(OCTREE_SCALE, cell * 2**depth / extent))

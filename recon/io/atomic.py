@@ -1,0 +1,91 @@
+"""Atomic file writes: temporary file, fsync, rename."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+
+from recon.core.errors import OutputError
+
+
+@contextmanager
+def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path to write to, which is renamed to ``path`` if the block succeeds.
+
+    The temporary file is in the same folder and has the same suffix, so a library that chooses the
+    format by the suffix chooses the same one. Missing folders are created. If the block raises,
+    the temporary file is removed and an existing file at ``path`` is left untouched.
+
+    Args:
+        path: The file to write or replace.
+
+    Yields:
+        The temporary path, which does not exist yet.
+
+    Raises:
+        OutputError: The folder or file cannot be written, or the block wrote nothing.
+    """
+    target = Path(path)
+    temporary = target.with_name(f".{secrets.token_hex(6)}-{target.name}")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        yield temporary
+        _sync(temporary)
+        temporary.replace(target)
+        _sync(target.parent)
+    except OSError as error:
+        raise _output_error(target, error) from error
+    finally:
+        _remove(temporary)
+
+
+def write_text(path: str | PathLike[str], text: str) -> None:
+    """Write UTF-8 text atomically, without converting line endings.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    # A name of a file that is not UTF-8 is written as \\udcXX, which JSON and YAML read back.
+    write_bytes(path, text.encode(errors="backslashreplace"))
+
+
+def write_bytes(path: str | PathLike[str], content: bytes) -> None:
+    """Write bytes atomically.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _sync(path: Path) -> None:
+    """Flush a file, or the directory entries of a folder, to disk."""
+    if os.name == "nt" and path.is_dir():  # Windows cannot open a folder, nor needs to sync it
+        return
+    handle = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _remove(temporary: Path) -> None:
+    """Remove the temporary file of a failed block; an error here must not hide the first one."""
+    try:
+        temporary.unlink(missing_ok=True)
+    except OSError:
+        return
+
+
+def _output_error(target: Path, error: OSError) -> OutputError:
+    return OutputError(
+        "cannot write the file",
+        where=target,
+        got=error.strerror or type(error).__name__,
+        hint="check that the folder is writable and the disk is not full",
+    )

@@ -1,0 +1,112 @@
+"""Reads any supported calibration file, recognised by its content."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from recon.core.errors import CalibrationError, FormatError
+from recon.core.values import RectifiedCamera, StereoCalibration, check_size
+from recon.io.cameras.camera_info import read_camera_info
+from recon.io.cameras.kalibr import read_kalibr
+from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras
+from recon.io.cameras.kitti_raw import read_kitti_rig
+from recon.io.cameras.opencv_yaml import read_opencv_calibration
+from recon.io.cameras.recon_yaml import MARK, read_recon_calibration
+from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader
+from recon.io.middlebury.calib import read_middlebury_calib
+
+_KITTI: Final = re.compile(r"^P(?:_rect_0)?\d:", re.MULTILINE)
+_MIDDLEBURY: Final = re.compile(r"^\s*cam[01]\s*=", re.MULTILINE)
+_OURS: Final = re.compile(rf"^format:\s*{MARK}", re.MULTILINE)
+_CAMERA_INFO: Final = re.compile(r"^projection_matrix:", re.MULTILINE)
+_KALIBR: Final = re.compile(r"^cam0:", re.MULTILINE)
+_HOMOGRAPHIES: Final = re.compile(r"^H_left:", re.MULTILINE)
+_OPENCV: Final = re.compile(r"^%YAML|<opencv_storage>|opencv-matrix")
+
+
+@reader
+def read_calibration(
+    path: StrPath,
+    width_px: int | None = None,
+    height_px: int | None = None,
+    *,
+    metres_per_unit: float = 1.0,
+    cameras: tuple[int, int] | None = None,
+) -> RectifiedCamera | StereoCalibration:
+    """Read the calibration of images of one size from a file of any supported format.
+
+    Supported are our own YAML, KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt`` (its rectified or
+    raw cameras, according to the image size), Middlebury's ``calib.txt``, OpenCV's ``FileStorage``
+    files, ROS CameraInfo (either of the two files; the other is expected in the same folder), and
+    kalibr's camera chain.
+
+    Args:
+        path: The file.
+        width_px: Image width; None = that of the file, which KITTI's and some of OpenCV's lack.
+        height_px: Image height.
+        metres_per_unit: Unit of the translation in an OpenCV file; other formats define theirs.
+        cameras: Left and right camera of a KITTI file; None = the grey pair if it has one.
+
+    Returns:
+        A `RectifiedCamera` if the images are already rectified.
+
+    Raises:
+        FormatError: The file is missing, damaged or of an unknown format, or it does not contain
+            the image size and none is given.
+        CalibrationError: The calibration cannot give depth, or is of another image size.
+    """
+    size = None if width_px is None or height_px is None else (width_px, height_px)
+    rig = _read(path, size, metres_per_unit, cameras)
+    if size is not None:
+        check_size(rig, *size, path)
+    return rig
+
+
+def _read(
+    path: StrPath,
+    size: tuple[int, int] | None,
+    metres_per_unit: float,
+    cameras: tuple[int, int] | None,
+) -> RectifiedCamera | StereoCalibration:
+    """Recognise the format; ``size`` is for files that do not state one, or more than one."""
+    text = read_text(path, SMALL_FILE_BYTES)
+    if _OURS.search(text):
+        return read_recon_calibration(path)
+    if _CAMERA_INFO.search(text):
+        return read_camera_info(path)
+    if _KALIBR.search(text):
+        return read_kalibr(path)
+    # OpenCV after the others that may have its header, before KITTI: it may contain a ``P1:``.
+    if _OPENCV.search(text):
+        return read_opencv_calibration(path, size_px=size, metres_per_unit=metres_per_unit)
+    if _MIDDLEBURY.search(text):
+        return read_middlebury_calib(path).camera
+    if _KITTI.search(text):
+        if size is None:
+            raise FormatError(
+                "a KITTI calibration does not say which images it is of",
+                where=path,
+                hint="pass width_px and height_px, or give the file itself to recon.reconstruct or "
+                "recon.match, which take the size from the images",
+            )
+        return read_kitti_rig(path, *size, cameras or _kitti_cameras(path))
+    if _HOMOGRAPHIES.search(text):
+        raise CalibrationError(
+            "homographies know no focal length and no baseline: there is no depth in them",
+            where=path,
+            hint="recon disparity takes the rectified images as they are; for depth use a "
+            "calibration of the cameras (recon calibrate)",
+        )
+    raise FormatError(
+        "not a calibration file",
+        where=path,
+        expected="our YAML, KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…), "
+        "OpenCV YAML/XML (M1 …), ROS CameraInfo or a kalibr camchain (cam0: …)",
+    )
+
+
+def _kitti_cameras(path: StrPath) -> tuple[int, int]:
+    known = list_kitti_cameras(path)
+    grey = known.issuperset(GREY_CAMERAS) or not known.issuperset(COLOUR_CAMERAS)
+    return GREY_CAMERAS if grey else COLOUR_CAMERAS

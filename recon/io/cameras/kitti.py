@@ -1,0 +1,135 @@
+"""KITTI calibration: projection matrices ``P0`` … ``P3`` of the rectified cameras."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import CalibrationError, FormatError
+from recon.core.values import RectifiedCamera, check_unsized
+from recon.core.values.arrays import Float64
+from recon.io.files import StrPath, read_text, reader
+
+GREY_CAMERAS: Final = (0, 1)
+COLOUR_CAMERAS: Final = (2, 3)
+_FOLDER: Final = re.compile(r"image_0?([0-3])")
+_LINE: Final = re.compile(r"^P(?:_rect_0)?(\d):(.*)$", re.MULTILINE)
+
+
+@reader
+def read_kitti_calib(
+    path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int] = GREY_CAMERAS
+) -> RectifiedCamera:
+    """Read the rectified camera of one stereo pair.
+
+    ``P = K·[I | t]`` with ``t`` relative to camera 0. The baseline is the distance of the two
+    cameras along x, so it holds for the colour pair too.
+
+    Args:
+        path: ``calib.txt`` of a KITTI odometry sequence (``P0:`` …), or ``calib_cam_to_cam.txt``
+            of a raw drive (``P_rect_00:`` …).
+        width_px: Image width; the first kind of file does not contain it.
+        height_px: Image height.
+        cameras: Left and right camera: (0, 1) grey, (2, 3) colour.
+
+    Raises:
+        FormatError: The file is missing or lacks a camera, or a matrix is not 12 numbers.
+        CalibrationError: The cameras differ in focal length or principal row, the baseline is
+            not positive, or the principal point cannot be that of images of this size.
+    """
+    left, right = (_projection(path, camera) for camera in cameras)
+    if not np.allclose(left[:, :3][[0, 1, 1], [0, 1, 2]], right[:, :3][[0, 1, 1], [0, 1, 2]]):
+        raise CalibrationError(
+            f"P{cameras[0]} and P{cameras[1]} have different focal lengths or rows",
+            where=path,
+            hint="a rectified pair shares them; rectify the images first",
+        )
+    check_unsized((float(left[0, 2]), float(left[1, 2])), width_px, height_px, path)
+    baseline_m = float(_centre_m(left)[0] - _centre_m(right)[0])
+    if baseline_m <= 0:
+        raise CalibrationError(
+            "baseline is zero" if baseline_m == 0 else "baseline is negative",
+            where=path,
+            got=f"{baseline_m:g} m",
+            expected="> 0 m",
+            hint="check that left and right are not swapped",
+        )
+    return RectifiedCamera(
+        focal_px=float(left[0, 0]),
+        cx_px=float(left[0, 2]),
+        cy_px=float(left[1, 2]),
+        cx_right_px=float(right[0, 2]),
+        baseline_m=baseline_m,
+        width_px=width_px,
+        height_px=height_px,
+    )
+
+
+@reader
+def read_kitti_offset(path: StrPath, camera: int) -> Float64:
+    """Pose of a camera: float64 (4, 4), ``T_camera_camera0``, a translation in metres.
+
+    KITTI's trajectories are those of camera 0.
+
+    Raises:
+        FormatError: As in `read_kitti_calib`.
+    """
+    T = np.eye(4)
+    T[:3, 3] = _centre_m(_projection(path, camera))
+    return T
+
+
+def kitti_cameras_of(left: Path) -> tuple[int, int] | None:
+    """Left and right camera, if the path of a left image names KITTI's folder of one of them."""
+    for part in reversed(left.parts):
+        found = _FOLDER.fullmatch(part)
+        if found:
+            return COLOUR_CAMERAS if int(found[1]) in COLOUR_CAMERAS else GREY_CAMERAS
+    return None
+
+
+@reader
+def list_kitti_cameras(path: StrPath) -> frozenset[int]:
+    """Numbers of the cameras that have a matrix in a calibration file.
+
+    Raises:
+        FormatError: The file is missing or not text.
+    """
+    return frozenset(int(number) for number, _ in _LINE.findall(read_text(path)))
+
+
+def _projection(path: StrPath, camera: int) -> Float64:
+    """Read float64 (3, 4), the projection matrix of one camera."""
+    rows = {int(number): row for number, row in _LINE.findall(read_text(path))}
+    if camera not in rows:
+        raise FormatError(
+            f"calibration has no P{camera}",
+            where=path,
+            got=", ".join(f"P{number}" for number in sorted(rows)) or "no projection matrix",
+            hint="a stereo pair needs P0 and P1, or P2 and P3",
+        )
+    try:
+        matrix = np.array([float(word) for word in rows[camera].split()]).reshape(3, 4)
+    except ValueError as error:
+        raise FormatError(
+            f"P{camera} is not a 3x4 matrix", where=path, expected="12 numbers"
+        ) from error
+    if not np.isfinite(matrix).all():
+        raise FormatError(f"P{camera} has a value that is not finite", where=path)
+    if not np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
+        raise FormatError(
+            f"P{camera} is not the projection matrix of a rectified camera", where=path
+        )
+    if min(matrix[0, 0], matrix[1, 1]) <= 0:
+        raise CalibrationError(
+            f"focal length of P{camera} is not positive", where=path, got=f"{matrix[0, 0]:g} px"
+        )
+    return matrix
+
+
+def _centre_m(projection: Float64) -> Float64:
+    """``t`` of ``P = K·[I | t]``, float64 (3,)."""
+    return np.asarray(np.linalg.solve(projection[:, :3], projection[:, 3]), dtype=np.float64)

@@ -1,0 +1,215 @@
+"""OpenCV's stereo calibration: YAML, XML or JSON as written by ``cv2.FileStorage``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+
+from recon.core.errors import CalibrationError, FormatError
+from recon.core.geometry.se3 import make_transform
+from recon.core.values import CameraIntrinsics, LensModel, StereoCalibration, check_unsized
+from recon.core.values.arrays import Float64
+from recon.io.atomic import write_text
+from recon.io.file_storage import read_file_storage
+from recon.io.files import StrPath, reader, reading
+
+# Accepted names: those of OpenCV's samples first, then those of calibration tools and tutorials.
+_LEFT_MATRIX: Final = ("M1", "K1", "cameraMatrix1", "camera_matrix_left", "cameraMatrixL")
+_RIGHT_MATRIX: Final = ("M2", "K2", "cameraMatrix2", "camera_matrix_right", "cameraMatrixR")
+_LEFT_DISTORTION: Final = ("D1", "distCoeffs1", "dist_coeffs_left", "distCoeffsL")
+_RIGHT_DISTORTION: Final = ("D2", "distCoeffs2", "dist_coeffs_right", "distCoeffsR")
+_ROTATION: Final = ("R", "rotation_matrix")
+_TRANSLATION: Final = ("T", "translation_vector")
+_SIZE: Final = ("image_size", "imageSize", "img_size")
+_WIDTH: Final = ("image_width", "imageWidth", "width")
+_HEIGHT: Final = ("image_height", "imageHeight", "height")
+_MODEL: Final = ("distortion_model", "camera_model", "model")
+_FISHEYE_NAMES: Final = frozenset({"fisheye", "equidistant", "kannala-brandt", "kannalabrandt8"})
+# OpenCV names no lens model, and both have four coefficients. A pinhole that sees more than 90
+# degrees has a distortion above this; a fisheye's polynomial is close to 1.
+_FISHEYE_LIKE: Final = 0.1
+
+# Numbers of coefficients that OpenCV's distortion model supports.
+_DISTORTION_COUNTS: Final = frozenset({0, 4, 5, 8, 12, 14})
+
+# Longer than any stereo rig: a longer baseline means millimetres read as metres.
+_LONGEST_BASELINE_M: Final = 20.0
+
+Nodes = dict[str, Float64 | str]
+
+
+@reader
+def read_opencv_calibration(
+    intrinsics: StrPath,
+    extrinsics: StrPath | None = None,
+    *,
+    size_px: tuple[int, int] | None = None,
+    metres_per_unit: float = 1.0,
+) -> StereoCalibration:
+    """Read two raw cameras from one file, or from OpenCV's pair of files.
+
+    Args:
+        intrinsics: File with ``M1 D1 M2 D2`` (or ``cameraMatrix1`` …), and possibly ``R T``.
+        extrinsics: File with ``R T``. None = the same file if it has them, else the file in the
+            same folder with ``extrinsics`` in place of ``intrinsics`` in its name.
+        size_px: (width, height) of the images, for files without ``image_width`` and
+            ``image_height``.
+        metres_per_unit: Unit of ``T`` in metres: 0.001 for millimetres, or the square size if the
+            board was calibrated with squares of size 1.
+
+    Raises:
+        FormatError: A file or matrix is missing, or the image size is unknown.
+        CalibrationError: The calibration cannot give depth, or cannot be of images of ``size_px``.
+    """
+    nodes = read_file_storage(intrinsics)
+    outer = _find_extrinsics(intrinsics, extrinsics, nodes)
+    stated = _size(nodes)
+    size = stated or size_px
+    if size is None:
+        raise FormatError(
+            "calibration does not contain the image size",
+            where=intrinsics,
+            expected="image_width and image_height",
+            hint="from Python: pass width_px and height_px, or give the file itself to "
+            "recon.reconstruct or recon.match, which take the size from the images",
+        )
+    model = _model(nodes)
+    lens: LensModel = model or "pinhole"
+    left = _camera(nodes, (_LEFT_MATRIX, _LEFT_DISTORTION), size, lens, intrinsics)
+    right = _camera(nodes, (_RIGHT_MATRIX, _RIGHT_DISTORTION), size, lens, intrinsics)
+    if model is None:
+        for camera in (left, right):
+            _check_model(camera, intrinsics)
+    if stated is None:
+        check_unsized((left.matrix[0, 2], left.matrix[1, 2]), *size, intrinsics)
+    outer_nodes = read_file_storage(outer)
+    rotation = _matrix(outer_nodes, _ROTATION, (3, 3), outer)
+    translation = _matrix(outer_nodes, _TRANSLATION, (3,), outer)
+    with reading(outer):
+        calibration = StereoCalibration(
+            left, right, make_transform(rotation, translation * metres_per_unit)
+        )
+    _check_baseline(calibration.baseline_m, outer)
+    return calibration
+
+
+def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> None:
+    """Write one YAML file for OpenCV's ``FileStorage``, ``T`` in metres, atomically.
+
+    OpenCV defines no key for the lens model; fisheye cameras are marked by ``distortion_model``.
+
+    Raises:
+        CalibrationError: One camera is a fisheye and the other is not.
+        OutputError: The file cannot be written.
+    """
+    models = {calibration.left.model, calibration.right.model}
+    if len(models) > 1:
+        raise CalibrationError("an OpenCV file cannot store two lens models", where=path)
+    storage = cv2.FileStorage(".yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("image_width", calibration.left.width_px)
+    storage.write("image_height", calibration.left.height_px)
+    if "fisheye" in models:
+        storage.write("distortion_model", "fisheye")
+    for number, camera in enumerate((calibration.left, calibration.right), start=1):
+        storage.write(f"M{number}", np.array(camera.matrix))
+        storage.write(f"D{number}", np.array(camera.distortion).reshape(1, -1))
+    storage.write("R", np.array(calibration.T_right_left[:3, :3]))
+    storage.write("T", np.array(calibration.T_right_left[:3, 3]).reshape(3, 1))
+    write_text(path, storage.releaseAndGetString())
+
+
+def _model(nodes: Nodes) -> LensModel | None:
+    """The lens model named in a file, if any."""
+    named = {str(nodes[name]).lower() for name in _MODEL if name in nodes}
+    if not named:
+        return None
+    return "fisheye" if named & _FISHEYE_NAMES else "pinhole"
+
+
+def _check_model(camera: CameraIntrinsics, path: StrPath) -> None:
+    """Raise if a camera of an unnamed lens model may as well be a fisheye."""
+    wide = camera.width_px / 2 > camera.matrix[0, 0]
+    largest = np.abs(camera.distortion).max(initial=0.0)
+    if camera.distortion.size == 4 and wide and 0 < largest < _FISHEYE_LIKE:
+        raise FormatError(
+            "calibration does not say which lens model its four coefficients belong to",
+            where=path,
+            expected="a line 'distortion_model: fisheye', or 'distortion_model: pinhole'",
+        )
+
+
+def _find(nodes: Nodes, names: Sequence[str]) -> Float64 | None:
+    """The numbers under the first of some names that has any."""
+    found = (nodes.get(name) for name in names)
+    return next((value for value in found if isinstance(value, np.ndarray)), None)
+
+
+def _matrix(nodes: Nodes, names: Sequence[str], shape: tuple[int, ...], path: StrPath) -> Float64:
+    value = _find(nodes, names)
+    if value is None:
+        raise FormatError(
+            f"calibration has no {names[0]!r}",
+            where=path,
+            got=", ".join(nodes) or "nothing",
+            expected=" or ".join(names),
+        )
+    if value.size != np.prod(shape):
+        raise FormatError(
+            f"{names[0]!r} has the wrong size", where=path, got=value.shape, expected=shape
+        )
+    return value.reshape(shape)
+
+
+def _camera(
+    nodes: Nodes,
+    names: tuple[Sequence[str], Sequence[str]],
+    size_px: tuple[int, int],
+    model: LensModel,
+    path: StrPath,
+) -> CameraIntrinsics:
+    matrix_names, distortion_names = names
+    matrix = _matrix(nodes, matrix_names, (3, 3), path)
+    found = _find(nodes, distortion_names)
+    distortion = np.zeros(0) if found is None else found.ravel()
+    if distortion.size not in _DISTORTION_COUNTS:
+        raise FormatError(
+            f"{distortion_names[0]!r} has the wrong size",
+            where=path,
+            got=f"{distortion.size} coefficients",
+            expected="4, 5, 8, 12 or 14",
+        )
+    return CameraIntrinsics(matrix, distortion, *size_px, model)
+
+
+def _size(nodes: Nodes) -> tuple[int, int] | None:
+    """Image width and height, if the file states them."""
+    width, height, both = (_find(nodes, names) for names in (_WIDTH, _HEIGHT, _SIZE))
+    if width is not None and height is not None:
+        return int(width), int(height)
+    if both is not None and both.size == 2:
+        return int(both.ravel()[0]), int(both.ravel()[1])
+    return None
+
+
+def _find_extrinsics(intrinsics: StrPath, extrinsics: StrPath | None, nodes: Nodes) -> StrPath:
+    """The file with ``R`` and ``T``."""
+    if extrinsics is not None:
+        return extrinsics
+    path = Path(intrinsics)
+    beside = path.with_name(path.name.replace("intrinsics", "extrinsics"))
+    return beside if _find(nodes, _ROTATION) is None and beside.is_file() else intrinsics
+
+
+def _check_baseline(baseline_m: float, path: StrPath) -> None:
+    if baseline_m > _LONGEST_BASELINE_M:
+        raise CalibrationError(
+            "baseline is implausibly long",
+            where=path,
+            got=f"{baseline_m:g} m",
+            expected=f"at most {_LONGEST_BASELINE_M:g} m",
+            hint="if the file is in millimetres, pass 0.001 metres per unit",
+        )

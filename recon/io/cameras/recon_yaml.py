@@ -1,0 +1,161 @@
+"""Our own calibration format: YAML with the unit in every name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final, cast
+
+import numpy as np
+import yaml
+
+from recon.core.errors import FormatError
+from recon.core.geometry.se3 import make_transform
+from recon.core.values import CameraIntrinsics, LensModel, RectifiedCamera, StereoCalibration
+from recon.core.values.arrays import Float64
+from recon.io.atomic import write_text
+from recon.io.cameras.lens_models import pinhole_matrix
+from recon.io.fields import Fields
+from recon.io.files import StrPath, reader
+from recon.io.yaml_file import read_yaml
+
+MARK: Final = "recon-calibration"
+_VERSION: Final = 1
+_HEADER: Final = """\
+# Pixel centres are at integers; camera axes: x right, y down, z forward.
+# xyz_right = rotation * xyz_left + translation_m
+"""
+_PINHOLE: Final = (
+    "k1",
+    "k2",
+    "p1",
+    "p2",
+    "k3",
+    "k4",
+    "k5",
+    "k6",
+    "s1",
+    "s2",
+    "s3",
+    "s4",
+    "tx",
+    "ty",
+)
+_FISHEYE: Final = ("k1", "k2", "k3", "k4")
+_RECTIFIED: Final = ("focal_px", "cx_px", "cy_px", "cx_right_px", "baseline_m")
+
+
+def write_recon_calibration(
+    path: StrPath,
+    calibration: StereoCalibration | RectifiedCamera,
+    quality: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a calibration atomically; `read_recon_calibration` restores it bit by bit.
+
+    Args:
+        path: The file.
+        calibration: A raw stereo calibration or a rectified camera.
+        quality: Quality figures to store with it, as plain values; not read back.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    content = {"format": MARK, "version": _VERSION, **_content(calibration)}
+    if quality:
+        content["quality"] = dict(quality)
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    write_text(path, _HEADER + text)
+
+
+@reader
+def read_recon_calibration(path: StrPath) -> StereoCalibration | RectifiedCamera:
+    """Read what `write_recon_calibration` wrote.
+
+    Raises:
+        FormatError: The file is damaged, or of an unknown version or kind.
+        CalibrationError: The calibration cannot give depth.
+    """
+    fields = Fields(read_yaml(path), path)
+    if fields.text("format") != MARK or fields.number("version") != _VERSION:
+        raise FormatError(
+            "version of the calibration file is not supported",
+            where=path,
+            got=f"{fields.get('format')} {fields.get('version')}",
+            expected=f"{MARK} {_VERSION}",
+        )
+    kind = fields.text("kind")
+    if kind not in ("stereo", "rectified"):
+        raise FormatError(
+            "unknown kind of calibration", where=path, got=kind, expected="stereo or rectified"
+        )
+    return _read_rectified(fields) if kind == "rectified" else _read_stereo(fields)
+
+
+def _content(calibration: StereoCalibration | RectifiedCamera) -> dict[str, Any]:
+    if isinstance(calibration, RectifiedCamera):
+        numbers = {name: float(getattr(calibration, name)) for name in _RECTIFIED}
+        size = {"width_px": calibration.width_px, "height_px": calibration.height_px}
+        searched = {} if calibration.ndisp is None else {"ndisp": calibration.ndisp}
+        return {"kind": "rectified", "camera": {**size, **numbers, **searched}}
+    T = calibration.T_right_left
+    return {
+        "kind": "stereo",
+        "left": _camera_content(calibration.left),
+        "right": _camera_content(calibration.right),
+        "right_from_left": {"rotation": T[:3, :3].tolist(), "translation_m": T[:3, 3].tolist()},
+    }
+
+
+def _camera_content(camera: CameraIntrinsics) -> dict[str, Any]:
+    K = camera.matrix
+    pinhole = {"fx_px": K[0, 0], "fy_px": K[1, 1], "cx_px": K[0, 2], "cy_px": K[1, 2]}
+    names = _names(camera.model)
+    return {
+        "model": camera.model,
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        **{name: float(value) for name, value in pinhole.items()},
+        "distortion": dict(zip(names, camera.distortion.tolist(), strict=False)),
+    }
+
+
+def _names(model: LensModel) -> tuple[str, ...]:
+    return _FISHEYE if model == "fisheye" else _PINHOLE
+
+
+def _read_stereo(fields: Fields) -> StereoCalibration:
+    pose = fields.below("right_from_left")
+    T = make_transform(pose.numbers("rotation", (3, 3)), pose.numbers("translation_m", (3,)))
+    return StereoCalibration(
+        _read_camera(fields.below("left")), _read_camera(fields.below("right")), T
+    )
+
+
+def _read_camera(fields: Fields) -> CameraIntrinsics:
+    model = fields.text("model")
+    if model not in ("pinhole", "fisheye"):
+        raise FormatError("unknown lens model", got=model, expected="pinhole or fisheye")
+    fx, fy, cx, cy = (fields.number(name) for name in ("fx_px", "fy_px", "cx_px", "cy_px"))
+    return CameraIntrinsics(
+        pinhole_matrix(fx, fy, cx, cy),
+        _read_distortion(fields.below("distortion"), _names(cast("LensModel", model))),
+        fields.count("width_px"),
+        fields.count("height_px"),
+        cast("LensModel", model),
+    )
+
+
+def _read_distortion(fields: Fields, names: tuple[str, ...]) -> Float64:
+    known = [name for name in names if name in fields]
+    if known != list(names[: len(known)]):
+        raise FormatError("distortion has gaps", got=", ".join(known), expected=", ".join(names))
+    return np.array([fields.number(name) for name in known], dtype=np.float64)
+
+
+def _read_rectified(fields: Fields) -> RectifiedCamera:
+    camera = fields.below("camera")
+    return RectifiedCamera(
+        **{name: camera.number(name) for name in _RECTIFIED},
+        width_px=camera.count("width_px"),
+        height_px=camera.count("height_px"),
+        ndisp=camera.count("ndisp") if "ndisp" in camera else None,
+    )

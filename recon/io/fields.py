@@ -1,0 +1,87 @@
+"""Typed access to nested mappings read from YAML; errors name the field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from recon.core.errors import FormatError
+from recon.core.values.arrays import Float64
+from recon.io.files import StrPath
+
+
+class Fields:
+    """A mapping read from a file.
+
+    Args:
+        values: The mapping.
+        path: The file, for error messages.
+        prefix: Path of the mapping in the file, such as ``left.``.
+    """
+
+    def __init__(self, values: Mapping[str, Any], path: StrPath, prefix: str = "") -> None:
+        self._values, self._path, self._prefix = values, path, prefix
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
+
+    def get(self, name: str) -> Any:
+        """The value of a field, of any type.
+
+        Raises:
+            FormatError: The field is missing; all methods raise this.
+        """
+        if name not in self._values:
+            got = ", ".join(str(key) for key in self._values) or "nothing"
+            raise FormatError(
+                f"calibration has no {self._prefix + name!r}", where=self._path, got=got
+            )
+        return self._values[name]
+
+    def below(self, name: str) -> Fields:
+        """The mapping in a field."""
+        value = self.get(name)
+        if not isinstance(value, Mapping):
+            raise self._wrong(name, value, "a mapping")
+        return Fields(value, self._path, f"{self._prefix}{name}.")
+
+    def text(self, name: str) -> str:
+        """The value of a field as text."""
+        return str(self.get(name))
+
+    def numbers(self, name: str, shape: tuple[int, ...] | None = None) -> Float64:
+        """The value as float64 of that shape; None = a list of any length."""
+        value = self.get(name)
+        try:
+            # Via text, as PyYAML reads 1e-05 (no dot) as text.
+            array = np.array(value, dtype=np.str_).astype(np.float64)
+        except (TypeError, ValueError) as error:
+            raise self._wrong(name, value, "numbers") from error
+        if not np.isfinite(array).all():
+            raise self._wrong(name, value, "finite numbers")
+        if shape is None:
+            return array.ravel()
+        if array.size != np.prod(shape):
+            raise self._wrong(name, f"{array.size} numbers", f"{int(np.prod(shape))} numbers")
+        return array.reshape(shape)
+
+    def number(self, name: str) -> float:
+        """The value as one number."""
+        return float(self.numbers(name, (1,))[0])
+
+    def count(self, name: str) -> int:
+        """The value as one positive integer."""
+        value = self.number(name)
+        if value != int(value) or value < 1:
+            raise self._wrong(name, value, "a positive integer")
+        return int(value)
+
+    def _wrong(self, name: str, got: Any, expected: str) -> FormatError:
+        return FormatError(
+            f"{self._prefix + name!r} is wrong",
+            where=self._path,
+            got=str(got)[:60],
+            expected=expected,
+        )

@@ -1,0 +1,183 @@
+"""Reads whole files; `reading` turns whatever a parser raises into an error that names the file."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from os import PathLike
+from pathlib import Path
+from typing import Final, ParamSpec, TypeVar, cast
+
+import numpy as np
+
+from recon.core.errors import FormatError, ReconError
+from recon.core.values.arrays import Float64
+
+StrPath = str | PathLike[str]
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+#: Larger than any calibration or configuration: other files are not read to the end.
+SMALL_FILE_BYTES: Final = 1 << 22
+_LONGEST_REASON: Final = 120
+_KINDS: Final = (
+    (stat.S_ISFIFO, "a named pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+@contextmanager
+def naming(path: StrPath) -> Iterator[None]:
+    """Add the file to errors raised by values built from its content."""
+    try:
+        yield
+    except ReconError as error:
+        if error.where is not None:
+            raise
+        raise type(error)(
+            error.what, where=path, got=error.got, expected=error.expected, hint=error.hint
+        ) from error
+
+
+@contextmanager
+def reading(path: StrPath) -> Iterator[None]:
+    """Name the file in every error raised while its content is parsed.
+
+    Content from outside can make a parser raise anything. Around parsing, and only there, every
+    exception is a fault of the file; elsewhere it is a fault of ours and must not pass as one.
+
+    Args:
+        path: The file, or another name of the content. Pipes and devices, whose reading may never
+            end, are refused.
+
+    Raises:
+        FormatError: The content cannot be parsed. Other errors of this project stay what they are.
+    """
+    try:
+        _refuse_special(path)
+        with naming(path), np.errstate(all="ignore"):
+            yield
+    except ReconError:
+        raise
+    except FileNotFoundError as error:
+        raise FormatError("file does not exist", where=error.filename or path) from error
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise FormatError("cannot read the file", where=path, got=reason) from error
+    except MemoryError as error:
+        raise FormatError("content does not fit in memory", where=path) from error
+    except RecursionError as error:
+        raise FormatError("content is nested too deeply", where=path) from error
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"[:_LONGEST_REASON]
+        raise FormatError("content cannot be read", where=path, got=reason) from error
+
+
+def reader(read: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Decorate a function that reads the file given by its first argument; see `reading`."""
+
+    @wraps(read)
+    def named(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        path = args[0] if args else next(iter(kwargs.values()))
+        with reading(cast("StrPath", path)):
+            return read(*args, **kwargs)
+
+    return named
+
+
+def _refuse_special(path: StrPath) -> None:
+    try:
+        mode = Path(path).stat().st_mode
+    except (OSError, ValueError):  # missing, or not a path: found when it is opened
+        return
+    kind = next((name for test, name in _KINDS if test(mode)), None)
+    if kind is not None:
+        raise FormatError("not a regular file", where=path, got=kind)
+
+
+@reader
+def read_bytes(path: StrPath, at_most: int | None = None) -> bytes:
+    """Read a file that must not be empty.
+
+    Args:
+        path: The file.
+        at_most: Largest size in bytes; None = any.
+
+    Raises:
+        FormatError: The file does not exist, cannot be read, is empty or too large.
+    """
+    with Path(path).open("rb") as file:
+        if at_most is not None and os.fstat(file.fileno()).st_size > at_most:
+            expected = f"at most {at_most / 1e6:.0f} MB"
+            raise FormatError("file is too large for its kind", where=path, expected=expected)
+        content = file.read()
+    if not content:
+        raise FormatError("file is empty", where=path)
+    return content
+
+
+def read_text(path: StrPath, at_most: int | None = None) -> str:
+    """Read a UTF-8 text file that must not be empty.
+
+    Args:
+        path: The file.
+        at_most: Largest size in bytes; None = any.
+
+    Raises:
+        FormatError: The file does not exist, cannot be read, is empty, too large or not text.
+    """
+    try:
+        return read_bytes(path, at_most).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FormatError(
+            "not a text file", where=path, got=f"byte {error.start} is not UTF-8"
+        ) from error
+
+
+@reader
+def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[int]]:
+    """Read rows of numbers separated by spaces or commas; ``#`` starts a comment.
+
+    Args:
+        path: The text file.
+        columns: The permitted numbers of columns; all rows must have the same.
+
+    Returns:
+        float64 (N, C), finite, N ≥ 1, and the line number of each row, counted from 1.
+
+    Raises:
+        FormatError: A row has the wrong number of columns or a value that is not a finite number;
+            the line is named.
+    """
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        words = line.partition("#")[0].replace(",", " ").split()
+        if not words:
+            continue
+        rows.append(_parse_row(words, columns, f"{path}:{number}"))
+        lines.append(number)
+        columns = (len(words),)
+    if not rows:
+        raise FormatError("file contains no numbers", where=path)
+    return np.array(rows, dtype=np.float64), lines
+
+
+def _parse_row(words: list[str], columns: tuple[int, ...], where: str) -> list[float]:
+    if len(words) not in columns:
+        expected = " or ".join(str(count) for count in columns)
+        raise FormatError(
+            "wrong number of columns", where=where, got=str(len(words)), expected=expected
+        )
+    try:
+        row = [float(word) for word in words]
+    except ValueError as error:
+        raise FormatError("not a number", where=where, got=" ".join(words)[:60]) from error
+    if not np.isfinite(row).all():
+        raise FormatError("number is not finite", where=where, got=" ".join(words)[:60])
+    return row

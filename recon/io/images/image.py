@@ -1,0 +1,224 @@
+"""Images: PNG, JPEG, PGM, PPM, BMP and TIFF; damaged files are rejected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from threading import Lock
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.errors import FormatError, OutputError, ShapeError
+from recon.core.values.arrays import UInt8
+from recon.io.atomic import write_bytes
+from recon.io.files import SMALL_FILE_BYTES, StrPath, read_bytes, reader, reading
+from recon.io.images.image_header import image_size
+from recon.io.images.image_integrity import check_image_bytes, is_tiff
+
+FULL_WHITE: Final = 65535
+MAX_MEGAPIXELS: Final = 100.0
+"""Larger images are refused before they are decoded, unless more is asked for."""
+_PIXEL_BYTES: Final = 16
+"""More than a pixel takes in any file."""
+_LOG_LEVEL_LOCK: Final = Lock()
+_GREY_ONLY: Final = frozenset({".pgm"})
+_COLOUR_ONLY: Final = frozenset({".ppm"})
+_EIGHT_BIT_ONLY: Final = frozenset({".jpg", ".jpeg"})
+_WRITABLE: Final = _GREY_ONLY | _COLOUR_ONLY | _EIGHT_BIT_ONLY | {".png", ".tif", ".tiff"}
+
+
+def read_image(
+    path: StrPath, white: int = FULL_WHITE, max_megapixels: float = MAX_MEGAPIXELS
+) -> UInt8:
+    """Read an image for display or matching, as 8 bits.
+
+    16-bit images are scaled to 8 bits, linearly. An alpha channel is dropped. The EXIF orientation
+    is ignored: a calibration refers to the pixels as the sensor recorded them.
+
+    Args:
+        path: PNG, JPEG, PGM, PPM, BMP or TIFF, recognised by content.
+        white: The 16-bit value that becomes 255, see `find_white`; the same for all images of a
+            drive.
+        max_megapixels: Refuse larger images, in 10⁶ pixels.
+
+    Returns:
+        uint8 (H, W) if the file is grey, else (H, W, 3) RGB.
+
+    Raises:
+        FormatError: The file is missing, empty, truncated, not an image, too large, or has
+            floating-point pixels.
+    """
+    return eight_bits(read_levels(path, max_megapixels), white)
+
+
+def eight_bits(levels: NDArray[Any], white: int = FULL_WHITE) -> UInt8:
+    """Scale 16 bits to 8, rounded; brighter values than ``white`` are 255."""
+    if levels.dtype == np.uint8:
+        return levels
+    scaled = (levels.astype(np.uint32) * 255 + white // 2) // white
+    return np.minimum(scaled, 255).astype(np.uint8)
+
+
+def find_white(images: Iterable[NDArray[Any]]) -> int:
+    """The largest value that the sensor of some images can give: 2^n - 1, 8 to 16 bits.
+
+    Cameras of 10, 12 or 14 bits often store their values unscaled in 16 bits.
+    """
+    brightest = max((int(image.max()) for image in images if image.size), default=FULL_WHITE)
+    return int(2 ** max(8, brightest.bit_length()) - 1)
+
+
+@reader
+def read_levels(path: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> NDArray[Any]:
+    """Read an image with its values as stored, such as a mask or a scaled disparity.
+
+    Returns:
+        uint8 or uint16, (H, W) or (H, W, 3) RGB.
+
+    Raises:
+        FormatError: As in `read_image`.
+    """
+    content = read_bytes(path, int(max_megapixels * 1e6 * _PIXEL_BYTES) + SMALL_FILE_BYTES)
+    return decode_levels(content, path, max_megapixels)
+
+
+def decode_image(content: bytes, where: StrPath) -> UInt8:
+    """Like `read_image`, from bytes in memory.
+
+    Raises:
+        FormatError: As in `read_image`.
+    """
+    return eight_bits(decode_levels(content, where))
+
+
+def decode_levels(
+    content: bytes, path: StrPath, max_megapixels: float = MAX_MEGAPIXELS
+) -> NDArray[Any]:
+    """Like `read_levels`, from the bytes of a file.
+
+    Raises:
+        FormatError: As in `read_image`.
+    """
+    with reading(path):
+        _check_size(image_size(content), path, max_megapixels)
+        check_image_bytes(content, path)
+    try:
+        with silent_opencv() if is_tiff(content) else nullcontext():
+            image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise FormatError("image cannot be decoded", where=path, got=error.err) from error
+    if image is None:
+        raise FormatError("image cannot be decoded", where=path, hint="copy the file again")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise FormatError(
+            "pixel type of the image is not supported",
+            where=path,
+            got=image.dtype.name,
+            expected="8 or 16 bits",
+        )
+    return image if image.ndim == 2 else swap_red_and_blue(image[:, :, :3])
+
+
+def _check_size(size: tuple[int, int] | None, path: StrPath, max_megapixels: float) -> None:
+    """Refuse an image by the size in its header: a small file can hold very many pixels."""
+    if size is not None and size[0] * size[1] > max_megapixels * 1e6:
+        raise FormatError(
+            "image has too many pixels",
+            where=path,
+            got=f"{size[0]}x{size[1]}",
+            expected=f"at most {max_megapixels:g} million",
+            hint="make it smaller; --set source.max_megapixels= allows more",
+        )
+
+
+def read_grey_levels(path: StrPath) -> NDArray[Any]:
+    """Like `read_levels`, but always (H, W); three equal channels count as grey.
+
+    Raises:
+        FormatError: As in `read_image`, or the image is in colour.
+    """
+    levels = read_levels(path)
+    if levels.ndim == 2:
+        return levels
+    if (levels != levels[:, :, :1]).any():
+        raise FormatError("image is in colour", where=path, expected="grey")
+    return np.ascontiguousarray(levels[:, :, 0])
+
+
+def write_image(path: StrPath, image: NDArray[Any]) -> None:
+    """Write an image atomically, in the format given by the suffix.
+
+    Args:
+        path: Ends in .png, .tif, .tiff, .jpg, .jpeg, .pgm (grey) or .ppm (colour).
+        image: uint8 or uint16 (not JPEG), (H, W) grey or (H, W, 3) RGB.
+
+    Raises:
+        ShapeError: The array is not an image.
+        OutputError: The format is unknown or cannot hold this image, or the file cannot be written.
+    """
+    _check_pixels(image)
+    suffix = Path(path).suffix.lower()
+    _check_suffix(path, suffix, image)
+    pixels = image if image.ndim == 2 else swap_red_and_blue(image)
+    try:
+        done, content = cv2.imencode(suffix, pixels)
+    except cv2.error as error:
+        raise OutputError("image cannot be encoded", where=path, got=error.err) from error
+    if not done:
+        raise OutputError("image cannot be encoded", where=path)
+    write_bytes(path, content.tobytes())
+
+
+@contextmanager
+def silent_opencv() -> Iterator[None]:
+    """Stop OpenCV from logging to standard error what we raise as an exception anyway.
+
+    The log level is shared by all threads, hence the lock.
+    """
+    log = cv2.utils.logging
+    with _LOG_LEVEL_LOCK:
+        before = log.getLogLevel()
+        log.setLogLevel(log.LOG_LEVEL_SILENT)
+        try:
+            yield
+        finally:
+            log.setLogLevel(before)
+
+
+def swap_red_and_blue(image: NDArray[Any]) -> NDArray[Any]:
+    """Convert between RGB and OpenCV's BGR, in either direction."""
+    return np.ascontiguousarray(image[:, :, ::-1])
+
+
+def _check_pixels(image: NDArray[Any]) -> None:
+    shaped = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
+    if image.dtype not in (np.uint8, np.uint16) or not shaped or image.size == 0:
+        raise ShapeError(
+            "array is not an image",
+            got=f"{image.dtype.name} {image.shape}",
+            expected="uint8 or uint16 (H, W) or (H, W, 3)",
+        )
+
+
+def _check_suffix(path: StrPath, suffix: str, image: NDArray[Any]) -> None:
+    if suffix not in _WRITABLE:
+        expected = ", ".join(sorted(_WRITABLE))
+        raise OutputError(
+            "unknown image format", where=path, got=suffix or "no suffix", expected=expected
+        )
+    fits = (
+        not (suffix in _GREY_ONLY and image.ndim == 3)
+        and not (suffix in _COLOUR_ONLY and image.ndim == 2)
+        and not (suffix in _EIGHT_BIT_ONLY and image.dtype != np.uint8)
+    )
+    if not fits:
+        raise OutputError(
+            f"a {suffix} file cannot hold this image",
+            where=path,
+            got=f"{image.dtype.name} {image.shape}",
+            hint="write .png",
+        )

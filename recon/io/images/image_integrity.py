@@ -1,0 +1,116 @@
+"""Detects truncated and damaged image files, which decoders fill in silently.
+
+Ref:
+    PNG: ISO/IEC 15948, section 5 (chunks). JPEG: ITU-T T.81, annex B (markers).
+    PGM and PPM: the netpbm manual. BMP: BITMAPINFOHEADER in the Windows GDI reference.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from typing import Final
+
+from recon.core.errors import FormatError
+from recon.io.files import StrPath
+
+_PNG_START: Final = b"\x89PNG\r\n\x1a\n"
+_JPEG_START: Final = b"\xff\xd8\xff"
+_TIFF_STARTS: Final = (b"II*\x00", b"MM\x00*")
+_PNM_HEADER: Final = re.compile(
+    rb"P([2356])(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)\s"
+)
+_BMP_HEADER: Final = struct.Struct("<2xI4xI4xiiHHII")
+UNDERSTOOD: Final = "PNG, JPEG, PGM, PPM, BMP or TIFF"
+
+
+def check_image_bytes(content: bytes, path: StrPath) -> None:
+    """Check that the content of a file is a complete image of a supported format.
+
+    For TIFF only the format is checked: its decoder does reject truncated files.
+
+    Args:
+        content: The whole file.
+        path: The file, for the error message.
+
+    Raises:
+        FormatError: The file is not an image, or is truncated or damaged.
+    """
+    if content.startswith(_PNG_START):
+        _check_png(content, path)
+    elif content.startswith(_JPEG_START):
+        _check_jpeg(content, path)
+    elif content[:1] == b"P" and content[1:2] in b"2356":
+        _check_pnm(content, path)
+    elif content.startswith(b"BM"):
+        _check_bmp(content, path)
+    elif not is_tiff(content):
+        raise FormatError("not an image", where=path, expected=UNDERSTOOD)
+
+
+def is_tiff(content: bytes) -> bool:
+    """Whether the content starts like a TIFF."""
+    return content.startswith(_TIFF_STARTS)
+
+
+def _truncated(kind: str, path: StrPath, got: str) -> FormatError:
+    return FormatError(
+        f"{kind} image is truncated or damaged", where=path, got=got, hint="copy the file again"
+    )
+
+
+def _check_png(content: bytes, path: StrPath) -> None:
+    """Walk the chunks up to IEND; each must be complete and match its checksum."""
+    at = len(_PNG_START)
+    name = b""
+    while name != b"IEND":
+        if at + 12 > len(content):
+            raise _truncated("PNG", path, f"the file ends after {len(content)} bytes, before IEND")
+        length = int.from_bytes(content[at : at + 4], "big")
+        name = content[at + 4 : at + 8]
+        end = at + 8 + length
+        if end + 4 > len(content):
+            raise _truncated("PNG", path, f"the file ends inside a chunk of {length} bytes")
+        if zlib.crc32(content[at + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
+            raise _truncated("PNG", path, f"checksum of chunk {name!r} differs")
+        at = end + 4
+
+
+def _check_jpeg(content: bytes, path: StrPath) -> None:
+    """Look for the end marker after the start of scan; an embedded thumbnail has its own."""
+    at = 2
+    while content[at : at + 2] != b"\xff\xda":
+        if at + 4 > len(content) or content[at] != 0xFF:
+            raise _truncated("JPEG", path, "no start of scan")
+        # A marker may be preceded by any number of fill bytes 0xFF.
+        at += 1 if content[at + 1] == 0xFF else 2 + struct.unpack_from(">H", content, at + 2)[0]
+    if content.rfind(b"\xff\xd9") < at:
+        raise _truncated("JPEG", path, "no end-of-image marker")
+
+
+def _check_pnm(content: bytes, path: StrPath) -> None:
+    header = _PNM_HEADER.match(content)
+    if header is None:
+        raise _truncated("PGM/PPM", path, "no readable header")
+    kind, width, height, top = (int(group) for group in header.groups())
+    samples = width * height * (3 if kind in {3, 6} else 1)
+    if kind in {2, 3}:
+        found = len(content[header.end() :].split())
+    else:
+        found = (len(content) - header.end()) // (2 if top > 255 else 1)
+    if found < samples:
+        raise _truncated("PGM/PPM", path, f"{found} of {samples} samples")
+
+
+def _check_bmp(content: bytes, path: StrPath) -> None:
+    """Compute the size from rows padded to four bytes, as a header may declare a size of 0."""
+    if len(content) < _BMP_HEADER.size:
+        raise _truncated("BMP", path, f"the file ends after {len(content)} bytes, in its header")
+    header = _BMP_HEADER.unpack_from(content)
+    _, offset, width, height, _, bits, compression, stored = header
+    rows = (width * bits + 31) // 32 * 4 * abs(height)
+    run_lengths = compression in {1, 2}
+    needed = offset + (stored if run_lengths else rows)
+    if len(content) < needed:
+        raise _truncated("BMP", path, f"{len(content)} of {needed} bytes")

@@ -1,0 +1,122 @@
+"""Decodes ROS images: ``sensor_msgs/Image`` in its common encodings."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.errors import FormatError
+from recon.core.values.arrays import UInt8
+
+# Encoding: channels and bits per channel.
+_LAYOUT: Final = {
+    "mono8": (1, 8),
+    "8uc1": (1, 8),
+    "mono16": (1, 16),
+    "16uc1": (1, 16),
+    "rgb8": (3, 8),
+    "bgr8": (3, 8),
+    "8uc3": (3, 8),
+    "rgba8": (4, 8),
+    "bgra8": (4, 8),
+    "8uc4": (4, 8),
+    "bayer_rggb8": (1, 8),
+    "bayer_bggr8": (1, 8),
+    "bayer_gbrg8": (1, 8),
+    "bayer_grbg8": (1, 8),
+    "yuv422": (2, 8),
+    "uyvy": (2, 8),
+    "yuv422_yuy2": (2, 8),
+    "yuyv": (2, 8),
+}
+# OpenCV names a Bayer pattern from pixel (1, 1) on, ROS from pixel (0, 0) on.
+_TO_RGB: Final = {
+    "bgr8": cv2.COLOR_BGR2RGB,
+    "8uc3": cv2.COLOR_BGR2RGB,
+    "rgba8": cv2.COLOR_RGBA2RGB,
+    "bgra8": cv2.COLOR_BGRA2RGB,
+    "8uc4": cv2.COLOR_BGRA2RGB,
+    "bayer_rggb8": cv2.COLOR_BayerBG2RGB,
+    "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2RGB,
+    "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
+    "yuv422": cv2.COLOR_YUV2RGB_UYVY,
+    "uyvy": cv2.COLOR_YUV2RGB_UYVY,
+    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
+    "yuyv": cv2.COLOR_YUV2RGB_YUY2,
+}
+
+
+def pixels_of_ros_image(
+    data: NDArray[np.uint8],
+    encoding: str,
+    shape: tuple[int, int],
+    step: int,
+    *,
+    big_endian: bool = False,
+    where: str = "",
+) -> UInt8:
+    """Decode the bytes of an image message.
+
+    16-bit pixels are scaled over their full range to 8 bits, as in image files.
+
+    Args:
+        data: uint8 (N,), all rows, each ``step`` bytes long.
+        encoding: Name of the encoding in ROS.
+        shape: Height and width.
+        step: Bytes per row, including padding.
+        big_endian: Whether 16-bit pixels are big-endian.
+        where: Topic or message, for the error message.
+
+    Returns:
+        uint8 (H, W) if the encoding is grey, else (H, W, 3) RGB.
+
+    Raises:
+        FormatError: The encoding is not supported, or there are too few bytes.
+
+    Ref: ``sensor_msgs/image_encodings.hpp``.
+    """
+    name = encoding.lower()
+    if name not in _LAYOUT:
+        raise FormatError(
+            "image encoding is not supported",
+            where=where,
+            got=encoding,
+            expected=", ".join(sorted(_LAYOUT)),
+        )
+    pixels = _unpack(data, name, shape, step, big_endian=big_endian, where=where)
+    if pixels.dtype != np.uint8:
+        return ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if name in _TO_RGB:
+        return np.asarray(cv2.cvtColor(pixels, _TO_RGB[name]), dtype=np.uint8)
+    return pixels
+
+
+def _unpack(
+    data: NDArray[np.uint8],
+    name: str,
+    shape: tuple[int, int],
+    step: int,
+    *,
+    big_endian: bool,
+    where: str,
+) -> NDArray[Any]:
+    """Pixels (H, W) or (H, W, channels), without the padding of rows."""
+    height_px, width_px = shape
+    channels, bits = _LAYOUT[name]
+    row = width_px * channels * bits // 8
+    if step < row or data.size < step * (height_px - 1) + row or min(shape) < 1:
+        raise FormatError(
+            "image message has too few bytes",
+            where=where,
+            got=f"{data.size} bytes, {step} per row",
+            expected=f"{width_px}x{height_px} pixels of {name}",
+        )
+    rows = np.lib.stride_tricks.as_strided(data, (height_px, row), (step, 1))
+    pixels = np.ascontiguousarray(rows)
+    if bits == 16:
+        pixels = pixels.view(">u2" if big_endian else "<u2")
+    return pixels if channels == 1 else pixels.reshape(height_px, width_px, channels)

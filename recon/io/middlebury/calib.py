@@ -1,0 +1,139 @@
+"""Calibration of Middlebury scenes: ``calib.txt`` of 2014, nominal values of 2005 and 2006."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import CalibrationError, FormatError
+from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import Float64
+from recon.io.files import StrPath, read_text, reader
+
+_LINE: Final = re.compile(r"^\s*(\w+)\s*=\s*(.*?)\s*$", re.MULTILINE)
+
+# Ref: https://vision.middlebury.edu/stereo/data/scenes2005/ and scenes2006/, at full size.
+_2005_FOCAL_PX: Final = 3740.0
+_2005_BASELINE_M: Final = 0.160
+
+
+@dataclass(frozen=True)
+class MiddleburyCalib:
+    """The content of a ``calib.txt``.
+
+    Attributes:
+        camera: The rectified camera, in metres.
+        isint: True if the ground truth is in whole pixels, so that results are rounded before
+            comparison.
+        vmin_px: Smallest true disparity, or None.
+        vmax_px: Largest true disparity, or None.
+        doffs_px: ``doffs`` as in the file; that of the camera is the difference of its rounded
+            principal points. None = not in the file.
+    """
+
+    camera: RectifiedCamera
+    isint: bool = False
+    vmin_px: float | None = None
+    vmax_px: float | None = None
+    doffs_px: float | None = None
+
+
+@reader
+def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
+    """Read a ``calib.txt`` of the 2014 data or of MiddEval3.
+
+    Raises:
+        FormatError: The file is missing, lacks a key, or a value is not a number.
+        CalibrationError: The cameras differ in focal length or principal row, the baseline is
+            not positive, or ``doffs`` is not ``cx1 - cx0``.
+    """
+    entries = dict(_LINE.findall(read_text(path)))
+    cam0, cam1 = (_matrix(entries, key, path) for key in ("cam0", "cam1"))
+    doffs_px = _number(entries, "doffs", path)
+    _check_views(cam0, cam1, doffs_px, path)
+    camera = RectifiedCamera(
+        focal_px=float(cam0[0, 0]),
+        cx_px=float(cam0[0, 2]),
+        cy_px=float(cam0[1, 2]),
+        cx_right_px=float(cam1[0, 2]),
+        baseline_m=_number(entries, "baseline", path) / 1000,
+        width_px=int(_number(entries, "width", path)),
+        height_px=int(_number(entries, "height", path)),
+        ndisp=int(_number(entries, "ndisp", path)) if "ndisp" in entries else None,
+    )
+    vmin, vmax = (_number(entries, k, path) if k in entries else None for k in ("vmin", "vmax"))
+    isint = "isint" in entries and _number(entries, "isint", path) != 0
+    return MiddleburyCalib(camera, isint, vmin, vmax, doffs_px)
+
+
+def nominal_camera_2005(
+    width_px: int, height_px: int, dmin_px: float, factor: float
+) -> RectifiedCamera:
+    """The camera of a 2005 or 2006 scene, from the nominal values that are published.
+
+    The images are cropped so that disparities are too small by ``dmin``. The principal point is
+    unknown and assumed at the image centre.
+
+    Args:
+        width_px: Image width.
+        height_px: Image height.
+        dmin_px: Content of ``dmin.txt``, in full-size pixels.
+        factor: Full-size pixels per pixel: 1, 2 or 3.
+    """
+    cx_px = (width_px - 1) / 2
+    return RectifiedCamera(
+        focal_px=_2005_FOCAL_PX / factor,
+        cx_px=cx_px,
+        cy_px=(height_px - 1) / 2,
+        cx_right_px=cx_px + dmin_px / factor,
+        baseline_m=_2005_BASELINE_M,
+        width_px=width_px,
+        height_px=height_px,
+    )
+
+
+def _check_views(cam0: Float64, cam1: Float64, doffs_px: float, path: StrPath) -> None:
+    if not np.allclose(cam0[[0, 1, 1], [0, 1, 2]], cam1[[0, 1, 1], [0, 1, 2]], rtol=1e-4):
+        raise CalibrationError("cam0 and cam1 have different focal lengths or rows", where=path)
+    # Each value is printed with three decimals.
+    if abs(cam1[0, 2] - cam0[0, 2] - doffs_px) > 0.01:
+        raise CalibrationError(
+            "doffs is not the difference of the principal points",
+            where=path,
+            got=f"{doffs_px:g}",
+            expected=f"{cam1[0, 2] - cam0[0, 2]:g}",
+        )
+
+
+def _entry(entries: dict[str, str], key: str, path: StrPath) -> str:
+    if key not in entries:
+        raise FormatError(f"calibration has no {key!r}", where=path, expected=f"a line {key}=…")
+    return entries[key]
+
+
+def _number(entries: dict[str, str], key: str, path: StrPath) -> float:
+    text = _entry(entries, key, path)
+    try:
+        number = float(text)
+    except ValueError:
+        number = float("nan")
+    if not np.isfinite(number):
+        raise FormatError(f"{key!r} is not a finite number", where=path, got=text)
+    return number
+
+
+def _matrix(entries: dict[str, str], key: str, path: StrPath) -> Float64:
+    text = _entry(entries, key, path)
+    try:
+        numbers = [float(word) for word in text.strip("[]").replace(";", " ").split()]
+        matrix = np.array(numbers).reshape(3, 3)
+    except ValueError as error:
+        raise FormatError(
+            f"{key!r} is not a 3x3 matrix", where=path, got=text, expected="[f 0 cx; 0 f cy; 0 0 1]"
+        ) from error
+    if not np.isfinite(matrix).all():
+        raise FormatError(f"{key!r} has a value that is not finite", where=path, got=text)
+    return matrix

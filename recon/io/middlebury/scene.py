@@ -1,0 +1,154 @@
+"""Middlebury stereo scenes of 2001, 2003, 2005, 2006, 2014 and MiddEval3."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from recon.core.errors import FormatError
+from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair, check_size
+from recon.core.values.arrays import UInt8
+from recon.io.files import StrPath, read_table, reader
+from recon.io.images.image import read_image
+from recon.io.middlebury.calib import (
+    MiddleburyCalib,
+    nominal_camera_2005,
+    read_middlebury_calib,
+)
+from recon.io.middlebury.layout import (
+    Generation,
+    Layout,
+    find_layout,
+    find_picture,
+    full_size_factor,
+    generation_of,
+    levels_per_pixel,
+    scene_root,
+)
+from recon.io.middlebury.truth import read_middlebury_truth
+
+
+@dataclass(frozen=True, eq=False)
+class MiddleburyScene:
+    """One scene with all data of its folder.
+
+    Attributes:
+        name: Name of the folder.
+        generation: Layout of the folder: "2005" includes 2006, and "2014" includes MiddEval3.
+        pair: The rectified images.
+        camera: The camera, or None if none is published: 2001, 2003, and 2005 or 2006 without
+            ``dmin.txt``. Matching can then use a `stand_in_camera`.
+        truth: True disparity of the left image, or None if the folder has none.
+        ndisp: Number of disparities to search, or None if it is not published.
+        isint: True if results are rounded to whole pixels before comparison.
+        full_size_factor: Full-size pixels per pixel of these images: the error thresholds of the
+            benchmark are in full-size pixels.
+    """
+
+    name: str
+    generation: Generation
+    pair: StereoPair
+    camera: RectifiedCamera | None
+    truth: DisparityTruth | None
+    ndisp: int | None
+    isint: bool
+    full_size_factor: float
+
+
+@reader
+def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
+    """Read one scene; `middlebury_layout` lists the supported layouts.
+
+    Raises:
+        FormatError: The folder is not a Middlebury scene, or a file in it is missing, damaged or
+            of another size than the left image.
+        CalibrationError: The calibration cannot give depth.
+    """
+    path = Path(folder).resolve()
+    layout = find_layout(path)
+    if layout is None:
+        raise FormatError(
+            "folder is not a Middlebury scene",
+            where=folder,
+            expected="im0 and im1 with calib.txt, view1 and view5, im2 and im6, or im3 and im4",
+        )
+    pair = _read_pair(path, layout)
+    height_px, width_px = pair.left.shape[:2]
+    factor = full_size_factor(layout, width_px, height_px, path)
+    root = scene_root(path)
+    calib = _read_calib(root, generation_of(layout, width_px), pair.left, factor)
+    scale = levels_per_pixel(layout, width_px, height_px)
+    return MiddleburyScene(
+        name=path.name,
+        generation=generation_of(layout, width_px),
+        pair=pair,
+        camera=calib.camera if calib else None,
+        truth=read_middlebury_truth(root, layout, scale, (height_px, width_px)),
+        ndisp=calib.camera.ndisp if calib else _read_ndisp(path),
+        isint=calib.isint if calib else False,
+        full_size_factor=factor,
+    )
+
+
+def stand_in_camera(width_px: int, height_px: int, ndisp: int | None = None) -> RectifiedCamera:
+    """A placeholder camera for uncalibrated images: valid for matching, not for depth.
+
+    The focal length is set to the image width and the baseline to 1, so depth has an unknown
+    scale.
+    """
+    cx_px = (width_px - 1) / 2
+    return RectifiedCamera(
+        focal_px=float(width_px),
+        cx_px=cx_px,
+        cy_px=(height_px - 1) / 2,
+        cx_right_px=cx_px,
+        baseline_m=1.0,
+        width_px=width_px,
+        height_px=height_px,
+        ndisp=ndisp,
+    )
+
+
+def _read_pair(path: Path, layout: Layout) -> StereoPair:
+    left, right = (_read_picture(path, stem) for stem in (layout.left, layout.right))
+    if left.shape != right.shape:
+        raise FormatError(
+            "left and right images differ in size",
+            where=path,
+            got=f"{layout.left} {_size(left)}, {layout.right} {_size(right)}",
+        )
+    return StereoPair(left, right, name=path.name)
+
+
+def _read_picture(path: Path, stem: str) -> UInt8:
+    file = find_picture(path, stem)
+    if file is None:
+        raise FormatError("image is missing", where=path, expected=f"{stem}.png")
+    return read_image(file)
+
+
+def _read_calib(
+    path: Path, generation: Generation, left: UInt8, factor: float
+) -> MiddleburyCalib | None:
+    height_px, width_px = left.shape[:2]
+    if generation == "2005" and (path / "dmin.txt").is_file():
+        table, _ = read_table(path / "dmin.txt", (1,))
+        return MiddleburyCalib(nominal_camera_2005(width_px, height_px, float(table[0, 0]), factor))
+    if generation != "2014" or not (path / "calib.txt").is_file():
+        return None
+    calib = read_middlebury_calib(path / "calib.txt")
+    check_size(calib.camera, width_px, height_px, path / "calib.txt")
+    return calib
+
+
+def _read_ndisp(path: Path) -> int | None:
+    """Read ``info.txt`` of the version 2 benchmark: grey levels per pixel, largest disparity."""
+    info = path / "v2eval" / "info.txt"
+    if not info.is_file():
+        return None
+    table, _ = read_table(info, (1, 2))
+    return int(table.ravel()[-1]) + 1
+
+
+def _size(image: UInt8) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"

@@ -1,0 +1,180 @@
+"""Meshes as PLY, OBJ, STL and GLB files, according to the suffix."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import FormatError, OutputError, SettingsError
+from recon.core.values import TriangleMesh
+from recon.core.values.arrays import Int32
+from recon.core.values.cloud import Frame
+from recon.io.atomic import atomic_path
+from recon.io.files import reader
+from recon.io.models.glb import srgb_from_linear, write_glb
+from recon.io.models.ply import colours_of, fill_vertices, normals_of, vertex_dtype
+from recon.io.models.ply_tables import (
+    Table,
+    list_length,
+    read_tables,
+    write_table_parts,
+    write_tables,
+)
+
+MESH_SUFFIXES: Final = (".ply", ".obj", ".stl", ".glb")
+#: Both names are in use for this property of a face.
+_INDICES: Final = ("vertex_indices", "vertex_index")
+
+
+def write_mesh(path: str | PathLike[str], mesh: TriangleMesh, frame: Frame | None = None) -> None:
+    """Write a mesh atomically.
+
+    PLY is binary with float vertices. PLY, OBJ and GLB keep normals and colours; STL has neither.
+    GLB is glTF 2.0 in one file.
+
+    Args:
+        path: The file; its suffix (.ply, .obj, .stl or .glb) gives the format.
+        mesh: The mesh.
+        frame: Axes of its vertices, so that GLB viewers show it upright; None = unknown.
+
+    Raises:
+        OutputError: The suffix is unknown, the mesh has no face, or the file cannot be written.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise OutputError("unknown kind of mesh file", where=path, expected=" ".join(MESH_SUFFIXES))
+    if len(mesh.faces) == 0:
+        raise OutputError("the mesh has no face", where=path)
+    if suffix == ".ply":
+        write_tables(path, _tables(mesh))
+    elif suffix == ".glb":
+        write_glb(path, mesh, frame)
+    else:
+        # Importing Open3D takes two seconds; PLY files do not need it.
+        from recon.io.models import open3d_meshes  # noqa: PLC0415
+
+        with atomic_path(path) as temporary:
+            open3d_meshes.write_mesh(temporary, mesh)
+
+
+def check_mesh_formats(formats: Sequence[str]) -> None:
+    """Refuse unknown formats before the work is done.
+
+    Args:
+        formats: Suffixes without the dot.
+
+    Raises:
+        SettingsError: One is not a suffix that `write_mesh` knows.
+    """
+    unknown = [name for name in formats if f".{name}" not in MESH_SUFFIXES]
+    if unknown:
+        raise SettingsError(
+            "unknown mesh format",
+            where="--format",
+            got=unknown[0],
+            expected=", ".join(suffix.lstrip(".") for suffix in MESH_SUFFIXES),
+        )
+
+
+def join_meshes(path: str | PathLike[str], parts: Sequence[tuple[Path, int, int]]) -> None:
+    """Join the meshes of several PLY files into one PLY, with at most two in memory.
+
+    Args:
+        path: The file, written atomically.
+        parts: File, number of vertices and number of faces of each part, at least one; all with
+            the same fields.
+
+    Raises:
+        FormatError: A part cannot be read.
+        OutputError: The file cannot be written.
+    """
+    files, vertices, faces = zip(*parts, strict=True)
+    starts = np.concatenate([[0], np.cumsum(vertices)[:-1]]).astype(np.int32)
+
+    def tables(element: str) -> Iterator[Table]:
+        for file, start in zip(files, starts, strict=True):
+            yield _tables(read_mesh(file), int(start))[element]
+
+    write_table_parts(
+        path, {"vertex": (sum(vertices), tables("vertex")), "face": (sum(faces), tables("face"))}
+    )
+
+
+@reader
+def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
+    """Read a mesh.
+
+    Args:
+        path: The file; its suffix (.ply, .obj, .stl or .glb) gives the format.
+
+    Raises:
+        FormatError: The file is missing, of an unknown format, truncated, has no faces, or has
+            faces that are not triangles or refer to vertices that do not exist.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise FormatError("unknown kind of mesh file", where=path, expected=" ".join(MESH_SUFFIXES))
+    if suffix == ".ply":
+        mesh = _read_ply(path)
+    elif Path(path).is_file():
+        from recon.io.models import open3d_meshes  # noqa: PLC0415
+
+        mesh = open3d_meshes.read_mesh(path)
+        if suffix == ".glb" and mesh.rgb is not None:
+            mesh = replace(mesh, rgb=srgb_from_linear(mesh.rgb))
+    else:
+        raise FormatError("no such file", where=path)
+    return _checked(mesh, path)
+
+
+def _tables(mesh: TriangleMesh, start: int = 0) -> dict[str, Table]:
+    """The two tables of a PLY mesh, with ``start`` added to the vertex indices of its faces."""
+    fields = vertex_dtype(normals=mesh.normals is not None, colours=mesh.rgb is not None)
+    vertices = np.zeros(len(mesh.vertices), fields)
+    fill_vertices(vertices, mesh.vertices, mesh.normals, mesh.rgb)
+    name = _INDICES[0]
+    faces = np.zeros(len(mesh.faces), [(list_length(name), "u1"), (name, "<i4", (3,))])
+    faces[list_length(name)] = 3
+    faces[name] = mesh.faces + np.int32(start)
+    return {"vertex": vertices, "face": faces}
+
+
+def _read_ply(path: str | PathLike[str]) -> TriangleMesh:
+    _, tables = read_tables(path, ["vertex", "face"])
+    vertex, faces = tables.get("vertex"), _faces(tables.get("face"))
+    if vertex is None or faces is None or len(faces) == 0:
+        raise FormatError("the PLY file has no faces: it is a point cloud", where=path)
+    if not {"x", "y", "z"} <= set(vertex.dtype.names or ()):
+        raise FormatError("the PLY file has no vertices with x, y and z", where=path)
+    return TriangleMesh(
+        vertices=np.stack([vertex[axis] for axis in "xyz"], axis=1).astype(np.float32),
+        faces=faces,
+        normals=normals_of(vertex),
+        rgb=colours_of(vertex),
+    )
+
+
+def _faces(table: Table | None) -> Int32 | None:
+    for name in _INDICES:
+        if table is not None and name in (table.dtype.names or ()):
+            return table[name].astype(np.int32)
+    return None
+
+
+def _checked(mesh: TriangleMesh, path: str | PathLike[str]) -> TriangleMesh:
+    """Check that all faces refer to existing vertices and all vertices are finite."""
+    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise FormatError(
+            "a face refers to a vertex that does not exist",
+            where=path,
+            got=f"{int(mesh.faces.max())}",
+            expected=f"less than {len(mesh.vertices)}",
+        )
+    if not np.isfinite(mesh.vertices).all():
+        raise FormatError("a vertex of the mesh is not finite", where=path)
+    return mesh

@@ -1,0 +1,122 @@
+"""Open3D's mesh files and mesh processing: arrays in, arrays out, its errors converted to ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from recon.core.errors import FormatError, MeshingError, OutputError
+from recon.core.values import TriangleMesh
+from recon.core.values.arrays import Float32, Int32
+
+
+def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
+    """Write OBJ or STL, chosen by the suffix.
+
+    Raises:
+        OutputError: Open3D could not write the file.
+    """
+    with _quiet():
+        written = o3d.io.write_triangle_mesh(Path(path), _legacy(mesh))
+    if not written:
+        raise OutputError("Open3D could not write the mesh", where=path)
+
+
+def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
+    """Read OBJ, STL, GLB or another format that Open3D knows, chosen by the suffix.
+
+    Raises:
+        FormatError: Open3D found no triangles in the file.
+    """
+    with _quiet():
+        mesh = o3d.io.read_triangle_mesh(Path(path))
+    if not mesh.has_triangles():
+        raise FormatError("the file has no triangles that Open3D can read", where=path)
+    return TriangleMesh(
+        vertices=np.asarray(mesh.vertices).astype(np.float32),
+        faces=np.asarray(mesh.triangles).astype(np.int32),
+        normals=_normals(mesh),
+        rgb=_colours(mesh),
+    )
+
+
+def component_labels(vertices: NDArray[Any], faces: NDArray[Any]) -> tuple[Int32, Int32]:
+    """Label the connected components of a mesh.
+
+    Args:
+        vertices: (V, 3).
+        faces: int (F, 3).
+
+    Returns:
+        int32 (F,), component of each face, and int32 (C,), number of faces of each component.
+    """
+    with _quiet():
+        labels, sizes, _ = _surface(vertices, faces).cluster_connected_triangles()
+    return np.asarray(labels).astype(np.int32), np.asarray(sizes).astype(np.int32)
+
+
+def decimate(
+    vertices: NDArray[Any], faces: NDArray[Any], target_faces: int
+) -> tuple[Float32, Int32]:
+    """Collapse edges until about ``target_faces`` are left, preserving shape and border.
+
+    Raises:
+        MeshingError: No face is left.
+
+    Ref: Garland & Heckbert, "Surface simplification using quadric error metrics", 1997.
+    """
+    with _quiet():
+        smaller = _surface(vertices, faces).simplify_quadric_decimation(
+            target_faces, boundary_weight=3.0
+        )
+    if not smaller.has_triangles():
+        raise MeshingError("decimation left no face", got=f"target of {target_faces} faces")
+    return (
+        np.asarray(smaller.vertices).astype(np.float32),
+        np.asarray(smaller.triangles).astype(np.int32),
+    )
+
+
+def _surface(vertices: NDArray[Any], faces: NDArray[Any]) -> Any:
+    """Open3D mesh of copies; it accepts neither read-only nor float32 arrays."""
+    return o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(np.array(vertices, dtype=np.float64)),
+        o3d.utility.Vector3iVector(np.array(faces, dtype=np.int32)),
+    )
+
+
+def _legacy(mesh: TriangleMesh) -> Any:
+    surface = _surface(mesh.vertices, mesh.faces)
+    if mesh.normals is not None:
+        normals = np.array(mesh.normals, dtype=np.float64)
+        surface.vertex_normals = o3d.utility.Vector3dVector(normals)
+    if mesh.rgb is not None:
+        surface.vertex_colors = o3d.utility.Vector3dVector(mesh.rgb.astype(np.float64) / 255)
+    surface.compute_triangle_normals()
+    return surface
+
+
+def _normals(mesh: Any) -> Float32 | None:
+    if not mesh.has_vertex_normals():
+        return None
+    return np.asarray(mesh.vertex_normals).astype(np.float32)
+
+
+def _colours(mesh: Any) -> NDArray[np.uint8] | None:
+    if not mesh.has_vertex_colors():
+        return None
+    return np.asarray(np.rint(np.asarray(mesh.vertex_colors) * 255), dtype=np.uint8)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Open3D's warnings off standard output; errors that matter are checked and raised."""
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        yield

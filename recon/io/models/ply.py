@@ -1,0 +1,267 @@
+"""Point clouds as PLY files for MeshLab, CloudCompare and Open3D."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from os import PathLike
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.errors import FormatError
+from recon.core.values import Frame, PointCloud
+from recon.core.values.arrays import Float32, UInt8
+from recon.io.atomic import atomic_path
+from recon.io.files import reader
+from recon.io.models.ply_tables import (
+    PlyHeader,
+    Table,
+    TableStream,
+    read_table_pieces,
+    read_tables,
+    write_tables,
+)
+
+_XYZ: Final = ("x", "y", "z")
+_NORMAL: Final = ("nx", "ny", "nz")
+_COLOUR: Final = ("red", "green", "blue")
+#: Scalars of a point: field of `PointCloud`, PLY property, type. MeshLab shows `quality`.
+_SCALARS: Final = (
+    ("confidence", "quality", "<f4"),
+    ("sigma_m", "sigma", "<f4"),
+    ("weight", "weight", "<f4"),
+    ("count", "count", "<i4"),
+)
+_FRAME: Final = "frame "
+_PIECE_POINTS: Final = 1 << 19
+# Less than any stereo camera or laser scanner measures.
+_LARGEST_ROUNDING_M: Final = 0.005
+_FRAMES: Final[tuple[Frame, ...]] = ("camera", "world", "map")
+
+
+def write_ply(
+    path: str | PathLike[str],
+    cloud: PointCloud,
+    *,
+    quality: Float32 | None = None,
+    ascii: bool = False,  # noqa: A002 - what the format calls it
+) -> None:
+    """Write a cloud atomically, binary little endian unless ``ascii``.
+
+    Positions and normals are float, colours uchar; ``quality`` is the confidence; sigma, weight and
+    count are written under their names if the cloud has them. The frame is a comment.
+
+    Args:
+        path: The file.
+        cloud: The cloud.
+        quality: float32 (N,), written as ``quality`` instead of the confidence.
+        ascii: Write text (larger and slower, with the same values).
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    rated = cloud if quality is None else replace(cloud, confidence=quality)
+    write_tables(path, {"vertex": _table(rated)}, [_FRAME + cloud.frame], ascii=ascii)
+
+
+def write_ply_tiles(
+    path: str | PathLike[str], clouds: Iterable[PointCloud], *, frame: Frame
+) -> int:
+    """Write several clouds into one file, in the format of `write_ply`.
+
+    Args:
+        path: The file, written atomically.
+        clouds: Clouds in the same frame and with the same fields; one is in memory at a time.
+        frame: Frame of the file if there is no cloud.
+
+    Returns:
+        The number of points.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    stream: TableStream | None = None
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        for cloud in clouds:
+            table = _table(cloud)
+            if stream is None:
+                stream = TableStream(file, "vertex", table.dtype, [_FRAME + cloud.frame])
+            stream.append(table)
+        if stream is None:
+            nothing = _table(PointCloud(np.zeros((0, 3), np.float32), frame=frame))
+            stream = TableStream(file, "vertex", nothing.dtype, [_FRAME + frame])
+        stream.close()
+    return stream.rows
+
+
+@reader
+def read_ply(path: str | PathLike[str]) -> PointCloud:
+    """Read the vertices of a cloud or mesh, in ascii or binary, float or double.
+
+    Points with a non-finite coordinate are dropped; organised clouds mark their gaps that way.
+    ``quality`` (or ``confidence``) becomes the confidence if all values lie in [0, 1].
+
+    Args:
+        path: The file.
+
+    Returns:
+        The cloud, in the frame named in the file, else ``camera``. It may be empty.
+
+    Raises:
+        FormatError: The file is missing, truncated, not a PLY, has no x, y, z, has points none of
+            which is finite, or doubles that float32 would move by millimetres.
+    """
+    header, tables = read_tables(path, ["vertex"])
+    vertex = _vertices(tables.get("vertex"), path)
+    cloud = replace(
+        _shape(vertex, header),
+        confidence=_confidence(vertex),
+        sigma_m=_scalar(vertex, "sigma", np.float32),
+        weight=_scalar(vertex, "weight", np.float32),
+        count=_scalar(vertex, "count", np.int32),
+    )
+    kept = _finite(cloud)
+    _check_kept(len(cloud), len(kept), path)
+    return kept
+
+
+def read_ply_pieces(
+    path: str | PathLike[str], points_each: int = _PIECE_POINTS
+) -> Iterator[PointCloud]:
+    """Read positions, normals and colours like `read_ply`, one piece at a time.
+
+    Other fields are left out, as the meaning of ``quality`` depends on all its values.
+
+    Args:
+        path: The file.
+        points_each: Points per piece, before non-finite ones are dropped.
+
+    Raises:
+        FormatError: As in `read_ply`, at the piece where the fault is found.
+    """
+    vertex: Table | None = None
+    points, kept = 0, 0
+    for header, vertex in read_table_pieces(path, "vertex", points_each):
+        piece = _finite(_shape(_vertices(vertex, path), header))
+        points, kept = points + len(vertex), kept + len(piece)
+        yield piece
+    _vertices(vertex, path)
+    _check_kept(points, kept, path)
+
+
+def vertex_dtype(*, normals: bool, colours: bool) -> list[tuple[str, str]]:
+    """Fields of a vertex table: position, and optionally normal and colour."""
+    fields = [(name, "<f4") for name in _XYZ + (_NORMAL if normals else ())]
+    return fields + [(name, "u1") for name in (_COLOUR if colours else ())]
+
+
+def fill_vertices(
+    table: Table, xyz: NDArray[Any], normals: NDArray[Any] | None, rgb: UInt8 | None
+) -> None:
+    """Copy positions, normals and colours into the fields of `vertex_dtype`."""
+    for names, values in ((_XYZ, xyz), (_NORMAL, normals), (_COLOUR, rgb)):
+        if values is not None:
+            for column, name in enumerate(names):
+                table[name] = values[:, column]
+
+
+def normals_of(vertex: Table) -> NDArray[np.float32] | None:
+    """float32 (N, 3), the normals of a vertex table, or None."""
+    return _stacked(vertex, _NORMAL, np.float32) if _has(vertex, _NORMAL) else None
+
+
+def colours_of(vertex: Table) -> UInt8 | None:
+    """uint8 (N, 3), the colours of a vertex table, or None; float colours are in [0, 1]."""
+    if not _has(vertex, _COLOUR):
+        return None
+    if vertex.dtype["red"].kind == "f":
+        share = np.nan_to_num(_stacked(vertex, _COLOUR, np.float32))
+        return np.asarray(np.rint(np.clip(share, 0, 1) * 255), dtype=np.uint8)
+    return np.asarray(_stacked(vertex, _COLOUR, np.uint8))
+
+
+def _table(cloud: PointCloud) -> Table:
+    scalars = [row for row in _SCALARS if getattr(cloud, row[0]) is not None]
+    fields = vertex_dtype(normals=cloud.normals is not None, colours=cloud.rgb is not None)
+    table = np.zeros(len(cloud), fields + [(name, code) for _, name, code in scalars])
+    fill_vertices(table, cloud.xyz, cloud.normals, cloud.rgb)
+    for attribute, name, _ in scalars:
+        table[name] = getattr(cloud, attribute)
+    return table
+
+
+def _vertices(vertex: Table | None, path: str | PathLike[str]) -> Table:
+    """Check that the vertex table exists and has positions."""
+    if vertex is None or not _has(vertex, _XYZ):
+        raise FormatError("the PLY file has no vertices with x, y and z", where=path)
+    _check_precision(vertex, path)
+    return vertex
+
+
+def _check_precision(vertex: Table, path: str | PathLike[str]) -> None:
+    """Reject coordinates that float32 would round too far, such as UTM: by up to half a metre."""
+    for name in _XYZ:
+        exact = vertex[name]
+        if exact.dtype.itemsize <= 4:
+            continue
+        exact = exact[np.isfinite(exact)]
+        with np.errstate(over="ignore"):
+            moved_m = np.abs(exact.astype(np.float32) - exact).max(initial=0.0)
+        if moved_m > _LARGEST_ROUNDING_M:
+            raise FormatError(
+                "coordinates are too large to be kept in single precision",
+                where=path,
+                got=f"{name} up to {np.abs(exact).max():.10g}, rounded by {moved_m:.2g} m",
+                expected=f"rounded by at most {_LARGEST_ROUNDING_M:g} m",
+                hint="subtract an offset, such as the first point, from all coordinates",
+            )
+
+
+def _shape(vertex: Table, header: PlyHeader) -> PointCloud:
+    """Positions, normals and colours of vertices."""
+    return PointCloud(
+        xyz=_stacked(vertex, _XYZ, np.float32),
+        rgb=colours_of(vertex),
+        normals=normals_of(vertex),
+        frame=_frame(header),
+    )
+
+
+def _finite(cloud: PointCloud) -> PointCloud:
+    finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
+    return cloud if finite.all() else cloud.select(finite)
+
+
+def _check_kept(points: int, kept: int, path: str | PathLike[str]) -> None:
+    if points and not kept:
+        raise FormatError("no point of the PLY file is finite", where=path)
+
+
+def _has(table: Table, names: tuple[str, ...]) -> bool:
+    return set(names) <= set(table.dtype.names or ())
+
+
+def _stacked(table: Table, names: tuple[str, ...], dtype: type[Any]) -> NDArray[Any]:
+    return np.stack([table[name] for name in names], axis=1).astype(dtype)
+
+
+def _scalar(table: Table, name: str, dtype: type[Any]) -> NDArray[Any] | None:
+    return table[name].astype(dtype) if _has(table, (name,)) else None
+
+
+def _confidence(vertex: Table) -> NDArray[np.float32] | None:
+    for name in ("quality", "confidence"):
+        values = _scalar(vertex, name, np.float32)
+        if values is not None and ((values >= 0) & (values <= 1)).all():
+            return values
+    return None
+
+
+def _frame(header: PlyHeader) -> Frame:
+    for comment in header.comments:
+        for frame in _FRAMES:
+            if comment == _FRAME + frame:
+                return frame
+    return "camera"

@@ -1,0 +1,1 @@
+"""Occupancy maps for robots: Nav2 and OctoMap."""

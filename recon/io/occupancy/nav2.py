@@ -1,0 +1,146 @@
+"""Nav2 (ROS) maps: a PGM image and a YAML file that describes it.
+
+Ref: https://docs.nav2.org/configuration/packages/configuring-map-server.html (mode ``trinary``):
+the occupancy of a pixel is ``(255 - value) / 255``; above ``occupied_thresh`` the cell is
+occupied, below ``free_thresh`` free, else unknown. The first row of the image has the largest y.
+"""
+
+from __future__ import annotations
+
+import re
+from os import PathLike
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from recon.core.errors import FormatError
+from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from recon.core.values.arrays import UInt8
+from recon.io.atomic import atomic_path, write_text
+from recon.io.files import read_bytes, reader
+from recon.io.yaml_file import read_yaml
+
+_OCCUPIED_THRESH: Final = 0.65
+# With the common 0.25, the grey level of unknown (205, occupancy 0.196…) would be read as free.
+_FREE_THRESH: Final = 0.196
+_GREY: Final = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
+_STRIP_ROWS: Final = 256
+_KEYS: Final = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
+_PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d+)\s+(\d+)\s+(\d+)\s")
+
+
+def write_nav2(path: str | PathLike[str], grid: OccupancyGrid) -> tuple[Path, Path]:
+    """Write ``path.pgm`` and ``path.yaml``, each atomically, the image first.
+
+    Args:
+        path: Both names without their suffixes, such as ``map/grid``.
+        grid: The grid.
+
+    Returns:
+        The two paths written: image, YAML.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    stem = Path(path)
+    picture, description = (stem.with_name(f"{stem.name}.{end}") for end in ("pgm", "yaml"))
+    rows, columns = grid.cells.shape
+    with atomic_path(picture) as temporary, temporary.open("wb") as file:
+        file.write(f"P5\n{columns} {rows}\n255\n".encode())
+        for last in range(rows, 0, -_STRIP_ROWS):
+            file.write(_grey(grid.cells[max(0, last - _STRIP_ROWS) : last][::-1]).tobytes())
+    write_text(description, yaml.safe_dump(_describe(grid, picture.name), sort_keys=False))
+    return picture, description
+
+
+@reader
+def read_nav2(path: str | PathLike[str]) -> OccupancyGrid:
+    """Read a map as Nav2 does in mode ``trinary``.
+
+    Args:
+        path: The YAML file.
+
+    Raises:
+        FormatError: A file is missing or damaged, the mode is not ``trinary``, or the map is
+            rotated.
+    """
+    path = Path(path)
+    fields = _fields(path)
+    picture = path.parent / str(fields["image"])
+    grey = _read_pgm(picture).astype(np.float64)
+    occupancy = grey / 255 if fields["negate"] else (255 - grey) / 255
+    cells = np.full(grey.shape, UNKNOWN, np.int8)
+    cells[occupancy > float(fields["occupied_thresh"])] = OCCUPIED
+    cells[occupancy < float(fields["free_thresh"])] = FREE
+    x, y, _ = fields["origin"]
+    return OccupancyGrid(
+        np.ascontiguousarray(cells[::-1]), float(fields["resolution"]), (float(x), float(y))
+    )
+
+
+def _grey(cells: NDArray[np.int8]) -> UInt8:
+    grey = np.full(cells.shape, _GREY[UNKNOWN], np.uint8)
+    for cell, value in _GREY.items():
+        grey[cells == cell] = value
+    return grey
+
+
+def _describe(grid: OccupancyGrid, image: str) -> dict[str, Any]:
+    """The content of the YAML file."""
+    return {
+        "image": image,
+        "mode": "trinary",
+        "resolution": float(grid.resolution_m),
+        "origin": [float(grid.origin_m[0]), float(grid.origin_m[1]), 0.0],
+        "negate": 0,
+        "occupied_thresh": _OCCUPIED_THRESH,
+        "free_thresh": _FREE_THRESH,
+    }
+
+
+def _fields(path: Path) -> dict[str, Any]:
+    """Read and validate the content of the YAML file."""
+    fields = read_yaml(path)
+    missing = [key for key in _KEYS if key not in fields]
+    if missing:
+        raise FormatError(f"the map's YAML file has no {missing[0]!r}", where=path)
+    if fields.get("mode", "trinary") != "trinary":
+        raise FormatError(
+            "mode of the map is not supported", where=path, got=fields["mode"], expected="trinary"
+        )
+    _check_numbers(fields, path)
+    return fields
+
+
+def _check_numbers(fields: dict[str, Any], path: Path) -> None:
+    """Reject fields that are not numbers, and rotated maps."""
+    origin = fields["origin"]
+    numbers = [fields[key] for key in ("resolution", "occupied_thresh", "free_thresh")]
+    whole = isinstance(origin, list) and len(origin) == 3
+    if not whole or not all(isinstance(n, (int, float)) for n in (*numbers, *origin)):
+        raise FormatError("the map's YAML file holds a value that is not a number", where=path)
+    if origin[2] != 0:
+        raise FormatError("the map is rotated", where=path, got=f"yaw {origin[2]:g}", expected="0")
+
+
+@reader
+def _read_pgm(path: Path) -> UInt8:
+    """Read a binary 8-bit PGM, uint8 (rows, columns)."""
+    content = read_bytes(path)
+    header = _PGM_HEADER.match(content)
+    if header is None or int(header[3]) != 255:
+        raise FormatError("the map's image is not a binary 8-bit PGM", where=path)
+    columns, rows = int(header[1]), int(header[2])
+    body = content[header.end() :]
+    if len(body) != rows * columns:
+        raise FormatError(
+            "the map's image is truncated",
+            where=path,
+            got=f"{len(body)} bytes",
+            expected=f"{rows * columns}",
+        )
+    pixels: NDArray[np.uint8] = np.frombuffer(body, np.uint8)
+    return pixels.reshape(rows, columns)

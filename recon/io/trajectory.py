@@ -1,0 +1,162 @@
+"""Trajectories: KITTI (a 3×4 pose per line) and TUM (``t x y z qx qy qz qw`` per line)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.core.errors import FormatError
+from recon.core.geometry.quaternion import quaternion_from_rotation, rotation_from_quaternion
+from recon.core.geometry.se3 import make_transform, orthonormalise
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64
+from recon.io.atomic import write_text
+from recon.io.files import StrPath, read_table, reader
+
+# Files print rotations with four to seven digits; a larger deviation means it is not a rotation.
+_RIGID_TOLERANCE = 1e-3
+_UNIT_TOLERANCE = 1e-2
+# Geocentric and projected map coordinates stay below 1e7 m.
+_FARTHEST_M = 1e8
+
+
+@reader
+def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
+    """Read a KITTI or TUM trajectory, recognised by the number of columns (12 or 8).
+
+    Args:
+        path: The text file.
+        timestamps_s: float64 (N,), the times for a KITTI file; TUM files contain theirs.
+
+    Raises:
+        FormatError: As in `read_kitti_poses` and `read_tum`.
+    """
+    table, lines = read_table(path, (12, 8))
+    if table.shape[1] == 12:
+        return _from_kitti(table, lines, path, timestamps_s)
+    return _from_tum(table, lines, path)
+
+
+@reader
+def holds_times(path: StrPath) -> bool:
+    """Whether a trajectory file has timestamps: TUM files do, KITTI files do not.
+
+    Raises:
+        FormatError: The file is missing or in neither format.
+    """
+    return bool(read_table(path, (12, 8))[0].shape[1] == 8)
+
+
+@reader
+def read_kitti_poses(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
+    """Read poses of the left camera, one row-major 3×4 matrix per line.
+
+    The rotations are re-orthonormalised, as they are printed with few digits.
+
+    Args:
+        path: The text file.
+        timestamps_s: float64 (N,), one time per pose; without it pose ``i`` gets ``i`` seconds.
+
+    Raises:
+        FormatError: The file is missing, a line is not 12 finite numbers or not a rigid
+            transform, or the numbers of poses and timestamps differ.
+    """
+    return _from_kitti(*read_table(path, (12,)), path, timestamps_s)
+
+
+@reader
+def read_tum(path: StrPath) -> Trajectory:
+    """Read timestamped poses, ``t tx ty tz qx qy qz qw`` per line.
+
+    Raises:
+        FormatError: The file is missing, a line is not 8 finite numbers, a quaternion is not of
+            unit length, or time runs backwards.
+    """
+    return _from_tum(*read_table(path, (8,)), path)
+
+
+def write_kitti_poses(path: StrPath, trajectory: Trajectory) -> None:
+    """Write poses in KITTI's format, 13 digits, atomically; it has no timestamps.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    rows = trajectory.T_world_camera[:, :3, :].reshape(-1, 12)
+    write_text(path, "".join(" ".join(f"{value:.12e}" for value in row) + "\n" for row in rows))
+
+
+def write_tum(path: StrPath, trajectory: Trajectory) -> None:
+    """Write poses in TUM's format, 12 decimals (9 for the time), ``qw ≥ 0``, atomically.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    write_text(
+        path,
+        "".join(
+            _tum_line(T, float(time_s))
+            for T, time_s in zip(trajectory.T_world_camera, trajectory.timestamps_s, strict=True)
+        ),
+    )
+
+
+def _tum_line(T: Float64, time_s: float) -> str:
+    numbers = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
+    return f"{time_s:.9f} " + " ".join(f"{number:.12f}" for number in numbers) + "\n"
+
+
+def _from_kitti(
+    table: Float64, lines: list[int], path: StrPath, timestamps_s: Float64 | None
+) -> Trajectory:
+    times = np.arange(len(table), dtype=np.float64) if timestamps_s is None else timestamps_s
+    if len(times) != len(table):
+        raise FormatError(
+            "numbers of poses and timestamps differ",
+            where=path,
+            got=f"{len(table)} poses",
+            expected=f"{len(times)}",
+        )
+    _check_positions(table[:, 3::4], lines, path)
+    poses = np.zeros((len(table), 4, 4))
+    poses[:, :3, :] = table.reshape(-1, 3, 4)
+    poses[:, 3, 3] = 1.0
+    for pose, line in zip(poses, lines, strict=True):
+        _check_rotation(pose[:3, :3], f"{path}:{line}")
+    return Trajectory(np.stack([orthonormalise(pose) for pose in poses]), times)
+
+
+def _from_tum(table: Float64, lines: list[int], path: StrPath) -> Trajectory:
+    _check_positions(table[:, 1:4], lines, path)
+    norms = np.linalg.norm(table[:, 4:], axis=1)
+    for norm, line in zip(norms, lines, strict=True):
+        if abs(norm - 1) > _UNIT_TOLERANCE:
+            raise FormatError(
+                "quaternion is not of unit length", where=f"{path}:{line}", got=f"{norm:g}"
+            )
+    backwards = np.diff(table[:, 0]) < 0
+    if backwards.any():
+        line = lines[int(np.argmax(backwards)) + 1]
+        raise FormatError("time runs backwards", where=f"{path}:{line}")
+    poses = [make_transform(rotation_from_quaternion(row[4:]), row[1:4]) for row in table]
+    return Trajectory(np.stack(poses), table[:, 0].copy())
+
+
+def _check_positions(xyz_m: Float64, lines: list[int], path: StrPath) -> None:
+    far_m = np.abs(xyz_m).max(axis=1)
+    worst = int(np.argmax(far_m))
+    if far_m[worst] > _FARTHEST_M:
+        raise FormatError(
+            "position is implausibly far from the origin",
+            where=f"{path}:{lines[worst]}",
+            got=f"{far_m[worst]:.3g} m",
+            expected=f"at most {_FARTHEST_M:.0e} m",
+        )
+
+
+def _check_rotation(rotation: Float64, where: str) -> None:
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=_RIGID_TOLERANCE)
+    if not orthonormal or np.linalg.det(rotation) < 0:
+        raise FormatError(
+            "pose is not a rigid transform",
+            where=where,
+            expected="a row-major 3x4 matrix of rotation and translation",
+        )

@@ -1,1 +1,0 @@
-"""Compiled loops (numba): arrays and scalars in and out, each with a readable numpy twin."""

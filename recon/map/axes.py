@@ -1,0 +1,208 @@
+"""Map axes (x forward, y left, z up), and the ground plane below the first frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recon.core.errors import FormatError, MappingError
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.settings import Settings
+from recon.core.values import PointCloud
+from recon.core.values.arrays import Float64, freeze
+
+AXES_MAP_WORLD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""The turn from camera-like axes (right, down, forward) to map axes (forward, left, up)."""
+_UP_CAMERA: Final = np.array([0.0, -1.0, 0.0])
+_FARTHEST_M: Final = 1e5
+"""From the first camera to the map's origin: farther than any drive."""
+_RIGID_TOLERANCE: Final = 1e-6
+
+
+class AxesSettings(Settings):
+    """How the ground is found, when the map is levelled by it, and where it has its origin."""
+
+    origin: Literal["camera", "ground"] = Field(
+        "camera",
+        description="Origin of the map: the first left camera, or the ground below it, so that "
+        "z = 0 is on the ground at the start.",
+    )
+
+    level_min_tilt_deg: float = Field(
+        3.0,
+        ge=0.0,
+        le=90.0,
+        description="The map is levelled only where the camera is tilted more than this.",
+    )
+    max_tilt_deg: float = Field(
+        30.0, gt=0.0, lt=90.0, description="Planes tilted more than this are no ground."
+    )
+    max_range_m: float = Field(20.0, gt=0.0, le=1000.0, description="Points used.")
+    inlier_m: float = Field(
+        0.05, gt=0.0, le=1.0, description="Distance to the plane of points that support it."
+    )
+    min_inliers: int = Field(
+        500, ge=3, description="Points that must support the plane, after thinning to 20 000."
+    )
+    trials: int = Field(300, ge=1, le=100_000, description="Random planes that are tried.")
+
+
+@dataclass(frozen=True, eq=False)
+class GroundPlane:
+    """The ground below a camera, in its axes: the points with ``normal · xyz = -height_m``.
+
+    Attributes:
+        normal: float64 (3,), unit length, upward.
+        height_m: Height of the camera above the plane.
+        inliers: Number of points that support it.
+    """
+
+    normal: Float64
+    height_m: float
+    inliers: int = 0
+
+    def __post_init__(self) -> None:
+        freeze(self, "normal", np.float64, (3,))
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between the camera's own up (-y) and the normal."""
+        return math.degrees(math.acos(min(1.0, max(-1.0, float(self.normal @ _UP_CAMERA)))))
+
+
+def map_axes(
+    ground: GroundPlane | None, settings: AxesSettings, camera_height_m: float | None = None
+) -> Float64:
+    """Return ``T_map_world``, from world to map axes.
+
+    Args:
+        ground: The ground below the first camera, or None (not found).
+        settings: When to level, and where the origin is.
+        camera_height_m: Known height of the camera above the ground; None = that of ``ground``.
+
+    Returns:
+        float64 (4, 4). Without a ground, or with a tilt below the limit, exactly
+        x_map = z_world, y_map = -x_world, z_map = -y_world; else also turned the short way so
+        that the ground's normal is z_map. With its origin on the ground, also moved up along z.
+
+    Raises:
+        MappingError: The origin is to be on the ground, and there is none.
+    """
+    turn = AXES_MAP_WORLD
+    if ground is not None and ground.tilt_deg > settings.level_min_tilt_deg:
+        normal_map = AXES_MAP_WORLD @ ground.normal
+        axis = np.cross(normal_map, [0.0, 0.0, 1.0])
+        axis /= np.linalg.norm(axis)
+        turn = exp_so3(axis * math.radians(ground.tilt_deg)) @ AXES_MAP_WORLD
+    height_m = 0.0
+    if settings.origin == "ground":
+        height_m = _height_along_z(ground, turn) if camera_height_m is None else camera_height_m
+    return make_transform(turn, np.array([0.0, 0.0, height_m]))
+
+
+def base_axes(T_map_world: Float64, camera_height_m: float | None) -> Float64:
+    """Return ``T_base_camera``, from the left camera to the base of the vehicle (`base_link`).
+
+    The base has the axes of the map in the first frame (x forward, y left, z up), and its origin
+    on the ground below the camera; in the camera where its height is not known (None).
+    """
+    return make_transform(T_map_world[:3, :3], np.array([0.0, 0.0, camera_height_m or 0.0]))
+
+
+def _height_along_z(ground: GroundPlane | None, turn: NDArray[Any]) -> float:
+    """How far the ground is below the camera, along z of the map."""
+    if ground is None:
+        raise MappingError(
+            "the first frame shows no ground to put the map's origin on",
+            hint="start where it is seen, set ground.camera_height_m, or use axes.origin=camera",
+        )
+    return ground.height_m / float(turn[2] @ ground.normal)
+
+
+def estimate_ground(cloud: PointCloud, settings: AxesSettings) -> GroundPlane | None:
+    """Find the plane that the camera stands above: RANSAC, then least squares.
+
+    Args:
+        cloud: Points of one frame in camera axes.
+        settings: What counts as ground.
+
+    Returns:
+        The plane below the camera, within ``max_tilt_deg`` of level, with the most support; or
+        None. The same cloud gives the same plane.
+
+    Ref: M. Fischler and R. Bolles, "Random sample consensus", CACM 24, 1981.
+    """
+    xyz = _candidates(cloud, settings)
+    if len(xyz) < settings.min_inliers:
+        return None
+    normal, height = _best_plane(xyz, settings)
+    for _ in range(3):
+        inside = np.abs(xyz @ normal + height) < settings.inlier_m
+        if inside.sum() < settings.min_inliers:
+            return None
+        normal, height = _fit_plane(xyz[inside])
+    plane = GroundPlane(normal, float(height), int(inside.sum()))
+    return plane if plane.tilt_deg <= settings.max_tilt_deg and height > 0 else None
+
+
+def _candidates(cloud: PointCloud, settings: AxesSettings) -> Float64:
+    """Points in range that a tilted ground could hold, thinned evenly; float64 (N, 3)."""
+    xyz = cloud.xyz.astype(np.float64)
+    z = xyz[:, 2]
+    highest = z * math.tan(math.radians(settings.max_tilt_deg))
+    below = (z > 0) & (z < settings.max_range_m) & (xyz[:, 1] > -highest)
+    xyz = xyz[below]
+    return np.asarray(xyz[:: max(1, math.ceil(len(xyz) / 20_000))])
+
+
+def _best_plane(xyz: Float64, settings: AxesSettings) -> tuple[Float64, float]:
+    """The plane through three points that most points support."""
+    random = np.random.default_rng(0)
+    few = xyz[:: max(1, len(xyz) // 4000)]
+    triples = few[random.integers(0, len(few), (settings.trials, 3))]
+    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    normals = normals / np.where(length > 0, length, 1.0)[:, None]
+    normals *= np.where(normals[:, 1] > 0, -1.0, 1.0)[:, None]
+    heights = -np.einsum("ij,ij->i", normals, triples[:, 0])
+    level = normals @ _UP_CAMERA >= math.cos(math.radians(settings.max_tilt_deg))
+    support = np.abs(few @ normals.T + heights) < settings.inlier_m
+    votes = np.where(level & (heights > 0), support.sum(axis=0), -1)
+    best = int(np.argmax(votes))
+    return normals[best], float(heights[best])
+
+
+def _fit_plane(xyz: Float64) -> tuple[Float64, float]:
+    """The plane nearest to the points in the least-squares sense; its normal points up."""
+    centre = xyz.mean(axis=0)
+    _, vectors = np.linalg.eigh(np.cov((xyz - centre).T))
+    normal: NDArray[Any] = vectors[:, 0] * (-1.0 if vectors[1, 0] > 0 else 1.0)
+    return normal, float(-normal @ centre)
+
+
+def check_rigid(name: str, T: Float64, where: Path | None = None) -> None:
+    """Check a pose that is read from a run: one that is none would spoil or exhaust a map.
+
+    Raises:
+        FormatError: It is not a rigid transform, or implausibly far away.
+    """
+    if not (
+        T.shape == (4, 4)
+        and np.isfinite(T).all()
+        and np.abs(T[:3, 3]).max() <= _FARTHEST_M
+        and np.array_equal(T[3], [0, 0, 0, 1])
+        and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), rtol=0, atol=_RIGID_TOLERANCE)
+        and np.linalg.det(T[:3, :3]) > 0
+    ):
+        raise FormatError(
+            f"{name} is not a rigid transform of a map",
+            where=where,
+            got=T.tolist(),
+            expected=f"a rotation and at most {_FARTHEST_M:g} m",
+        )

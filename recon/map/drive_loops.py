@@ -1,0 +1,275 @@
+"""The loops of a drive: detected frame by frame, closed at its end."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from recon.core.errors import FormatError
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64
+from recon.io.tree_file import read_tree, write_tree
+from recon.map.submap_store import SubmapEntry
+from recon.places import LoopSettings
+from recon.places.detector import CONTRADICTED, KeyframeMemory, LoopDetector, StoredKeyframe
+from recon.places.drift import doubtful_path
+from recon.places.graph import Closure, close_loops
+from recon.places.keyframe import Keyframe
+from recon.places.verify import Loop
+from recon.run.stopwatch import Stopwatch
+from recon.stereo.frame import ReconstructedFrame
+
+_CACHED: Final = 64
+_TELLING: Final = 3  # implausible place recognitions from which a warning is given
+_BEHIND: Final = 4  # frames by which loop detection may lag behind
+
+
+@dataclass(frozen=True, eq=False)
+class DriveLoops:
+    """The result of loop closure on a drive.
+
+    Attributes:
+        odometry: The path before closure.
+        closure: The path after closure, and the loops.
+        keyframes: Number of keyframes.
+        found: Number of loops that passed the geometric check, confirmed by neighbours or not.
+        refused: Number of rejected candidates by reason.
+    """
+
+    odometry: Trajectory
+    closure: Closure
+    keyframes: int
+    found: int
+    refused: dict[str, int]
+
+    @property
+    def corrections_m(self) -> Float64:
+        """float64 (N,), how far each pose was moved."""
+        moved = self.closure.trajectory.positions_m - self.odometry.positions_m
+        return np.asarray(np.linalg.norm(moved, axis=1))
+
+    def submap_corrections(self, entries: Sequence[SubmapEntry]) -> Float64 | None:
+        """``T_corrected_world`` (S, 4, 4), the correction of each submap: that of its middle frame.
+
+        None if no loop was closed, so that no submap moves by a rounding error.
+        """
+        if not self.closure.closed:
+            return None
+        middles = (entry.first_frame + entry.frames // 2 for entry in entries)
+        return np.stack([self.closure.correction(self.odometry, frame) for frame in middles])
+
+    def figures(self) -> dict[str, Any]:
+        """The figures for ``summary.json``."""
+        return {
+            "keyframes": self.keyframes,
+            "found": self.found,
+            "unconfirmed": self.found - len(self.closure.closed) - len(self.closure.refused),
+            "closed": len(self.closure.closed),
+            "refused_by_graph": len(self.closure.refused),
+            "refused": dict(sorted(self.refused.items())),
+            "largest_correction_m": float(self.corrections_m.max(initial=0.0)),
+        }
+
+    def edges(self) -> dict[str, Any]:
+        """The loops, for ``loops.json``."""
+        return {
+            name: [
+                {
+                    "first": loop.first,
+                    "last": loop.last,
+                    "inliers": loop.inliers,
+                    "dense_share": round(loop.dense_share, 4),
+                    "T_first_last": loop.T_first_last.tolist(),
+                }
+                for loop in loops
+            ]
+            for name, loops in (("closed", self.closure.closed), ("refused", self.closure.refused))
+        }
+
+    def warnings(self) -> list[str]:
+        """Warnings about loops that were not closed."""
+        closed, refused = len(self.closure.closed), len(self.closure.refused)
+        if refused and not closed:
+            what = "they contradict the odometry; the map may show a place twice"
+            return [f"{refused} loops were found and none closed: {what}"]
+        if refused:
+            return [f"{refused} of {refused + closed} loops contradict the others; they are left"]
+        elsewhere = self.refused.get(CONTRADICTED, 0)
+        if elsewhere >= _TELLING and not closed:
+            why = "streets look alike, or the odometry is far off"
+            return [f"{elsewhere} places were recognised where the drive cannot have been: {why}"]
+        return []
+
+
+class LoopWatch:
+    """Detects loops in its own thread while a drive is mapped, and closes them at its end.
+
+    Args:
+        settings: Settings of loop detection and closure.
+        folder: Folder for keyframes; None = they stay in memory.
+        stopwatch: Records the time spent.
+    """
+
+    def __init__(
+        self,
+        settings: LoopSettings,
+        folder: Path | None = None,
+        stopwatch: Stopwatch | None = None,
+    ) -> None:
+        self._settings = settings
+        self._stage = (stopwatch or Stopwatch()).stage
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
+        self._waiting: deque[Future[None]] = deque()
+        self._store = KeyframeMemory() if folder is None else KeyframeFiles(folder)
+        self._detector = LoopDetector(settings, self._store)
+        self._path_m: list[float] = []
+        self._last: Float64 = np.eye(4)
+
+    def add(self, frame: ReconstructedFrame, T_world_camera: Float64, *, measured: bool) -> None:
+        """Add the next frame; earlier ones may still be in progress.
+
+        Raises:
+            OutputError: A keyframe cannot be written.
+        """
+        path_m, number = self._advance(T_world_camera, measured=measured), len(self._path_m) - 1
+
+        def look() -> None:
+            with self._stage("loops"):
+                self._detector.add(
+                    number,
+                    frame.pair,
+                    frame.disparity,
+                    T_world_camera,
+                    path_m=path_m,
+                    measured=measured,
+                )
+
+        self._wait(_BEHIND)
+        self._waiting.append(self._pool.submit(look))
+
+    def settle(self) -> None:
+        """Wait until all frames so far have been processed.
+
+        Raises:
+            OutputError: A keyframe cannot be written.
+        """
+        self._wait(0)
+
+    def stop(self) -> None:
+        """End the thread; pending frames are dropped."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def restore(self, T_world_camera: Iterable[Float64], measured: Iterable[bool]) -> None:
+        """Resume after frames with these poses; their keyframes are in the store.
+
+        Raises:
+            FormatError: A keyframe's file is damaged.
+        """
+        for T, good in zip(T_world_camera, measured, strict=True):
+            self._advance(T, measured=good)
+        for stored in self._store:
+            # A killed run may have written keyframes after its last checkpoint.
+            if stored.keyframe.frame < len(self._path_m):
+                self._detector.restore(stored)
+
+    def close(self, trajectory: Trajectory) -> DriveLoops:
+        """Close the loops of a path.
+
+        Raises:
+            OutputError: A keyframe cannot be written.
+        """
+        self.settle()
+        path_m = np.array(self._path_m)
+        loops = self._detector.agreeing()
+        return DriveLoops(
+            odometry=trajectory,
+            closure=close_loops(trajectory, path_m, loops, self._settings),
+            keyframes=len(self._detector),
+            found=len(self._detector.loops),
+            refused=dict(self._detector.refused),
+        )
+
+    def _wait(self, left: int) -> None:
+        """Wait until at most ``left`` frames are pending."""
+        while len(self._waiting) > left:
+            self._waiting.popleft().result()
+
+    def _advance(self, T_world_camera: Float64, *, measured: bool) -> float:
+        """Path length up to the next frame, as the detector measures it."""
+        before = self._last if self._path_m else T_world_camera
+        step = doubtful_path(
+            np.stack([before, T_world_camera]), np.array([True, measured]), self._settings.drift
+        )
+        self._path_m.append((self._path_m[-1] if self._path_m else 0.0) + float(step[1]))
+        self._last = T_world_camera
+        return self._path_m[-1]
+
+
+class KeyframeFiles:
+    """Keeps each keyframe in a file, and those read last in memory.
+
+    Args:
+        folder: The folder of the files; created if missing.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._held: OrderedDict[int, StoredKeyframe] = OrderedDict()
+
+    def put(self, stored: StoredKeyframe) -> None:
+        """Store a keyframe.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        write_tree(self._path(stored.keyframe.frame), _to_tree(stored))
+
+    def get(self, frame: int) -> StoredKeyframe:
+        """The keyframe of a frame.
+
+        Raises:
+            FormatError: Its file is missing or damaged.
+        """
+        if frame not in self._held:
+            self._held[frame] = _read(self._path(frame))
+            while len(self._held) > _CACHED:
+                self._held.popitem(last=False)
+        self._held.move_to_end(frame)
+        return self._held[frame]
+
+    def __iter__(self) -> Iterator[StoredKeyframe]:
+        """All stored keyframes, in frame order."""
+        return (_read(path) for path in sorted(self._folder.glob("keyframe_*.zip")))
+
+    def _path(self, frame: int) -> Path:
+        return self._folder / f"keyframe_{frame:09d}.zip"
+
+
+def _read(path: Path) -> StoredKeyframe:
+    tree = read_tree(path)
+    try:
+        return StoredKeyframe(
+            Keyframe(**tree["keyframe"]),
+            tree["T_world_camera"],
+            tree["path_m"],
+            tuple(Loop(**loop) for loop in tree["loops"]),
+            tuple(tree["refused"]),
+        )
+    except (KeyError, TypeError) as error:
+        raise FormatError("the file holds no keyframe", where=path) from error
+
+
+def _to_tree(stored: StoredKeyframe) -> dict[str, Any]:
+    return {
+        "keyframe": asdict(stored.keyframe),
+        "T_world_camera": stored.T_world_camera,
+        "path_m": stored.path_m,
+        "loops": [asdict(loop) for loop in stored.loops],
+        "refused": list(stored.refused),
+    }

@@ -1,0 +1,128 @@
+"""The space that the vehicle took up on its way: it was free while the vehicle was there.
+
+A camera that looks ahead never sees the ground on which it starts, and what passed before it may
+have left hits. But where a vehicle drives nothing else is: from the ground to the height of its
+camera, and as wide as it is. That is as good as an observation of free space at that time. What was
+seen before is outdone by it, and what is seen on a later visit outdoes it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.values.arrays import Bool, Float64, Int32, freeze
+from recon.map.ground import GroundSurface
+
+_SAME_M: Final = 0.3
+"""Heights of the camera above the ground that differ by less are those of one vehicle."""
+_STEADY: Final = 0.8
+"""Share of the path on which the height is the same, if something carries the camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrivenPath:
+    """The path of the camera in small steps, where its poses are trusted; map axes.
+
+    Attributes:
+        points_m: float64 (P, 3).
+        submap: int (P,), number of the submap of each point.
+    """
+
+    points_m: Float64
+    submap: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        freeze(self, "points_m", np.float64, (None, 3))
+        freeze(self, "submap", np.int64, (len(self.points_m),))
+
+    @classmethod
+    def through(
+        cls, path_m: Float64, trusted: Bool, submap: NDArray[np.int64], step_m: float
+    ) -> DrivenPath:
+        """Fill in the path between neighbouring poses that are both trusted.
+
+        Args:
+            path_m: float64 (N, 3), positions of the camera, map axes; N >= 1.
+            trusted: bool (N,).
+            submap: int (N,), submap of each frame.
+            step_m: Largest distance between points.
+        """
+        length_m = np.linalg.norm(np.diff(path_m, axis=0), axis=1)
+        joined = trusted[:-1] & trusted[1:]
+        steps = np.where(joined, np.ceil(length_m / step_m), 1).astype(np.int64).clip(min=1)
+        end = np.repeat(np.arange(1, len(path_m)), steps)
+        left = np.repeat(np.cumsum(steps), steps) - np.arange(1, steps.sum() + 1)
+        share = (left / np.repeat(steps, steps))[:, None]
+        between = share * path_m[end - 1] + (1 - share) * path_m[end]
+        keep = np.append(trusted[0], trusted[end])
+        points = np.concatenate([path_m[:1], between])
+        return cls(points[keep], np.append(submap[0], submap[end])[keep])
+
+    def select(self, which: NDArray[Any]) -> DrivenPath:
+        """The points of a mask."""
+        return DrivenPath(self.points_m[which], self.submap[which])
+
+
+def is_driven(drops_m: Float64, camera_height_m: float) -> bool:
+    """Whether something carries the camera over the ground; a drone does not.
+
+    Args:
+        drops_m: float64 (C,), heights of the path above what was seen below it, place by place.
+        camera_height_m: Height of the camera above the ground; NaN = unknown.
+    """
+    if not np.isfinite(camera_height_m):
+        return False
+    steady = np.abs(drops_m - camera_height_m) <= _SAME_M
+    return bool(len(drops_m) == 0 or steady.mean() >= _STEADY)
+
+
+def sweep(points_m: Float64, ground: GroundSurface, width_m: float, resolution_m: float) -> Int32:
+    """Return the voxels that a vehicle took up.
+
+    Args:
+        points_m: float64 (P, 3), its path, in steps of at most half a voxel; map axes.
+        ground: The ground. Where something else than the ground was seen below the path, nothing
+            is taken up.
+        width_m: Its width.
+        resolution_m: Edge of a voxel.
+
+    Returns:
+        int32 (N, 3), each once: the columns that the path crosses and those with their centre
+        within half a width of it, from the ground up to the camera.
+    """
+    columns, top_m = _columns(points_m[_on_ground(points_m, ground)], width_m, resolution_m)
+    floor_m = ground.height_at((columns + 0.5) * resolution_m)
+    known = np.isfinite(floor_m)
+    columns, floor_m, top_m = columns[known], floor_m[known], top_m[known]
+    first = np.ceil(floor_m / resolution_m - 0.5).astype(np.int64)
+    last = np.maximum(first, np.floor(top_m / resolution_m - 0.5).astype(np.int64))
+    number = last - first + 1
+    above = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
+    keys = np.column_stack([np.repeat(columns, number, axis=0), np.repeat(first, number) + above])
+    return keys.astype(np.int32)
+
+
+def _on_ground(points_m: Float64, ground: GroundSurface) -> Bool:
+    """Which points are not above something else than the ground; unseen ground is ground."""
+    off_m = np.abs(ground.drop_at(points_m[:, :2]) - ground.camera_height_m)
+    return np.asarray(~(off_m > _SAME_M))
+
+
+def _columns(
+    points_m: Float64, width_m: float, resolution_m: float
+) -> tuple[NDArray[np.int64], Float64]:
+    """Columns (N, 2) near the path, each once, and its lowest height near each, (N,)."""
+    reach = int(np.ceil(width_m / 2 / resolution_m)) + 1
+    around = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), axis=-1).reshape(-1, 2)
+    home = np.floor(points_m[:, :2] / resolution_m).astype(np.int64)
+    columns = home[:, None] + around
+    offset = (columns + 0.5) * resolution_m - points_m[:, None, :2]
+    near = (np.linalg.norm(offset, axis=2) <= width_m / 2) | (around == 0).all(axis=1)
+    found, place = np.unique(columns[near], axis=0, return_inverse=True)
+    top_m = np.full(len(found), np.inf)
+    np.minimum.at(top_m, place.ravel(), points_m[np.nonzero(near)[0], 2])
+    return found, top_m

@@ -1,0 +1,200 @@
+"""From clouds in the world to one fused cloud: a voxel averages what all frames saw in it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from pydantic import Field
+
+from recon.core.errors import MappingError
+from recon.core.kernels import voxels
+from recon.core.settings import Settings
+from recon.core.values import PointCloud, RectifiedCamera
+from recon.core.values.arrays import Float32
+from recon.map.fused_part import CONFIDENCE, KNOWABLE, NORMAL, RGB, VALUES, FusedPart
+
+
+class FusionSettings(Settings):
+    """How clouds are fused."""
+
+    voxel_m: float = Field(0.1, gt=0.0, le=10.0, description="Edge of a voxel.")
+    min_count: int = Field(
+        3, ge=1, le=1000, description="Voxels seen by fewer frames are not exported."
+    )
+    precise_sigma_m: float | None = Field(
+        0.08,
+        gt=0.0,
+        le=10.0,
+        description="Voxels at least this precise need one frame less; null = none does.",
+    )
+    min_sigma_m: float = Field(
+        0.02,
+        gt=0.0,
+        le=10.0,
+        description="Points more precise than this count as this precise: bounds the weight.",
+    )
+    max_depth_error_m: float | None = Field(
+        0.25,
+        gt=0.0,
+        le=100.0,
+        description="Points are fused up to the depth at which `nominal_error_px` makes this "
+        "error; null = all.",
+    )
+    nominal_error_px: float = Field(
+        0.3, gt=0.0, le=10.0, description="Error of a good match, for that limit."
+    )
+    max_sigma_m: float = Field(
+        0.6,
+        gt=0.0,
+        le=100.0,
+        description="Points less precise than this are left out: they would smear over voxels.",
+    )
+
+
+def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
+    """The depth at which a matching error of ``nominal_error_px`` costs ``max_depth_error_m``.
+
+    The error of a depth grows with its square, ``Z²·error_px / (f·b)``: beyond this range a rig
+    measures less precisely than the map requires. The setting fits short and long baselines.
+
+    Args:
+        camera: The rectified camera.
+        settings: How to fuse.
+
+    Returns:
+        Metres; infinity where the settings have no limit.
+    """
+    if settings.max_depth_error_m is None:
+        return math.inf
+    fb = camera.focal_px * camera.baseline_m
+    return math.sqrt(settings.max_depth_error_m * fb / settings.nominal_error_px)
+
+
+class MapBuilder:
+    """Fuses clouds frame by frame.
+
+    A point weighs ``confidence / sigma²``. Time per frame grows with its points alone (on
+    average: stores grow by doubling); memory with the number of voxels. The same clouds in the
+    same order give the same map.
+
+    Args:
+        settings: How to fuse.
+    """
+
+    def __init__(self, settings: FusionSettings) -> None:
+        self._settings = settings
+        self._sums = voxels.make_sums(1, VALUES)
+        self._frames = 0
+        self._known = dict.fromkeys(KNOWABLE, True)
+
+    def __len__(self) -> int:
+        """Number of voxels seen by at least one frame."""
+        return int(self._sums.used[0])
+
+    def integrate(self, cloud: PointCloud) -> None:
+        """Add what one frame saw.
+
+        Args:
+            cloud: Points in world axes. ``confidence`` None = 1, ``sigma_m`` None = all equally
+                precise. What one of the clouds does not have, the map does not have.
+
+        Raises:
+            MappingError: The cloud is not in world axes, or a point is not finite or too far
+                away for the voxel size.
+        """
+        self._check(cloud)
+        for name in self._known:
+            self._known[name] &= getattr(cloud, name) is not None or len(cloud) == 0
+        points = voxels.VoxelPoints(cloud.xyz, self._weights(cloud), _values(cloud))
+        self._sums = voxels.add_points(self._sums, points, self._settings.voxel_m, self._frames)
+        self._frames += 1
+
+    def cloud(self, min_count: int | None = None) -> PointCloud:
+        """The map so far, one point per voxel, in the order in which voxels were first seen.
+
+        Args:
+            min_count: Voxels seen by fewer frames are left out, or by fewer than one less where
+                they are precise; None = as in the settings.
+
+        Returns:
+            As `FusedPart.cloud` gives it.
+        """
+        s = self._settings
+        return self.part().cloud(s.voxel_m, min_count or s.min_count, s.precise_sigma_m)
+
+    def part(self) -> FusedPart:
+        """What was seen since the start, or since the last `take`."""
+        n, s = len(self), self._sums
+        known = tuple(name for name, value in self._known.items() if value)
+        return FusedPart(
+            s.keys[:n].copy(),
+            s.sums[:n].copy(),
+            s.information[:n].copy(),
+            s.frames[:n].copy(),
+            known if self._frames else (),
+        )
+
+    def take(self) -> FusedPart:
+        """The part so far; the builder starts a new one."""
+        part = self.part()
+        self._sums = voxels.make_sums(1, VALUES)
+        self._known, self._frames = dict.fromkeys(self._known, True), 0
+        return part
+
+    def resume(self, part: FusedPart, frames: int) -> None:
+        """Continue a part that was taken from another builder.
+
+        Args:
+            part: The part.
+            frames: Number of frames that were integrated into it.
+        """
+        empty = voxels.make_sums(max(1, len(part)), VALUES)
+        self._sums = voxels.add_rows(empty, part.keys, part.sums, part.information, part.frames)
+        self._known = {name: name in part.known or frames == 0 for name in self._known}
+        self._frames = frames
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the voxels seen so far; the same after `resume` as before."""
+        return len(self) * sum(array[:1].nbytes for array in self._sums[1:-1])
+
+    def _weights(self, cloud: PointCloud) -> Float32:
+        """Weight of each point; 0 = not used. float32 (N,)."""
+        s = self._settings
+        confidence = np.float32(1) if cloud.confidence is None else cloud.confidence
+        if cloud.sigma_m is None:
+            return np.full(len(cloud), 1.0, np.float32) * confidence
+        bounded = np.maximum(cloud.sigma_m, np.float32(s.min_sigma_m))
+        weights = confidence / bounded**2
+        return np.where(cloud.sigma_m <= s.max_sigma_m, weights, 0).astype(np.float32)
+
+    def _check(self, cloud: PointCloud) -> None:
+        """Refuse what would silently spoil the map."""
+        if cloud.frame != "world":
+            raise MappingError(
+                "the fused map takes clouds in world axes", got=cloud.frame, expected="world"
+            )
+        limit_m = self._settings.voxel_m * (voxels.KEY_LIMIT - 1)
+        numbers = (cloud.xyz, cloud.sigma_m, cloud.confidence, cloud.normals)
+        if not all(a is None or np.isfinite(a).all() for a in numbers):
+            raise MappingError("a point to map is not finite")
+        if len(cloud) and np.abs(cloud.xyz).max() > limit_m:
+            raise MappingError(
+                "a point is too far from the origin for this voxel size",
+                got=f"{np.abs(cloud.xyz).max():.0f} m",
+                expected=f"at most {limit_m:.0f} m",
+            )
+
+
+def _values(cloud: PointCloud) -> Float32:
+    """What is averaged of each point: colour, normal, confidence; 0 where unknown. (N, 7)."""
+    values = np.zeros((len(cloud), VALUES), np.float32)
+    for columns, array in (
+        (RGB, cloud.rgb),
+        (NORMAL, cloud.normals),
+        (CONFIDENCE, cloud.confidence),
+    ):
+        if array is not None:
+            values[:, columns] = array
+    return values

@@ -1,0 +1,161 @@
+"""The part of the fused cloud by a part of a drive: sums per voxel, additive over parts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.geometry.se3 import apply, rotate
+from recon.core.kernels import voxels
+from recon.core.values import PointCloud
+from recon.core.values.arrays import Bool, Float32, Float64, Int32
+
+RGB: Final = slice(0, 3)
+NORMAL: Final = slice(3, 6)
+CONFIDENCE: Final = 6
+VALUES: Final = 7
+KNOWABLE: Final = ("rgb", "normals", "sigma_m", "confidence")
+_OFFSET: Final = slice(1, 4)
+_TURNED: Final = slice(4 + NORMAL.start, 4 + NORMAL.stop)
+
+
+@dataclass(frozen=True, eq=False)
+class FusedPart:
+    """Sums per voxel, one row each, in the order in which voxels were first seen.
+
+    Attributes:
+        keys: int64 (N,), packed cells in world axes (`recon.core.kernels.voxels`), each once.
+        sums: float32 (N, 11): sum of weights; weighted sums of the offset from the voxel's centre
+            and of the values (colour, normal, confidence).
+        information: float32 (N,), sum over frames of the largest weight in each frame.
+        frames: int32 (N,), number of frames that saw the voxel.
+        known: Which of ``rgb``, ``normals``, ``sigma_m`` and ``confidence`` all clouds had; empty
+            where there was no cloud.
+    """
+
+    keys: NDArray[np.int64]
+    sums: Float32
+    information: Float32
+    frames: Int32
+    known: tuple[str, ...] = KNOWABLE
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    @property
+    def cells(self) -> Int32:
+        """int32 (N, 3), indices of the voxels."""
+        return voxels.unpack_keys(self.keys)
+
+    def select(self, which: NDArray[Any]) -> FusedPart:
+        """The rows of a boolean mask or of an index array, in that order."""
+        return FusedPart(
+            self.keys[which],
+            self.sums[which],
+            self.information[which],
+            self.frames[which],
+            self.known,
+        )
+
+    def moved(self, T_new_world: Float64, voxel_m: float) -> FusedPart:
+        """The part after a rigid motion: each voxel's sums go to the voxel of its moved mean point.
+
+        Where several go to the same voxel, their sums add up; the number of frames and the
+        information are the largest of theirs, since the frames are the same.
+        """
+        if not len(self):
+            return self
+        weight = self.sums[:, :1]
+        points = (self.cells + 0.5) * voxel_m + self.sums[:, _OFFSET] / weight
+        points = apply(T_new_world, points)
+        cells = np.floor(points / voxel_m).astype(np.int64)
+        sums = self.sums.copy()
+        sums[:, _OFFSET] = weight * (points - (cells + 0.5) * voxel_m)
+        sums[:, _TURNED] = rotate(T_new_world, sums[:, _TURNED])
+        return _merged(replace(self, keys=voxels.pack_keys(cells), sums=sums))
+
+    def cloud(self, voxel_m: float, least: int, precise_m: float | None = None) -> PointCloud:
+        """One point per voxel that enough frames saw.
+
+        Args:
+            voxel_m: Edge of a voxel.
+            least: How many are enough.
+            precise_m: Where ``sigma_m`` is at most this, one less is enough; None = nowhere.
+
+        Returns:
+            Frame ``world``. ``sigma_m`` treats frames as independent, and the points of one
+            frame in one voxel as one measurement. Voxels whose normals cancel are left out.
+        """
+        rows = np.flatnonzero(self.frames >= self._needed(least, precise_m))
+        part = self.select(rows[self._has_direction(rows)])
+        weight = part.sums[:, :1]
+        values = part.sums[:, 4:] / weight
+        centres = (part.cells + 0.5) * voxel_m
+        known = frozenset(self.known)
+        return PointCloud(
+            xyz=(centres + part.sums[:, _OFFSET] / weight).astype(np.float32),
+            rgb=np.rint(values[:, RGB]).astype(np.uint8) if "rgb" in known else None,
+            normals=_unit(values[:, NORMAL]) if "normals" in known else None,
+            sigma_m=part.information ** np.float32(-0.5) if "sigma_m" in known else None,
+            confidence=values[:, CONFIDENCE].copy() if "confidence" in known else None,
+            weight=weight[:, 0].copy(),
+            count=part.frames,
+            frame="world",
+        )
+
+    def _needed(self, least: int, precise_m: float | None) -> Int32:
+        """int32 (N,), frames that must have seen each voxel."""
+        if precise_m is None or "sigma_m" not in self.known:
+            return np.full(len(self), least, np.int32)
+        precise = self.information >= np.float32(precise_m**-2)
+        return np.where(precise, max(1, least - 1), least).astype(np.int32)
+
+    def _has_direction(self, rows: NDArray[np.intp]) -> Bool:
+        """Which voxels have normals that do not cancel; all, where normals are not known."""
+        if "normals" not in self.known:
+            return np.ones(len(rows), dtype=np.bool_)
+        sums = self.sums[rows]
+        # 1e-3: below, the direction is that of rounding errors.
+        length = np.linalg.norm(sums[:, 4:][:, NORMAL], axis=1)
+        return np.asarray(length > 1e-3 * sums[:, 0])
+
+
+def join_fused(parts: Iterable[FusedPart]) -> FusedPart:
+    """Add parts of different frames, as if all their frames had been fused into one map.
+
+    Attributes that one of the parts does not know are unknown in the sum; empty parts do not count.
+    """
+    total = voxels.make_sums(1, VALUES)
+    known, any_known = set(KNOWABLE), False
+    for part in parts:
+        total = voxels.add_rows(total, part.keys, part.sums, part.information, part.frames)
+        if len(part):
+            known &= set(part.known)
+            any_known = True
+    n = int(total.used[0])
+    names = tuple(name for name in KNOWABLE if name in known) if any_known else ()
+    return FusedPart(total.keys[:n], total.sums[:n], total.information[:n], total.frames[:n], names)
+
+
+def _merged(part: FusedPart) -> FusedPart:
+    """One row for each voxel, in the order of the first row of each."""
+    order = np.argsort(part.keys, kind="stable")
+    keys = part.keys[order]
+    begin = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
+    merged = FusedPart(
+        keys[begin],
+        np.add.reduceat(part.sums[order], begin, axis=0),
+        np.maximum.reduceat(part.information[order], begin),
+        np.maximum.reduceat(part.frames[order], begin),
+        part.known,
+    )
+    return merged.select(np.argsort(order[begin], kind="stable"))
+
+
+def _unit(vectors: Float32) -> Float32:
+    """Vectors (N, 3) at unit length."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

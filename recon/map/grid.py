@@ -1,0 +1,180 @@
+"""From voxels to the 2-D grid that robots plan on, by heights above the local ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recon.core.errors import MappingError
+from recon.core.settings import Settings
+from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
+from recon.core.values.arrays import Bool, Float64
+from recon.map.ground import GroundSurface
+from recon.map.log_odds import log_odds
+
+
+class GridSettings(Settings):
+    """How voxels are flattened. Heights are of centres of voxels, above the local ground."""
+
+    min_height_m: float = Field(
+        0.3, ge=0.0, le=10.0, description="Lower end of the band in which obstacles are looked for."
+    )
+    max_height_m: float = Field(
+        2.0, gt=0.0, le=100.0, description="Upper end of the band: what is higher is passed under."
+    )
+    free_height_m: float = Field(
+        0.8,
+        gt=0.0,
+        le=100.0,
+        description="Free voxels below this height make a cell free; higher ones may be seen "
+        "over an obstacle that hides what is behind it.",
+    )
+    occupied_probability: float = Field(
+        0.55, ge=0.5, lt=1.0, description="Voxels at least this probable are obstacles."
+    )
+    free_probability: float = Field(
+        0.35, gt=0.0, le=0.5, description="Voxels at most this probable are free."
+    )
+    min_voxels: int = Field(1, ge=1, description="Occupied voxels in a column that block it.")
+    min_blob_cells: int = Field(
+        3, ge=1, description="Connected blocked cells fewer than this are taken for noise."
+    )
+    vehicle_width_m: float = Field(
+        0.6,
+        ge=0.0,
+        le=10.0,
+        description="Width of what carried the camera: cells that it passed over are free; 0 = "
+        "only what was seen is free.",
+    )
+    joined_cells: int = Field(
+        2,
+        ge=0,
+        le=100,
+        description="Cells that were hit, but not surely, belong to an obstacle that they hang "
+        "together with over so many cells, unless they touch a free one.",
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """What the voxels of each column say; all bool (rows, columns).
+
+    Attributes:
+        blocked: Surely occupied in the height band.
+        seen_through: Free, low enough.
+        hit: Hit in the band, surely or not.
+        low_hit: The same, as low as what frees.
+    """
+
+    blocked: Bool
+    seen_through: Bool
+    hit: Bool
+    low_hit: Bool
+
+
+def flatten(
+    voxels: OccupancyVoxels, ground: GroundSurface, settings: GridSettings
+) -> OccupancyGrid:
+    """Flatten an occupancy map.
+
+    A cell is occupied where an occupied voxel lies in the height band above the ground of that
+    place. It is free where nothing is occupied and a free voxel lies low enough. That the ground
+    was seen is no proof: it is also seen below a parked car. Where voxels in the band were hit,
+    but none surely, it belongs to the obstacle beside it if nothing free is beside it: no ray
+    came out between the two; and it is not free if it lies beside an obstacle and was hit as low
+    as it is free. Everything else, and every cell without a known ground, is unknown.
+
+    Args:
+        voxels: The observed voxels, map axes.
+        ground: Height of the ground, map axes.
+        settings: Band and thresholds.
+
+    Returns:
+        A grid with the resolution of the voxels that spans all of them.
+
+    Raises:
+        MappingError: There are no voxels, or the band is empty.
+    """
+    if len(voxels) == 0:
+        raise MappingError("nothing was observed: there is no map to flatten")
+    if settings.max_height_m <= settings.min_height_m:
+        raise MappingError(
+            "the height band of the grid is empty",
+            got=f"{settings.min_height_m:g} to {settings.max_height_m:g} m",
+        )
+    low = voxels.keys[:, :2].min(axis=0).astype(np.int64)
+    columns, rows = (voxels.keys[:, :2].max(axis=0) - low + 1).tolist()
+    cell = (voxels.keys[:, 1] - low[1]) * columns + voxels.keys[:, 0] - low[0]
+    floor = _floor(ground, low, (rows, columns), voxels.resolution_m)
+    height = (voxels.keys[:, 2] + 0.5) * voxels.resolution_m - floor[cell]
+
+    def any_in(which: Bool, least: int = 1) -> Bool:
+        found = np.bincount(cell[which], minlength=rows * columns) >= least
+        return np.asarray(found.reshape(rows, columns))
+
+    s = settings
+    hit = (height >= s.min_height_m) & (height <= s.max_height_m) & (voxels.log_odds > 0)
+    low_air = (height >= 0) & (height <= s.free_height_m)
+    full = voxels.log_odds >= log_odds(s.occupied_probability)
+    empty = voxels.log_odds <= log_odds(s.free_probability)
+    found = _Found(
+        blocked=any_in(hit & full, s.min_voxels),
+        seen_through=any_in(empty & low_air),
+        hit=any_in(hit),
+        low_hit=any_in(hit & low_air),
+    )
+    origin = (float(low[0]) * voxels.resolution_m, float(low[1]) * voxels.resolution_m)
+    return OccupancyGrid(_decide(found, s), voxels.resolution_m, origin)
+
+
+def _decide(found: _Found, s: GridSettings) -> NDArray[np.int8]:
+    """int8 (rows, columns), what each cell is."""
+    blocked = _without_small_blobs(found.blocked, s.min_blob_cells)
+    free = found.seen_through & ~blocked & ~(found.low_hit & _beside(blocked))
+    unsure = found.hit & ~free & ~_beside(free)
+    for _ in range(s.joined_cells):
+        blocked |= unsure & _beside(blocked)
+    cells = np.where(free, np.int8(FREE), np.int8(UNKNOWN))
+    cells[blocked] = OCCUPIED
+    return np.asarray(cells, dtype=np.int8)
+
+
+def drop_undecided(voxels: OccupancyVoxels, settings: GridSettings) -> OccupancyVoxels:
+    """The voxels that are occupied or free by the settings; the others count as unknown.
+
+    Programs that read an OctoMap call everything above 0.5 occupied, and the rest free: a voxel
+    that a single uncertain ray touched would be either.
+    """
+    full = voxels.log_odds >= log_odds(settings.occupied_probability)
+    empty = voxels.log_odds <= log_odds(settings.free_probability)
+    known = full | empty
+    return OccupancyVoxels(voxels.keys[known], voxels.log_odds[known], voxels.resolution_m)
+
+
+def _floor(
+    ground: GroundSurface, low: NDArray[Any], shape: tuple[int, int], resolution_m: float
+) -> Float64:
+    """Height of the ground at the centre of each cell, row by row; float64 (rows·columns,)."""
+    row, column = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
+    xy = (np.stack([column, row], axis=1) + low + 0.5) * resolution_m
+    return ground.height_at(xy)
+
+
+def _beside(cells: Bool) -> Bool:
+    """The cells of a mask, and those that share a side with one."""
+    cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    return np.asarray(cv2.dilate(cells.astype(np.uint8), cross) > 0)
+
+
+def _without_small_blobs(blocked: Bool, least: int) -> Bool:
+    """The mask without connected blobs (8 neighbours) of fewer than ``least`` cells."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(
+        blocked.astype(np.uint8), connectivity=8, ltype=cv2.CV_32S
+    )
+    large = stats[:, cv2.CC_STAT_AREA] >= least
+    return np.asarray(blocked & large[labels])

@@ -1,0 +1,322 @@
+"""The ground along a drive: a height map near the path that follows slopes and drift.
+
+A drive of some hundred metres is never level: one degree of pitch in the first frame is three
+metres after 170 m. So heights above ground are not heights above a plane. The surface starts
+below the path, one camera height down, and grows outward ring by ring; each cell of a ring
+searches for ground only near the height of its inner neighbours.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recon.core.errors import MappingError
+from recon.core.settings import Settings
+from recon.core.values import PointCloud
+from recon.core.values.arrays import Float64, freeze
+
+_BIN_M: Final = 0.05
+_DEEPEST_M: Final = 5.0
+"""Points farther below the path are not what the camera is carried on."""
+_NEIGHBOURS: Final = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
+
+
+class GroundSettings(Settings):
+    """How the ground is followed."""
+
+    cell_m: float = Field(1.0, gt=0.0, le=20.0, description="Edge of a cell of the surface.")
+    reach_m: float = Field(
+        25.0, gt=0.0, le=500.0, description="How far from the path the surface grows."
+    )
+    window_m: float = Field(
+        0.3,
+        gt=0.0,
+        le=2.0,
+        description="Points this far from the expected height may be ground: also the largest "
+        "step from one cell to the next.",
+    )
+    max_tilt_deg: float = Field(
+        35.0, gt=0.0, lt=90.0, description="Points with normals tilted more are no ground."
+    )
+    min_points: int = Field(3, ge=1, description="Points that make a measured cell.")
+    max_gap_m: float = Field(
+        4.0, ge=0.0, le=100.0, description="How far a height is carried over cells without points."
+    )
+    camera_height_m: float | None = Field(
+        None, gt=0.0, le=100.0, description="Height of the camera above ground; None = measured."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class GroundSurface:
+    """Height of the ground in map axes.
+
+    Attributes:
+        heights_m: float64 (rows, columns), z at the centre of each cell; NaN = unknown. Row 0 has
+            the smallest y, column 0 the smallest x.
+        cell_m: Edge of a cell.
+        origin_m: (x, y) of the outer corner of cell (0, 0).
+        camera_height_m: Height of the camera above the ground along the path; NaN = unknown.
+        drops_m: float64 (rows, columns), commonest height of the path above the points below it;
+            NaN = too few points, or no path. None = not measured.
+    """
+
+    heights_m: Float64
+    cell_m: float
+    origin_m: tuple[float, float]
+    camera_height_m: float = float("nan")
+    drops_m: Float64 | None = None
+
+    def __post_init__(self) -> None:
+        freeze(self, "heights_m", np.float64, (None, None))
+        freeze(self, "drops_m", np.float64, self.heights_m.shape)
+
+    def height_at(self, xy: NDArray[Any]) -> Float64:
+        """Height of the ground at places (N, 2), metres; float64 (N,), NaN = unknown.
+
+        Bilinear between the centres of cells; unknown where the cell of the place itself is.
+        """
+        place = (np.asarray(xy, dtype=np.float64) - self.origin_m) / self.cell_m
+        column, row = place[:, 0], place[:, 1]
+        own = self._cells(np.floor(row), np.floor(column))
+        top, left = np.floor(row - 0.5), np.floor(column - 0.5)
+        v, u = row - 0.5 - top, column - 0.5 - left
+        total, weight = np.zeros(len(place)), np.zeros(len(place))
+        for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            height = self._cells(top + down, left + right)
+            w = np.where(down, v, 1 - v) * np.where(right, u, 1 - u) * np.isfinite(height)
+            total += w * np.nan_to_num(height)
+            weight += w
+        known = np.isfinite(own) & (weight > 0)
+        return np.where(known, total / np.where(known, weight, 1.0), np.nan)
+
+    def drop_at(self, xy: NDArray[Any]) -> Float64:
+        """`drops_m` of the cells of places (N, 2); float64 (N,), NaN = unknown."""
+        if self.drops_m is None:
+            return np.full(len(xy), np.nan)
+        column, row = np.floor((np.asarray(xy, np.float64) - self.origin_m) / self.cell_m).T
+        return self._cells(row, column, self.drops_m)
+
+    def _cells(self, row: Float64, column: Float64, values: Float64 | None = None) -> Float64:
+        """Values of cells, by default heights; NaN outside the surface."""
+        values = self.heights_m if values is None else values
+        rows, columns = values.shape
+        inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        r, c = np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)
+        return np.where(inside, values[r, c], np.nan)
+
+
+def estimate_ground_surface(
+    cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings
+) -> GroundSurface:
+    """Follow the ground along a path and to its sides.
+
+    Args:
+        cloud: The fused cloud in map axes (z up). With normals, only points that face up count.
+        positions_m: float (N, 3), positions of the camera, map axes; N ≥ 1. A row of NaN separates
+            pieces of a path.
+        settings: How to follow it.
+
+    Returns:
+        The surface; unknown everywhere when no ground was found below the path.
+
+    Raises:
+        MappingError: The cloud is not in map axes, or there is no path.
+    """
+    field = _field(cloud, positions_m, settings)
+    camera_height = settings.camera_height_m or field.camera_height()
+    if math.isfinite(camera_height):
+        field.grow(camera_height)
+    return GroundSurface(
+        heights_m=_smooth(field.heights, field.measured),
+        cell_m=settings.cell_m,
+        origin_m=field.origin,
+        camera_height_m=camera_height,
+        drops_m=field.drops(),
+    )
+
+
+def measure_camera_height(
+    cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings
+) -> tuple[float, Float64]:
+    """Measure the height of the camera above the ground along a path.
+
+    Takes and raises what `estimate_ground_surface` does.
+
+    Returns:
+        The commonest height, NaN where no ground was found; and the commonest one in each cell of
+        the path that has points below it, float64 (C,).
+    """
+    field = _field(cloud, positions_m, settings)
+    drops = field.drops()
+    return field.camera_height(), drops[np.isfinite(drops)]
+
+
+def _field(cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings) -> _Field:
+    if cloud.frame != "map":
+        raise MappingError("ground is looked for in map axes", got=cloud.frame, expected="map")
+    if not np.isfinite(positions_m).any():
+        raise MappingError("ground is looked for below a path, and the path is empty")
+    return _Field(cloud, np.asarray(positions_m, dtype=np.float64), settings)
+
+
+class _Field:
+    """The surface while it grows."""
+
+    def __init__(self, cloud: PointCloud, path: Float64, settings: GroundSettings) -> None:
+        self._settings = settings
+        cell, rings = settings.cell_m, math.ceil(settings.reach_m / settings.cell_m)
+        path = np.concatenate([_densify(piece, cell / 2) for piece in _pieces(path)])
+        low = np.floor(path[:, :2].min(axis=0) / cell) - rings
+        columns, rows = (np.floor(path[:, :2].max(axis=0) / cell) - low + rings + 1).astype(int)
+        self.origin = (float(low[0] * cell), float(low[1] * cell))
+        self.heights = np.full((rows, columns), np.nan)
+        self.measured = np.zeros((rows, columns), dtype=np.bool_)
+        self._gap = np.full((rows, columns), np.inf)
+        self._path_z = self._path_height(path)
+        self._ring = _rings(np.isfinite(self._path_z), rings)
+        self._cell, self._z = self._points(cloud)
+
+    def camera_height(self) -> float:
+        """The commonest height of the path above the points near it; NaN without points."""
+        near = self._ring.ravel()[self._cell] == 0
+        drop = self._path_z.ravel()[self._cell[near]] - self._z[near]
+        drop = drop[(drop > 2 * _BIN_M) & (drop < _DEEPEST_M)]
+        if len(drop) < self._settings.min_points:
+            return math.nan
+        votes = np.bincount((drop / _BIN_M).astype(int), minlength=3)
+        smooth = np.convolve(votes, [1, 1, 1], mode="same")
+        mode = (int(np.argmax(smooth)) + 0.5) * _BIN_M
+        return float(np.median(drop[np.abs(drop - mode) < 3 * _BIN_M]))
+
+    def drops(self) -> Float64:
+        """Commonest height of the path above the points of each cell that it crosses, else NaN."""
+        drop = self._path_z.ravel()[self._cell] - self._z
+        below = (drop > 2 * _BIN_M) & (drop < _DEEPEST_M)
+        found = np.full(self.heights.size, np.nan)
+        cells, slot = np.unique(self._cell[below], return_inverse=True)
+        bins = math.ceil(_DEEPEST_M / _BIN_M)
+        place = slot * bins + (drop[below] / _BIN_M).astype(int)
+        votes = np.bincount(place, minlength=len(cells) * bins).reshape(-1, bins)
+        wide = np.pad(votes, ((0, 0), (1, 1)))
+        smooth = wide[:, :-2] + votes + wide[:, 2:]
+        mode = (smooth.argmax(axis=1) + 0.5) * _BIN_M
+        enough = smooth.max(axis=1, initial=0) >= self._settings.min_points
+        found[cells[enough]] = mode[enough]
+        return np.asarray(found.reshape(self.heights.shape))
+
+    def grow(self, camera_height_m: float) -> None:
+        """Fill ring after ring, from the path outward."""
+        ring_of_point = self._ring.ravel()[self._cell]
+        order = np.argsort(ring_of_point, kind="stable")
+        last = int(self._ring[self._ring < np.iinfo(np.int32).max].max())
+        bounds = np.searchsorted(ring_of_point[order], np.arange(last + 2))
+        for ring in range(last + 1):
+            cells = np.flatnonzero(self._ring.ravel() == ring)
+            if ring == 0:
+                expected, gap = self._path_z.ravel()[cells] - camera_height_m, np.zeros(len(cells))
+            else:
+                expected, gap = self._from_neighbours(cells)
+            self._settle(cells, expected, gap, order[bounds[ring] : bounds[ring + 1]])
+
+    def _settle(
+        self, cells: NDArray[np.intp], expected: Float64, gap: Float64, points: NDArray[np.intp]
+    ) -> None:
+        """Give the cells of a ring the height of their points, or carry the expected one."""
+        slot = np.searchsorted(cells, self._cell[points])
+        z = self._z[points]
+        height, window = expected, self._settings.window_m
+        for width in (window, window / 2):
+            near = np.abs(z - height[slot]) <= width
+            number = np.bincount(slot[near], minlength=len(cells))
+            total = np.bincount(slot[near], weights=z[near], minlength=len(cells))
+            found = number >= self._settings.min_points
+            height = np.where(found, total / np.maximum(number, 1), height)
+        gap = np.where(found, 0.0, gap + self._settings.cell_m)
+        lost = gap > self._settings.max_gap_m
+        self.heights.ravel()[cells] = np.where(lost, np.nan, height)
+        self.measured.ravel()[cells] = found
+        self._gap.ravel()[cells] = gap
+
+    def _from_neighbours(self, cells: NDArray[np.intp]) -> tuple[Float64, Float64]:
+        """Mean height of the known neighbours of cells, and their smallest gap."""
+        rows, columns = np.divmod(cells, self.heights.shape[1])
+        total, number = np.zeros(len(cells)), np.zeros(len(cells))
+        gap = np.full(len(cells), np.inf)
+        for down, right in _NEIGHBOURS:
+            r = np.clip(rows + down, 0, self.heights.shape[0] - 1)
+            c = np.clip(columns + right, 0, self.heights.shape[1] - 1)
+            height = self.heights[r, c]
+            known = np.isfinite(height)
+            total += np.where(known, height, 0.0)
+            number += known
+            gap = np.where(known, np.minimum(gap, self._gap[r, c]), gap)
+        return np.where(number > 0, total / np.maximum(number, 1), np.nan), gap
+
+    def _path_height(self, path: Float64) -> Float64:
+        """Mean height of the path in each cell that it crosses; NaN elsewhere."""
+        cells, _ = self._cells_of(path)
+        size = self.heights.size
+        number = np.bincount(cells, minlength=size)
+        total = np.bincount(cells, weights=path[:, 2], minlength=size)
+        mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+        return np.asarray(mean.reshape(self.heights.shape))
+
+    def _points(self, cloud: PointCloud) -> tuple[NDArray[np.intp], Float64]:
+        """Cell and height of each point that may be ground."""
+        xyz = cloud.xyz.astype(np.float64)
+        if cloud.normals is not None:
+            upright = math.cos(math.radians(self._settings.max_tilt_deg))
+            xyz = xyz[cloud.normals[:, 2] >= upright]
+        cells, inside = self._cells_of(xyz)
+        cells, z = cells[inside], xyz[inside, 2]
+        reached = self._ring.ravel()[cells] < np.iinfo(np.int32).max
+        return cells[reached], z[reached]
+
+    def _cells_of(self, xyz: Float64) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """Flat index of the cell of each point, and whether it lies on the field."""
+        rows, columns = self.heights.shape
+        place = np.floor((xyz[:, :2] - self.origin) / self._settings.cell_m)
+        inside = np.all((place >= 0) & (place < (columns, rows)), axis=1)
+        column, row = np.where(inside, place.T, 0).astype(np.intp)
+        return row * columns + column, np.asarray(inside)
+
+
+def _pieces(path: Float64) -> list[Float64]:
+    """The runs of rows between those of NaN."""
+    known = np.isfinite(path).all(axis=1)
+    runs = np.split(path, np.flatnonzero(np.diff(known)) + 1)
+    return [run for run in runs if len(run) and np.isfinite(run[0]).all()]
+
+
+def _densify(path: Float64, step_m: float) -> Float64:
+    """The path with points at most ``step_m`` apart."""
+    if len(path) == 1:
+        return path
+    pieces = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    along = np.concatenate([[0.0], np.cumsum(pieces)])
+    wanted = np.linspace(0.0, along[-1], max(2, math.ceil(along[-1] / step_m) + 1))
+    return np.stack([np.interp(wanted, along, path[:, axis]) for axis in range(3)], axis=1)
+
+
+def _rings(seeds: NDArray[np.bool_], reach: int) -> NDArray[np.int32]:
+    """Steps (to any of 8 neighbours) from the nearest seed; the largest int32 beyond ``reach``."""
+    away = np.where(seeds, 0, 255).astype(np.uint8)
+    steps = np.rint(cv2.distanceTransform(away, cv2.DIST_C, 3)).astype(np.int32)
+    return np.where(steps <= reach, steps, np.iinfo(np.int32).max).astype(np.int32)
+
+
+def _smooth(heights: Float64, measured: NDArray[np.bool_]) -> Float64:
+    """Blur the known heights with their neighbours; carried ones count a tenth."""
+    known = np.isfinite(heights)
+    weight = known * np.where(measured, 1.0, 0.1)
+    total = cv2.GaussianBlur(weight * np.nan_to_num(heights), (5, 5), 1.0)
+    sums = cv2.GaussianBlur(weight, (5, 5), 1.0)
+    return np.where(known, total / np.where(known, sums, 1.0), np.nan)

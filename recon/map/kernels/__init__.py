@@ -1,0 +1,1 @@
+"""Compiled loops of occupancy and surfaces, each with a reference implementation in Python."""

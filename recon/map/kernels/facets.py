@@ -1,0 +1,109 @@
+"""Which cells the surface of the points around them crosses.
+
+Depth is uncertain, so hits of one surface scatter over several cells along the rays. The mean of
+many hits is more precise than each: a plane through the points in and around a cell, weighted by
+their precision, tells whether the surface is in this cell or in the one before or behind it.
+
+All lengths are in cells. The twin in plain Python is in `recon.map.kernels.facets_reference`.
+
+Ref: H. Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992, section 3.2
+(the tangent plane from the covariance of the neighbourhood).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.kernels.compiled import kernel
+from recon.core.kernels.voxels import EMPTY, enter_keys, find, make_table, pack_key
+
+AROUND: Final = 27
+LEAST: Final = 3
+"""Points that a plane needs; with fewer, a cell counts as crossed if it holds one."""
+
+
+def crossed_cells(
+    cells: NDArray[np.int32], keys: NDArray[np.int64], sums: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Fit a plane to the points in and around each cell, and test whether it crosses the cell.
+
+    The normal is that of the weighted covariance of the points. The plane's distance from the
+    centre of the cell is their weighted mean; points beside the normal count less, by a Gaussian
+    of one cell.
+
+    Args:
+        cells: int32 (N, 3), the cells asked about.
+        keys: int64 (M,), packed cells that hold points, each once.
+        sums: float32 (M, 4), sum of the weights of their points, above 0, and weighted sums of the
+            offsets from the centre of the cell.
+
+    Returns:
+        bool (N,).
+    """
+    table = make_table(len(keys))
+    enter_keys(table, keys)
+    crossed = np.zeros(len(cells), np.bool_)
+    _crossed_cells(cells, table, sums, crossed)
+    return crossed
+
+
+@kernel
+def _crossed_cells(
+    cells: NDArray[np.int32],
+    table: NDArray[np.int64],
+    sums: NDArray[np.float32],
+    crossed: NDArray[np.bool_],
+) -> None:
+    """The loop of `crossed_cells`."""
+    points, weights = np.empty((AROUND, 3)), np.empty(AROUND)
+    for n in range(len(cells)):
+        i, j, k = np.int64(cells[n, 0]), np.int64(cells[n, 1]), np.int64(cells[n, 2])
+        found, own = 0, False
+        for step in range(AROUND):
+            di, dj, dk = step // 9 - 1, step // 3 % 3 - 1, step % 3 - 1
+            row = find(table, pack_key(i + di, j + dj, k + dk))
+            if row == EMPTY:
+                continue
+            own = own or (di == 0 and dj == 0 and dk == 0)
+            weight = np.float64(sums[row, 0])
+            weights[found] = weight
+            points[found, 0] = di + sums[row, 1] / weight
+            points[found, 1] = dj + sums[row, 2] / weight
+            points[found, 2] = dk + sums[row, 3] / weight
+            found += 1
+        crossed[n] = own if found < LEAST else _crosses(points[:found], weights[:found])
+
+
+@kernel
+def _crosses(points: NDArray[np.float64], weights: NDArray[np.float64]) -> bool:
+    """Whether the plane through points around a cell's centre crosses the cell."""
+    normal = _normal(points, weights)
+    total, distance = 0.0, 0.0
+    for n in range(len(points)):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        along = x * normal[0] + y * normal[1] + z * normal[2]
+        weight = weights[n] * math.exp(along * along - x * x - y * y - z * z)
+        total += weight
+        distance += weight * along
+    reach = 0.5 * (abs(normal[0]) + abs(normal[1]) + abs(normal[2]))
+    return bool(abs(distance) <= reach * total)
+
+
+@kernel
+def _normal(points: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """float64 (3,), the direction in which weighted points spread least."""
+    total = weights.sum()
+    mean, spread = np.zeros(3), np.zeros((3, 3))
+    for n in range(len(points)):
+        for a in range(3):
+            mean[a] += weights[n] / total * points[n, a]
+    for n in range(len(points)):
+        for a in range(3):
+            for b in range(3):
+                product = (points[n, a] - mean[a]) * (points[n, b] - mean[b])
+                spread[a, b] += weights[n] / total * product
+    return np.linalg.eigh(spread)[1][:, 0]

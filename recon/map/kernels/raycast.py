@@ -1,0 +1,310 @@
+"""Evidence of occupancy along rays, in blocks of 8×8×8 voxels that are allocated where rays go.
+
+A ray is traversed cell by cell (Amanatides and Woo 1987). The evidence of one frame is collected
+first, so that a thousand rays through a cell count once and a hit outweighs every miss: OctoMap's
+rule (Hornung et al. 2013). Then `recon.map.kernels.clamped` adds the frame to the log-odds.
+
+A measurement is a normal distribution along its ray, not a point: a cell is hit by the share of the
+distribution that lies in it, and only what lies well before it is free.
+
+All lengths are in cells, except those of the points given. The twins in plain Python are in
+`recon.map.kernels.raycast_reference`.
+
+Ref: J. Amanatides and A. Woo, "A fast voxel traversal algorithm for ray tracing", Eurographics
+1987; A. Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on
+octrees", Autonomous Robots 34, 2013.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.kernels.compiled import kernel
+from recon.core.kernels.voxels import find_or_add, make_table, pack_key, reserve
+
+BLOCK_BITS: Final = 3
+BLOCK_EDGE: Final = 1 << BLOCK_BITS
+BLOCK_CELLS: Final = BLOCK_EDGE**3
+_LOW: Final = BLOCK_EDGE - 1
+MIN_DEPTH_M: Final = 1e-3
+_SQRT2: Final = math.sqrt(2.0)
+
+
+class Blocks(NamedTuple):
+    """The evidence of one frame: blocks of cells, one row each.
+
+    Attributes:
+        table: int64 (C, 2), hash from packed block index to row.
+        keys: int64 (B,), packed index of each block.
+        values: float32 (B, 512), change of the log-odds; 0 = not touched. Cell (i, j, k) of a
+            block is column ``(i·8 + j)·8 + k``.
+        used: int64 (1,), number of rows in use.
+    """
+
+    table: NDArray[np.int64]
+    keys: NDArray[np.int64]
+    values: NDArray[np.float32]
+    used: NDArray[np.int64]
+
+
+class Rays(NamedTuple):
+    """Rays from one origin; lengths in cells.
+
+    Attributes:
+        origin: float64 (3,).
+        ends: float64 (N, 3), the measured points.
+        free: float64 (N,), length before which every cell is free.
+        sigma: float64 (N,), standard deviation of the measured length; 0 = exact.
+        hit: float32 (N,), log-odds of a certain hit; 0 = the ray ends in nothing.
+        miss: float32 (N,), log-odds of a miss, not above 0.
+    """
+
+    origin: NDArray[np.float64]
+    ends: NDArray[np.float64]
+    free: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    hit: NDArray[np.float32]
+    miss: NDArray[np.float32]
+
+
+def measure_points(
+    xyz: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    T: NDArray[np.float64],
+    max_range: float,
+    margin: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Turn points of a camera into rays: their ends, and what is known of each.
+
+    A point farther than ``max_range`` is moved along its ray to that range and is no hit.
+
+    Args:
+        xyz: float32 (N, 3), camera axes, metres.
+        sigma: float32 (N,), standard deviation of the depth, metres.
+        confidence: float32 (N,), passed through.
+        T: float64 (4, 4), from camera axes in metres to cells of the map: a rotation times a scale.
+        max_range: Range of a hit, in cells.
+        margin: Standard deviations before a point where free space ends.
+
+    Returns:
+        float32 (N, 3), ends in cells of the map, and float32 (N, 4): standard deviation of the
+        length and free length (cells), confidence, and 1 where the ray hits or 0.
+    """
+    ends = np.empty((len(xyz), 3), np.float32)
+    values = np.empty((len(xyz), 4), np.float32)
+    scale = float(np.linalg.norm(T[0, :3]))
+    limits = (scale, max_range, margin)
+    _measure_points(xyz, sigma, confidence, T, limits, (ends, values))
+    return ends, values
+
+
+@kernel
+def _measure_points(
+    xyz: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    confidence: NDArray[np.float32],
+    T: NDArray[np.float64],
+    limits: tuple[float, float, float],
+    out: tuple[NDArray[np.float32], NDArray[np.float32]],
+) -> None:
+    """The loop of `measure_points`."""
+    scale, max_range, margin = limits
+    ends, values = out
+    for n in range(len(xyz)):
+        x, y, z = np.float64(xyz[n, 0]), np.float64(xyz[n, 1]), np.float64(xyz[n, 2])
+        metres = math.sqrt(x * x + y * y + z * z)
+        length = scale * metres
+        # The error lies along the optical axis: along an oblique ray it is longer.
+        spread = scale * sigma[n] * metres / max(abs(z), MIN_DEPTH_M)
+        near = length <= max_range
+        shrink = 1.0 if near else max_range / length
+        for axis in range(3):
+            turned = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z
+            ends[n, axis] = T[axis, 3] + shrink * turned
+        values[n, 0] = spread
+        # A ray without a hit ends a cell before the range, where a hit could still be.
+        values[n, 1] = min(length - margin * spread, max_range - 1.0)
+        values[n, 2] = confidence[n]
+        values[n, 3] = 1.0 if near else 0.0
+
+
+def limit_points(
+    xyz: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    max_range: float,
+    beyond: float,
+    margin: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Move points that are out of range along their rays to a common distance.
+
+    They are no hits anyway, and at one distance they can be averaged. A ray must stay free as far
+    as before, so the uncertainty of a point shrinks by as much as it moves, down to none.
+
+    Args:
+        xyz: float32 (N, 3), camera axes.
+        sigma: float32 (N,), standard deviation of the depth, same unit.
+        max_range: Points up to here stay as they are.
+        beyond: Where the others are moved to, not below ``max_range``.
+        margin: Standard deviations before a point where free space ends.
+
+    Returns:
+        Points float32 (N, 3) and standard deviations float32 (N,).
+    """
+    moved, left = xyz.copy(), sigma.copy()
+    _limit_points(moved, left, (max_range, beyond, margin))
+    return moved, left
+
+
+@kernel
+def _limit_points(
+    xyz: NDArray[np.float32], sigma: NDArray[np.float32], limits: tuple[float, float, float]
+) -> None:
+    """The loop of `limit_points`, in place."""
+    max_range, beyond, margin = limits
+    for n in range(len(xyz)):
+        x, y, z = np.float64(xyz[n, 0]), np.float64(xyz[n, 1]), np.float64(xyz[n, 2])
+        length = math.sqrt(x * x + y * y + z * z)
+        if length <= max_range:
+            continue
+        # A point between the two is moved outwards, and its free length does not change either.
+        shrink = beyond / length
+        surplus = np.float64(sigma[n]) * margin - abs(z) * (1.0 - shrink)
+        sigma[n] = max(surplus, 0.0) / margin if margin > 0 else sigma[n]
+        xyz[n, 0], xyz[n, 1], xyz[n, 2] = x * shrink, y * shrink, z * shrink
+
+
+def make_blocks(rows: int) -> Blocks:
+    """No blocks yet, memory for ``rows``, without evidence."""
+    return Blocks(
+        table=make_table(rows),
+        keys=np.zeros(rows, np.int64),
+        values=np.zeros((rows, BLOCK_CELLS), np.float32),
+        used=np.zeros(1, np.int64),
+    )
+
+
+@kernel
+def block_key(i: int, j: int, k: int) -> int:
+    """Packed index of the block that a cell lies in."""
+    return int(pack_key(i >> BLOCK_BITS, j >> BLOCK_BITS, k >> BLOCK_BITS))
+
+
+@kernel
+def cell_in_block(i: int, j: int, k: int) -> int:
+    """Column of a cell in the row of its block."""
+    return ((i & _LOW) << (2 * BLOCK_BITS)) | ((j & _LOW) << BLOCK_BITS) | (k & _LOW)
+
+
+def cast_rays(evidence: Blocks, rays: Rays, spread: float) -> Blocks:
+    """Collect the evidence of the rays of one frame.
+
+    The cells that a ray leaves before its length reaches ``free`` are missed. Where it hits,
+    the cells that touch ``length ± spread·sigma`` get ``hit`` times the share of the normal
+    distribution between the ray's entry and exit. Of several hits the largest counts, of
+    several misses the strongest, and a hit outweighs misses; so the order of rays is irrelevant.
+
+    Args:
+        evidence: Written, or replaced by larger stores where they are full.
+        rays: The rays, all finite; a ray of zero length says nothing.
+        spread: Half width of the zone of a hit, in standard deviations.
+
+    Returns:
+        The stores that hold the evidence.
+    """
+    done = 0
+    while True:
+        # Plain tuples: numba's cache on disk would remember the classes by name, and break when
+        # one is renamed.
+        done = _cast_rays(tuple(evidence), tuple(rays), done, spread)
+        if done == len(rays.ends):
+            return evidence
+        evidence = reserve(evidence, len(evidence.keys) + 1, make_blocks)
+
+
+@kernel
+def _cast_rays(
+    evidence: tuple[NDArray[Any], ...], rays: tuple[NDArray[Any], ...], start: int, spread: float
+) -> int:
+    """Cast from ray ``start`` on; return the first that finds no memory left, to be cast again."""
+    # Arrays are taken out of their tuples once: inside the loops numba would count references.
+    table, keys, values, used = evidence
+    origin, ends, frees, sigmas, hits, misses = rays
+    rows = used[0]
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    for n in range(start, len(ends)):
+        dx, dy, dz = ends[n, 0] - ox, ends[n, 1] - oy, ends[n, 2] - oz
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        if length == 0:
+            continue
+        free, sigma, hit, miss = frees[n], sigmas[n], hits[n], misses[n]
+        near = length - spread * sigma if hit > 0 else np.inf
+        stop = max(free, length + spread * sigma) if hit > 0 else free
+        i, j, k = math.floor(ox), math.floor(oy), math.floor(oz)
+        step_x, next_x, delta_x = _axis(ox, dx / length, i)
+        step_y, next_y, delta_y = _axis(oy, dy / length, j)
+        step_z, next_z, delta_z = _axis(oz, dz / length, k)
+        enter, below, block, row = 0.0, -1.0, -1, 0
+        while True:
+            leave = min(next_x, next_y, next_z)
+            touched = leave > near
+            if touched or leave <= free:
+                key = block_key(i, j, k)
+                if key != block:
+                    if rows == len(keys):
+                        used[0] = rows
+                        return n
+                    row = find_or_add(table, key, rows)
+                    if row == rows:
+                        keys[row] = key
+                        rows += 1
+                    block = key
+                cell = cell_in_block(i, j, k)
+                value = values[row, cell]
+                if not touched:
+                    if value <= 0 and miss < value:
+                        values[row, cell] = miss
+                else:
+                    if below < 0:
+                        below = _normal_cdf(enter, length, sigma)
+                    above = _normal_cdf(leave, length, sigma)
+                    gain = np.float32(hit * (above - below))
+                    below = above
+                    if gain > 0 and gain > value:
+                        values[row, cell] = gain
+            if leave >= stop:
+                break
+            enter = leave
+            if next_x <= next_y and next_x <= next_z:
+                i += step_x
+                next_x += delta_x
+            elif next_y <= next_z:
+                j += step_y
+                next_y += delta_y
+            else:
+                k += step_z
+                next_z += delta_z
+    used[0] = rows
+    return len(ends)
+
+
+@kernel
+def _axis(origin: float, direction: float, cell: int) -> tuple[int, float, float]:
+    """Step along one axis, length to the first boundary, length between boundaries."""
+    if direction > 0:
+        return 1, (cell + 1 - origin) / direction, 1.0 / direction
+    if direction < 0:
+        return -1, (cell - origin) / direction, -1.0 / direction
+    return 0, np.inf, np.inf
+
+
+@kernel
+def _normal_cdf(value: float, mean: float, sigma: float) -> float:
+    """Share of a normal distribution below ``value``; a step where ``sigma`` is 0."""
+    if sigma <= 0:
+        return 1.0 if value > mean else 0.0
+    return 0.5 * (1.0 + math.erf((value - mean) / (sigma * _SQRT2)))

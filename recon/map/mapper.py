@@ -1,0 +1,166 @@
+"""The stateful part of mapping: odometry and the maps under construction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from recon.core.geometry.transform import transform_cloud
+from recon.core.values import PointCloud, RayCloud, RectifiedCamera, Trajectory
+from recon.core.values.arrays import Float64
+from recon.map import SubmapBuilder, estimate_ground, fusion_range_m, map_axes, thin_rays
+from recon.map.axes import check_rigid
+from recon.map.frame_log import FrameLog
+from recon.map.observer import FrameResult
+from recon.map.ray_log import RayLog
+from recon.map.settings import DriveSettings
+from recon.map.submap_store import SubmapStore
+from recon.map.workspace import Workspace
+from recon.odometry import Odometry, OdometryFrame, OdometryHealth
+from recon.run.lookahead import OneBehind
+from recon.stereo.frame import ReconstructedFrame
+
+
+class Mapper:
+    """Registers frames; integrates each into the current submap while the next is registered.
+
+    Args:
+        config: The configuration.
+        camera: The rectified camera.
+        odometry: Estimates the poses.
+        workspace: Storage for closed submaps, and the stopwatch.
+    """
+
+    def __init__(
+        self,
+        config: DriveSettings,
+        camera: RectifiedCamera,
+        odometry: Odometry,
+        workspace: Workspace,
+    ) -> None:
+        self._config = config
+        self._odometry = odometry
+        self._workspace = workspace
+        self._fusion_range_m = fusion_range_m(camera, config.fusion)
+        self._behind = OneBehind()
+        self._builder: SubmapBuilder | None = None
+        self._frames = FrameLog(workspace.frames)
+        self._rays = RayLog(workspace.rays, config.occupancy)
+        self.submaps = SubmapStore(workspace.submaps, config.memory.cached_submaps)
+        self.T_map_world: Float64 = np.eye(4)
+
+    def __len__(self) -> int:
+        """Number of frames so far."""
+        return len(self._frames)
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The poses so far; at least one frame must have been added."""
+        return self._frames.trajectory
+
+    @property
+    def health(self) -> tuple[OdometryHealth, ...]:
+        """Health of each pose."""
+        return self._frames.health
+
+    def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
+        """Register the next frame and start its integration."""
+        stage = self._workspace.stopwatch.stage
+        with stage("odometry"):
+            registered = self._odometry.register(OdometryFrame(frame.pair, frame.disparity))
+        T_world_camera = registered.T_world_camera
+        health = replace(registered.health, warnings=(*frame.warnings, *registered.health.warnings))
+        # A hole in the map is better than wrong geometry.
+        cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))
+        rays = frame.rays if health.ok else None
+        builder = self._builder_from(frame)
+        self._behind.begin(partial(self._integrate, builder, cloud, rays, T_world_camera))
+        self._frames.add(T_world_camera, frame.pair.timestamp_s, health)
+        valid_share = float(np.mean(frame.disparity.valid))
+        return FrameResult(
+            len(self) - 1, total, 0.0, valid_share, len(frame.cloud), T_world_camera, health
+        )
+
+    def _integrate(
+        self,
+        builder: SubmapBuilder,
+        cloud: PointCloud,
+        rays: RayCloud | None,
+        T_world_camera: Float64,
+    ) -> None:
+        """Integrate a frame into the maps; runs while the next one is registered."""
+        stage = self._workspace.stopwatch.stage
+        with stage("map"):
+            rays = thin_rays(cloud, self._config.occupancy) if rays is None else rays
+            near = cloud.select(cloud.xyz[:, 2] <= self._fusion_range_m)
+            cloud_world = transform_cloud(near, T_world_camera, frame="world")
+            builder.integrate(cloud_world, rays.cloud(), T_world_camera)
+        with stage("store"):
+            self._rays.add(rays)
+            if builder.full:
+                self.submaps.add(builder.close())
+
+    def settle(self) -> None:
+        """Wait until all frames are integrated.
+
+        Raises:
+            ReconError: A frame cannot be integrated.
+        """
+        self._behind.settle()
+
+    def abandon(self) -> None:
+        """Stop after the integration in progress; required after an error, otherwise harmless."""
+        self._behind.abandon()
+
+    def close(self) -> None:
+        """Close the current submap after the last frame."""
+        self._behind.settle()
+        if self._builder is not None and self._builder.frames:
+            self.submaps.add(self._builder.close())
+        self._rays.close()
+
+    def state(self) -> dict[str, Any]:
+        """Everything that later results depend on, as a tree of arrays and plain values."""
+        self._behind.settle()
+        return {
+            "odometry": self._odometry.state(),
+            "builder": None if self._builder is None else self._builder.state(),
+            "submaps": self.submaps.state(),
+            "rays": self._rays.state(),
+            "T_map_world": self.T_map_world,
+            "frames": self._frames.state(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state`."""
+        self._odometry.restore(state["odometry"])
+        self.submaps.restore(state["submaps"])
+        self._rays.restore(state["rays"])
+        check_rigid("T_map_world", state["T_map_world"])
+        self.T_map_world = state["T_map_world"]
+        self._frames.restore(state["frames"])
+        if state["builder"] is not None:
+            self._builder = self._new_builder()
+            self._builder.restore(state["builder"])
+
+    def _builder_from(self, frame: ReconstructedFrame) -> SubmapBuilder:
+        """The submap under construction; the first frame fixes the map axes."""
+        if self._builder is None:
+            ground = estimate_ground(frame.cloud, self._config.axes)
+            height_m = self._config.ground.camera_height_m
+            self.T_map_world = map_axes(ground, self._config.axes, height_m)
+            self._builder = self._new_builder()
+        return self._builder
+
+    def _new_builder(self) -> SubmapBuilder:
+        config = self._config
+        return SubmapBuilder(
+            config.submaps,
+            config.fusion,
+            config.occupancy,
+            self.T_map_world,
+            config.memory.submap_bytes,
+        )

@@ -1,0 +1,223 @@
+"""From clouds and poses to the occupancy of space: log-odds of voxels, by ray casting."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recon.core.errors import MappingError
+from recon.core.kernels import voxels
+from recon.core.settings import Settings
+from recon.core.values import OccupancyVoxels, PointCloud
+from recon.core.values.arrays import Float32, Float64, Int32
+from recon.map.kernels import clamped, raycast
+from recon.map.log_odds import log_odds
+from recon.map.occupancy_part import OccupancyPart
+from recon.map.surface_points import points_of, sum_points
+
+_FIRST_POINTS: Final = 1 << 12
+_LEAST_SIGMA_CELLS: Final = 0.1
+"""Least standard deviation of a point, so that none outweighs all others in a mean."""
+
+
+class OccupancySettings(Settings):
+    """How clouds become occupancy. The defaults of the probabilities are OctoMap's."""
+
+    resolution_m: float = Field(0.2, gt=0.0, le=10.0, description="Edge of a voxel.")
+    max_range_m: float = Field(
+        25.0, gt=0.0, le=1000.0, description="Points farther away hit nothing."
+    )
+    hit_probability: float = Field(
+        0.7, gt=0.5, lt=1.0, description="Occupancy of a voxel after one certain hit."
+    )
+    miss_probability: float = Field(
+        0.4, gt=0.0, lt=0.5, description="Occupancy of a voxel after one ray went through it."
+    )
+    min_probability: float = Field(
+        0.12, gt=0.0, lt=0.5, description="Lower clamp: keeps the map able to change."
+    )
+    max_probability: float = Field(0.97, gt=0.5, lt=1.0, description="Upper clamp.")
+    free_margin_sigmas: float = Field(
+        2.0,
+        ge=0.0,
+        le=10.0,
+        description="Free space ends this many standard deviations before the point.",
+    )
+    spread_sigmas: float = Field(
+        1.0,
+        ge=0.0,
+        le=5.0,
+        description="Voxels within this many standard deviations of the point share its hit.",
+    )
+    min_points: int = Field(
+        2, ge=1, le=1000, description="Voxels with fewer points in a frame start no ray."
+    )
+    rays_per_voxel: int = Field(
+        2,
+        ge=1,
+        le=16,
+        description="Points of a frame are averaged in cubes so many times finer than a voxel.",
+    )
+    thin_surfaces: bool = Field(
+        default=True,
+        description="Voxels that the surface of the points around them does not cross are "
+        "undecided, however often they were hit.",
+    )
+    keep_rays: bool = Field(
+        default=True,
+        description="Keep the rays of every frame in the run's folder, for recon occupancy.",
+    )
+
+
+class OccupancyBuilder:
+    """Integrates clouds frame by frame into log-odds.
+
+    The points of a frame are first reduced to one ray per voxel that they end in; then each
+    voxel is updated at most once per frame, and a hit outweighs misses (OctoMap's rule).
+
+    Args:
+        settings: How to integrate.
+        T_map_world: float64 (4, 4), from world to map axes (z up).
+    """
+
+    def __init__(self, settings: OccupancySettings, T_map_world: NDArray[Any]) -> None:
+        self._settings = settings
+        self._T_map_world = np.asarray(T_map_world, dtype=np.float64)
+        self._map = clamped.make_clamped(256)
+        self._evidence = raycast.make_blocks(256)
+        self._points = voxels.make_sums(_FIRST_POINTS, 0)
+
+    def integrate(self, cloud: PointCloud, T_world_camera: NDArray[Any]) -> None:
+        """Add what one frame saw.
+
+        Args:
+            cloud: Points in camera axes. ``sigma_m`` None = exact; ``confidence`` None = 1;
+                ``count`` is the number of points that each stands for, None = 1.
+            T_world_camera: float64 (4, 4), pose of the camera.
+
+        Raises:
+            MappingError: The cloud is not in camera axes, or a point or pose is not finite or
+                too far away.
+        """
+        check_camera_cloud(cloud)
+        _check_pose(T_world_camera, self._settings.resolution_m)
+        rays = self._rays(cloud, self._T_map_world @ T_world_camera)
+        s = self._settings
+        self._evidence = raycast.cast_rays(self._evidence, rays, s.spread_sigmas)
+        if s.thin_surfaces:
+            self._points = voxels.add_points(self._points, _hits(rays), 1.0, 0)
+        low, high = log_odds(s.min_probability), log_odds(s.max_probability)
+        self._map = clamped.add_evidence(self._map, self._evidence, low, high)
+
+    def voxels(self) -> OccupancyVoxels:
+        """Every voxel that was observed so far, block by block as first touched."""
+        return self.part().voxels(self._settings.resolution_m)
+
+    def part(self) -> OccupancyPart:
+        """What was observed since the start, or since the last `take`."""
+        points = points_of(self._points) if self._settings.thin_surfaces else None
+        return OccupancyPart(clamped.observed_rows(self._map), points)
+
+    def take(self) -> OccupancyPart:
+        """The part so far; the builder starts a new one."""
+        part, self._map = self.part(), clamped.make_clamped(256)
+        self._points = voxels.make_sums(_FIRST_POINTS, 0)
+        return part
+
+    def resume(self, part: OccupancyPart) -> None:
+        """Continue a part that was taken from another builder."""
+        self._map = clamped.chain_rows(clamped.make_clamped(256), part.rows)
+        if part.points is not None:
+            self._points = sum_points([part.points])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the blocks and points so far; the same after `resume` as before."""
+        points = int(self._points.used[0]) * sum(a[:1].nbytes for a in self._points[1:-1])
+        return int(self._map.used[0]) * self._map.cells[:1].nbytes + points
+
+    def _rays(self, cloud: PointCloud, T_map_camera: Float64) -> raycast.Rays:
+        """One ray per voxel in which enough points end; lengths in voxels."""
+        s = self._settings
+        T = T_map_camera.copy()
+        T[:3] /= s.resolution_m
+        ends, values = raycast.measure_points(
+            cloud.xyz,
+            *sigma_and_confidence(cloud),
+            T,
+            s.max_range_m / s.resolution_m,
+            s.free_margin_sigmas,
+        )
+        means, values = _reduce(ends, values, cloud.count, s.min_points)
+        sigma, free, confidence, hit = np.ascontiguousarray(values.T)
+        return raycast.Rays(
+            origin=T[:3, 3].copy(),
+            ends=means,
+            free=free.astype(np.float64),
+            sigma=sigma.astype(np.float64),
+            hit=np.float32(log_odds(s.hit_probability)) * confidence * hit,
+            miss=np.float32(log_odds(s.miss_probability)) * confidence,
+        )
+
+
+def _hits(rays: raycast.Rays) -> voxels.VoxelPoints:
+    """The ends of the rays that hit something, precise ones with more weight."""
+    hit = np.flatnonzero(rays.hit > 0)
+    weights = 1.0 / (rays.sigma[hit] ** 2 + _LEAST_SIGMA_CELLS**2)
+    return voxels.VoxelPoints(
+        rays.ends[hit], weights.astype(np.float32), np.zeros((len(hit), 0), np.float32)
+    )
+
+
+def _reduce(
+    ends: Float32, values: Float32, count: Int32 | None, least: int
+) -> tuple[Float64, Float32]:
+    """Means of the ends (M, 3) and values (M, C) in each voxel with ``least`` trusted points."""
+    trusted = (values[:, 2] > 0).astype(np.float32)
+    weights = trusted if count is None else trusted * count.astype(np.float32)
+    points = voxels.VoxelPoints(ends, weights, values)
+    sums = voxels.add_points(voxels.make_sums(4096, values.shape[1]), points, 1.0, 0)
+    enough = np.flatnonzero(sums.sums[: sums.used[0], 0] >= least)
+    means = sums.sums[enough, 1:] / sums.sums[enough, :1]
+    centres = voxels.unpack_keys(sums.keys[enough]) + 0.5
+    return centres + means[:, :3], means[:, 3:]
+
+
+def sigma_and_confidence(cloud: PointCloud) -> tuple[Float32, Float32]:
+    """Both float32 (N,); 0 m and 1 where the cloud has none."""
+    n = len(cloud)
+    return (
+        np.zeros(n, np.float32) if cloud.sigma_m is None else cloud.sigma_m,
+        np.ones(n, np.float32) if cloud.confidence is None else cloud.confidence,
+    )
+
+
+def check_camera_cloud(cloud: PointCloud) -> None:
+    """Refuse a cloud that would silently spoil the map.
+
+    Raises:
+        MappingError: It is not in camera axes, or a number is not finite.
+    """
+    if cloud.frame != "camera":
+        raise MappingError(
+            "the occupancy map takes clouds in camera axes", got=cloud.frame, expected="camera"
+        )
+    numbers = (cloud.xyz, cloud.sigma_m, cloud.confidence)
+    if not all(a is None or np.isfinite(a).all() for a in numbers):
+        raise MappingError("a point to map is not finite")
+
+
+def _check_pose(T_world_camera: NDArray[Any], resolution_m: float) -> None:
+    """Refuse a pose that would silently spoil the map."""
+    if not np.isfinite(T_world_camera).all():
+        raise MappingError("a pose to map is not finite")
+    far_m = resolution_m * (voxels.KEY_LIMIT / 2)
+    if np.abs(T_world_camera[:3, 3]).max() > far_m:
+        raise MappingError(
+            "the camera is too far from the origin for this resolution",
+            got=f"{np.abs(T_world_camera[:3, 3]).max():.0f} m",
+            expected=f"at most {far_m:.0f} m",
+        )

@@ -1,0 +1,125 @@
+"""The part of the occupancy by a part of a drive, to be chained with other parts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.kernels import voxels
+from recon.core.values import OccupancyVoxels
+from recon.core.values.arrays import Float32, Float64, Int32
+from recon.map.kernels import clamped, raycast
+from recon.map.surface_points import SurfacePoints, join_points
+
+_UNSURE: Final = np.float32(0.01)
+"""Log-odds of a voxel that was hit though the surface is likely in another: just above even."""
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyPart:
+    """The cells that a part of a drive observed, and what it did to the log-odds of each.
+
+    Attributes:
+        rows: `recon.map.kernels.clamped.CellRows`, cells in map axes.
+        points: Where its hits lie; None = not kept, surfaces are as thick as they were hit.
+    """
+
+    rows: clamped.CellRows
+    points: SurfacePoints | None = None
+
+    def __len__(self) -> int:
+        return len(self.rows.cells)
+
+    @property
+    def blocks(self) -> Int32:
+        """int32 (B, 3), indices of the blocks of 8×8×8 cells."""
+        return voxels.unpack_keys(self.rows.blocks)
+
+    @property
+    def cells(self) -> Int32:
+        """int32 (N, 3), indices of the observed cells."""
+        edge = raycast.BLOCK_EDGE
+        corner = np.repeat(self.blocks * edge, np.diff(self.rows.starts), axis=0)
+        local = np.stack(np.unravel_index(self.rows.cells, (edge, edge, edge)), axis=1)
+        return (corner + local).astype(np.int32)
+
+    def select(self, which: NDArray[Any]) -> OccupancyPart:
+        """The blocks of a boolean mask (B,)."""
+        sizes = np.diff(self.rows.starts)
+        cells = np.repeat(which, sizes)
+        starts = np.concatenate([[0], np.cumsum(sizes[which])]).astype(np.int64)
+        blocks = self.rows.blocks[which]
+        return OccupancyPart(
+            clamped.CellRows(blocks, starts, self.rows.cells[cells], self.rows.values[cells]),
+            None if self.points is None else self.points.in_blocks(blocks),
+        )
+
+    def moved(self, T_new_map: Float64, resolution_m: float) -> OccupancyPart:
+        """The part after a rigid motion: each cell gets the values that were at its centre."""
+        T_cells = T_new_map.copy()
+        T_cells[:3, 3] /= resolution_m
+        blocks = clamped.chain_rows(clamped.make_clamped(1), self.rows)
+        moved = OccupancyPart(
+            clamped.observed_rows(clamped.move_blocks(blocks, T_cells)),
+            None if self.points is None else self.points.moved(T_cells),
+        )
+        return moved.select(np.diff(moved.rows.starts) > 0)
+
+    def voxels(self, resolution_m: float) -> OccupancyVoxels:
+        """The log-odds of a drive that consists of this part alone.
+
+        A voxel that was hit is undecided unless the surface of the points around it crosses it:
+        the surface is then in the voxel before or behind.
+        """
+        change, low, high = self.rows.values.T
+        cells, log_odds = self.cells, np.minimum(np.maximum(change, low), high)
+        if self.points is not None:
+            log_odds = _thinned(cells, log_odds, self.points)
+        return OccupancyVoxels(keys=cells, log_odds=log_odds, resolution_m=resolution_m)
+
+
+def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints) -> Float32:
+    """Log-odds (N,) of cells (N, 3), no more than unsure where no surface crosses."""
+    hit = np.flatnonzero(log_odds > _UNSURE)
+    # What was hit and then looked through is no surface: a car that drove off, an outlier.
+    points = points.select(np.isin(points.keys, voxels.pack_keys(cells[hit])))
+    log_odds[hit[~points.cross(cells[hit])]] = _UNSURE
+    return log_odds
+
+
+def join_occupancy(parts: Iterable[OccupancyPart]) -> OccupancyPart:
+    """Parts that follow one another in time, chained."""
+    blocks, points = clamped.make_clamped(1), []
+    for part in parts:
+        blocks = clamped.chain_rows(blocks, part.rows)
+        points.append(part.points)
+    known = [part for part in points if part is not None]
+    joined = join_points(known) if known and len(known) == len(points) else None
+    return OccupancyPart(clamped.observed_rows(blocks), joined)
+
+
+def free_part(keys: Int32, log_odds: float) -> OccupancyPart:
+    """A part of a drive after which cells have given log-odds, whatever was known of them before.
+
+    Args:
+        keys: int32 (N, 3), the cells, each once.
+        log_odds: What they have afterwards.
+    """
+    home = voxels.pack_keys(keys >> raycast.BLOCK_BITS)
+    order = np.argsort(home, kind="stable")
+    blocks, starts = np.unique(home[order], return_index=True)
+    edge = raycast.BLOCK_EDGE
+    cells = np.ravel_multi_index(tuple((keys[order] % edge).T), (edge, edge, edge))
+    rows = clamped.CellRows(
+        blocks,
+        np.append(starts, len(keys)).astype(np.int64),
+        cells.astype(np.uint16),
+        # x -> min(max(x + 0, low), high) with low = high.
+        np.tile(np.array([0.0, log_odds, log_odds], np.float32), (len(keys), 1)),
+    )
+    nothing = SurfacePoints(np.zeros(0, np.int64), np.zeros((0, 4), np.float32))
+    return OccupancyPart(rows, nothing)

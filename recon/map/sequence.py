@@ -1,0 +1,340 @@
+"""A drive, frame by frame: reconstruct, register, integrate."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from recon.core.errors import RegistrationError
+from recon.core.values import OccupancyVoxels, PointCloud, RectifiedCamera, StereoPair, Trajectory
+from recon.core.values.arrays import Float64
+from recon.map.drive_loops import DriveLoops, LoopWatch
+from recon.map.drive_map import DriveMap
+from recon.map.mapper import Mapper
+from recon.map.observer import FrameResult, Observer
+from recon.map.rays import thin_rays
+from recon.map.settings import DriveSettings
+from recon.map.submap_store import SubmapStore
+from recon.map.workspace import Workspace
+from recon.odometry import (
+    KnownPoses,
+    MotionPrior,
+    Odometry,
+    OdometryFrame,
+    OdometryHealth,
+    OdometrySettings,
+    find_axes,
+    first_moving,
+    make_odometry,
+)
+from recon.run.lookahead import look_ahead
+from recon.run.machine import serial_algebra
+from recon.sources import IncompleteSource, StampedSource, StereoSource
+from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
+
+
+@dataclass(frozen=True)
+class UsedPrior:
+    """How an external trajectory was used.
+
+    Attributes:
+        axes: The axes of its poses.
+        known_from: ``images``, ``settings``, or ``assumed``.
+        sigmas: Median distance from the visual motion in each set of axes, standard deviations.
+    """
+
+    axes: str
+    known_from: str
+    sigmas: Mapping[str, float] = field(default_factory=dict)
+
+    def warnings(self) -> list[str]:
+        """What the user should know about it."""
+        if self.known_from != "assumed":
+            return []
+        what = "too little motion was seen to tell the axes of the prior"
+        return [f"{what}; taken as those of the camera (odometry.prior.axes)"]
+
+
+@dataclass(frozen=True, eq=False)
+class MappedSequence:
+    """A mapped drive, before its results are written.
+
+    Attributes:
+        trajectory: Pose of the left camera in each frame.
+        health: Health of each pose.
+        submaps: Fused cloud and occupancy, in submaps of consecutive frames.
+        config: The configuration.
+        T_map_world: float64 (4, 4).
+        camera: The rectified camera.
+        sample: The frame in the middle of the drive, for display.
+        seconds: Wall-clock time from the first frame to the last.
+        T_corrected_world: float64 (S, 4, 4), correction still to be applied to each submap; the
+            trajectory already includes it. None = none.
+        loops: Result of loop closure; None = it was not run.
+        prior: How the external trajectory was used; None = there was none.
+    """
+
+    trajectory: Trajectory
+    health: tuple[OdometryHealth, ...]
+    submaps: SubmapStore
+    config: DriveSettings
+    T_map_world: Float64
+    camera: RectifiedCamera
+    sample: ReconstructedFrame
+    seconds: float
+    T_corrected_world: Float64 | None = None
+    loops: DriveLoops | None = None
+    prior: UsedPrior | None = None
+
+    def __repr__(self) -> str:
+        trusted = sum(record.ok for record in self.health)
+        return f"MappedSequence({self.trajectory}, {trusted} of them trusted, {self.seconds:.4g} s)"
+
+    @cached_property
+    def map(self) -> DriveMap:
+        """Fused cloud and occupancy, tile by tile."""
+        return DriveMap(self.submaps, self.config, self.T_map_world, self.T_corrected_world)
+
+    @cached_property
+    def cloud(self) -> PointCloud:
+        """The whole fused cloud, frame ``world``; for long drives, see `map`."""
+        return self.map.cloud()
+
+    @cached_property
+    def voxels(self) -> OccupancyVoxels:
+        """The whole 3-D occupancy, map axes; for long drives, see `map`."""
+        return self.map.voxels()
+
+    def corrected(self, T_corrected_world: Float64) -> MappedSequence:
+        """The drive with each submap and its part of the path moved rigidly.
+
+        Args:
+            T_corrected_world: float64 (S, 4, 4), one correction per submap.
+        """
+        entries = self.submaps.entries
+        of_frame = np.repeat(np.arange(len(entries)), [entry.frames for entry in entries])
+        poses = T_corrected_world[of_frame] @ self.trajectory.T_world_camera
+        return replace(
+            self,
+            trajectory=replace(self.trajectory, T_world_camera=poses),
+            T_corrected_world=T_corrected_world,
+        )
+
+    def closed(self, loops: DriveLoops) -> MappedSequence:
+        """The drive after loop closure: the corrected trajectory, and submaps that follow it."""
+        return replace(
+            self,
+            trajectory=loops.closure.trajectory,
+            T_corrected_world=loops.submap_corrections(self.submaps.entries),
+            loops=loops,
+        )
+
+
+def map_sequence(
+    source: StereoSource,
+    config: DriveSettings,
+    *,
+    known_poses: Trajectory | None = None,
+    prior: Trajectory | None = None,
+    observers: Iterable[Observer] = (),
+    workspace: Workspace | None = None,
+) -> MappedSequence:
+    """Register and fuse all frames of a source, and close loops in the path.
+
+    Matching of the next frames, registration of this one and integration of the last one overlap,
+    which does not change the result.
+
+    Args:
+        source: The source of stereo pairs.
+        config: The configuration.
+        known_poses: Poses to use instead of odometry, one per frame of the source; used
+            unchanged, without loop closure.
+        prior: Motion of the left camera from wheel odometry, an IMU or GNSS, in the time base of
+            the source; only relative motions are used.
+        observers: Notified of progress.
+        workspace: Disk storage, threads and stopwatch of the run; None = in memory, all cores,
+            not timed.
+
+    Raises:
+        ReconError: A frame cannot be read, matched or registered.
+    """
+    work = workspace or Workspace()
+    audience = tuple(observers)
+    reconstructor = FrameReconstructor(
+        source.calibration, config, threads=work.threads, stopwatch=work.stopwatch
+    )
+
+    def reconstruct(pair: StereoPair) -> ReconstructedFrame:
+        frame = reconstructor.reconstruct(pair)
+        with work.stopwatch.stage("thin"):
+            return replace(frame, rays=thin_rays(frame.cloud, config.occupancy))
+
+    used = None
+    if prior is not None and known_poses is None:
+        used = _axes_of(prior, source, reconstructor, config.odometry)
+    odometry = _odometry(config, source, known_poses, prior, used)
+    looking = config.loops.enabled and known_poses is None
+    loops = LoopWatch(config.loops, work.loops, work.stopwatch) if looking else None
+    mapper = Mapper(config, reconstructor.camera, odometry, work)
+    drive = _Drive(mapper, loops, config, work)
+    for observer in audience:
+        observer.on_start(source.name, len(source))
+    try:
+        with serial_algebra():
+            pairs = source.frames(len(drive.mapper))
+            for frame in look_ahead(reconstruct, pairs):
+                result = drive.add(frame, total=len(source))
+                for observer in audience:
+                    observer.on_frame(result)
+            drive.settle()
+    finally:
+        drive.stop()
+        for observer in audience:
+            observer.on_finish()
+    return replace(drive.finish(source, reconstructor), prior=used)
+
+
+class _Drive:
+    """Couples the mapper with the search for loops, checkpoints and timing.
+
+    Resumes from a checkpoint if there is one; the time spent before it is included.
+    """
+
+    def __init__(
+        self, mapper: Mapper, loops: LoopWatch | None, config: DriveSettings, workspace: Workspace
+    ) -> None:
+        self.mapper = mapper
+        self._loops = loops
+        self._config = config
+        self._checkpoint = workspace.checkpoint
+        self._stage = workspace.stopwatch.stage
+        self._sample: ReconstructedFrame | None = None
+        self._saved = 0
+        self._start = self._last = time.perf_counter()
+        if workspace.resume and self._checkpoint is not None and self._checkpoint.exists():
+            self._checkpoint.restore(self._restore)
+
+    def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
+        result = self.mapper.add(frame, total=total)
+        if self._loops is not None:
+            self._loops.add(frame, result.T_world_camera, measured=result.health.ok)
+        if result.index <= total // 2:
+            self._sample = frame
+        if len(self.mapper) - self._saved >= self._config.checkpoints.every_frames:
+            self._save()
+        self._config.memory.check(f"frame {result.index}")
+        now = time.perf_counter()
+        seconds, self._last = now - self._last, now
+        return replace(result, seconds=seconds)
+
+    def settle(self) -> None:
+        """Wait for background work: the integration of the last frame, and the search for loops."""
+        self.mapper.settle()
+        if self._loops is not None:
+            self._loops.settle()
+        self._last = time.perf_counter()
+
+    def stop(self) -> None:
+        """Stop background work, finished or not."""
+        self.mapper.abandon()
+        if self._loops is not None:
+            self._loops.stop()
+
+    def finish(self, source: StereoSource, reconstructor: FrameReconstructor) -> MappedSequence:
+        if not len(self.mapper):
+            raise RegistrationError("the source has no frame")
+        if len(self.mapper) > self._saved:
+            self._save()
+        self.mapper.close()
+        mapped = MappedSequence(
+            trajectory=self.mapper.trajectory,
+            health=self.mapper.health,
+            submaps=self.mapper.submaps,
+            config=self._config,
+            T_map_world=self.mapper.T_map_world,
+            camera=reconstructor.camera,
+            sample=self._sample or self._sample_again(source, reconstructor),
+            seconds=self._last - self._start,
+        )
+        if self._loops is None:
+            return mapped
+        with self._stage("close_loops"):
+            return mapped.closed(self._loops.close(mapped.trajectory))
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        self.mapper.restore(state["mapper"])
+        if self._loops is not None:
+            path, health = self.mapper.trajectory, self.mapper.health
+            self._loops.restore(path.T_world_camera, [record.ok for record in health])
+        self._saved = len(self.mapper)
+        self._last = time.perf_counter()
+        self._start = self._last - state["seconds"]
+
+    def _save(self) -> None:
+        if self._checkpoint is None:
+            return
+        self.settle()  # else keyframes that a resumed run needs might be missing
+        with self._stage("checkpoint"):
+            seconds = time.perf_counter() - self._start
+            self._checkpoint.save({"mapper": self.mapper.state(), "seconds": seconds})
+        self._saved = len(self.mapper)
+
+    def _sample_again(
+        self, source: StereoSource, reconstructor: FrameReconstructor
+    ) -> ReconstructedFrame:
+        """Reconstruct the sample again if it was mapped before this process started."""
+        index = min(len(source) // 2, len(self.mapper) - 1)
+        return reconstructor.reconstruct(next(source.frames(index)))
+
+
+def _axes_of(
+    prior: Trajectory,
+    source: StereoSource,
+    reconstructor: FrameReconstructor,
+    settings: OdometrySettings,
+) -> UsedPrior:
+    """The axes of a prior: those set, else those that explain the first motions in the images."""
+    start = 0
+    if isinstance(source, StampedSource):
+        MotionPrior(prior, settings.prior).check_covers(source.stamps_s)
+        start = first_moving(prior, source.stamps_s, settings.prior)
+    if settings.prior.axes != "auto":
+        return UsedPrior(settings.prior.axes, "settings")
+    frames = (OdometryFrame(*reconstructor.match(pair)) for pair in source.frames(start))
+    found = find_axes(prior, frames, settings)
+    if found is None:
+        return UsedPrior("camera", "assumed")
+    return UsedPrior(found.axes, "images", found.sigmas)
+
+
+def _odometry(
+    config: DriveSettings,
+    source: StereoSource,
+    known_poses: Trajectory | None,
+    prior: Trajectory | None,
+    used: UsedPrior | None,
+) -> Odometry:
+    if known_poses is None:
+        settings = config.odometry
+        if used is not None:
+            axes = settings.prior.model_copy(update={"axes": used.axes})
+            settings = settings.model_copy(update={"prior": axes})
+        return make_odometry(settings.method, settings, prior)
+    count = len(known_poses)
+    lines = list(range(len(source))) if count >= len(source) else None
+    if isinstance(source, IncompleteSource):
+        lines = source.lines(count)
+    if lines is None:
+        raise RegistrationError(
+            "fewer known poses than frames",
+            got=f"{count} poses",
+            expected=f"{len(source)}",
+            hint="the pose file must list every frame of the source",
+        )
+    poses, times_s = known_poses.T_world_camera[lines], known_poses.timestamps_s[lines]
+    return KnownPoses(Trajectory(poses, times_s))

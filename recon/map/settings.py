@@ -1,0 +1,40 @@
+"""Settings of a drive: what determines its map."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from pydantic import Field
+
+from recon.map.axes import AxesSettings
+from recon.map.checkpoint import CheckpointSettings
+from recon.map.fused import FusionSettings
+from recon.map.grid import GridSettings
+from recon.map.ground import GroundSettings
+from recon.map.occupancy import OccupancySettings
+from recon.map.submaps import SubmapSettings
+from recon.odometry import OdometrySettings
+from recon.places import LoopSettings
+from recon.run.memory import MemorySettings
+from recon.stereo.cloud import FilterSettings
+from recon.stereo.settings import StereoSettings
+
+NO_ISLANDS: Final = FilterSettings(voxel_m=None, radius_m=0.3, radius_neighbours=2)
+
+
+class DriveSettings(StereoSettings):
+    """Everything that determines the map of a drive."""
+
+    map_filters: FilterSettings = Field(
+        default=NO_ISLANDS, description="Filters of the fused cloud on export."
+    )
+    odometry: OdometrySettings = OdometrySettings()
+    loops: LoopSettings = LoopSettings()
+    axes: AxesSettings = AxesSettings()
+    fusion: FusionSettings = FusionSettings()
+    occupancy: OccupancySettings = OccupancySettings()
+    submaps: SubmapSettings = SubmapSettings()
+    checkpoints: CheckpointSettings = CheckpointSettings()
+    memory: MemorySettings = MemorySettings()
+    ground: GroundSettings = GroundSettings()
+    grid: GridSettings = GridSettings()

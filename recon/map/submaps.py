@@ -1,0 +1,229 @@
+"""Submaps: consecutive frames with their part of the fused cloud and of the occupancy.
+
+A submap is built in the world of the odometry. Without corrections, all submaps together are the
+map that one long drive would have given; where loop closure moves a submap, its voxels are moved
+with it, and nothing has to be matched again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from recon.core.geometry.se3 import invert
+from recon.core.settings import Settings
+from recon.core.values import PointCloud
+from recon.core.values.arrays import Float64
+from recon.map.fused import FusionSettings, MapBuilder
+from recon.map.fused_part import FusedPart
+from recon.map.kernels import clamped
+from recon.map.occupancy import OccupancyBuilder, OccupancySettings
+from recon.map.occupancy_part import OccupancyPart
+from recon.map.surface_points import SurfacePoints
+
+
+class SubmapSettings(Settings):
+    """Where a drive is divided into submaps, and into which tiles its map.
+
+    Both bound the memory; apart from rounding they change no result, except where a vehicle turned
+    back and saw something on its own track: whether that came later is known by submaps.
+    """
+
+    length_m: float = Field(
+        25.0, gt=0.0, le=10_000.0, description="Path after which a new submap begins."
+    )
+    max_frames: int = Field(
+        100, ge=1, le=100_000, description="Frames after which a new submap begins at the latest."
+    )
+    tile_m: float = Field(
+        50.0, ge=5.0, le=10_000.0, description="Edge of the tiles, rounded to whole voxels."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """What consecutive frames saw.
+
+    Attributes:
+        index: Number of the submap in its drive, from 0.
+        first_frame: Number of its first frame.
+        frames: Number of its frames.
+        fused: Its part of the fused cloud, world axes.
+        occupancy: Its part of the occupancy, map axes.
+    """
+
+    index: int
+    first_frame: int
+    frames: int
+    fused: FusedPart
+    occupancy: OccupancyPart
+
+    def moved(self, motion: SubmapMotion) -> Submap:
+        """The submap after a correction of its pose."""
+        return replace(
+            self,
+            fused=self.fused.moved(motion.T_corrected_world, motion.voxel_m),
+            occupancy=self.occupancy.moved(motion.T_corrected_map, motion.resolution_m),
+        )
+
+    def to_tree(self) -> dict[str, Any]:
+        """Everything, as a tree of arrays and plain values."""
+        fused, rows, points = self.fused, self.occupancy.rows, self.occupancy.points
+        return {
+            "index": self.index,
+            "first_frame": self.first_frame,
+            "frames": self.frames,
+            "fused": {
+                "keys": fused.keys,
+                "sums": fused.sums,
+                "information": fused.information,
+                "frames": fused.frames,
+                "known": list(fused.known),
+            },
+            "occupancy": rows._asdict(),
+            "points": None if points is None else {"keys": points.keys, "sums": points.sums},
+        }
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> Submap:
+        """What `to_tree` gave."""
+        fused = {**tree["fused"], "known": tuple(tree["fused"]["known"])}
+        points = tree["points"]
+        return cls(
+            tree["index"],
+            tree["first_frame"],
+            tree["frames"],
+            FusedPart(**fused),
+            OccupancyPart(
+                clamped.CellRows(**tree["occupancy"]),
+                None if points is None else SurfacePoints(**points),
+            ),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SubmapMotion:
+    """A correction of a submap's pose.
+
+    Attributes:
+        T_corrected_world: float64 (4, 4), from the world of the odometry to the corrected one.
+        T_map_world: float64 (4, 4), from world to map axes.
+        voxel_m: Edge of a voxel of the fused cloud.
+        resolution_m: Edge of a cell of the occupancy.
+    """
+
+    T_corrected_world: Float64
+    T_map_world: Float64
+    voxel_m: float
+    resolution_m: float
+
+    @property
+    def T_corrected_map(self) -> Float64:
+        """The same motion in map axes."""
+        return np.asarray(self.T_map_world @ self.T_corrected_world @ invert(self.T_map_world))
+
+
+class SubmapBuilder:
+    """Builds the submaps of a drive, one after the other.
+
+    Args:
+        settings: Where to cut.
+        fusion: How to fuse.
+        occupancy: How clouds become occupancy.
+        T_map_world: float64 (4, 4), from world to map axes.
+        max_bytes: Size of a submap at which a new one begins; None = no limit.
+    """
+
+    def __init__(
+        self,
+        settings: SubmapSettings,
+        fusion: FusionSettings,
+        occupancy: OccupancySettings,
+        T_map_world: Float64,
+        max_bytes: int | None = None,
+    ) -> None:
+        self._settings = settings
+        self._max_bytes = max_bytes
+        self._fused = MapBuilder(fusion)
+        self._occupancy = OccupancyBuilder(occupancy, T_map_world)
+        self._index = 0
+        self._first_frame = 0
+        self._frames = 0
+        self._path_m = 0.0
+        self._last_m: Float64 | None = None
+
+    @property
+    def frames(self) -> int:
+        """Number of frames in the submap so far."""
+        return self._frames
+
+    def integrate(
+        self, cloud_world: PointCloud, cloud_camera: PointCloud, T_world_camera: Float64
+    ) -> None:
+        """Add what one frame saw.
+
+        Args:
+            cloud_world: What is fused, world axes.
+            cloud_camera: What occupies and frees space, camera axes.
+            T_world_camera: float64 (4, 4).
+
+        Raises:
+            MappingError: A point or the pose would spoil the map.
+        """
+        self._fused.integrate(cloud_world)
+        self._occupancy.integrate(cloud_camera, T_world_camera)
+        place = T_world_camera[:3, 3]
+        if self._last_m is not None:
+            self._path_m += float(np.linalg.norm(place - self._last_m))
+        self._last_m = place.copy()
+        self._frames += 1
+
+    @property
+    def full(self) -> bool:
+        """Whether the submap is to be closed."""
+        s, limit = self._settings, self._max_bytes
+        long = self._path_m >= s.length_m or self._frames >= s.max_frames
+        return long or (limit is not None and self._fused.nbytes + self._occupancy.nbytes >= limit)
+
+    def current(self) -> Submap:
+        """The submap so far; without frames it is empty."""
+        return Submap(
+            self._index,
+            self._first_frame,
+            self._frames,
+            self._fused.part(),
+            self._occupancy.part(),
+        )
+
+    def close(self) -> Submap:
+        """The submap, whose place the next one takes."""
+        submap = Submap(
+            self._index,
+            self._first_frame,
+            self._frames,
+            self._fused.take(),
+            self._occupancy.take(),
+        )
+        self._first_frame += self._frames
+        self._index, self._frames, self._path_m = self._index + 1, 0, 0.0
+        return submap
+
+    def state(self) -> dict[str, Any]:
+        """All that decides what comes later, as a tree of arrays and plain values."""
+        return {
+            "submap": self.current().to_tree(),
+            "path_m": self._path_m,
+            "last_m": self._last_m,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a `state`."""
+        submap = Submap.from_tree(state["submap"])
+        self._index, self._first_frame = submap.index, submap.first_frame
+        self._frames = submap.frames
+        self._path_m, self._last_m = state["path_m"], state["last_m"]
+        self._fused.resume(submap.fused, submap.frames)
+        self._occupancy.resume(submap.occupancy)

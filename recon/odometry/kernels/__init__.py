@@ -1,0 +1,1 @@
+"""Compiled loops of bundle adjustment, with a reference implementation in numpy."""

@@ -1,0 +1,293 @@
+"""Adapter of kiss-icp: arrays in, arrays out, its exceptions converted to ours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from kiss_icp.config import KISSConfig
+from kiss_icp.config.config import (
+    AdaptiveThresholdConfig,
+    DataConfig,
+    MappingConfig,
+    RegistrationConfig,
+)
+from kiss_icp.kiss_icp import KissICP
+from numpy.typing import NDArray
+
+from recon.core.errors import RegistrationError
+from recon.core.geometry.se3 import angle_rad, orthonormalise
+from recon.core.values.arrays import Float64
+
+
+@dataclass(frozen=True)
+class KissIcpOptions:
+    """All parameters of kiss-icp.
+
+    Attributes:
+        max_range_m: Points farther from the sensor are dropped, and the map is clipped there.
+        source_range_m: Points farther away are added to the map, but not used for alignment.
+        voxel_m: Voxel size of the map.
+        points_per_voxel: Maximum number of points per voxel of the map.
+        iterations: Maximum number of ICP iterations.
+        convergence: Step length below which ICP has converged.
+        initial_threshold_m: Initial value of the adaptive threshold.
+        min_motion_m: Deviations from the motion model below this do not change the adaptive
+            threshold.
+    """
+
+    max_range_m: float
+    source_range_m: float
+    voxel_m: float
+    points_per_voxel: int = 20
+    iterations: int = 500
+    convergence: float = 1e-4
+    initial_threshold_m: float = 2.0
+    min_motion_m: float = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class IcpAlignment:
+    """Result of ICP for one frame.
+
+    Attributes:
+        T_world_camera: float64 (4, 4), the aligned pose.
+        source: float64 (N, 3), the points used for alignment, camera axes.
+    """
+
+    T_world_camera: Float64
+    source: Float64
+
+
+class KissIcp:
+    """kiss-icp and its local map.
+
+    Points are in OpenCV's camera axes, poses are those of the camera. It runs in one thread, so
+    that sums have a fixed order and equal input gives equal output.
+
+    Args:
+        options: All parameters of kiss-icp.
+
+    Raises:
+        RegistrationError: kiss-icp rejects the options.
+    """
+
+    def __init__(self, options: KissIcpOptions) -> None:
+        self._options = options
+        with _our_errors():
+            self._icp = _RangedKissIcp(_config(options), options)
+
+    def register(self, xyz_camera: NDArray[np.floating]) -> IcpAlignment:
+        """Register a frame with kiss-icp's own motion model, threshold and map update.
+
+        Args:
+            xyz_camera: (N, 3), metres, finite; not empty.
+
+        Raises:
+            RegistrationError: There are no points, or kiss-icp fails.
+        """
+        points = _points(xyz_camera)
+        with _our_errors():
+            _, source = self._icp.register_frame(points, np.zeros(0))
+        return IcpAlignment(_pose(self._icp.last_pose), np.array(source))
+
+    def align(
+        self,
+        xyz_camera: NDArray[np.floating],
+        T_world_guess: NDArray[np.floating],
+        threshold_m: float,
+    ) -> IcpAlignment:
+        """Align a frame to the map without changing it; the caller may reject the result.
+
+        Args:
+            xyz_camera: (N, 3), metres, finite; not empty.
+            T_world_guess: (4, 4), initial guess of the camera's pose.
+            threshold_m: Scale of the robust kernel; correspondences are at most three times as far.
+
+        Raises:
+            RegistrationError: There are no points, or kiss-icp fails.
+        """
+        points = _points(xyz_camera)
+        guess = _pose(T_world_guess)
+        with _our_errors():
+            source, _ = self._icp.voxelize(self._icp.clip(points))
+            pose = self._icp.align(source, guess, threshold_m)
+        return IcpAlignment(_pose(pose), np.array(source))
+
+    def update(
+        self, xyz_camera: NDArray[np.floating], T_world_camera: NDArray[np.floating]
+    ) -> None:
+        """Add a frame to the map at its final pose.
+
+        Raises:
+            RegistrationError: There are no points, or kiss-icp fails.
+        """
+        points = _points(xyz_camera)
+        pose = _pose(T_world_camera)
+        with _our_errors():
+            _, frame = self._icp.voxelize(self._icp.clip(points))
+            self._icp.settle(frame, pose)
+
+    def map_points(self) -> Float64:
+        """float64 (M, 3), the points of the local map, world axes, in ascending order."""
+        with _our_errors():
+            points = np.array(self._icp.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3)
+        # The order of kiss-icp's hash map depends on its history; sorted order does not.
+        return points[np.lexsort(points.T[::-1])]
+
+    def state(self) -> dict[str, Any]:
+        """Everything that later results depend on, as arrays and plain values."""
+        icp = self._icp
+        return {
+            "points": np.array(icp.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3),
+            "last_pose": np.array(icp.last_pose),
+            "last_delta": np.array(icp.last_delta),
+            "threshold": icp.adaptive_threshold.state(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a `state` of the same options.
+
+        Raises:
+            RegistrationError: The state is damaged.
+        """
+        poses = [state[name] for name in ("last_pose", "last_delta")]
+        for pose in poses:
+            _pose(pose)
+        with _our_errors():
+            self._icp = _RangedKissIcp(_config(self._options), self._options)
+            if len(state["points"]):
+                self._icp.local_map.add_points(_points(state["points"]))
+        self._icp.last_pose, self._icp.last_delta = poses
+        self._icp.adaptive_threshold.restore(state["threshold"])
+
+
+class _AdaptiveThreshold:
+    """kiss-icp's adaptive threshold: rms error of the motion model. The state of its own is hidden.
+
+    Ref:
+        Vizzo et al., "KISS-ICP: in defense of point-to-point ICP", RA-L 2023, section III-C.
+    """
+
+    def __init__(self, options: KissIcpOptions) -> None:
+        self._max_range_m = options.max_range_m
+        self._min_motion_m = options.min_motion_m
+        self._sum_m2 = options.initial_threshold_m**2
+        self._count = 1
+
+    def get_threshold(self) -> float:
+        """Root mean square of the deviations so far, metres."""
+        return math.sqrt(self._sum_m2 / self._count)
+
+    def update_model_deviation(self, model_deviation: Float64) -> None:
+        """Count one more deviation, a transform (4, 4)."""
+        turn_m = 2.0 * self._max_range_m * math.sin(0.5 * float(angle_rad(model_deviation)))
+        error_m = turn_m + float(np.linalg.norm(model_deviation[:3, 3]))
+        if error_m > self._min_motion_m:
+            self._sum_m2 += error_m**2
+            self._count += 1
+
+    def state(self) -> list[float]:
+        """Sum of the squared deviations, and their number."""
+        return [self._sum_m2, self._count]
+
+    def restore(self, state: list[float]) -> None:
+        """Continue from a `state`."""
+        sum_m2, count = state
+        if not (math.isfinite(sum_m2) and sum_m2 >= 0 and count >= 1):
+            raise RegistrationError("threshold of ICP is damaged", got=state)
+        self._sum_m2, self._count = float(sum_m2), int(count)
+
+
+class _RangedKissIcp(KissICP):  # type: ignore[misc]
+    """kiss-icp with a shorter range for alignment than for the map, and with separate steps."""
+
+    def __init__(self, config: KISSConfig, options: KissIcpOptions) -> None:
+        super().__init__(config)
+        self.last_pose: Float64 = np.eye(4)
+        self.adaptive_threshold = _AdaptiveThreshold(options)
+        self._source_range_m = options.source_range_m
+
+    def voxelize(self, iframe: Float64) -> tuple[Float64, Float64]:
+        """Source and map points; source points near the map's edge would bias the alignment."""
+        source, frame = super().voxelize(iframe)
+        near = np.linalg.norm(source, axis=1) <= self._source_range_m
+        return source[near], frame
+
+    def clip(self, points: Float64) -> Float64:
+        """Points within range."""
+        clipped: Float64 = self.preprocessor.preprocess(points, np.zeros(0), np.eye(4))
+        return clipped
+
+    def align(self, source: Float64, guess: Float64, threshold_m: float) -> Float64:
+        """Pose of a source in the map; the guess if there is nothing to align."""
+        # The guess enters where kiss-icp's motion model does: as last pose times last delta.
+        self.last_delta = orthonormalise(np.linalg.inv(self.last_pose) @ guess)
+        if not len(source) or self.local_map.empty():
+            return guess
+        pose: Float64 = self.registration.align_points_to_map(
+            points=source,
+            voxel_map=self.local_map,
+            initial_guess=orthonormalise(self.last_pose @ self.last_delta),
+            max_correspondance_distance=3 * threshold_m,
+            kernel=threshold_m,
+        )
+        return pose
+
+    def settle(self, frame: Float64, pose: Float64) -> None:
+        """Accept a pose and add its frame to the map."""
+        self.last_delta = orthonormalise(np.linalg.inv(self.last_pose) @ pose)
+        self.last_pose = pose
+        self.local_map.update(frame, pose)
+
+
+def _config(options: KissIcpOptions) -> KISSConfig:
+    """kiss-icp's configuration; ``model_construct`` ignores environment variables."""
+    return KISSConfig.model_construct(
+        out_dir="",
+        data=DataConfig(max_range=options.max_range_m, min_range=0.0, deskew=False),
+        registration=RegistrationConfig(
+            max_num_iterations=options.iterations,
+            convergence_criterion=options.convergence,
+            max_num_threads=1,
+        ),
+        mapping=MappingConfig(
+            voxel_size=options.voxel_m, max_points_per_voxel=options.points_per_voxel
+        ),
+        adaptive_threshold=AdaptiveThresholdConfig(
+            fixed_threshold=None,
+            initial_threshold=options.initial_threshold_m,
+            min_motion_th=options.min_motion_m,
+        ),
+    )
+
+
+def _points(xyz: NDArray[np.floating]) -> Float64:
+    """Check points and make a writable float64 copy (kiss-icp rejects read-only arrays)."""
+    points = np.array(xyz, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        # kiss-icp accepts an empty frame silently, but changes its pose.
+        raise RegistrationError("no points to register", got=points.shape, expected="(N, 3)")
+    if not np.isfinite(points).all():
+        raise RegistrationError("points to register are not finite")
+    return points
+
+
+def _pose(T: NDArray[np.floating]) -> Float64:
+    """A writable orthonormal copy: kiss-icp aborts the process if the rotation is not."""
+    pose = np.array(T, dtype=np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise RegistrationError("pose for ICP is not a finite 4x4 matrix", got=pose.shape)
+    return orthonormalise(pose)
+
+
+@contextmanager
+def _our_errors() -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, TypeError, RuntimeError, MemoryError, ArithmeticError) as error:
+        raise RegistrationError("kiss-icp failed", got=str(error)) from error

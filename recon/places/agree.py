@@ -1,0 +1,63 @@
+"""Which loops are confirmed by neighbouring loops."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final, TypeAlias
+
+import numpy as np
+
+from recon.core.geometry.se3 import invert
+from recon.core.values.arrays import Float64
+from recon.places.drift import Drift, drift_over, is_possible
+from recon.places.settings import LoopSettings
+from recon.places.verify import Loop
+
+Poses: TypeAlias = Mapping[int, tuple[Float64, float]]
+"""For each keyframe its pose by odometry, and the path up to it."""
+
+LOOP_SIGMAS: Final = Drift(0.3, np.deg2rad(1.0))
+"""Standard deviation of a verified loop, added to the drift: small, but never zero."""
+_MAJORITY: Final = 2  # keyframes that confirm a loop, for each that contradicts it
+
+
+def agreeing_loops(loops: Sequence[Loop], poses: Poses, settings: LoopSettings) -> list[Loop]:
+    """The loops that enough others confirm, and few contradict.
+
+    Two loops and the odometry between their ends form a cycle that must close within the drift
+    over its two odometry sections. False loops would have to be wrong in the same way several
+    times. Where a row of similar houses makes them so, right loops nearby contradict them: without
+    a clear majority none is accepted.
+
+    Args:
+        loops: Verified loops.
+        poses: For each keyframe of a loop its pose by odometry, and the path up to it.
+        settings: How near neighbours are, and how many must agree.
+    """
+    paths_m = np.array([(poses[loop.first][1], poses[loop.last][1]) for loop in loops])
+    agreeing = []
+    for number, loop in enumerate(loops):
+        firsts_m, lasts_m = np.abs(paths_m - paths_m[number]).T
+        near = np.flatnonzero(lasts_m <= settings.agree_m)
+        rings = {k: _closes(loop, loops[k], poses, settings) for k in near.tolist()}
+        against = {loops[k].last for k, closes in rings.items() if not closes}
+        # Loops to elsewhere on the path may contradict, but over that distance agree too easily.
+        same = {loops[k].last for k, closes in rings.items() if firsts_m[k] <= settings.agree_m}
+        if len(same - against) >= max(settings.min_agreeing, _MAJORITY * len(against)):
+            agreeing.append(loop)
+    return agreeing
+
+
+def _closes(one: Loop, other: Loop, poses: Poses, settings: LoopSettings) -> bool:
+    """Whether two loops agree within the drift of the odometry between them."""
+    T_lasts, lasts_m = _between(one.last, other.last, poses)
+    T_firsts, firsts_m = _between(one.first, other.first, poses)
+    ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
+    drift = drift_over(lasts_m + firsts_m, settings.drift)
+    return is_possible(ring, drift, LOOP_SIGMAS, settings.drift)
+
+
+def _between(first: int, last: int, poses: Poses) -> tuple[Float64, float]:
+    """``T_first_last`` by odometry, and the path between the two."""
+    (T_world_first, from_m), (T_world_last, to_m) = poses[first], poses[last]
+    return invert(T_world_first) @ T_world_last, abs(to_m - from_m)

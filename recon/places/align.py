@@ -1,0 +1,178 @@
+"""The motion between two stereo frames from points that both see, symmetric in the two."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.geometry.projection import project
+from recon.core.geometry.se3 import apply, as_transform, invert, make_transform, step_jacobian
+from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import Bool, Float64
+from recon.places.settings import VerifySettings
+
+_STEPS = 15
+_CAUCHY_SIGMAS = 2.0
+_SHARED = 0.5  # both directions see the same matches, so together they count once
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Matched points as one frame sees them.
+
+    Attributes:
+        uvd: float64 (N, 3), column, row, disparity.
+        xyz: float64 (N, 3), the same points in camera axes.
+    """
+
+    uvd: Float64
+    xyz: Float64
+
+    def select(self, rows: NDArray[np.bool_]) -> Seen:
+        """Some of the points."""
+        return Seen(self.uvd[rows], self.xyz[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A motion between two frames.
+
+    Attributes:
+        T_first_last: float64 (4, 4).
+        agree: bool (N,), matches that agree with it in both views.
+        information: float64 (6, 6) of a step (translation in metres, rotation vector in radians)
+            in the axes of the last frame.
+    """
+
+    T_first_last: Float64
+    agree: Bool
+    information: Float64
+
+
+def locate(
+    points: Float64, uv: Float64, camera: RectifiedCamera, settings: VerifySettings
+) -> Float64 | None:
+    """Pose of a camera that sees known points, ``T_points_camera``; None = too few agree.
+
+    Ref:
+        Fischler and Bolles, "Random sample consensus", CACM 1981.
+    """
+    if len(points) < settings.min_inliers:
+        return None
+    found, rotation, translation, inliers = cv2.solvePnPRansac(
+        points,
+        uv,
+        camera.matrix,
+        None,
+        iterationsCount=settings.iterations,
+        reprojectionError=settings.reprojection_px,
+        confidence=0.999,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not found or inliers is None or len(inliers) < settings.min_inliers:
+        return None
+    among = inliers.reshape(-1)
+    # RANSAC's own pose is a closed-form fit that one far point can throw off: refit to the set.
+    rotation, translation = cv2.solvePnPRefineLM(
+        points[among], uv[among], camera.matrix, None, *_start(points, uv, among, camera)
+    )
+    T = make_transform(cv2.Rodrigues(rotation)[0], translation)
+    return invert(T) if np.isfinite(T).all() else None
+
+
+def refine(
+    first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCamera, s: VerifySettings
+) -> Alignment:
+    """Fit the motion to columns, rows and disparities in both frames, with Cauchy weights.
+
+    Args:
+        first: The matches in the earlier frame.
+        last: The same in the later frame.
+        T_first_last: float64 (4, 4), initial motion.
+        camera: Of both frames.
+        s: Standard deviations, and the inlier limit.
+    """
+    T = T_first_last
+    for _ in range(_STEPS):
+        H, g = _normal_equations(first, last, T, camera, s)
+        step = np.linalg.solve(H + 1e-9 * np.eye(6), -g)
+        T = T @ as_transform(step)
+        if np.linalg.norm(step) < 1e-6:
+            break
+    H, _ = _normal_equations(first, last, T, camera, s)
+    return Alignment(T, agreement(first, last, T, camera, s), _SHARED * H)
+
+
+def agreement(
+    first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCamera, s: VerifySettings
+) -> Bool:
+    """bool (N,), matches whose reprojection error is within the limit in both frames."""
+    agree = np.ones(len(first.xyz), np.bool_)
+    for T, points, seen in (
+        (T_first_last, last.xyz, first.uvd),
+        (invert(T_first_last), first.xyz, last.uvd),
+    ):
+        u, v, _ = project(apply(T, points), camera)
+        # A point behind the camera has a NaN error, which compares as False.
+        agree &= np.hypot(u - seen[:, 0], v - seen[:, 1]) <= s.reprojection_px
+    return agree
+
+
+def _start(
+    points: Float64, uv: Float64, among: NDArray[np.int32], camera: RectifiedCamera
+) -> tuple[Float64, Float64]:
+    """An initial pose from the inliers."""
+    _, rotation, translation = cv2.solvePnP(
+        points[among], uv[among], camera.matrix, None, flags=cv2.SOLVEPNP_SQPNP
+    )
+    return rotation, translation
+
+
+def _normal_equations(
+    first: Seen, last: Seen, T: Float64, camera: RectifiedCamera, s: VerifySettings
+) -> tuple[Float64, Float64]:
+    """Gauss-Newton's matrix (6, 6) and gradient (6,) for a step in the axes of ``last``."""
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    # Points of the last frame, seen by the first: they move with the step.
+    moved = apply(T, last.xyz)
+    turn = T[:3, :3] @ step_jacobian(last.xyz)
+    # Points of the first frame, seen by the last: they move against it.
+    back = apply(invert(T), first.xyz)
+    for xyz, d_xyz, seen in ((moved, turn, first.uvd), (back, -step_jacobian(back), last.uvd)):
+        r, J = _residuals(xyz, d_xyz, seen, camera, s)
+        weight = 1.0 / (1.0 + np.einsum("nk,nk->n", r, r) / _CAUCHY_SIGMAS**2)
+        H += np.einsum("nki,n,nkj->ij", J, weight, J)
+        g += np.einsum("nki,n,nk->i", J, weight, r)
+    return H, g
+
+
+def _residuals(
+    xyz: Float64, d_xyz: Float64, seen: Float64, camera: RectifiedCamera, s: VerifySettings
+) -> tuple[Float64, Float64]:
+    """Whitened residuals (N, 3) and their derivatives (N, 3, 6); 0 for points behind a camera."""
+    sigma = np.array([s.sigma_uv_px, s.sigma_uv_px, s.sigma_d_px])
+    front = xyz[:, 2] > 0.1
+    z = np.where(front, xyz[:, 2], 1.0)
+    f, b = camera.focal_px, camera.baseline_m
+    predicted = np.stack(
+        [
+            f * xyz[:, 0] / z + camera.cx_px,
+            f * xyz[:, 1] / z + camera.cy_px,
+            f * b / z - camera.doffs_px,
+        ],
+        axis=1,
+    )
+    J = np.zeros((len(xyz), 3, 3))
+    J[:, 0, 0] = J[:, 1, 1] = f / z
+    J[:, 0, 2], J[:, 1, 2], J[:, 2, 2] = (
+        -f * xyz[:, 0] / z**2,
+        -f * xyz[:, 1] / z**2,
+        -f * b / z**2,
+    )
+    J = J @ d_xyz / sigma[:, None]
+    return np.where(front[:, None], (predicted - seen) / sigma, 0.0), np.where(
+        front[:, None, None], J, 0.0
+    )

@@ -1,0 +1,190 @@
+"""Detection of loops during a drive."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final, Protocol, runtime_checkable
+
+import numpy as np
+
+from recon.core.geometry.se3 import angle_rad, invert
+from recon.core.values import Disparity, RectifiedPair
+from recon.core.values.arrays import Float64
+from recon.places.agree import LOOP_SIGMAS, agreeing_loops
+from recon.places.drift import drift_over, is_possible
+from recon.places.keyframe import Keyframe, make_keyframe, words_of
+from recon.places.places import Place, Places
+from recon.places.settings import LoopSettings
+from recon.places.verify import Loop, verify
+
+CONTRADICTED: Final = "odometry contradicts"
+"""Why a loop is refused that differs from odometry by more than its drift explains."""
+
+
+@dataclass(frozen=True, eq=False)
+class StoredKeyframe:
+    """A keyframe with its pose and the result of its search for loops.
+
+    Attributes:
+        keyframe: Features and coarse disparities.
+        T_world_camera: float64 (4, 4), by odometry.
+        path_m: Path up to it, by `doubtful_path`.
+        loops: Verified loops that end in it.
+        refused: Why other candidates were refused.
+    """
+
+    keyframe: Keyframe
+    T_world_camera: Float64
+    path_m: float
+    loops: tuple[Loop, ...] = ()
+    refused: tuple[str, ...] = ()
+
+
+@runtime_checkable
+class KeyframeStore(Protocol):
+    """Where the detector keeps keyframes, in memory or on disk."""
+
+    def put(self, stored: StoredKeyframe) -> None:
+        """Keep a keyframe."""
+        ...
+
+    def get(self, frame: int) -> StoredKeyframe:
+        """The keyframe of a frame, as it was put."""
+        ...
+
+
+class KeyframeMemory:
+    """Keeps keyframes in memory, for short drives."""
+
+    def __init__(self) -> None:
+        self._kept: dict[int, StoredKeyframe] = {}
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __iter__(self) -> Iterator[StoredKeyframe]:
+        return iter(self._kept.values())
+
+    def put(self, stored: StoredKeyframe) -> None:
+        """Keep a keyframe."""
+        self._kept[stored.keyframe.frame] = stored
+
+    def get(self, frame: int) -> StoredKeyframe:
+        """The keyframe of a frame."""
+        return self._kept[frame]
+
+
+class LoopDetector:
+    """Searches the earlier keyframes of a drive for the place of each new one.
+
+    It keeps the pose and some kilobytes of words of each keyframe; the rest goes to the store. The
+    same frames in the same order give the same loops.
+
+    Args:
+        settings: Of loop closure.
+        store: Where keyframes go.
+    """
+
+    def __init__(self, settings: LoopSettings, store: KeyframeStore) -> None:
+        self._settings = settings
+        self._store = store
+        self._places = Places()
+        self.loops: list[Loop] = []
+        self.refused: Counter[str] = Counter()
+
+    def __len__(self) -> int:
+        """Number of keyframes."""
+        return len(self._places)
+
+    def add(
+        self,
+        frame: int,
+        pair: RectifiedPair,
+        disparity: Disparity,
+        T_world_camera: Float64,
+        *,
+        path_m: float,
+        measured: bool = True,
+    ) -> tuple[Loop, ...]:
+        """Add the next frame; return its verified loops, which ``loops`` keeps as well.
+
+        Args:
+            frame: Its number.
+            pair: Its pictures.
+            disparity: Of its left view.
+            T_world_camera: float64 (4, 4), by odometry.
+            path_m: Path up to it, by `doubtful_path`.
+            measured: False where the pose is extrapolated; such a frame is no keyframe.
+        """
+        if not measured or not self._is_due(T_world_camera):
+            return ()
+        keyframe = make_keyframe(frame, pair, disparity, self._settings.keyframes)
+        stored = self._compared(StoredKeyframe(keyframe, T_world_camera, path_m), pair)
+        self._store.put(stored)
+        self.restore(stored)
+        return stored.loops
+
+    def restore(self, stored: StoredKeyframe) -> None:
+        """Add a keyframe of an interrupted drive, with its loops."""
+        self._places.add(self._place(stored))
+        self.loops.extend(stored.loops)
+        self.refused.update(stored.refused)
+
+    def agreeing(self) -> list[Loop]:
+        """The loops that enough loops of other keyframes confirm."""
+        places = self._places
+        known = zip(places.frames, places.T_world_camera, places.path_m.tolist(), strict=True)
+        poses = {frame: (T, path_m) for frame, T, path_m in known}
+        return agreeing_loops(self.loops, poses, self._settings)
+
+    def _place(self, stored: StoredKeyframe) -> Place:
+        words = words_of(stored.keyframe.descriptors, self._settings.candidates)
+        return Place(stored.keyframe.frame, stored.T_world_camera, stored.path_m, words)
+
+    def _is_due(self, T_world_camera: Float64) -> bool:
+        if not len(self._places):
+            return True
+        T = invert(self._places.T_world_camera[-1]) @ T_world_camera
+        settings = self._settings.keyframes
+        moved = float(np.linalg.norm(T[:3, 3])) >= settings.distance_m
+        return moved or float(np.rad2deg(angle_rad(T))) >= settings.angle_deg
+
+    def _compared(self, new: StoredKeyframe, pair: RectifiedPair) -> StoredKeyframe:
+        """The keyframe with the loop to the first candidate that is verified, if any is."""
+        place, refused = self._place(new), []
+        for old in self._candidates(place):
+            known = self._store.get(self._places.frames[old]).keyframe
+            verdict = verify(known, new.keyframe, pair.camera, self._settings.verify)
+            if verdict.loop is None:
+                refused.append(verdict.refused)
+            elif self._possible(old, place, verdict.loop):
+                return replace(new, loops=(verdict.loop,), refused=tuple(refused))
+            else:
+                refused.append(CONTRADICTED)
+        return replace(new, refused=tuple(refused))
+
+    def _candidates(self, place: Place) -> list[int]:
+        """Numbers of old keyframes that may be near, most similar first."""
+        candidates = self._settings.candidates
+        near = self._places.near(place, self._settings)
+        if not near.any():
+            return []
+        likeness = self._places.likeness(place)
+        worth = np.flatnonzero(near & (likeness >= candidates.min_likeness * likeness[-1]))
+        chosen: list[int] = []
+        path_m = self._places.path_m
+        for number in worth[np.argsort(-likeness[worth], kind="stable")].tolist():
+            gaps_m = np.abs(path_m[chosen] - path_m[number])
+            if gaps_m.min(initial=np.inf) >= candidates.apart_m:
+                chosen.append(number)
+            if len(chosen) == candidates.verified:
+                break
+        return chosen
+
+    def _possible(self, old: int, new: Place, loop: Loop) -> bool:
+        """Whether drift explains the difference between a loop and odometry."""
+        T = invert(self._places.T_world_camera[old]) @ new.T_world_camera
+        drift = drift_over(new.path_m - float(self._places.path_m[old]), self._settings.drift)
+        return is_possible(invert(T) @ loop.T_first_last, drift, LOOP_SIGMAS, self._settings.drift)

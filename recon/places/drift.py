@@ -1,0 +1,84 @@
+"""A model of how odometry drifts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.geometry.se3 import angle_rad, invert
+from recon.core.values.arrays import Bool, Float64
+from recon.places.settings import DriftSettings
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Standard deviations of a motion by odometry.
+
+    Attributes:
+        position_m: Of its translation.
+        angle_rad: Of its rotation.
+    """
+
+    position_m: float
+    angle_rad: float
+
+
+def doubtful_path(T_world_camera: Float64, measured: Bool, settings: DriftSettings) -> Float64:
+    """Length of the path up to each frame, in which extrapolated metres count several times.
+
+    Args:
+        T_world_camera: float64 (N, 4, 4).
+        measured: bool (N,), False where a pose is extrapolated.
+        settings: How much such frames count.
+
+    Returns:
+        float64 (N,), metres.
+    """
+    step_m = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
+    lost = ~measured[1:]
+    step_m = np.where(lost, settings.lost_factor * step_m + settings.lost_m, step_m)
+    return np.concatenate([np.zeros(min(1, len(measured))), np.cumsum(step_m)])
+
+
+def drift_over(path_m: float, settings: DriftSettings) -> Drift:
+    """Drift over a path.
+
+    The scale error is constant and the heading a random walk. The position error of the latter is
+    that of a straight drive, the worst case: ``turn·√(path³/3)``.
+    """
+    position_m, turn_rad = spread_over(np.array(path_m), settings)
+    return Drift(float(position_m), float(turn_rad))
+
+
+def spread_over(path_m: Float64, settings: DriftSettings) -> tuple[Float64, Float64]:
+    """`drift_over` of many paths (N,): standard deviations of positions and of rotations."""
+    turn = math.radians(settings.turn_deg)
+    position_m = np.hypot(settings.share * path_m, turn * np.sqrt(path_m**3 / 3.0))
+    return position_m, turn * np.sqrt(path_m)
+
+
+def is_possible(
+    T_difference: NDArray[np.float64], drift: Drift, floor: Drift, settings: DriftSettings
+) -> bool:
+    """Whether a motion differs from odometry's by no more than drift explains.
+
+    Args:
+        T_difference: float64 (4, 4), inverse of odometry's motion times the other one.
+        drift: Of odometry over that motion.
+        floor: Standard deviations of the other motion.
+        settings: How many standard deviations are possible.
+    """
+    off_m = float(np.linalg.norm(T_difference[:3, 3]))
+    off_rad = float(angle_rad(T_difference))
+    sigma_m = math.hypot(drift.position_m, floor.position_m)
+    sigma_rad = math.hypot(drift.angle_rad, floor.angle_rad)
+    return off_m <= settings.sigmas * sigma_m and off_rad <= settings.sigmas * sigma_rad
+
+
+def motion(T_world_camera: Float64, first: int, last: int) -> Float64:
+    """``T_first_last`` (4, 4) of two poses of a stack."""
+    T: Float64 = invert(T_world_camera[first]) @ T_world_camera[last]
+    return T

@@ -1,0 +1,191 @@
+"""Pose graph optimisation: corrects a path so that its loops close."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.errors import RegistrationError
+from recon.core.geometry.interpolation import pose_between
+from recon.core.geometry.se3 import as_step, hat, invert, orthonormalise
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64
+from recon.places.drift import Drift, drift_over
+from recon.places.pose_graph import PoseEdge, optimise_poses
+from recon.places.settings import LoopSettings
+from recon.places.verify import Loop
+
+_EASING: Final = 10.0  # factor by which the tolerance of loops falls from round to round
+_KEPT: Final = 0.25  # least weight of a loop that is believed
+
+
+@dataclass(frozen=True, eq=False)
+class Closure:
+    """A path after loop closure.
+
+    Attributes:
+        trajectory: The corrected path; the same object where no loop is closed.
+        closed: The loops that are closed.
+        refused: The loops that the rest of the graph contradicts.
+    """
+
+    trajectory: Trajectory
+    closed: tuple[Loop, ...]
+    refused: tuple[Loop, ...]
+
+    def correction(self, odometry: Trajectory, frame: int) -> Float64:
+        """``T_corrected_world`` (4, 4) for what was mapped at a frame with the odometry's pose."""
+        T_new, T_old = (path.T_world_camera[frame] for path in (self.trajectory, odometry))
+        return orthonormalise(T_new @ invert(T_old))
+
+
+def close_loops(
+    trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop], settings: LoopSettings
+) -> Closure:
+    """Correct a path so that its loops close.
+
+    Nodes are spaced along the path; odometry edges link each to the next, loop edges link distant
+    ones. The optimiser may switch loops off. It starts with a tolerance that admits every loop and
+    tightens it step by step, so that a right loop is not refused because of the very drift that it
+    corrects. If the loops deform the odometry more than its drift explains, none is believed.
+
+    Args:
+        trajectory: By odometry.
+        path_m: float64 (N,), path up to each frame, by `doubtful_path`.
+        loops: Loops between frames of it.
+        settings: Nodes and tolerances.
+
+    Ref:
+        Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
+    """
+    if not loops:
+        return Closure(trajectory, (), ())
+    nodes = _nodes(path_m, settings)
+    steps = _odometry_edges(trajectory, path_m, nodes, settings)
+    ties = [_loop_edge(loop, trajectory, path_m, nodes, settings) for loop in loops]
+    try:
+        poses, weights = _solve(trajectory.T_world_camera[nodes], steps, ties, settings)
+    except RegistrationError:  # a map by odometry alone is better than none
+        return Closure(trajectory, (), tuple(loops))
+    bend_chi2 = float(np.mean([misfit(edge, poses) for edge in steps]))
+    kept = weights >= _KEPT
+    if bend_chi2 > settings.graph.max_bend_chi2 or not kept.any():
+        return Closure(trajectory, (), tuple(loops))
+    return Closure(
+        _bent(trajectory, path_m, nodes, poses),
+        tuple(loop for loop, keep in zip(loops, kept, strict=True) if keep),
+        tuple(loop for loop, keep in zip(loops, kept, strict=True) if not keep),
+    )
+
+
+def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
+    """Chi-square of an edge."""
+    T = invert(T_world_node[edge.first]) @ T_world_node[edge.last]
+    off = invert(edge.T_first_last) @ T
+    step = as_step(off)
+    return float(step @ edge.information @ step)
+
+
+def _nodes(path_m: Float64, settings: LoopSettings) -> NDArray[np.intp]:
+    """Frames at even distances along the path, including the first and the last."""
+    length = float(path_m[-1])
+    count = min(settings.graph.max_nodes, max(2, math.ceil(length / settings.graph.node_m) + 1))
+    marks = np.searchsorted(path_m, np.linspace(0.0, length, count))
+    return np.unique(np.concatenate([[0], marks, [len(path_m) - 1]]))
+
+
+def _solve(
+    start: Float64, steps: list[PoseEdge], ties: list[PoseEdge], settings: LoopSettings
+) -> tuple[Float64, Float64]:
+    """Poses of the nodes, and the weights of the loops."""
+    poses = start
+    worst = max(misfit(edge, poses) for edge in ties)
+    rounds = math.ceil(math.log(max(worst / settings.graph.max_chi2, 1.0), _EASING))
+    for k in range(rounds, -1, -1):
+        tolerance = settings.graph.max_chi2 * _EASING**k
+        poses, weights = optimise_poses(poses, [*steps, *ties], tolerance)
+    return poses, weights[len(steps) :]
+
+
+def _odometry_edges(
+    trajectory: Trajectory, path_m: Float64, nodes: NDArray[np.intp], settings: LoopSettings
+) -> list[PoseEdge]:
+    poses = trajectory.T_world_camera
+    edges = []
+    for k, (first, last) in enumerate(pairwise(nodes)):
+        # Where the camera stands still, 0.1 m keeps the information finite.
+        drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1), settings.drift)
+        T = invert(poses[first]) @ poses[last]
+        edges.append(PoseEdge(k, k + 1, T, _information(drift)))
+    return edges
+
+
+def _loop_edge(
+    loop: Loop,
+    trajectory: Trajectory,
+    path_m: Float64,
+    nodes: NDArray[np.intp],
+    settings: LoopSettings,
+) -> PoseEdge:
+    """The loop as an edge between the nodes nearest to its frames."""
+    poses = trajectory.T_world_camera
+    first, last = (_nearest_node(path_m, nodes, frame) for frame in (loop.first, loop.last))
+    to_first = invert(poses[nodes[first]]) @ poses[loop.first]
+    to_last = invert(poses[loop.last]) @ poses[nodes[last]]
+    way_m = abs(float(path_m[nodes[first]] - path_m[loop.first]))
+    way_m += abs(float(path_m[nodes[last]] - path_m[loop.last]))
+    drift, graph = drift_over(way_m, settings.drift), settings.graph
+    apart_m = float(np.linalg.norm(loop.T_first_last[:3, 3]))
+    floor = Drift(
+        math.hypot(drift.position_m, graph.loop_sigma_m, graph.loop_share * apart_m),
+        math.hypot(drift.angle_rad, math.radians(graph.loop_sigma_deg)),
+    )
+    covariance = np.linalg.inv(_turned(loop.information, to_last)) + np.linalg.inv(
+        _information(floor)
+    )
+    T = orthonormalise(to_first @ loop.T_first_last @ to_last)
+    return PoseEdge(first, last, T, np.linalg.inv(covariance), doubtful=True)
+
+
+def _nearest_node(path_m: Float64, nodes: NDArray[np.intp], frame: int) -> int:
+    return int(np.argmin(np.abs(path_m[nodes] - path_m[frame])))
+
+
+def _information(drift: Drift) -> Float64:
+    """Information (6, 6) of a step with these standard deviations."""
+    return np.diag([drift.position_m**-2] * 3 + [drift.angle_rad**-2] * 3)
+
+
+def _turned(information: Float64, T_frame_node: Float64) -> Float64:
+    """Information of a step in a node's axes, from that in a frame's axes near it."""
+    R, t = T_frame_node[:3, :3], T_frame_node[:3, 3]
+    adjoint = np.zeros((6, 6))
+    adjoint[:3, :3] = adjoint[3:, 3:] = R
+    adjoint[:3, 3:] = hat(t) @ R
+    turned: Float64 = adjoint.T @ information @ adjoint
+    return turned
+
+
+def _bent(
+    trajectory: Trajectory, path_m: Float64, nodes: NDArray[np.intp], T_world_node: Float64
+) -> Trajectory:
+    """Every pose moved with the nodes before and after it, interpolated by distance."""
+    old = trajectory.T_world_camera
+    before = np.clip(np.searchsorted(nodes, np.arange(len(old)), side="right") - 1, 0, None)
+    before = np.minimum(before, len(nodes) - 2)
+    new = np.empty_like(old)
+    for frame, k in enumerate(before):
+        a, b = nodes[k], nodes[k + 1]
+        from_a = T_world_node[k] @ invert(old[a]) @ old[frame]
+        from_b = T_world_node[k + 1] @ invert(old[b]) @ old[frame]
+        span = float(path_m[b] - path_m[a])
+        share = float(path_m[frame] - path_m[a]) / span if span > 0 else 0.0
+        new[frame] = orthonormalise(pose_between(from_a, from_b, share))
+    new[0] = old[0]
+    return Trajectory(new, trajectory.timestamps_s)

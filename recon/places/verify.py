@@ -1,0 +1,232 @@
+"""Geometric verification of loops."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from recon.core.geometry.projection import project
+from recon.core.geometry.se3 import angle_rad, apply, invert
+from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import Float32, Float64, UInt8, freeze
+from recon.places.align import Alignment, Seen, agreement, locate, refine
+from recon.places.keyframe import Keyframe, points_of
+from recon.places.settings import VerifySettings
+
+_CELLS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Two frames that show the same place, and the motion between them.
+
+    Attributes:
+        first: Number of the earlier frame.
+        last: Number of the later frame.
+        T_first_last: float64 (4, 4).
+        information: float64 (6, 6) of a step (translation in metres, rotation vector in radians)
+            in the axes of the later frame.
+        inliers: Matches that agree in both frames.
+        dense_share: Share of the coarse disparities that agree.
+    """
+
+    first: int
+    last: int
+    T_first_last: Float64
+    information: Float64
+    inliers: int
+    dense_share: float
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_first_last", np.float64, (4, 4))
+        freeze(self, "information", np.float64, (6, 6))
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """The result of a verification.
+
+    Attributes:
+        loop: The loop; None = refused.
+        refused: Why; "" where there is a loop.
+    """
+
+    loop: Loop | None
+    refused: str = ""
+
+
+def verify(
+    first: Keyframe, last: Keyframe, camera: RectifiedCamera, settings: VerifySettings
+) -> Verdict:
+    """Whether two keyframes show the same place.
+
+    Matches must be mutually best. The motions found in either direction must be inverse to each
+    other. The inliers must be many, a fair share of the matches, spread over both pictures, and
+    determine the motion in all directions. The coarse disparities must agree with it, too.
+    """
+    seen = match(first, last, camera, settings)
+    aligned = _aligned(*seen, camera, settings)
+    if isinstance(aligned, str):
+        return Verdict(None, aligned)
+    dense = dense_agreement(first, last, aligned.T_first_last, camera, settings)
+    if dense < settings.min_dense_share:
+        return Verdict(None, "surfaces differ")
+    inliers = int(aligned.agree.sum())
+    T = aligned.T_first_last
+    return Verdict(Loop(first.frame, last.frame, T, aligned.information, inliers, dense))
+
+
+def _aligned(
+    first: Seen, last: Seen, camera: RectifiedCamera, settings: VerifySettings
+) -> Alignment | str:
+    """The motion between the frames, or why it is not verified."""
+    T_there = locate(first.xyz, last.uvd[:, :2], camera, settings)
+    if T_there is None:
+        return "no common motion"
+    T_back = locate(last.xyz, first.uvd[:, :2], camera, settings)
+    if T_back is None:
+        return "no common motion"
+    if not _inverse(T_there, T_back, settings):
+        return "there and back differ"
+    agree = agreement(first, last, T_there, camera, settings)
+    among = (first.select(agree), last.select(agree))
+    if int(agree.sum()) < settings.min_inliers:
+        return "few inliers"
+    aligned = refine(*among, T_there, camera, settings)
+    return _weakness(*among, aligned, agree.size, camera, settings) or aligned
+
+
+def match(
+    first: Keyframe, last: Keyframe, camera: RectifiedCamera, settings: VerifySettings
+) -> tuple[Seen, Seen]:
+    """Features that are each other's best match and have a depth in both frames."""
+    ours, theirs = (np.isfinite(k.uvd[:, 2]) for k in (first, last))
+    pairs = _mutual(first.descriptors[ours], last.descriptors[theirs], settings.max_hamming)
+    uvds = (first.uvd[ours][pairs[:, 0]], last.uvd[theirs][pairs[:, 1]])
+    seen = [Seen(uvd.astype(np.float64), points_of(uvd, camera)) for uvd in uvds]
+    return seen[0], seen[1]
+
+
+def dense_agreement(
+    first: Keyframe,
+    last: Keyframe,
+    T_first_last: Float64,
+    camera: RectifiedCamera,
+    settings: VerifySettings,
+) -> float:
+    """Share of the coarse disparities of one frame that the other confirms, in the worse direction.
+
+    A smaller disparity than predicted means seeing through the other's surface: a contradiction. A
+    larger one means that something is in front of it, which does not count. 0 where the two frames
+    hardly overlap.
+    """
+    shares = (
+        _confirmed(last, first, T_first_last, camera, settings),
+        _confirmed(first, last, invert(T_first_last), camera, settings),
+    )
+    return min(shares)
+
+
+def _confirmed(
+    source: Keyframe,
+    target: Keyframe,
+    T_target_source: Float64,
+    camera: RectifiedCamera,
+    settings: VerifySettings,
+) -> float:
+    """Share of the source's coarse points that the target sees where they should be."""
+    uvd = _coarse_uvd(source, camera)
+    u, v, d = project(apply(T_target_source, points_of(uvd, camera)), camera)
+    step, half = _grid(target, camera)
+    off = _interpolated(target.coarse, (u - half) / step, (v - half) / step) - d
+    tolerance = settings.dense_tolerance_px + settings.dense_tolerance_share * np.abs(d)
+    with np.errstate(invalid="ignore"):
+        telling = off <= tolerance  # False for NaN, unknown in one of the frames
+    if int(telling.sum()) < settings.min_dense_points:
+        return 0.0
+    return float(np.mean(off[telling] >= -tolerance[telling]))
+
+
+def _interpolated(values: Float32, column: Float64, row: Float64) -> Float64:
+    """Values (N,) between samples; NaN beyond them, or where one of the four is unknown."""
+    rows, columns = values.shape
+    with np.errstate(invalid="ignore"):
+        inside = (column >= 0) & (column < columns - 1) & (row >= 0) & (row < rows - 1)
+    x, y = np.where(inside, column, 0.0), np.where(inside, row, 0.0)
+    i, j = y.astype(np.intp), x.astype(np.intp)
+    i1, j1 = np.minimum(i + 1, rows - 1), np.minimum(j + 1, columns - 1)
+    x, y = x - j, y - i
+    upper = (1 - x) * values[i, j] + x * values[i, j1]
+    lower = (1 - x) * values[i1, j] + x * values[i1, j1]
+    return np.where(inside, (1 - y) * upper + y * lower, np.nan)
+
+
+def _grid(keyframe: Keyframe, camera: RectifiedCamera) -> tuple[int, int]:
+    """Pixels between coarse samples, and the place of the first."""
+    rows = keyframe.coarse.shape[0]
+    step = max(1, round(camera.height_px / rows)) if rows else 1
+    return step, step // 2
+
+
+def _coarse_uvd(keyframe: Keyframe, camera: RectifiedCamera) -> Float64:
+    """Columns, rows and disparities (N, 3) of the coarse samples that have one."""
+    row, column = np.nonzero(keyframe.coarse + camera.doffs_px > 1.0)
+    step, half = _grid(keyframe, camera)
+    d = keyframe.coarse[row, column]
+    return np.column_stack([column * step + half, row * step + half, d]).astype(np.float64)
+
+
+def _mutual(ours: UInt8, theirs: UInt8, max_hamming: int) -> np.ndarray:
+    """Rows (M, 2) of descriptors that are each other's nearest."""
+    if not len(ours) or not len(theirs):
+        return np.zeros((0, 2), np.intp)
+    found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(ours, theirs)
+    pairs = [(m.queryIdx, m.trainIdx) for m in found if m.distance <= max_hamming]
+    return np.array(pairs, np.intp).reshape(-1, 2)
+
+
+def _inverse(T_there: Float64, T_back: Float64, settings: VerifySettings) -> bool:
+    """Whether the two poses are inverse to each other."""
+    around = T_there @ T_back
+    off_deg = float(np.rad2deg(angle_rad(around)))
+    off_m = float(np.linalg.norm(around[:3, 3]))
+    return off_m <= settings.both_ways_m and off_deg <= settings.both_ways_deg
+
+
+def _weakness(
+    first: Seen,
+    last: Seen,
+    aligned: Alignment,
+    matches: int,
+    camera: RectifiedCamera,
+    settings: VerifySettings,
+) -> str:
+    """Why the inliers are not enough; "" where they are."""
+    inliers = int(aligned.agree.sum())
+    if inliers < max(settings.min_inliers, settings.min_inlier_share * matches):
+        return "few inliers"
+    if min(_spread(seen.uvd[aligned.agree], camera) for seen in (first, last)) < (
+        settings.spread_cells
+    ):
+        return "inliers in one corner"
+    if _sigma_m(aligned.information) > settings.max_sigma_m:
+        return "motion not fixed"
+    return ""
+
+
+def _spread(uvd: Float64, camera: RectifiedCamera) -> int:
+    """Of 4 by 4 cells of the picture, how many hold a feature."""
+    column = np.clip(uvd[:, 0] * _CELLS / camera.width_px, 0, _CELLS - 1).astype(int)
+    row = np.clip(uvd[:, 1] * _CELLS / camera.height_px, 0, _CELLS - 1).astype(int)
+    return len(np.unique(row * _CELLS + column))
+
+
+def _sigma_m(information: Float64) -> float:
+    """Standard deviation of the translation in its worst direction; infinity where unknown."""
+    values = np.linalg.eigvalsh(information)
+    if values[0] <= 1e-9 * values[-1]:
+        return float("inf")
+    covariance = np.linalg.inv(information)[:3, :3]
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))

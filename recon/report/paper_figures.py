@@ -1,0 +1,151 @@
+"""Figures of the seed paper's experiments. All return PNG bytes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.values import Disparity, RectifiedCamera
+from recon.evaluation.paper.methods import ABSOLUTE, AS_PRINTED, CORRECTED, TITLES, PatchFigure
+from recon.report.canvas import (
+    BAD,
+    ESTIMATE,
+    FAINT,
+    HALF_IN,
+    INK,
+    TRUTH,
+    WIDE_IN,
+    new_figure,
+    style_plot,
+    to_png,
+    write_note,
+)
+from recon.report.colour import DISPARITY_SCALE, colour_values, value_range
+
+COLOURS: Final[Mapping[str, str]] = {CORRECTED: ESTIMATE, ABSOLUTE: TRUTH, AS_PRINTED: BAD}
+_SURFACE_COLUMNS: Final = 220
+_CURVE_SAMPLES: Final = 400
+_ELEVATION_DEG: Final = 55.0
+_AZIMUTH_DEG: Final = -72.0
+
+
+def surface_figure(disparity: Disparity) -> bytes:
+    """The disparity map as a surface over the image, height = disparity; gaps stay open.
+
+    Ref: Fig. 6 of the seed paper.
+    """
+    step = max(1, math.ceil(disparity.values.shape[1] / _SURFACE_COLUMNS))
+    height, width = disparity.values.shape
+    values = disparity.values[::step, ::step].astype(np.float64)
+    rows, columns = np.mgrid[0:height:step, 0:width:step]
+    limits = value_range(values)
+    colours = colour_values(values, DISPARITY_SCALE, limits)
+    figure = new_figure(HALF_IN, 5.2, layout=None)
+    axes: Any = figure.add_axes((0.02, 0.02, 0.9, 0.98), projection="3d")
+    axes.plot_surface(
+        columns,
+        rows,
+        np.clip(values, *limits),
+        facecolors=np.dstack([colours / 255.0, np.isfinite(values)]),  # gaps are transparent
+        rstride=1,
+        cstride=1,
+        linewidth=0,
+        antialiased=False,
+        shade=False,
+    )
+    _style_surface(axes, width, height)
+    return to_png(figure)
+
+
+def depth_curve_figure(
+    camera: RectifiedCamera, believed: RectifiedCamera | None, disparities_px: NDArray[Any]
+) -> bytes:
+    """Depth against disparity, with the true camera and with the focal length of Table 1.
+
+    Args:
+        camera: The true camera.
+        believed: The camera according to Table 1, or None.
+        disparities_px: Disparities that occur, of any shape; their range is shaded.
+
+    Ref: Fig. 24-26 of the seed paper.
+    """
+    last = float(camera.ndisp or np.nanmax(disparities_px, initial=1.0))
+    d = np.linspace(last / _CURVE_SAMPLES, last, _CURVE_SAMPLES)
+    figure = new_figure(HALF_IN, 4.2)
+    axes = figure.subplots()
+    axes.plot(
+        d,
+        depth_from_disparity(d, camera),
+        color=ESTIMATE,
+        linewidth=2.2,
+        label=f"Z = f·b / (d + doffs), f = {camera.focal_px:.7g} px, "
+        f"doffs = {camera.doffs_px:.7g} px",
+    )
+    if believed is not None:
+        label = f"as printed: Z = f·b / d, f = {believed.focal_px:.7g} px"
+        axes.plot(d, depth_from_disparity(d, believed), color=BAD, linewidth=2.2, label=label)
+    known = disparities_px[np.isfinite(disparities_px)]
+    if known.size:
+        low, high = np.percentile(known, (1.0, 99.0))
+        axes.axvspan(low, high, color=FAINT, alpha=0.13, linewidth=0, label="disparities found")
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    style_plot(axes, "disparity d (px)", "depth Z (m, logarithmic)")
+    figure.legend(loc="outside lower center", frameon=False, fontsize=9)
+    return to_png(figure)
+
+
+def patches_figure(patches: Mapping[str, Sequence[PatchFigure]], bad_px: float) -> bytes:
+    """Effect of the patch size: wrong pixels, mean error, pixels with a value."""
+    figure = new_figure(WIDE_IN, 3.8)
+    panels = (
+        (f"off by more than {bad_px:g} px (%)", "bad_percent"),
+        ("mean error (px)", "avgerr_px"),
+        ("pixels with a value (%)", "valid_percent"),
+    )
+    for axes, (label, name) in zip(figure.subplots(1, 3), panels, strict=True):
+        _plot_patches(axes, patches, name)
+        style_plot(axes, "patch (px)", label)
+        axes.set_ylim(bottom=0)
+    handles = [Line2D([], [], **_line(method), label=TITLES[method]) for method in patches]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+    return to_png(figure)
+
+
+def _plot_patches(axes: Axes, patches: Mapping[str, Sequence[PatchFigure]], name: str) -> None:
+    known = False
+    for method, figures in patches.items():
+        values = [getattr(figure, name) for figure in figures]
+        if any(value is not None and math.isfinite(value) for value in values):
+            sizes = [figure.patch_px for figure in figures]
+            axes.plot(sizes, values, **_line(method))
+            axes.set_xticks(sizes)
+            known = True
+    if not known:
+        write_note(axes, "no truth to compare with")
+
+
+def _line(method: str) -> dict[str, Any]:
+    """Line style of a method; dashed if it coincides with another line."""
+    # Both printed methods give a value to the same pixels.
+    dashes = "--" if method == AS_PRINTED else "-"
+    look = {"marker": "o", "markersize": 4, "linewidth": 1.6}
+    return {"color": COLOURS[method], "linestyle": dashes, **look}
+
+
+def _style_surface(axes: Any, width: int, height: int) -> None:
+    """View the surface like the image: row 0 is far and on top."""
+    axes.set_ylim(height, 0)
+    axes.set_box_aspect((1.0, height / width, 0.45), zoom=1.0)
+    axes.view_init(elev=_ELEVATION_DEG, azim=_AZIMUTH_DEG)
+    for axis, label in ((axes.xaxis, "column"), (axes.yaxis, "row"), (axes.zaxis, "disparity")):
+        axis.set_label_text(f"{label} (px)", color=INK)
+        axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
+        axis.set_tick_params(labelsize=8, colors=INK)

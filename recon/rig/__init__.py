@@ -1,0 +1,1 @@
+"""Two cameras as one instrument: boards, calibration, audit, capture."""

@@ -1,0 +1,193 @@
+"""Row errors of a rectified pair, and the small rotation that corrects them.
+
+Two of the right camera's three rotations move rows: pitch moves all rows alike, roll in proportion
+to the column. Yaw moves columns, which cannot be told from disparity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
+from recon.core.values.arrays import Bool, Float32, Float64
+
+_NEAR_PX: Final = 1.5
+"""Features with a smaller row error after a rotation agree with it."""
+
+_TRIALS: Final = 300
+_REFITS: Final = 8
+
+
+@dataclass(frozen=True)
+class RowAlignment:
+    """Row errors (right minus left), and the rotation that minimises them.
+
+    Attributes:
+        features: Number of matched features.
+        agreeing: Number of features that agree with the rotation.
+        mean_px: Mean row error of the agreeing features.
+        spread_px: Standard deviation of their row error.
+        rms_px: Root mean square row error with the feature noise removed; 0 if rows are aligned.
+        residual_px: Robust standard deviation after the rotation: the feature noise.
+        pitch_rad: Correcting rotation of the right camera about x.
+        roll_rad: Correcting rotation of the right camera about z.
+    """
+
+    features: int
+    agreeing: int
+    mean_px: float
+    spread_px: float
+    rms_px: float
+    residual_px: float
+    pitch_rad: float
+    roll_rad: float
+
+    @property
+    def rotation(self) -> Float64:
+        """float64 (3, 3): rotates rays of the right camera so that rows are aligned."""
+        return exp_so3(np.array([self.pitch_rad, 0.0, self.roll_rad]))
+
+    def turned_rows(self, right_uv: Float32, camera: RectifiedCamera) -> Float64:
+        """float64 (N,): rows of features of the right image after correction."""
+        turn = np.array([self.pitch_rad, self.roll_rad])
+        return np.asarray(turn_features(right_uv, camera, turn)[:, 1])
+
+
+def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> RowAlignment | None:
+    """Fit the rotation of the right camera that aligns rows.
+
+    Args:
+        left_uv: float32 (N, 2), features in the left image; some may be wrong matches.
+        right_uv: float32 (N, 2), the same features in the right image.
+        camera: The rectified camera.
+
+    Returns:
+        None if fewer than 12 features agree.
+    """
+    if len(left_uv) < 12:
+        return None
+    basis, rows = _linear(left_uv, right_uv, camera)
+    agree = _consensus(basis, rows, camera.focal_px)
+    if agree.sum() < 12:
+        return None
+    turn = _solve(basis[agree], rows[agree])
+    for _ in range(_REFITS):
+        # The basis is valid for small rotations: linearise again at the best one so far.
+        basis, rows = _linear(left_uv, turn_features(right_uv, camera, turn), camera)
+        agree = np.abs(rows) * camera.focal_px < _NEAR_PX
+        turn = turn + _solve(basis[agree], rows[agree])
+    left_over = left_uv[:, 1] - turn_features(right_uv, camera, turn)[:, 1]
+    agree = np.abs(left_over) < _NEAR_PX
+    left_over = left_over[agree]
+    error = (right_uv[:, 1] - left_uv[:, 1])[agree].astype(np.float64)
+    residual = float(1.4826 * np.median(np.abs(left_over - np.median(left_over))))
+    noise = float(np.mean(left_over**2))
+    return RowAlignment(
+        features=len(rows),
+        agreeing=int(agree.sum()),
+        mean_px=float(error.mean()),
+        spread_px=float(error.std()),
+        rms_px=float(np.sqrt(max(0.0, np.mean(error**2) - noise))),
+        residual_px=residual,
+        pitch_rad=float(turn[0]),
+        roll_rad=float(turn[1]),
+    )
+
+
+def turn_features(right_uv: Float32, camera: RectifiedCamera, turn: Float64) -> Float64:
+    """Positions of features of the right image after a rotation of the right camera.
+
+    Args:
+        right_uv: float32 (N, 2).
+        camera: The rectified camera.
+        turn: float64 (2,), pitch and roll, radians.
+
+    Returns:
+        float64 (N, 2).
+    """
+    centre = np.array([camera.cx_right_px, camera.cy_px])
+    rays = np.column_stack([(right_uv - centre) / camera.focal_px, np.ones(len(right_uv))])
+    turned = rays @ exp_so3(np.array([turn[0], 0.0, turn[1]])).T
+    return np.asarray(turned[:, :2] / turned[:, 2:] * camera.focal_px + centre)
+
+
+def count_aligned(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> int:
+    """Number of features that agree with one rotation of the right camera, however large."""
+    if len(left_uv) < 2:
+        return 0
+    return int(_consensus(*_linear(left_uv, right_uv, camera), camera.focal_px).sum())
+
+
+def mend_rig(
+    rig: RectifiedCamera | StereoCalibration, alignment: RowAlignment, R_rect_left: Float64
+) -> StereoCalibration:
+    """The calibration with the right camera rotated in place so that rows are aligned.
+
+    Args:
+        rig: The calibration that the images were rectified with.
+        alignment: Row errors of the rectified images.
+        R_rect_left: float64 (3, 3), rotation from the left camera to the rectified camera; the
+            identity for a rectified rig.
+    """
+    raw = _as_raw(rig)
+    R, t = raw.T_right_left[:3, :3], raw.T_right_left[:3, 3]
+    centre = -R.T @ t
+    # Rectified right rays are R_rect_left @ R.T @ ray; the alignment rotates them further.
+    turned = R @ R_rect_left.T @ alignment.rotation.T @ R_rect_left
+    return replace(raw, T_right_left=make_transform(turned, -turned @ centre))
+
+
+def _as_raw(rig: RectifiedCamera | StereoCalibration) -> StereoCalibration:
+    if isinstance(rig, StereoCalibration):
+        return rig
+    right = rig.matrix.copy()
+    right[0, 2] = rig.cx_right_px
+    cameras = [
+        CameraIntrinsics(matrix, np.zeros(0), rig.width_px, rig.height_px)
+        for matrix in (rig.matrix, right)
+    ]
+    T_right_left = make_transform(np.eye(3), np.array([-rig.baseline_m, 0.0, 0.0]))
+    return StereoCalibration(cameras[0], cameras[1], T_right_left)
+
+
+def _linear(
+    left_uv: Float32, right_uv: Float32 | Float64, camera: RectifiedCamera
+) -> tuple[Float64, Float64]:
+    """Basis (N, 2) and target (N,) of ``rows = basis @ (pitch, roll)``, in focal lengths.
+
+    A small rotation w moves a ray p by w × p; its row becomes y - w_x·(1 + y²) + w_z·x.
+    """
+    x = (right_uv[:, 0].astype(np.float64) - camera.cx_right_px) / camera.focal_px
+    y = (right_uv[:, 1].astype(np.float64) - camera.cy_px) / camera.focal_px
+    rows = (left_uv[:, 1].astype(np.float64) - right_uv[:, 1]) / camera.focal_px
+    return np.stack([-(1 + y * y), x], axis=1), rows
+
+
+def _solve(basis: Float64, rows: Float64) -> Float64:
+    """float64 (2,): least-squares pitch and roll."""
+    return np.asarray(np.linalg.lstsq(basis, rows, rcond=None)[0], dtype=np.float64)
+
+
+def _consensus(basis: Float64, rows: Float64, focal_px: float) -> Bool:
+    """bool (N,): the largest set of features that agree with one rotation (RANSAC, pairs)."""
+    rng = np.random.default_rng(0)
+    pick = rng.integers(0, len(rows), (_TRIALS, 2))
+    a, b = basis[pick[:, 0]], basis[pick[:, 1]]
+    det = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    # Two features in nearly the same column do not determine roll.
+    good = np.abs(det) > 0.05
+    a, b, det = a[good], b[good], det[good]
+    first, second = rows[pick[good, 0]], rows[pick[good, 1]]
+    turns = np.stack(
+        [
+            (first * b[:, 1] - second * a[:, 1]) / det,
+            (a[:, 0] * second - b[:, 0] * first) / det,
+        ]
+    )
+    turns = np.concatenate([turns, np.zeros((2, 1))], axis=1)
+    near = np.abs(basis @ turns - rows[:, None]) * focal_px < _NEAR_PX
+    return np.asarray(near[:, int(np.argmax(near.sum(axis=0)))])

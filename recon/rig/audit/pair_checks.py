@@ -1,0 +1,144 @@
+"""Checks whether a single pair can give a trustworthy result."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import CalibrationError, MatchingError
+from recon.core.values import (
+    Disparity,
+    Reason,
+    RectifiedCamera,
+    SequenceTruth,
+    StereoCalibration,
+    StereoPair,
+)
+from recon.export.mesh import COVERED_WITHIN
+from recon.rig.audit import Finding
+from recon.rig.audit.run import run_audit
+from recon.rig.audit.settings import AuditedSettings
+
+#: Findings that images alone support, and those that need a calibration. The inspection of the
+#: frame reports swapped cameras and misaligned rows; few features do not matter if the disparity
+#: is dense.
+_BY_PICTURES: Final = frozenset({"black", "gain", "blur"})
+_BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
+
+FEW_VALID_SHARE: Final = 0.25
+"""Share of pixels with a disparity below which the images are hardly a stereo pair: real pairs,
+even of bare walls, exceed 40 %; swapped images, or those of different moments, stay under 15 %."""
+
+
+LEAST_COVERAGE: Final = 0.8
+"""Share of the points of a pair that its mesh should cover."""
+
+
+@dataclass(frozen=True, eq=False)
+class OnePair:
+    """A pair as a source of one frame.
+
+    Attributes:
+        pair: The images.
+        calibration: Calibration of the two cameras.
+        files: Files that the pair was read from.
+    """
+
+    pair: StereoPair
+    calibration: RectifiedCamera | StereoCalibration
+    files: tuple[Path, ...] = ()
+    description: str = "two pictures"
+    truth: SequenceTruth | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the pair."""
+        return self.pair.name
+
+    def __len__(self) -> int:
+        return 1
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return self.frames()
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """Yield the pair, or nothing if ``start`` is after it."""
+        yield from (self.pair,)[start:]
+
+
+def find_pair_faults(
+    given: OnePair, config: AuditedSettings, *, metric: bool
+) -> tuple[Finding, ...]:
+    """Findings of a quick audit; none if it is switched off.
+
+    Args:
+        given: The pair.
+        config: The configuration; its ``audit`` and ``rectification`` sections are used.
+        metric: Whether depth is wanted, so that the calibration matters.
+    """
+    if not config.audit.quick:
+        return ()
+    telling = _BY_PICTURES | _BY_CALIBRATION if metric else _BY_PICTURES
+    try:
+        audit = run_audit(given, config, quick=True)
+    except CalibrationError:
+        return ()  # the run itself reports this later
+    return tuple(finding for finding in audit.findings if finding.code in telling)
+
+
+def check_found(
+    disparity: Disparity, pair: StereoPair, faults: tuple[Finding, ...] = ()
+) -> tuple[str, ...]:
+    """Warnings about the share of pixels with a disparity.
+
+    Args:
+        disparity: The disparity map.
+        pair: The images it was computed from.
+        faults: Known problems of the images.
+
+    Raises:
+        MatchingError: No pixel has a disparity.
+    """
+    share = float(disparity.valid.mean())
+    if share >= FEW_VALID_SHARE:
+        return ()
+    found = f"{100 * share:.0f} % of the pixels have a disparity ({_reasons(disparity)})"
+    advice = (
+        "check that both pictures show the same moment, that left and right are not swapped, that "
+        "the calibration is theirs, and the range (--ndisp)"
+    )
+    if share > 0:
+        return (f"only {found}; {advice}",)
+    if np.array_equal(pair.left, pair.right):
+        advice = "left and right are the same picture"
+    raise MatchingError(
+        "no pixel has a match in the other image",
+        where=pair.name or None,
+        got=_reasons(disparity),
+        hint=next((fault.text for fault in faults if fault.fatal), advice),
+    )
+
+
+def check_coverage(coverage: float) -> tuple[str, ...]:
+    """A warning if the mesh of a pair leaves out much of its cloud.
+
+    Args:
+        coverage: Share of the points that are on the mesh, see `mesh_coverage`.
+    """
+    if coverage >= LEAST_COVERAGE:
+        return ()
+    tolerance = f"points within {100 * COVERED_WITHIN:g} % of their depth"
+    advice = "lower mesh.cell_spacings or mesh.min_component_faces, or use the cloud"
+    return (f"the mesh covers {100 * coverage:.2g} % of the cloud ({tolerance}); {advice}",)
+
+
+def _reasons(disparity: Disparity) -> str:
+    """The two most common reasons for having no disparity."""
+    count = np.bincount(disparity.reason.ravel(), minlength=len(Reason))
+    percent = 100 * count / disparity.reason.size
+    most = sorted((r for r in Reason if r and percent[r] >= 1), key=lambda r: -percent[r])[:2]
+    return ", ".join(f"{percent[r]:.0f} % {r.name.lower().replace('_', ' ')}" for r in most)

@@ -1,0 +1,270 @@
+"""Findings of an audit, derived from its measures: each problem, with advice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from recon.core.values import RectifiedCamera, StereoCalibration
+from recon.rig.audit import AuditSettings, Finding
+from recon.rig.audit.geometry import Geometry
+from recon.rig.audit.sample import Sample
+from recon.sources import StampedSource, StereoSource
+from recon.stereo.match import Matcher
+
+_SIDES = ("left", "right")
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Missing frames, from the timestamps of all pairs.
+
+    Attributes:
+        count: Number of gaps; 0 if the timestamps are not known in advance.
+        longest_s: Longest time step.
+        after: Frame before that step.
+        usual_s: Median time step; NaN if unknown.
+    """
+
+    count: int = 0
+    longest_s: float = float("nan")
+    after: int = 0
+    usual_s: float = float("nan")
+
+
+def find_picture_faults(
+    sample: Sample, settings: AuditSettings, matcher: str | Matcher
+) -> Iterator[Finding]:
+    """Problems of single images: unreadable, black, blurred, of unequal brightness.
+
+    Args:
+        sample: The sampled images.
+        settings: Limits.
+        matcher: The matcher that will be used, or its name.
+    """
+    if sample.broken is not None:
+        code = "size" if "size" in sample.broken.what else "unreadable"
+        yield Finding(code, True, str(sample.broken))
+    for side in _blank_sides(sample, settings):
+        mean = np.median([pair[side] for pair in sample.brightness_dn])
+        yield Finding(
+            "black",
+            True,
+            f"the {_SIDES[side]} camera shows nothing: its images are uniform, at grey level "
+            f"{mean:.0f} of 255; check its cable, its lens cap and its exposure "
+            "(16-bit images must fill their range)",
+        )
+    yield from _find_blur(sample, settings)
+    gains = np.concatenate([np.zeros(0), *sample.gains])
+    if len(gains) >= settings.min_features:
+        gain = float(np.median(gains))
+        if not 1 / settings.gain < gain < settings.gain:
+            # The census transform of sgm compares grey levels only with their neighbours.
+            other = "" if matcher == "sgm" else ", or match with sgm"
+            yield Finding(
+                "gain",
+                False,
+                f"the right camera is {gain:.2f} times as bright as the left one; give both the "
+                f"same fixed exposure and gain{other}",
+            )
+
+
+def _blank_sides(sample: Sample, settings: AuditSettings) -> list[int]:
+    """Cameras whose images are uniform in most pairs."""
+    blank = np.array(sample.contrast_dn).reshape(-1, 2) < settings.contrast_dn
+    return [side for side in range(2) if len(blank) and blank[:, side].mean() >= 0.5]
+
+
+def _find_blur(sample: Sample, settings: AuditSettings) -> Iterator[Finding]:
+    if not sample.sharpness:
+        return
+    left, right = np.median(sample.sharpness, axis=0)
+    worse = _SIDES[int(right < left)]
+    if min(left, right) < settings.sharpness_ratio * max(left, right):
+        yield Finding(
+            "blur",
+            False,
+            f"the {worse} camera is blurred: sharpness {min(left, right):.2f}, the other "
+            f"{max(left, right):.2f}; focus it or clean its lens",
+        )
+    elif max(left, right) < settings.sharpness:
+        yield Finding(
+            "blur",
+            False,
+            f"both cameras are blurred: sharpness {left:.2f} and {right:.2f}, expected above "
+            f"{settings.sharpness:g}; focus them, expose shorter, or halve the image size",
+        )
+
+
+def find_series_faults(sample: Sample, gaps: Gaps, settings: AuditSettings) -> Iterator[Finding]:
+    """Problems of the sequence: repeated frames, frozen cameras, gaps."""
+    repeats = sample.repeats
+    if repeats.steps and repeats.both > settings.repeated_share * repeats.steps:
+        yield Finding(
+            "duplicates",
+            False,
+            f"{repeats.both} of {repeats.steps} frames repeat the previous one; the recorder wrote "
+            "frames twice, or the rig stood still: drop them, or record at the cameras' own rate",
+        )
+    blank = _blank_sides(sample, settings)
+    for side, run in enumerate(repeats.frozen):
+        # A camera with uniform images would count as frozen, too.
+        if run >= settings.frozen_frames and side not in blank:
+            yield Finding(
+                "frozen",
+                True,
+                f"the {_SIDES[side]} camera is frozen for {run} frames while the other goes on; "
+                "it hung or lost frames: record again",
+            )
+    if gaps.count:
+        yield Finding(
+            "gaps",
+            False,
+            f"frames are missing at {gaps.count} places, at most {gaps.longest_s:.2f} s after "
+            f"frame {gaps.after} (usual {gaps.usual_s:.3f} s); the path may jump there",
+        )
+
+
+def find_gaps(source: StereoSource, settings: AuditSettings) -> Gaps:
+    """Find time steps that are too long, in sources with known timestamps."""
+    steps = np.diff(source.stamps_s) if isinstance(source, StampedSource) else np.zeros(0)
+    usual_s = float(np.median(steps)) if len(steps) else 0.0
+    if usual_s <= 0:
+        return Gaps()
+    after = int(np.argmax(steps))
+    count = int(np.count_nonzero(steps > settings.gap_periods * usual_s))
+    return Gaps(count, float(steps[after]), after, usual_s)
+
+
+def find_geometry_faults(geometry: Geometry, settings: AuditSettings) -> Iterator[Finding]:
+    """Problems of the geometry: swapped cameras, delays, row errors."""
+    swapped, lag, skew = geometry.swapped_share, geometry.lag, geometry.skew
+    if swapped >= settings.swapped_share:
+        yield Finding(
+            "swapped",
+            True,
+            f"left and right are swapped: {100 * swapped:.0f} % of the near features are farther "
+            "right in the right image; exchange --left and --right (or un-mirror the images)",
+        )
+    if lag:
+        late = "right" if lag > 0 else "left"
+        yield Finding(
+            "lag",
+            True,
+            f"the {late} camera is {abs(lag)} frames late; shift its sequence, or pair the images "
+            "by timestamp",
+        )
+    elif skew is not None and abs(skew[0]) > max(settings.skew_frames, 4 * skew[1]):
+        yield Finding(
+            "skew",
+            False,
+            f"the right images are taken {skew[0]:+.2f} frames after the left ones; trigger "
+            "both cameras together, or drive slowly",
+        )
+    yield from _find_row_faults(geometry, settings)
+
+
+def _find_row_faults(geometry: Geometry, settings: AuditSettings) -> Iterator[Finding]:
+    alignment = geometry.alignment
+    if alignment is None:
+        if not geometry.pairs:
+            return
+        yield Finding(
+            "features",
+            False,
+            f"too few features match between left and right ({geometry.matched} matched) to check "
+            "the geometry: the images show too little texture, or different scenes",
+        )
+    elif alignment.rms_px > settings.row_px:
+        pitch, roll = np.degrees([alignment.pitch_rad, alignment.roll_rad])
+        yield Finding(
+            "rows",
+            alignment.rms_px > settings.bad_row_px,
+            f"rows of left and right are not aligned: {alignment.rms_px:.2f} px rms, mean "
+            f"{alignment.mean_px:+.2f} px, spread {alignment.spread_px:.2f} px; rotating the right "
+            f"camera by {pitch:+.3f} deg pitch and {roll:+.3f} deg roll corrects this: "
+            "recon audit --mend FILE",
+        )
+
+
+def find_range_faults(
+    geometry: Geometry, reach_px: int | None, camera: RectifiedCamera, settings: AuditSettings
+) -> Iterator[Finding]:
+    """Scenes that are too near or too far for the rig.
+
+    Args:
+        geometry: Measures of the matched features.
+        reach_px: Largest disparity that will be searched, if that is fixed.
+        camera: The rectified camera.
+        settings: Limits.
+    """
+    disparity_px = geometry.disparity_px
+    if len(disparity_px) < settings.min_features:
+        return
+    scale = camera.focal_px * camera.baseline_m
+    # A matcher's disparity is in image columns, without doffs.
+    columns_px = disparity_px - camera.doffs_px
+    near = float(np.mean(columns_px > reach_px)) if reach_px else 0.0
+    if reach_px and near > settings.near_share:
+        reach_m = scale / (reach_px + camera.doffs_px)
+        most = int(np.ceil(np.quantile(columns_px, 0.98) / 16) * 16)
+        yield Finding(
+            "near",
+            False,
+            f"{100 * near:.0f} % of the features are nearer than the disparity range covers "
+            f"({reach_px} px, {reach_m:.1f} m); give the matcher an ndisp of {most}",
+        )
+    middle = float(np.median(disparity_px))
+    if 0 < middle < settings.far_px:
+        yield Finding(
+            "far",
+            False,
+            f"half of the features are farther away than {scale / middle:.0f} m, at less than "
+            f"{middle:.1f} px of disparity: the baseline of {camera.baseline_m:.3g} m is too short "
+            "for this scene",
+        )
+
+
+def find_calibration_faults(
+    sample: Sample,
+    rig: RectifiedCamera | StereoCalibration,
+    camera: RectifiedCamera,
+    settings: AuditSettings,
+) -> Iterator[Finding]:
+    """Implausible calibration: image size, baseline."""
+    for name, centre, size in _centres(rig):
+        off = np.abs(np.array(centre) / size - 0.5)
+        if off.max() > settings.centre_share:
+            yield Finding(
+                "size",
+                True,
+                f"the calibration is of another size: principal point of the {name} camera at "
+                f"({centre[0]:.0f}, {centre[1]:.0f}) of {size[0]}x{size[1]} pixels; scale it, or "
+                "use images of the calibrated size",
+            )
+            break
+    shortest, longest = settings.baseline_m
+    speed = float(np.median(sample.speeds_m_per_s)) if sample.speeds_m_per_s else 0.0
+    long = not shortest <= camera.baseline_m <= longest
+    if long or speed > settings.max_speed_m_per_s:
+        moving = f", with which the rig moves at {speed:.0f} m/s" if speed > 0 else ""
+        yield Finding(
+            "baseline",
+            True,
+            f"the baseline is implausible: {camera.baseline_m:.4g} m{moving}; check the unit of "
+            "the calibration (--set source.metres_per_unit=0.001 for an OpenCV file in mm)",
+        )
+
+
+def _centres(
+    rig: RectifiedCamera | StereoCalibration,
+) -> list[tuple[str, tuple[float, float], tuple[int, int]]]:
+    if isinstance(rig, RectifiedCamera):
+        size = (rig.width_px, rig.height_px)
+        return [("left", (rig.cx_px, rig.cy_px), size)]
+    return [
+        (name, (float(c.matrix[0, 2]), float(c.matrix[1, 2])), (c.width_px, c.height_px))
+        for name, c in zip(_SIDES, (rig.left, rig.right), strict=True)
+    ]

@@ -1,0 +1,237 @@
+"""Sampling of a drive for an audit: stretches of frames, and pairs with matched features."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+
+import numpy as np
+
+from recon.core.errors import ReconError
+from recon.core.values import RectifiedPair
+from recon.core.values.arrays import Float64
+from recon.rig.audit import (
+    AuditSettings,
+    RepeatCounter,
+    count_aligned,
+    measure_gain,
+    measure_sharpness,
+    measure_speed,
+    track,
+)
+from recon.sources import StereoSource
+from recon.stereo.rectify import PairFeatures, Rectifier, match_features
+
+# Stretches of a quick audit; each is just long enough to detect a delayed camera.
+_QUICK_RUNS = 2
+# Pairs that are also compared at other lags.
+_LAG_PAIRS = 4
+# A quick audit stays near the start, since a video is decoded up to each frame.
+_QUICK_REACH = 300
+# Smaller images have no features, and are too small to measure their sharpness.
+_LEAST_SIDE_PX = 16
+_NO_FEATURES = PairFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What was measured in one pair.
+
+    Attributes:
+        index: Number of the pair.
+        brightness_dn: (left, right) mean grey level.
+        sharpness: (left, right) share of the finest detail; NaN if unknown.
+        features: Matched features.
+        pair: The images; None where they are not kept.
+    """
+
+    index: int
+    brightness_dn: tuple[float, float]
+    sharpness: tuple[float, float]
+    features: PairFeatures
+    pair: RectifiedPair | None
+
+    @property
+    def rows_px(self) -> Float64:
+        """float64 (N,): row of each feature in the right image minus that in the left one."""
+        apart = self.features.right_uv[:, 1] - self.features.left_uv[:, 1]
+        return apart.astype(np.float64)
+
+
+@dataclass(eq=False)
+class Sample:
+    """Measures of the sampled images.
+
+    Attributes:
+        frames: Number of pairs that were read.
+        repeats: Counts of repeated and frozen images.
+        contrast_dn: (left, right) standard deviation of the grey levels of each measured pair.
+        brightness_dn: (left, right) mean grey level.
+        sharpness: (left, right) share of the finest detail.
+        gains: Brightness ratios around features.
+        features: Matched features of each pair.
+        by_lag: Number of features that agree on one rotation, summed over pairs; the key is how
+            many frames after the left image the right image is taken from.
+        lagged: Matched features of the pairs at each lag.
+        speeds_m_per_s: Speed of the rig at each pair where it could be measured.
+        flows: float64 (N,) per pair, rows by which each feature moves to the next frame; NaN if
+            unknown.
+        looks: Each measured pair; a few of them with their images.
+        broken: The error that ended the sampling, if any.
+    """
+
+    frames: int = 0
+    repeats: RepeatCounter = field(default_factory=RepeatCounter)
+    contrast_dn: list[tuple[float, float]] = field(default_factory=list)
+    brightness_dn: list[tuple[float, float]] = field(default_factory=list)
+    sharpness: list[tuple[float, float]] = field(default_factory=list)
+    gains: list[Float64] = field(default_factory=list)
+    features: list[PairFeatures] = field(default_factory=list)
+    by_lag: dict[int, int] = field(default_factory=dict)
+    lagged: dict[int, list[PairFeatures]] = field(default_factory=dict)
+    speeds_m_per_s: list[float] = field(default_factory=list)
+    flows: list[Float64] = field(default_factory=list)
+    looks: list[Look] = field(default_factory=list)
+    broken: ReconError | None = None
+
+
+def take_sample(
+    source: StereoSource, rectifier: Rectifier, settings: AuditSettings, *, quick: bool
+) -> Sample:
+    """Sample a drive; an error of a pair ends the sampling and is kept in ``broken``."""
+    stretches = plan_stretches(len(source), settings, quick=quick)
+    centres = plan_centres(stretches, settings, quick=quick)
+    sampler = _Sampler(source, rectifier, settings, centres)
+    try:
+        for start, stop in stretches:
+            sampler.look(start, stop)
+    except ReconError as error:
+        sampler.sample.broken = error
+    return sampler.sample
+
+
+def plan_stretches(frames: int, settings: AuditSettings, *, quick: bool) -> list[tuple[int, int]]:
+    """First frame and end of each stretch: the whole drive, or stretches evenly spread over it.
+
+    A quick audit stays near the start.
+    """
+    frames = min(frames, _QUICK_REACH) if quick else frames
+    runs = _QUICK_RUNS if quick else settings.runs
+    length = 2 * settings.max_lag + 1 if quick else max(2, settings.frames // runs)
+    if frames <= runs * length:
+        return [(0, frames)]
+    # In the middle of equal parts, since a drive may begin and end at rest.
+    starts = [int((k + 0.5) * frames / runs - length / 2) for k in range(runs)]
+    return [(start, start + length) for start in starts]
+
+
+def plan_centres(
+    stretches: list[tuple[int, int]], settings: AuditSettings, *, quick: bool
+) -> list[int]:
+    """Frames whose features are matched, evenly spread, with a margin for the lags."""
+    pairs = _QUICK_RUNS if quick else settings.pairs
+    each = max(1, pairs // len(stretches))
+    chosen: list[int] = []
+    for start, stop in stretches:
+        # On a short drive, several pairs with a few lags are better than one pair with all.
+        margin = min(settings.max_lag, (stop - start - 1) // (2 if quick else 3))
+        places = np.linspace(start + margin, stop - 1 - margin, each)
+        chosen += sorted({int(place) for place in np.rint(places)})
+    return chosen
+
+
+class _Sampler:
+    """Reads stretches, keeping the pairs around the current one."""
+
+    def __init__(
+        self,
+        source: StereoSource,
+        rectifier: Rectifier,
+        settings: AuditSettings,
+        centres: list[int],
+    ) -> None:
+        self.sample = Sample()
+        self._source, self._rectifier, self._settings = source, rectifier, settings
+        self._centres = centres
+        # The first, middle and last pair are kept; all would not fit into memory.
+        self._kept = {centres[n] for n in (0, len(centres) // 2, -1)} if centres else set()
+        self._with_lag = set(centres[:: max(1, len(centres) // _LAG_PAIRS)])
+        self._recent: dict[int, RectifiedPair] = {}
+
+    def look(self, start: int, stop: int) -> None:
+        """Read one stretch; a pair is measured once its neighbours have been read."""
+        self.sample.repeats.restart()
+        self._recent.clear()
+        reach = self._settings.max_lag
+        waiting = [centre for centre in self._centres if start <= centre < stop]
+        for pair in self._pairs(start, stop):
+            self._recent[pair.index] = pair
+            self._recent.pop(pair.index - 2 * reach - 1, None)
+            while waiting and pair.index >= min(waiting[0] + reach, stop - 1):
+                self._measure(waiting.pop(0))
+
+    def _pairs(self, start: int, stop: int) -> Iterator[RectifiedPair]:
+        for recorded in islice(self._source.frames(start), stop - start):
+            self.sample.frames += 1
+            self.sample.repeats.add(recorded.left, recorded.right)
+            yield self._rectifier.rectify(recorded)
+
+    def _measure(self, centre: int) -> None:
+        """Measure one pair, alone and against its neighbours."""
+        pair, sample, settings = self._recent[centre], self.sample, self._settings
+        sample.contrast_dn.append((float(pair.left.std()), float(pair.right.std())))
+        sample.brightness_dn.append((float(pair.left.mean()), float(pair.right.mean())))
+        if min(sample.contrast_dn[-1]) < settings.contrast_dn:
+            self._note(pair, (np.nan, np.nan), _NO_FEATURES)
+            return
+        if min(pair.left.shape) < _LEAST_SIDE_PX:
+            sample.features.append(_NO_FEATURES)
+            sample.flows.append(np.zeros(0))
+            return
+        sample.sharpness.append((measure_sharpness(pair.left), measure_sharpness(pair.right)))
+        features = match_features(pair.left, pair.right, settings.features)
+        sample.features.append(features)
+        self._note(pair, sample.sharpness[-1], features)
+        gains = measure_gain(pair.left, pair.right, features.left_uv, features.right_uv)
+        sample.gains.append(gains)
+        if centre in self._with_lag:
+            self._compare_lags(centre, features)
+        self._follow(centre, features)
+
+    def _note(
+        self, pair: RectifiedPair, sharpness: tuple[float, float], features: PairFeatures
+    ) -> None:
+        """Keep what the report shows of a pair."""
+        kept = pair if pair.index in self._kept else None
+        brightness = self.sample.brightness_dn[-1]
+        self.sample.looks.append(Look(pair.index, brightness, sharpness, features, kept))
+
+    def _compare_lags(self, centre: int, features: PairFeatures) -> None:
+        """Match the left image with the right images before and after it."""
+        ends = (min(self._recent), max(self._recent))
+        span = min(self._settings.max_lag, *(abs(end - centre) for end in ends))
+        pair, sample = self._recent[centre], self.sample
+        for lag in range(-span, span + 1):
+            found = features
+            if lag:
+                right = self._recent[centre + lag].right
+                found = match_features(pair.left, right, self._settings.features)
+            agreeing = count_aligned(found.left_uv, found.right_uv, pair.camera)
+            sample.by_lag[lag] = sample.by_lag.get(lag, 0) + agreeing
+            sample.lagged.setdefault(lag, []).append(found)
+
+    def _follow(self, centre: int, features: PairFeatures) -> None:
+        """Measure speed and row flow against the left image of the next frame."""
+        flow = np.full(len(features), np.nan)
+        later = self._recent.get(centre + 1)
+        if later is not None:
+            pair = self._recent[centre]
+            there, found = track(pair.left, later.left, features.left_uv)
+            flow[found] = there[found, 1] - features.left_uv[found, 1]
+            seen = (features.left_uv[found], features.right_uv[found], there[found])
+            moved_m = measure_speed(*seen, pair.camera)
+            step_s = later.timestamp_s - pair.timestamp_s
+            if moved_m is not None and step_s > 0:
+                self.sample.speeds_m_per_s.append(moved_m / step_s)
+        self.sample.flows.append(flow)

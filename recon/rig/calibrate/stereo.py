@@ -1,0 +1,176 @@
+"""Stereo calibration from views of a board; views that do not fit are dropped and named."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import CalibrationError
+from recon.core.values import StereoCalibration
+from recon.core.values.arrays import Bool, Float64
+from recon.rig.calibrate.bundle import Information, RigState, View, solve
+from recon.rig.calibrate.initial import (
+    Size,
+    calibrate_one,
+    join_cameras,
+    solve_robustly,
+    view_errors,
+)
+from recon.rig.calibrate.repeats import group_views
+from recon.rig.calibrate.settings import CalibrationSettings
+
+_DROPPING_ROUNDS: Final = 4
+# An rms error this many times that of each camera alone: the images were not taken together.
+_MISMATCH: Final = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class StereoFit:
+    """A calibrated rig, and how well it fits.
+
+    Attributes:
+        calibration: The rig.
+        state: The rig with the poses of the board.
+        information: Information of each view about the shared parameters.
+        views: The views that were used.
+        repeated: Names of the views that were left out since they repeat another.
+        dropped: Names of the views that were dropped, with their rms errors in pixels.
+        errors_px: float64 (V, 2), rms error of each used view in the left and right image.
+        alone_px: Rms errors of the left and the right camera, each calibrated alone.
+        rms_px: Rms reprojection error over all corners of both cameras.
+    """
+
+    calibration: StereoCalibration
+    state: RigState
+    information: Information
+    views: tuple[View, ...]
+    repeated: tuple[str, ...]
+    dropped: dict[str, float]
+    errors_px: Float64
+    alone_px: tuple[float, float]
+    rms_px: float
+
+
+def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSettings) -> StereoFit:
+    """Calibrate two cameras.
+
+    Each camera is calibrated alone, then all parameters of both are refined together. Of views that
+    repeat each other, one is used. Views whose error exceeds `CalibrationSettings.outlier_ratio`
+    times the median are dropped.
+
+    Args:
+        views: Each with a sighting of the left and of the right camera.
+        size: (width, height) of the images.
+        settings: Lens model and limits.
+
+    Raises:
+        CalibrationError: There are too few views, or no rig fits them.
+
+    Ref: Zhang 2000; the lens models are OpenCV's.
+    """
+    groups = group_views(views)
+    kept = [group[0] for group in groups]
+    repeated = tuple(view.name for group in groups for view in group[1:])
+    _check_count(kept, settings, repeated=len(repeated))
+    left, right = (
+        calibrate_one([view.seen[side] for view in kept], size, settings) for side in (0, 1)
+    )
+    alone = tuple(
+        view_errors([replace(v, seen=(v.seen[side],)) for v in kept], state)
+        for side, state in enumerate((left, right))
+    )
+    state = solve_robustly(kept, join_cameras(left, right))
+    dropped: dict[str, float] = {}
+    for _ in range(_DROPPING_ROUNDS):
+        errors = view_errors(kept, state)
+        limit = max(settings.outlier_ratio * float(np.median(errors)), settings.outlier_px)
+        good = errors <= limit
+        dropped |= {v.name: float(e) for v, e, g in zip(kept, errors, good, strict=True) if not g}
+        kept, state = _keep(kept, state, good)
+        alone = tuple(each[good] for each in alone)
+        _check_count(kept, settings, dropped, len(repeated))
+        state, information = solve(kept, state)
+        if good.all():
+            break
+    fit = _finish(kept, state, information, (_rms(alone[0]), _rms(alone[1])), settings)
+    return replace(fit, dropped=dropped, repeated=repeated)
+
+
+def stereo_of(state: RigState) -> StereoCalibration:
+    """The rig of a state.
+
+    Raises:
+        CalibrationError: Its parameters are invalid, such as a zero baseline.
+    """
+    left, right = state.cameras
+    return StereoCalibration(left, right, state.T_camera_rig[1])
+
+
+def _finish(
+    views: list[View],
+    state: RigState,
+    information: Information,
+    alone_px: tuple[float, float],
+    settings: CalibrationSettings,
+) -> StereoFit:
+    apart = [state.residuals(view, number) for number, view in enumerate(views)]
+    errors = np.array([[_length_rms(side) for side in both] for both in apart])
+    rms_px = _length_rms(np.concatenate([side for both in apart for side in both]))
+    if rms_px > settings.max_rms_px:
+        raise _no_fit(rms_px, alone_px, settings)
+    return StereoFit(
+        stereo_of(state), state, information, tuple(views), (), {}, errors, alone_px, rms_px
+    )
+
+
+def _keep(views: list[View], state: RigState, good: Bool) -> tuple[list[View], RigState]:
+    chosen = np.flatnonzero(good)
+    poses = tuple(state.T_rig_board[number] for number in chosen)
+    return [views[number] for number in chosen], replace(state, T_rig_board=poses)
+
+
+def _length_rms(apart: Float64) -> float:
+    return math.sqrt(float((apart**2).sum(axis=1).mean()))
+
+
+def _rms(errors: Float64) -> float:
+    return math.sqrt(float((errors**2).mean()))
+
+
+def _check_count(
+    views: Sequence[View],
+    settings: CalibrationSettings,
+    dropped: dict[str, float] | None = None,
+    repeated: int = 0,
+) -> None:
+    if len(views) >= settings.min_views:
+        return
+    lost = f", after {', '.join(dropped)} did not fit" if dropped else ""
+    lost += f", and {repeated} that repeat them" if repeated else ""
+    raise CalibrationError(
+        "too few views show the board in both images",
+        got=f"{len(views)}{lost}",
+        expected=f"at least {settings.min_views}",
+        hint="take more, with the board tilted, and near and far",
+    )
+
+
+def _no_fit(
+    rms_px: float, alone_px: tuple[float, float], settings: CalibrationSettings
+) -> CalibrationError:
+    if rms_px > _MISMATCH * max(alone_px):
+        what = "each camera fits alone, but not both together"
+        hint = "were left and right taken at the same time, and do their names pair them correctly?"
+    else:
+        what = "no lens of this model fits the corners"
+        hint = "is the board flat, and does --model (radtan, rational, fisheye) suit the lens?"
+    return CalibrationError(
+        what,
+        got=f"{rms_px:.1f} px rms (alone: left {alone_px[0]:.1f}, right {alone_px[1]:.1f})",
+        expected=f"at most {settings.max_rms_px:g} px",
+        hint=hint,
+    )

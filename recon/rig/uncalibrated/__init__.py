@@ -1,0 +1,15 @@
+"""Rectification from the images alone, where no calibration is known."""
+
+from recon.rig.uncalibrated.rectify import (
+    UncalibratedRectification,
+    UncalibratedSettings,
+    rectify_pictures,
+    rectify_uncalibrated,
+)
+
+__all__ = [
+    "UncalibratedRectification",
+    "UncalibratedSettings",
+    "rectify_pictures",
+    "rectify_uncalibrated",
+]

@@ -1,0 +1,1 @@
+"""What every command shares: the result folder, its record, threads, memory and timing."""

@@ -1,0 +1,237 @@
+"""The result folder of a run: complete, or not there at all.
+
+Everything is written below ``<folder>/.partial`` and moved up when the run is done. A run that
+fails removes its partial files and leaves an earlier run in the same folder untouched. A run that
+was killed, interrupted or met a full disk keeps them if it can be resumed.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from contextlib import suppress
+from datetime import datetime, timezone
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final
+
+from typing_extensions import Self
+
+from recon.core.errors import MemoryLimitError, OutputError
+from recon.io.atomic import write_text
+
+RECORD: Final = "run.json"
+STARTED: Final = "started.json"
+"""State file that records what a resumable run was started with."""
+_PARTIAL: Final = ".partial"
+_STATE: Final = ".state"
+_LOCK: Final = ".lock"
+#: Errors that the input did not cause: the run can be resumed later.
+_PASSING: Final = (OutputError, MemoryLimitError, OSError, MemoryError, KeyboardInterrupt)
+
+
+def state_folder(folder: Path) -> Path:
+    """Folder where an unfinished run keeps the state it resumes from."""
+    return folder / _PARTIAL / _STATE
+
+
+def default_folder(command: str, base: Path = Path("outputs")) -> Path:
+    """``outputs/<command>/<UTC stamp>``."""
+    stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%S.%fZ")
+    return base / command / stamp
+
+
+class RunDirectory:
+    """Context manager: files are written to `path` and appear in `folder` on success.
+
+    Args:
+        folder: Result folder; created if missing.
+        latest: Keep a link ``latest`` beside the folder (for the default folders).
+        resume: Resume the unfinished run in the folder.
+
+    Raises:
+        OutputError: The folder cannot be written, holds files that are not of a run, or another
+            run is writing to it.
+    """
+
+    def __init__(self, folder: Path, *, latest: bool = False, resume: bool = False) -> None:
+        self.folder = folder
+        self.resumes = resume
+        self._latest = latest
+        self._made: list[Path] = []
+        self._lock: int | None = None
+
+    @classmethod
+    def for_command(cls, command: str, out: Path | None, *, resume: bool = False) -> Self:
+        """The requested folder, or a new one under ``outputs/``."""
+        if out is None:
+            return cls(default_folder(command), latest=True)
+        # A run in a default folder keeps its link when it is resumed.
+        stamped = out.parent.resolve() == default_folder(command).parent.resolve()
+        return cls(out, latest=resume and stamped, resume=resume)
+
+    def path(self, name: str) -> Path:
+        """Path to write the file ``name`` to; its parent folder is created."""
+        target = self._partial / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return target
+
+    def state(self, name: str) -> Path:
+        """Path of the state file ``name``, which is deleted when the run is done."""
+        target = self._partial / _STATE / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return target
+
+    def keep(self, state: str, name: str) -> None:
+        """Publish a state file as a result: hard-linked where links are supported, else copied."""
+        source, target = self.state(state), self.path(name)
+        try:
+            os.link(source, target)
+        except OSError:
+            shutil.copyfile(source, target)
+
+    def files(self) -> list[str]:
+        """Sorted names of the files written so far, without those of the state."""
+        written = (p.relative_to(self._partial) for p in self._partial.rglob("*") if p.is_file())
+        return sorted(p.as_posix() for p in written if p.parts[0] not in (_STATE, _LOCK))
+
+    def write_json(self, name: str, content: Mapping[str, Any]) -> None:
+        """Write a JSON file; NaN is refused, since it is not valid JSON."""
+        text = json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False)
+        write_text(self.path(name), text + "\n")
+
+    def __enter__(self) -> Self:
+        if not self.resumes:
+            _refuse_foreign(self.folder)
+        self._made = [p for p in (self.folder, *self.folder.parents) if not p.exists()]
+        try:
+            self._lock = self._take_lock()
+            self._clear()
+        except OSError as error:
+            self._withdraw()
+            raise _unwritable(self.folder, error) from error
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if kind is None:
+                self._publish()
+            elif not (self.resumable and (self.resumes or issubclass(kind, _PASSING))):
+                self._withdraw()
+        except OSError as failure:
+            raise _unwritable(self.folder, failure) from failure
+        finally:
+            self._release()
+
+    @property
+    def resumable(self) -> bool:
+        """Whether the run has recorded what it was started with."""
+        return (state_folder(self.folder) / STARTED).is_file()
+
+    def _take_lock(self) -> int:
+        """Lock the folder against other runs until `_release` or the end of the process."""
+        while True:
+            self._partial.mkdir(parents=True, exist_ok=True)
+            path = self._partial / _LOCK
+            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # A run that ended meanwhile has removed the file that was opened here.
+                if path.exists() and os.fstat(handle).st_ino == path.stat().st_ino:
+                    return handle
+            except BlockingIOError as error:
+                os.close(handle)
+                raise OutputError(
+                    "another run is writing to this folder",
+                    where=self.folder,
+                    hint="wait for it, or choose another --out",
+                ) from error
+            os.close(handle)
+
+    def _release(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def _clear(self) -> None:
+        """Remove partial files of an earlier run; a resumed run keeps its state."""
+        kept = {_LOCK, _STATE} if self.resumes else {_LOCK}
+        for path in self._partial.iterdir():
+            if path.name in kept:
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+
+    @property
+    def _partial(self) -> Path:
+        return self.folder / _PARTIAL
+
+    def _publish(self) -> None:
+        files = [Path(name) for name in self.files()]
+        for stale in set(_earlier_files(self.folder)) - set(files):
+            (self.folder / stale).unlink(missing_ok=True)
+        # The record goes last: a folder with a new run.json has every file it lists.
+        for file in sorted(files, key=lambda f: f.name == RECORD):
+            (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
+            (self._partial / file).replace(self.folder / file)
+        # A state that is only half removed must not be resumable.
+        (state_folder(self.folder) / STARTED).unlink(missing_ok=True)
+        shutil.rmtree(self._partial)
+        if self._latest:
+            _link_latest(self.folder)
+
+    def _withdraw(self) -> None:
+        shutil.rmtree(self._partial, ignore_errors=True)
+        for folder in self._made:
+            with suppress(OSError):  # not empty: files of others, which stay
+                folder.rmdir()
+
+
+def _refuse_foreign(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise OutputError("output folder is a file", where=folder, hint="choose another --out")
+    try:
+        occupied = folder.is_dir() and any(p.name != _PARTIAL for p in folder.iterdir())
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+    if occupied and not (folder / RECORD).is_file():
+        raise OutputError(
+            "output folder contains files that are not of a run",
+            where=folder,
+            hint="choose another --out or empty it",
+        )
+
+
+def _earlier_files(folder: Path) -> list[Path]:
+    try:
+        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        names = [Path(name) for name in record.get("files", [])]
+    except (OSError, ValueError, AttributeError):
+        return []  # no earlier run or a broken record: no file is known to be stale
+    return [name for name in names if not name.is_absolute() and ".." not in name.parts]
+
+
+def _link_latest(folder: Path) -> None:
+    link = folder.parent / "latest"
+    with suppress(OSError):  # a file system without links: the stamped folder is enough
+        link.unlink(missing_ok=True)
+        link.symlink_to(folder.name)
+
+
+def _unwritable(folder: Path, error: OSError) -> OutputError:
+    return OutputError(
+        "output folder cannot be written",
+        where=folder,
+        got=error.strerror or str(error),
+        hint="choose another --out or fix its permissions",
+    )

@@ -1,0 +1,86 @@
+"""The memory limit of a run: sizes derived from it, and the check that it is kept."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from pydantic import Field
+
+from recon.core.errors import MemoryLimitError, SettingsError
+from recon.core.settings import Settings
+from recon.run.machine import peak_memory_mb
+
+_UNITS_MB: Final = {"": 1, "M": 1, "MB": 1, "G": 1000, "GB": 1000}
+_SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*")
+#: Shares of the limit for an open submap and for the cells of one tile. Stores grow by doubling
+#: and are copied when closed, so each briefly costs several times its size; most of the limit is
+#: left to the libraries, the images and the matcher.
+_SUBMAP_SHARE: Final = 1 / 40
+_TILE_SHARE: Final = 1 / 24
+_CACHED: Final = 6
+_FEW_CACHED: Final = 2
+
+
+class MemorySettings(Settings):
+    """How much memory a run may take."""
+
+    limit_mb: float | None = Field(
+        None,
+        gt=0.0,
+        description="Largest resident memory of the process, in 10⁶ bytes; none = no limit. "
+        "Submaps and tiles are made smaller to meet it, so results may differ by rounding.",
+    )
+
+    @property
+    def submap_bytes(self) -> int | None:
+        """Size at which a submap is closed; None = closed by the path alone."""
+        return None if self.limit_mb is None else int(1e6 * self.limit_mb * _SUBMAP_SHARE)
+
+    @property
+    def tile_bytes(self) -> int | None:
+        """Largest size of a tile's cells before they are merged; None = unlimited."""
+        return None if self.limit_mb is None else int(1e6 * self.limit_mb * _TILE_SHARE)
+
+    @property
+    def cached_submaps(self) -> int:
+        """Number of submaps kept in memory after being read."""
+        return _CACHED if self.limit_mb is None else _FEW_CACHED
+
+    def check(self, where: str) -> None:
+        """Stop a run that exceeds the limit.
+
+        Raises:
+            MemoryLimitError: The peak memory of the process is above the limit.
+        """
+        if self.limit_mb is not None and peak_memory_mb() > self.limit_mb:
+            raise MemoryLimitError(
+                "the memory limit cannot be kept",
+                where=where,
+                got=f"{peak_memory_mb():.0f} MB",
+                expected=f"at most {self.limit_mb:g} MB",
+                hint="give more with --memory-limit, or take smaller images, fewer disparities "
+                "or a coarser map",
+            )
+
+
+def memory_overrides(limit: str | None) -> list[str]:
+    """The override for a size such as ``2G`` or ``1500M``; None = no override.
+
+    Raises:
+        SettingsError: The text is not a size.
+    """
+    return [] if limit is None else [f"memory.limit_mb={parse_size_mb(limit):g}"]
+
+
+def parse_size_mb(text: str) -> float:
+    """Parse a size into 10⁶ bytes, which is also the unit if none is given.
+
+    Raises:
+        SettingsError: The text is not a size.
+    """
+    found = _SIZE.fullmatch(text)
+    unit = None if found is None else _UNITS_MB.get(found[2].upper())
+    if found is None or unit is None or float(found[1]) == 0:
+        raise SettingsError("cannot read this size", got=text, expected="such as 2G or 1500M")
+    return float(found[1]) * unit

@@ -1,0 +1,32 @@
+"""The figures of a run, as ``summary.json`` holds them and ``--json`` prints them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, is_dataclass
+from typing import Any
+
+from recon.run.machine import peak_memory_mb
+from recon.run.stopwatch import Stopwatch
+
+
+def plain(value: Any) -> Any:
+    """Convert a value for JSON: dataclasses to mappings, NaN and infinity to None."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(asdict(value))
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def cost(stopwatch: Stopwatch, total_seconds: float) -> dict[str, Any]:
+    """Cost of a run: total seconds, seconds per stage (stages overlap), and peak memory."""
+    return {
+        "seconds": round(total_seconds, 3),
+        "stages": {name: round(value, 3) for name, value in stopwatch.seconds.items()},
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+    }

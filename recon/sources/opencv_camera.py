@@ -1,0 +1,157 @@
+"""Live cameras through OpenCV; a video file can take the place of a camera."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Final, Protocol
+
+import cv2
+import numpy as np
+
+from recon.core.errors import SourceError
+from recon.core.values.arrays import UInt8
+
+# V4L2's exposure modes: 1 = manual, 3 = automatic.
+_MANUAL: Final = 1
+
+
+class Camera(Protocol):
+    """Interface of a camera for capture."""
+
+    name: str
+    live: bool
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second; NaN if the driver does not report it."""
+        ...
+
+    def grab(self) -> float | None:
+        """Grab the next frame without decoding it; its time in seconds, None = end."""
+        ...
+
+    def retrieve(self) -> UInt8:
+        """Decode the grabbed frame: uint8 (H, W, 3) RGB."""
+        ...
+
+    def lock(self, exposure: float | None) -> float | None:
+        """Fix exposure and white balance; the exposure, None = not supported by the driver."""
+        ...
+
+    def close(self) -> None:
+        """Release the device."""
+        ...
+
+
+class OpenCvCamera:
+    """A device by number or path, or a video file.
+
+    Args:
+        device: ``0``, ``/dev/video0`` or a file.
+        size: Width and height to request; None = unchanged.
+        rate_hz: Frames per second to request; None = unchanged.
+
+    Attributes:
+        name: The device as given.
+        live: False for a file.
+
+    Raises:
+        SourceError: The device cannot be opened, or does not support that size.
+    """
+
+    def __init__(
+        self, device: str, size: tuple[int, int] | None = None, rate_hz: float | None = None
+    ) -> None:
+        self.name, self.live = device, not Path(device).is_file()
+        number = int(device) if device.isdecimal() else None
+        if Path(device).is_fifo() or Path(device).is_socket():  # opening one would wait for ever
+            raise SourceError("not a camera and not a regular file", where=device)
+        log = cv2.utils.logging
+        before = log.getLogLevel()
+        log.setLogLevel(log.LOG_LEVEL_SILENT)  # a failure is raised as an error below
+        try:
+            self._capture = cv2.VideoCapture(device if number is None else number)
+        finally:
+            log.setLogLevel(before)
+        if not self._capture.isOpened():
+            found = ", ".join(sorted(str(path) for path in Path("/dev").glob("video*")))
+            raise SourceError(
+                "camera cannot be opened",
+                where=device,
+                expected=f"one of {found}" if found else "a camera: there is no /dev/video*",
+                hint="another program may be using it",
+            )
+        if self.live:
+            self._ask(size, rate_hz)
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second; NaN if the driver does not report it."""
+        rate = self._capture.get(cv2.CAP_PROP_FPS)
+        return float(rate) if rate > 0 else float("nan")
+
+    def grab(self) -> float | None:
+        """Grab the next frame without decoding it.
+
+        Returns:
+            Time of the frame according to the driver, in seconds of the machine's monotonic clock;
+            for a file, its position. None = end of the stream.
+        """
+        if not self._capture.grab():
+            return None
+        now_s = time.monotonic()
+        stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+        # A driver without timestamps returns 0, or uses another clock.
+        believed = not self.live or 0 <= now_s - stamp_s < 1
+        return float(stamp_s) if believed else now_s
+
+    def retrieve(self) -> UInt8:
+        """Decode the grabbed frame: uint8 (H, W, 3) RGB.
+
+        Raises:
+            SourceError: The frame cannot be decoded.
+        """
+        done, image = self._capture.retrieve()
+        if not done:
+            raise SourceError("frame cannot be decoded", where=self.name)
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+    def lock(self, exposure: float | None) -> float | None:
+        """Fix exposure and white balance.
+
+        Args:
+            exposure: Exposure of the other camera, in the driver's unit; None = keep the current.
+
+        Returns:
+            The fixed exposure; None = not supported by the driver.
+        """
+        if not self.live:
+            return None
+        value = self._capture.get(cv2.CAP_PROP_EXPOSURE) if exposure is None else exposure
+        self._capture.set(cv2.CAP_PROP_AUTO_WB, 0)
+        held = self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL) and self._capture.set(
+            cv2.CAP_PROP_EXPOSURE, value
+        )
+        return float(value) if held else None
+
+    def close(self) -> None:
+        """Release the device."""
+        self._capture.release()
+
+    def _ask(self, size: tuple[int, int] | None, rate_hz: float | None) -> None:
+        if rate_hz is not None:
+            self._capture.set(cv2.CAP_PROP_FPS, rate_hz)
+        if size is None:
+            return
+        keys = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        for key, value in zip(keys, size, strict=True):
+            self._capture.set(key, value)
+        given = tuple(int(self._capture.get(key)) for key in keys)
+        if given != size:
+            raise SourceError(
+                "camera does not support this image size",
+                where=self.name,
+                got=f"{given[0]}x{given[1]}",
+                expected=f"{size[0]}x{size[1]}",
+            )

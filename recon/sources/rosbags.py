@@ -1,0 +1,312 @@
+"""Bags of ROS 1 (.bag), ROS 2 (a folder, .db3) and MCAP, read with rosbags, without ROS.
+
+Only message types that a stereo source or a motion prior needs are read; a bag may contain any
+others, known or not. Exceptions of rosbags and its dependencies become a `FormatError`.
+"""
+
+from __future__ import annotations
+
+import heapq
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.errors import FormatError, ReconError
+from recon.core.optional import require
+from recon.core.values.arrays import Float64
+
+IMAGE: Final = "sensor_msgs/msg/Image"
+COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
+TRANSFORMS: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+POSES: Final = (
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+    *TRANSFORMS,
+)
+_EXTRA: Final = "ros"
+_NS_PER_S: Final = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class BagTopic:
+    """One topic.
+
+    Attributes:
+        name: Name of the topic.
+        kind: Message type, such as `IMAGE`, `COMPRESSED`, `CAMERA_INFO` or one of `POSES`.
+        messages: Number of messages.
+    """
+
+    name: str
+    kind: str
+    messages: int
+
+
+@dataclass(frozen=True, eq=False)
+class BagImage:
+    """An image as recorded; a compressed image has only ``encoding`` and ``data``.
+
+    Attributes:
+        encoding: ROS's encoding, such as ``mono8`` or ``bgr8``; ``format`` of a compressed image.
+        data: The bytes.
+        width_px: Width; 0 if compressed.
+        height_px: Height; 0 if compressed.
+        step: Bytes per row; 0 if compressed.
+        big_endian: Whether 16-bit pixels are big-endian.
+    """
+
+    encoding: str
+    data: NDArray[np.uint8]
+    width_px: int = 0
+    height_px: int = 0
+    step: int = 0
+    big_endian: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class BagCameraInfo:
+    """``sensor_msgs/CameraInfo``.
+
+    Attributes:
+        width_px: Width of the images.
+        height_px: Height of the images.
+        model: Name of the lens model.
+        D: float64 (N,), distortion.
+        K: float64 (3, 3), the raw camera.
+        R: float64 (3, 3), rotation of the rectification.
+        P: float64 (3, 4), the rectified camera.
+    """
+
+    width_px: int
+    height_px: int
+    model: str
+    D: Float64
+    K: Float64
+    R: Float64
+    P: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class BagPose:
+    """The pose of one frame in another, from any of the `POSES`.
+
+    Attributes:
+        recorded_ns: Time of recording.
+        stamp_ns: Header stamp; 0 = none.
+        parent: The frame the pose is given in.
+        child: The frame whose pose it is; empty if the message does not say.
+        xyz_m: float64 (3,), position.
+        xyzw: float64 (4,), quaternion.
+    """
+
+    recorded_ns: int
+    stamp_ns: int
+    parent: str
+    child: str
+    xyz_m: Float64
+    xyzw: Float64
+
+
+class Bag:
+    """A recording in one or more files.
+
+    Args:
+        paths: ROS 1 files that belong together, or one folder or file of ROS 2.
+
+    Attributes:
+        topics: All topics, by name.
+
+    Raises:
+        MissingDependencyError: rosbags is not installed.
+        FormatError: The recording is missing, truncated or damaged.
+    """
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.paths = tuple(paths)
+        self._ros1 = self.paths[0].suffix == ".bag"
+        module = "rosbags.rosbag1" if self._ros1 else "rosbags.rosbag2"
+        self._reader = require(module, extra=_EXTRA).Reader
+        typesys = require("rosbags.typesys", extra=_EXTRA)
+        store = typesys.Stores.ROS1_NOETIC if self._ros1 else typesys.Stores.ROS2_HUMBLE
+        self._store = typesys.get_typestore(store)
+        for kind in TRANSFORMS:
+            if kind not in self._store.types:
+                fields = "geometry_msgs/TransformStamped[] transforms\n"
+                self._store.register(typesys.get_types_from_msg(fields, kind))
+        self.topics = self._list_topics()
+
+    def scan(self, topics: Sequence[str]) -> dict[str, NDArray[np.int64]]:
+        """Read only the times of all messages of some topics.
+
+        Returns:
+            For each topic int64 (N, 2), nanoseconds: time of recording and header stamp, in the
+            order of recording.
+
+        Raises:
+            FormatError: The recording is truncated or damaged.
+        """
+        times: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
+        for topic, recorded_ns, content in self._messages(topics):
+            times[topic].append((recorded_ns, self._stamp_ns(content, topic)))
+        return {
+            topic: np.array(found, dtype=np.int64).reshape(-1, 2) for topic, found in times.items()
+        }
+
+    def images(self, topic: str, start_ns: int | None = None) -> Iterator[BagImage]:
+        """Yield the images of a topic in the order of recording.
+
+        Args:
+            topic: An image topic.
+            start_ns: Skip messages recorded before this time.
+
+        Raises:
+            FormatError: The recording is truncated or damaged.
+        """
+        compressed = self.topics[topic].kind == COMPRESSED
+        for _, _, content in self._messages([topic], start_ns):
+            message = self._parse(content, topic)
+            if compressed:
+                yield BagImage(message.format, message.data)
+            else:
+                yield BagImage(
+                    message.encoding,
+                    message.data,
+                    message.width,
+                    message.height,
+                    message.step,
+                    bool(message.is_bigendian),
+                )
+
+    def camera_info(self, topic: str) -> BagCameraInfo:
+        """Read the first message of a ``CameraInfo`` topic.
+
+        Raises:
+            FormatError: There is no message, or the recording is damaged.
+        """
+        for _, _, content in self._messages([topic]):
+            message = self._parse(content, topic)
+            # ROS 1 has upper-case field names.
+            matrix = {
+                name: np.array(getattr(message, name if self._ros1 else name.lower()))
+                for name in "DKRP"
+            }
+            return BagCameraInfo(
+                width_px=int(message.width),
+                height_px=int(message.height),
+                model=str(message.distortion_model),
+                D=matrix["D"].astype(np.float64),
+                K=matrix["K"].reshape(3, 3),
+                R=matrix["R"].reshape(3, 3),
+                P=matrix["P"].reshape(3, 4),
+            )
+        raise FormatError("topic has no message", where=self.paths[0], got=topic)
+
+    def frame_id(self, topic: str) -> str:
+        """The coordinate frame that the first message of an image topic names; empty if none."""
+        for _, _, content in self._messages([topic]):
+            return str(self._parse(content, topic).header.frame_id).lstrip("/")
+        return ""
+
+    def poses(self, topic: str) -> Iterator[BagPose]:
+        """Yield the poses of a topic of one of the `POSES`, in the order of recording.
+
+        Raises:
+            FormatError: The recording is truncated or damaged.
+        """
+        for _, recorded_ns, content in self._messages([topic]):
+            message = self._parse(content, topic)
+            for part in getattr(message, "transforms", [message]):
+                yield _pose_of(part, recorded_ns)
+
+    def _list_topics(self) -> dict[str, BagTopic]:
+        found: dict[str, BagTopic] = {}
+        with self._our_errors(), self._opened() as readers:
+            for connection in (c for reader in readers for c in reader.connections):
+                name, kind = connection.topic, connection.msgtype
+                before = found[name].messages if name in found else 0
+                found[name] = BagTopic(name, kind, before + connection.msgcount)
+        return found
+
+    def _messages(
+        self, topics: Sequence[str], start_ns: int | None = None
+    ) -> Iterator[tuple[str, int, bytes]]:
+        """Topic, time of recording and content of each message, in that order."""
+        with self._our_errors(), self._opened() as readers:
+            streams = []
+            for reader in readers:
+                wanted = [c for c in reader.connections if c.topic in topics]
+                if wanted:
+                    streams.append(reader.messages(wanted, start=start_ns))
+            for connection, recorded_ns, content in heapq.merge(*streams, key=lambda m: m[1]):
+                yield connection.topic, recorded_ns, content
+
+    def _parse(self, content: bytes, topic: str) -> Any:
+        kind = self.topics[topic].kind
+        with self._our_errors():
+            if self._ros1:
+                return self._store.deserialize_ros1(content, kind)
+            return self._store.deserialize_cdr(content, kind)
+
+    def _stamp_ns(self, content: bytes, topic: str) -> int:
+        """The header stamp: all supported types begin with a header."""
+        try:
+            if self._ros1:
+                _, seconds, nanoseconds = struct.unpack_from("<III", content)
+            else:
+                # The second byte of CDR gives the byte order.
+                order = "<" if content[1] & 1 else ">"
+                seconds, nanoseconds = struct.unpack_from(order + "iI", content, 4)
+        except (struct.error, IndexError) as error:
+            raise FormatError(
+                "message is too short", where=self.paths[0], got=f"{len(content)} bytes on {topic}"
+            ) from error
+        return int(seconds) * _NS_PER_S + int(nanoseconds)
+
+    @contextmanager
+    def _opened(self) -> Iterator[list[Any]]:
+        with ExitStack() as stack:
+            yield [stack.enter_context(self._reader(path)) for path in self.paths]
+
+    @contextmanager
+    def _our_errors(self) -> Iterator[None]:
+        """Convert any exception that a damaged file causes to a `FormatError`."""
+        try:
+            yield
+        except (ReconError, MemoryError):
+            raise
+        except Exception as error:
+            raise FormatError(
+                "recording cannot be read",
+                where=self.paths[0],
+                got=str(error) or type(error).__name__,
+                hint="it may be truncated; copy it again, or repair it with rosbag reindex, "
+                "ros2 bag reindex or mcap recover",
+            ) from error
+
+
+def _pose_of(message: Any, recorded_ns: int) -> BagPose:
+    """The pose in a message; one with a covariance is wrapped once more."""
+    if hasattr(message, "transform"):
+        place, turn = message.transform.translation, message.transform.rotation
+    else:
+        pose = getattr(message.pose, "pose", message.pose)
+        place, turn = pose.position, pose.orientation
+    stamp = message.header.stamp
+    return BagPose(
+        recorded_ns,
+        int(stamp.sec) * _NS_PER_S + int(stamp.nanosec),
+        # Old recordings write frames with a leading slash.
+        str(message.header.frame_id).lstrip("/"),
+        str(getattr(message, "child_frame_id", "")).lstrip("/"),
+        np.array([place.x, place.y, place.z], dtype=np.float64),
+        np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64),
+    )

@@ -1,0 +1,1 @@
+"""From a recorded pair to a cloud: rectification, matching, back-projection."""

@@ -1,0 +1,97 @@
+"""Back-projection of a disparity map to 3-D points with uncertainties."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+from pydantic import Field
+
+from recon.core.errors import ShapeError
+from recon.core.settings import Settings
+from recon.core.values import Disparity, PointCloud, RectifiedCamera, RectifiedPair
+from recon.stereo.kernels import points
+
+
+class CloudSettings(Settings):
+    """Which pixels become points."""
+
+    min_range_m: float = Field(default=0.1, ge=0, description="Nearest depth kept.")
+    max_range_m: float | None = Field(
+        default=30.0, gt=0, description="Farthest depth kept; null = no limit."
+    )
+    max_relative_sigma: float | None = Field(
+        default=0.1, gt=0, description="Largest sigma_z / Z kept; null = no limit."
+    )
+    min_confidence: float = Field(default=0.0, ge=0, le=1, description="Least confidence kept.")
+    stride: int = Field(default=1, ge=1, le=16, description="Every n-th row and column is used.")
+    normals_radius_px: int | None = Field(
+        default=3,
+        ge=1,
+        le=20,
+        description="Half width of the window that gives a point its normal; null = no normals.",
+    )
+
+
+def back_project(disparity: Disparity, pair: RectifiedPair, settings: CloudSettings) -> PointCloud:
+    """Points of the pixels that have a disparity, ``Z = f·b / (d + doffs)``.
+
+    Args:
+        disparity: The disparity of ``pair``.
+        pair: Provides the camera, the colours and the pixels valid after rectification.
+        settings: Range, confidence and thinning.
+
+    Returns:
+        A cloud in camera axes with colours, ``sigma_m`` (``sigma_z = Z²·sigma_d / (f·b)``),
+        confidence and, if asked for, normals towards the camera; points in row order. It may
+        be empty.
+
+    Raises:
+        ShapeError: The disparity and the pair differ in size.
+    """
+    if disparity.values.shape != pair.left.shape:
+        raise ShapeError(
+            "disparity and image differ in size",
+            got=f"disparity {disparity.values.shape}",
+            expected=f"{pair.left.shape}",
+        )
+    found = points.make_points(_maps(disparity, pair), _rules(pair.camera, settings))
+    return PointCloud(
+        xyz=found.xyz,
+        rgb=found.colours,
+        normals=None if settings.normals_radius_px is None else found.normals,
+        sigma_m=found.sigma,
+        confidence=found.confidence,
+        frame="camera",
+    )
+
+
+def _maps(disparity: Disparity, pair: RectifiedPair) -> points.Maps:
+    return points.Maps(
+        values=disparity.values,
+        confidence=disparity.confidence,
+        sigma=disparity.sigma_px,
+        colours=pair.left[:, :, None] if pair.left_rgb is None else pair.left_rgb,
+        usable=np.zeros((0, 0), np.bool_) if pair.valid is None else pair.valid,
+    )
+
+
+def _rules(camera: RectifiedCamera, settings: CloudSettings) -> points.PointRules:
+    return points.PointRules(
+        focal=float(camera.focal_px),
+        cx=float(camera.cx_px),
+        cy=float(camera.cy_px),
+        fb=float(camera.focal_px * camera.baseline_m),
+        doffs=float(camera.doffs_px),
+        nearest=settings.min_range_m,
+        farthest=_or_infinity(settings.max_range_m),
+        relative_sigma=_or_infinity(settings.max_relative_sigma),
+        confidence=settings.min_confidence,
+        stride=settings.stride,
+        radius=settings.normals_radius_px or 0,
+    )
+
+
+def _or_infinity(limit: float | None) -> float:
+    # The largest float, not infinity: 0 · inf is NaN, and infinite depths must be rejected.
+    return sys.float_info.max if limit is None else limit

@@ -1,0 +1,226 @@
+"""Open3D's point cloud filters: arrays in, arrays out, its errors converted to ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from recon.core.errors import SettingsError, ShapeError
+from recon.core.values.arrays import Bool, Float32, Float64, Int32
+
+# Open3D searches by squared distances, and float32 ends at 3e38.
+_SEARCHABLE_M: Final = 1e18
+
+
+def voxel_downsample(
+    xyz: NDArray[Any], attributes: NDArray[Any], voxel_m: float
+) -> tuple[Float32, Float32]:
+    """One point per occupied voxel: the mean of its points and of their attributes.
+
+    Args:
+        xyz: (N, 3), metres, finite.
+        attributes: (N, K) attributes of the points; K may be 0.
+        voxel_m: Voxel size.
+
+    Returns:
+        float32 (M, 3) and float32 (M, K).
+
+    Raises:
+        SettingsError: The voxel is too small for Open3D's voxel index.
+        ShapeError: A point is not finite.
+    """
+    # Open3D averages three attributes per point (as colours), so they are passed in groups of
+    # three; the order of its voxels depends only on positions and is the same for each group.
+    groups = [attributes[:, k : k + 3] for k in range(0, attributes.shape[1], 3)]
+    cloud = _legacy(xyz)
+    if not groups:
+        return _array(_voxelised(cloud, voxel_m).points), np.zeros((0, 0), dtype=np.float32)
+    means = []
+    for group in groups:
+        padded = np.zeros((len(xyz), 3))
+        padded[:, : group.shape[1]] = group
+        cloud.colors = o3d.utility.Vector3dVector(padded)
+        reduced = _voxelised(cloud, voxel_m)
+        means.append(_array(reduced.colors)[:, : group.shape[1]])
+    return _array(reduced.points), np.concatenate(means, axis=1)
+
+
+def statistical_inliers(xyz: NDArray[Any], neighbours: int, sigmas: float) -> Bool:
+    """Points whose mean distance to their neighbours is not unusually large.
+
+    Args:
+        xyz: (N, 3), metres, finite.
+        neighbours: Number of nearest neighbours.
+        sigmas: Limit, in standard deviations above the mean over the cloud.
+
+    Returns:
+        bool (N,), True = keep.
+    """
+    if len(xyz) <= neighbours:
+        return np.ones(len(xyz), dtype=bool)
+    with _quiet():
+        _, index = _legacy(xyz).remove_statistical_outlier(neighbours, sigmas)
+    return _mask(index, len(xyz))
+
+
+def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float) -> Bool:
+    """Points that have at least ``neighbours`` others within ``radius_m``.
+
+    Args:
+        xyz: (N, 3), metres, finite.
+        neighbours: Minimum number of other points within the radius.
+        radius_m: The radius.
+
+    Returns:
+        bool (N,), True = keep.
+    """
+    if len(xyz) == 0:
+        return np.ones(0, dtype=bool)
+    with _quiet():
+        # Open3D counts the point itself, but requires more neighbours than the given number.
+        _, index = _legacy(xyz).remove_radius_outlier(neighbours, radius_m)
+    return _mask(index, len(xyz))
+
+
+def estimate_normals(xyz: NDArray[Any], neighbours: int) -> Float32:
+    """Unit normals of the planes fitted to each point's nearest neighbours, of arbitrary sign.
+
+    Args:
+        xyz: (N, 3), metres, finite.
+        neighbours: Number of nearest neighbours, including the point itself.
+
+    Returns:
+        float32 (N, 3).
+    """
+    cloud = _legacy(xyz)
+    with _quiet():
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(neighbours))
+    return _array(cloud.normals)
+
+
+def agree_normals(xyz: NDArray[Any], normals: NDArray[Any], neighbours: int) -> Float32:
+    """Orient normals consistently between neighbours, along a minimum spanning tree.
+
+    Args:
+        xyz: (N, 3), metres, finite.
+        normals: (N, 3), unit.
+        neighbours: Number of nearest neighbours that the tree may connect.
+
+    Returns:
+        float32 (N, 3).
+
+    Ref: Hoppe et al., "Surface reconstruction from unorganized points", SIGGRAPH 1992.
+    """
+    try:
+        return _orient(_legacy(xyz), normals, neighbours)
+    except RuntimeError:
+        # Qhull finds no simplex among points of one plane or one sphere; moved a little, it does.
+        return _orient(_legacy(_joggled(xyz)), normals, neighbours)
+
+
+def _orient(cloud: Any, normals: NDArray[Any], neighbours: int) -> Float32:
+    """Open3D's own flipping."""
+    cloud.normals = o3d.utility.Vector3dVector(np.array(normals, dtype=np.float64))
+    with _quiet():
+        cloud.orient_normals_consistent_tangent_plane(min(neighbours, len(cloud.points) - 1))
+    return _array(cloud.normals)
+
+
+def _joggled(xyz: NDArray[Any]) -> Float64:
+    """The points, moved by up to a millionth of their extent, the same way each time."""
+    points = _finite(xyz)
+    reach = 1e-6 * float(np.ptp(points, axis=0).max())
+    return points + np.random.default_rng(0).uniform(-reach, reach, points.shape)
+
+
+def nearest(
+    query: NDArray[Any], reference: NDArray[Any], neighbours: int = 1
+) -> tuple[Int32, Float32]:
+    """The nearest reference points of each query point.
+
+    Args:
+        query: (N, 3), metres, finite.
+        reference: (M, 3), metres, finite, ``M >= neighbours``.
+        neighbours: Number of neighbours.
+
+    Returns:
+        int32 (N, neighbours), rows of ``reference``, and float32 (N, neighbours), distances in
+        metres, nearest first.
+
+    Raises:
+        ShapeError: There are fewer reference points than neighbours, a point is not finite, or
+            points lie so far apart that float32 cannot hold squared distances.
+    """
+    if len(reference) < neighbours:
+        raise ShapeError(
+            "too few points to search", got=len(reference), expected=f"at least {neighbours}"
+        )
+    if len(query) == 0:
+        empty = np.zeros((0, neighbours))
+        return empty.astype(np.int32), empty.astype(np.float32)
+    # Far from the origin, squared float32 distances lose centimetres: centre both clouds.
+    centre = np.mean(reference, axis=0, dtype=np.float64)
+    moved = [_finite(xyz) - centre for xyz in (reference, query)]
+    farthest_m = max(float(np.abs(xyz).max()) for xyz in moved)
+    if farthest_m > _SEARCHABLE_M:
+        raise ShapeError(
+            "points lie too far apart to be searched",
+            got=f"{farthest_m:.3g} m",
+            expected=f"at most {_SEARCHABLE_M:.0e} m",
+        )
+    near_origin, points = (_tensor(xyz) for xyz in moved)
+    with _quiet():
+        search = o3d.core.nns.NearestNeighborSearch(near_origin)
+        search.knn_index()
+        index, squared = search.knn_search(points, neighbours)
+    return index.numpy().astype(np.int32), np.sqrt(squared.numpy()).astype(np.float32)
+
+
+def _voxelised(cloud: Any, voxel_m: float) -> Any:
+    """Open3D's voxel downsampling."""
+    try:
+        with _quiet():
+            return cloud.voxel_down_sample(voxel_m)
+    except RuntimeError as error:
+        raise SettingsError(
+            "the voxel is too small for the extent of the cloud", got=f"{voxel_m:g} m"
+        ) from error
+
+
+def _legacy(xyz: NDArray[Any]) -> Any:
+    """Open3D cloud of a copy of the points; it accepts neither read-only nor float32 arrays."""
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(_finite(xyz).copy()))
+
+
+def _finite(xyz: NDArray[Any]) -> Float64:
+    """The points as float64, checked to be finite."""
+    points = np.asarray(xyz, dtype=np.float64)
+    if not np.isfinite(points).all():
+        raise ShapeError("a point of the cloud is not finite")
+    return points
+
+
+def _tensor(xyz: NDArray[Any]) -> Any:
+    return o3d.core.Tensor.from_numpy(np.array(xyz, dtype=np.float32))
+
+
+def _array(vectors: Any) -> Float32:
+    return np.asarray(vectors).astype(np.float32)
+
+
+def _mask(index: Any, length: int) -> Bool:
+    mask = np.zeros(length, dtype=bool)
+    mask[np.asarray(index, dtype=np.intp)] = True
+    return mask
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Open3D's warnings off standard output; errors that matter are checked and raised."""
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        yield

@@ -1,0 +1,107 @@
+"""One frame, from the recorded pair to a filtered cloud: the stateless part of the pipeline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from recon.core.values import (
+    Disparity,
+    PointCloud,
+    RayCloud,
+    RectifiedCamera,
+    RectifiedPair,
+    StereoCalibration,
+    StereoPair,
+)
+from recon.run.stopwatch import Stopwatch
+from recon.stereo.cloud import back_project, filter_cloud, remove_flying_edges
+from recon.stereo.match import make_matcher
+from recon.stereo.rectify import Rectifier, check_inspection, inspect_pair
+from recon.stereo.settings import StereoSettings
+
+
+@dataclass(frozen=True, eq=False)
+class ReconstructedFrame:
+    """The results of one stereo pair.
+
+    Attributes:
+        pair: The rectified images.
+        disparity: Its disparity, with flying edges removed.
+        cloud: Its points in camera axes, filtered.
+        warnings: Problems of the images that did not prevent a result.
+        rays: Its rays for the occupancy map; None if no map is made.
+    """
+
+    pair: RectifiedPair
+    disparity: Disparity
+    cloud: PointCloud
+    warnings: tuple[str, ...] = ()
+    rays: RayCloud | None = None
+
+
+class FrameReconstructor:
+    """Reconstructs pairs: rectify, inspect, match, remove edges, back-project, filter.
+
+    Args:
+        calibration: Calibration of the cameras.
+        config: The configuration.
+        threads: Threads for the matcher; None = all cores. Does not change results.
+        stopwatch: Records the time per stage.
+    """
+
+    def __init__(
+        self,
+        calibration: RectifiedCamera | StereoCalibration,
+        config: StereoSettings,
+        *,
+        threads: int | None = None,
+        stopwatch: Stopwatch | None = None,
+    ) -> None:
+        self._config = config
+        self._stopwatch = stopwatch or Stopwatch()
+        self._rectifier = Rectifier(calibration, config.rectification)
+        self._matcher = make_matcher(config.matching.matcher, config.matching, threads)
+
+    @property
+    def camera(self) -> RectifiedCamera:
+        """The rectified camera of all frames."""
+        return self._rectifier.camera
+
+    def match(self, pair: StereoPair) -> tuple[RectifiedPair, Disparity]:
+        """Rectify and match one pair, and remove flying edges."""
+        config, stage = self._config, self._stopwatch.stage
+        with stage("rectify"):
+            rectified = self._rectifier.rectify(pair)
+        with stage("match"):
+            disparity = self._matcher.match(rectified)
+        with stage("edges"):
+            disparity = remove_flying_edges(disparity, config.edges)
+        return rectified, disparity
+
+    def inspect(self, pair: RectifiedPair) -> tuple[str, ...]:
+        """Warnings about the geometry of a pair; only every so many pairs are inspected.
+
+        Raises:
+            CalibrationError: Left and right are swapped.
+        """
+        settings = self._config.inspection
+        if settings.every is None or pair.index % settings.every:
+            return ()
+        with self._stopwatch.stage("inspect"):
+            found = inspect_pair(pair, settings)
+        return check_inspection(found, settings, where=f"frame {pair.index}")
+
+    def reconstruct(self, pair: StereoPair) -> ReconstructedFrame:
+        """Reconstruct one pair.
+
+        Raises:
+            CalibrationError: Left and right are swapped.
+        """
+        config, stage = self._config, self._stopwatch.stage
+        rectified, disparity = self.match(pair)
+        warnings = self.inspect(rectified)
+        with stage("back_project"):
+            cloud = back_project(disparity, rectified, config.cloud)
+        with stage("filter"):
+            cloud = filter_cloud(cloud, config.filters)
+        return ReconstructedFrame(rectified, disparity, cloud, warnings)

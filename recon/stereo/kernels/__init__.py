@@ -1,0 +1,1 @@
+"""Compiled loops of matching and back-projection, each with a reference implementation."""

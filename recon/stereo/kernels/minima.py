@@ -1,0 +1,64 @@
+"""What a search finds: the best candidate of each pixel, in the left view and in the right.
+
+Both views are found from the same costs, so a left-right check needs no second search.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.kernels.compiled import kernel
+
+NO_COST: Final = 65535
+"""Stands for the cost of a candidate that does not exist; real costs stay below it."""
+
+
+class Minima(NamedTuple):
+    """What a search finds.
+
+    Attributes:
+        winner: uint16 (H, W), best candidate of each pixel of the left view; ndisp = none.
+        costs: uint16 (4, H, W), costs of the best, of the ones before and after it, and of the
+            best that is at least two candidates away; `NO_COST` = does not exist.
+        right_winner: uint16 (H, W), best candidate of each pixel of the right view; ndisp = none.
+    """
+
+    winner: NDArray[np.uint16]
+    costs: NDArray[np.uint16]
+    right_winner: NDArray[np.uint16]
+
+
+def empty_minima(height: int, width: int) -> Minima:
+    """Arrays for a search to write to."""
+    # One block, so that the system uses large pages: faulting in small ones outlasts a search.
+    block = np.empty((6, height, width), np.uint16)
+    return Minima(winner=block[0], costs=block[1:5], right_winner=block[5])
+
+
+@kernel
+def claim_right(ndisp: int, minimum: int, y: int, minima: Minima) -> None:
+    """Match each pixel of row ``y`` of the right view to the left pixel that chose it best.
+
+    The left pixel of the least cost gets it, of equal ones the leftmost. The check is weaker than
+    with a search of the right view among all costs, but takes a hundredth of the time.
+
+    Args:
+        ndisp: Number of candidates.
+        minimum: Disparity of candidate 0, pixels.
+        y: The row.
+        minima: Read: row ``y`` of ``winner`` and the best costs. Written: row ``y`` of
+            ``right_winner``.
+    """
+    best = np.full(minima.winner.shape[1], NO_COST, np.uint16)
+    winners, costs, claims = minima.winner[y], minima.costs[0, y], minima.right_winner[y]
+    claims[:] = ndisp
+    for x in range(best.size):
+        k = np.int64(winners[x])
+        if k < ndisp:
+            # Unsigned: an index that cannot be negative needs no check.
+            right = np.uint64(x - minimum - k)
+            if costs[x] < best[right]:
+                best[right], claims[right] = costs[x], k

@@ -1,0 +1,163 @@
+"""Speckles: small connected regions of a disparity map."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.kernels.compiled import kernel
+
+
+class _Runs(NamedTuple):
+    """Connected pixels of a row: run ``n`` is ``starts[n]`` to ``ends[n] - 1``.
+
+    There is memory for as many runs as pixels; pages that are never touched cost nothing.
+
+    Attributes:
+        starts: int32 (N,), indices into the flattened map.
+        ends: int32 (N,).
+        parents: int32 (N,), an earlier run of the same region, or for the root itself.
+        sizes: int32 (N,), for a root, pixels of its region.
+    """
+
+    starts: NDArray[np.int32]
+    ends: NDArray[np.int32]
+    parents: NDArray[np.int32]
+    sizes: NDArray[np.int32]
+
+
+class _Row(NamedTuple):
+    """The runs of a row.
+
+    Attributes:
+        runs: int32 (W,), the run of each pixel that has a value.
+        breaks: uint8 (W,), 1 where a pixel does not belong to the run of the one before.
+    """
+
+    runs: NDArray[np.int32]
+    breaks: NDArray[np.uint8]
+
+
+@kernel
+def find_speckles(
+    values: NDArray[np.float32], largest_step: float, smallest_size: int
+) -> NDArray[np.bool_]:
+    """Mark the pixels of regions that are too small.
+
+    Two neighbours (left, right, above, below) belong to one region when both have a value and
+    the values differ by ``largest_step`` or less.
+
+    Args:
+        values: float32 (H, W); NaN = no value.
+        largest_step: In the unit of ``values``.
+        smallest_size: Regions of fewer pixels are marked.
+
+    Returns:
+        bool (H, W); False where there is no value.
+
+    Ref: union-find with path halving, R. Sedgewick, K. Wayne, "Algorithms", 4th ed., 1.5; runs as
+    nodes, L. He, Y. Chao, K. Suzuki, "A run-based two-scan labeling algorithm", IEEE Transactions
+    on Image Processing 17, 2008.
+    """
+    height, width = values.shape
+    block = np.empty((values.size, 4), np.int32)
+    runs = _Runs(block[:, 0], block[:, 1], block[:, 2], block[:, 3])
+    above = _Row(np.empty(width, np.int32), np.empty(width, np.uint8))
+    here = _Row(np.empty(width, np.int32), np.empty(width, np.uint8))
+    touches, joins = np.empty(width, np.uint8), np.empty(width, np.uint8)
+    count, step = 0, np.float32(largest_step)
+    for y in range(height):
+        above, here = here, above
+        count = _cut_row(values[y], y * width, step, runs, count, here)
+        if y > 0:
+            _mark_touching(values[y], values[y - 1], step, touches)
+            _join_rows(touches, runs.parents, above, here, joins)
+    small = np.zeros((height, width), np.bool_)
+    _mark_small(runs, count, smallest_size, small.reshape(-1))
+    return small
+
+
+@kernel
+def _cut_row(
+    row: NDArray[np.float32], place: int, step: np.float32, runs: _Runs, count: int, here: _Row
+) -> int:
+    """Append the runs of a row to the ``count`` there are; return how many there are then."""
+    breaks, width = here.breaks, row.size
+    _mark_touching(row[1:], row, step, breaks[1:])
+    for x in range(1, width):
+        breaks[x] = np.uint8(1) - breaks[x]
+    breaks[0], x = 1, 0
+    while x < width:
+        start = x
+        x += 1
+        while x < width and breaks[x] == 0:
+            x += 1
+        if not np.isnan(row[start]):
+            here.runs[start:x] = count
+            runs.starts[count], runs.ends[count] = place + start, place + x
+            runs.parents[count], runs.sizes[count] = count, 0
+            count += 1
+    return count
+
+
+@kernel
+def _mark_touching(
+    one: NDArray[np.float32], other: NDArray[np.float32], step: np.float32, marks: NDArray[np.uint8]
+) -> None:
+    """Mark the pixels whose values differ by a step or less. No comparison with NaN is true."""
+    for x in range(one.size):
+        marks[x] = np.uint8(1) if abs(one[x] - other[x]) <= step else np.uint8(0)
+
+
+@kernel
+def _join_rows(
+    touches: NDArray[np.uint8],
+    parents: NDArray[np.int32],
+    above: _Row,
+    here: _Row,
+    joins: NDArray[np.uint8],
+) -> None:
+    """Join the runs of a row with those of the row above, where their pixels touch."""
+    # Along two runs that touch, one join does: where either begins, or where they begin to touch.
+    before, begins, begins_above = touches[:-1], here.breaks[1:], above.breaks[1:]
+    joins[0], last = touches[0], joins[1:]
+    for x in range(last.size):
+        goes_on = before[x] & ~(begins[x] | begins_above[x])
+        last[x] = touches[x + 1] & ~goes_on
+    for x in range(joins.size):
+        if joins[x] != 0:
+            _join(parents, here.runs[x], above.runs[x])
+
+
+@kernel
+def _mark_small(runs: _Runs, count: int, smallest_size: int, small: NDArray[np.bool_]) -> None:
+    """Mark the runs of regions of fewer pixels."""
+    parents = runs.parents
+    for run in range(count):
+        # A parent comes before its child: it points to its root already.
+        parents[run] = parents[parents[run]]
+        runs.sizes[parents[run]] += runs.ends[run] - runs.starts[run]
+    for run in range(count):
+        if runs.sizes[parents[run]] < smallest_size:
+            small[runs.starts[run] : runs.ends[run]] = True
+
+
+@kernel
+def _join(parents: NDArray[np.int32], one: int, other: int) -> None:
+    """Give two regions one root: the smaller index."""
+    a, b = _root(parents, one), _root(parents, other)
+    if a < b:
+        parents[b] = a
+    else:
+        parents[a] = b
+
+
+@kernel
+def _root(parents: NDArray[np.int32], node: int) -> int:
+    """The root of a node's region; every step halves the path for the next call."""
+    while parents[node] != node:
+        parents[node] = parents[parents[node]]
+        node = parents[node]
+    return node

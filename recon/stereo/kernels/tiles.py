@@ -1,0 +1,123 @@
+"""Which candidates are searched in which tile of a picture.
+
+A search at half size costs an eighth and tells which disparities occur in each part of a picture.
+Only those are worth searching at full size.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.kernels.compiled import kernel
+
+GROUP: Final = 8
+"""Candidates that are offered or left out together."""
+
+Offer = NDArray[np.bool_]
+"""bool (G,), which groups of candidates are offered."""
+
+
+class Tiles(NamedTuple):
+    """Which candidates are offered where.
+
+    Attributes:
+        offered: bool (I, J, G), by tile and group of candidates.
+        height: Rows of a tile, at least the half height of a window.
+        width: Columns of a tile.
+    """
+
+    offered: NDArray[np.bool_]
+    height: int
+    width: int
+
+
+class Support(NamedTuple):
+    """How much support by matches at half size offers a group of candidates to a tile.
+
+    Attributes:
+        margin_x: Columns beside a tile whose matches count too, pixels at full size.
+        margin_y: Rows above and below a tile whose matches count too, pixels at full size.
+        margin: A match supports candidates up to this far from it.
+        matched: Least share of matched pixels; with fewer, all candidates are offered.
+        share: Least share of the matches that support an offered group.
+        least: Least number of matches that support an offered group.
+    """
+
+    margin_x: int
+    margin_y: int
+    margin: int
+    matched: float
+    share: float
+    least: int
+
+
+def make_tiles(shape: tuple[int, int], size: tuple[int, int], ndisp: int) -> Tiles:
+    """Tiles that are offered every candidate.
+
+    Args:
+        shape: Rows and columns of the picture.
+        size: Rows and columns of a tile.
+        ndisp: Number of candidates.
+    """
+    across, down = -(-shape[0] // size[0]), -(-shape[1] // size[1])
+    return Tiles(np.ones((across, down, -(-ndisp // GROUP)), np.bool_), *size)
+
+
+@kernel
+def offer_supported(
+    halved: NDArray[np.float32],
+    minimum: int,
+    ndisp: int,
+    support: Support,
+    first: int,
+    end: int,
+    tiles: Tiles,
+) -> None:
+    """Offer the tiles of some rows those groups of candidates that matches at half size support.
+
+    Args:
+        halved: float32 (h, w), disparities of the pictures at half size; NaN = no match.
+        minimum: Disparity of candidate 0 at full size.
+        ndisp: Number of candidates at full size.
+        support: How much support is needed.
+        first: First row of tiles to do.
+        end: The row after the last.
+        tiles: ``offered`` is written.
+    """
+    counts = np.empty(ndisp, np.int64)
+    _, columns, groups = tiles.offered.shape
+    for i in range(first, end):
+        y0, y1 = _reach(i, tiles.height, support.margin_y, halved.shape[0])
+        for j in range(columns):
+            x0, x1 = _reach(j, tiles.width, support.margin_x, halved.shape[1])
+            counts[:] = 0
+            matched = _count(halved[y0:y1, x0:x1], minimum, counts)
+            least = max(support.share * matched, support.least)
+            everything = matched < support.matched * (y1 - y0) * (x1 - x0)
+            for group in range(groups):
+                first = max(group * GROUP - support.margin, 0)
+                supporters = counts[first : (group + 1) * GROUP + support.margin].sum()
+                tiles.offered[i, j, group] = everything or supporters >= least
+
+
+@kernel
+def _reach(tile: int, size: int, margin: int, halved: int) -> tuple[int, int]:
+    """Range at half size that counts for a tile, along one axis: first and one after the last."""
+    start, end = tile * size - margin, (tile + 1) * size + margin
+    return max(start, 0) // 2, min(end // 2, halved)
+
+
+@kernel
+def _count(halved: NDArray[np.float32], minimum: int, counts: NDArray[np.int64]) -> int:
+    """Count the matches at each candidate of full size; return their number."""
+    matched = 0
+    for y in range(halved.shape[0]):
+        for x in range(halved.shape[1]):
+            if not np.isnan(halved[y, x]):
+                k = np.int64(np.rint(2 * halved[y, x])) - minimum
+                counts[min(max(k, 0), counts.size - 1)] += 1
+                matched += 1
+    return matched

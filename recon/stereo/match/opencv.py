@@ -1,0 +1,208 @@
+"""OpenCV's block matcher and its semi-global matcher, to compare with.
+
+What changes at this border: OpenCV gives 16ths of a pixel, and ``(minimum - 1) · 16`` where it
+found nothing; it skips the columns that the whole range does not fit, unless `OpencvSettings.pad`
+widens the pictures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from recon.core.errors import MatchingError
+from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
+from recon.core.values.arrays import UInt8
+from recon.stereo.match.search import LEFT_RIGHT_PX, OddInt, SearchSettings
+from recon.stereo.match.unrated import unrated_disparity
+
+_STEPS: Final = 16
+"""OpenCV counts in 16ths of a pixel, and searches multiples of 16 disparities."""
+
+_LIMIT_PX: Final = 2**15 // _STEPS - 1
+"""16ths of a pixel are counted in 16 bits."""
+
+_MODES: Final = {
+    "sgbm": cv2.STEREO_SGBM_MODE_SGBM,
+    "hh": cv2.STEREO_SGBM_MODE_HH,
+    "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+}
+_BM_PREFILTER_CAP: Final = 31
+_BM_TEXTURE_THRESHOLD: Final = 10
+"""Least sum of prefiltered values in the window; OpenCV's default, as the cap."""
+
+_SGBM_PREFILTER_CAP: Final = 63
+_SMALL_PENALTY, _LARGE_PENALTY = 8, 32
+"""P1 and P2 per pixel of the block, as OpenCV's documentation suggests."""
+
+_UNIQUENESS_PERCENT: Final = 5
+"""By how much the second best cost must exceed the best; OpenCV suggests 5 to 15."""
+
+_SPECKLE_PX: Final = 50
+"""Regions of at most so many pixels are removed, as of our matchers."""
+
+_SPECKLE_STEP_PX: Final = 1
+
+
+class OpencvSettings(SearchSettings):
+    """What both of OpenCV's matchers have."""
+
+    pad: bool = Field(
+        default=False,
+        description="Widen the images by repeating their edges, so that every pixel is searched "
+        "as far as the right image reaches. false = OpenCV as it comes, without a strip at the "
+        "left as wide as the range, which scoring then fills by a guess.",
+    )
+
+
+class OpencvBmSettings(OpencvSettings):
+    """Settings of ``cv2.StereoBM``."""
+
+    block_px: OddInt = Field(default=9, ge=5, le=255, description="Width of the window; odd.")
+
+
+class OpencvSgbmSettings(OpencvSettings):
+    """Settings of ``cv2.StereoSGBM``."""
+
+    block_px: OddInt = Field(default=3, ge=1, le=51, description="Width of the window; odd.")
+    mode: Literal["hh", "3way", "sgbm"] = Field(
+        default="hh",
+        description="8 paths over the whole image, 3 paths in strips (fastest), or 5 paths.",
+    )
+
+
+class OpencvBmMatcher:
+    """``cv2.StereoBM`` as a `Matcher`.
+
+    Args:
+        settings: What to search and what to believe.
+        threads: Not used: OpenCV has one number of threads for the whole process, which the
+            commands set (``--threads``).
+    """
+
+    def __init__(self, settings: OpencvBmSettings, threads: int | None = None) -> None:
+        del threads
+        self._settings = settings
+
+    def match(self, pair: RectifiedPair) -> Disparity:
+        """Match one rectified pair.
+
+        Raises:
+            MatchingError: OpenCV refuses the pair or the settings.
+        """
+        s = self._settings
+        ndisp = _range(s, pair.camera)
+        engine = cv2.StereoBM.create(ndisp, s.block_px)
+        engine.setMinDisparity(s.min_disparity_px)
+        engine.setPreFilterType(cv2.STEREO_BM_PREFILTER_XSOBEL)
+        engine.setPreFilterCap(_BM_PREFILTER_CAP)
+        engine.setTextureThreshold(_BM_TEXTURE_THRESHOLD)
+        engine.setUniquenessRatio(_UNIQUENESS_PERCENT)
+        engine.setDisp12MaxDiff(LEFT_RIGHT_PX)
+        return _match(pair, engine, s, _Margins.around(s, ndisp))
+
+
+class OpencvSgbmMatcher:
+    """``cv2.StereoSGBM`` as a `Matcher`.
+
+    Args:
+        settings: What to search and what to believe.
+        threads: Not used, as in `OpencvBmMatcher`.
+    """
+
+    def __init__(self, settings: OpencvSgbmSettings, threads: int | None = None) -> None:
+        del threads
+        self._settings = settings
+
+    def match(self, pair: RectifiedPair) -> Disparity:
+        """Match one rectified pair.
+
+        Raises:
+            MatchingError: OpenCV refuses the pair or the settings.
+        """
+        s = self._settings
+        ndisp, pixels = _range(s, pair.camera), s.block_px**2
+        engine = cv2.StereoSGBM.create(
+            minDisparity=s.min_disparity_px,
+            numDisparities=ndisp,
+            blockSize=s.block_px,
+            P1=_SMALL_PENALTY * pixels,
+            P2=_LARGE_PENALTY * pixels,
+            disp12MaxDiff=LEFT_RIGHT_PX,
+            preFilterCap=_SGBM_PREFILTER_CAP,
+            uniquenessRatio=_UNIQUENESS_PERCENT,
+            mode=_MODES[s.mode],
+        )
+        return _match(pair, engine, s, _Margins.around(s, ndisp))
+
+
+@dataclass(frozen=True)
+class _Margins:
+    """Pixels added to each side of both pictures."""
+
+    rows: int
+    left: int
+    right: int
+
+    @classmethod
+    def around(cls, settings: OpencvBmSettings | OpencvSgbmSettings, ndisp: int) -> _Margins:
+        """As many as OpenCV leaves out, half a window and the range, or none."""
+        if not settings.pad:
+            return cls(0, 0, 0)
+        margin = settings.block_px // 2 + 1
+        low, high = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1
+        return cls(margin, margin + max(0, high), margin + max(0, -low))
+
+    def widen(self, image: UInt8) -> UInt8:
+        """The picture with its edges repeated."""
+        sides = (self.rows, self.rows, self.left, self.right)
+        return np.asarray(cv2.copyMakeBorder(image, *sides, cv2.BORDER_REPLICATE))
+
+    def crop(self, image: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
+        """What `widen` made of a picture of that shape, without the edges."""
+        height, width = shape
+        rows, columns = slice(self.rows, self.rows + height), slice(self.left, self.left + width)
+        return image[rows, columns]
+
+
+def _match(pair: RectifiedPair, engine: Any, s: OpencvSettings, margins: _Margins) -> Disparity:
+    """Let OpenCV match, and say of each pixel without a value why, as far as that is known.
+
+    OpenCV does not tell which of its own checks (texture, uniqueness, left against right) a pixel
+    failed: such pixels are AMBIGUOUS.
+    """
+    try:
+        raw = engine.compute(margins.widen(pair.left), margins.widen(pair.right))
+    except cv2.error as error:
+        raise MatchingError(
+            "OpenCV cannot match this pair with these settings",
+            got=f"{pair.camera.width_px}x{pair.camera.height_px}: {error.err[:200]}",
+        ) from error
+    fixed = np.ascontiguousarray(margins.crop(raw, pair.left.shape))
+    unknown = (s.min_disparity_px - 1) * _STEPS
+    values = fixed / np.float32(_STEPS)
+    reason = np.where(fixed > unknown, Reason.VALID, Reason.AMBIGUOUS).astype(np.uint8)
+    found = unrated_disparity(values, reason, pair)
+    kept = np.where(found.valid, fixed, np.int16(unknown))
+    cv2.filterSpeckles(kept, unknown, _SPECKLE_PX, _SPECKLE_STEP_PX * _STEPS)
+    return found.reject(kept == unknown, Reason.SPECKLE)
+
+
+def _range(settings: OpencvSettings, camera: RectifiedCamera) -> int:
+    """Number of disparities, a multiple of 16."""
+    ndisp = settings.ndisp_for(camera)
+    ndisp = _STEPS * -(-ndisp // _STEPS)
+    first, last = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1
+    if first <= -_LIMIT_PX or last >= _LIMIT_PX:
+        raise MatchingError(
+            "disparities exceed the range of OpenCV",
+            got=f"disparities from {first} to {last} px",
+            expected=f"between {-_LIMIT_PX} and {_LIMIT_PX} px",
+            hint="check min_disparity_px and ndisp, or match smaller images",
+        )
+    return ndisp

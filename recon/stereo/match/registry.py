@@ -1,0 +1,137 @@
+"""The matchers by name: ours, and those that installed packages register."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from pydantic import Field, InstanceOf, field_serializer
+
+from recon.core.errors import SettingsError
+from recon.core.settings import Settings
+from recon.core.values import RectifiedPair
+from recon.stereo.match.foreign import (
+    CheckedMatcher,
+    check_object,
+    load_registered,
+    name_of,
+    registered_names,
+)
+from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
+from recon.stereo.match.opencv import (
+    OpencvBmMatcher,
+    OpencvBmSettings,
+    OpencvSgbmMatcher,
+    OpencvSgbmSettings,
+)
+from recon.stereo.match.protocol import Matcher
+from recon.stereo.match.range import AutoRangeMatcher, estimate_ndisp
+from recon.stereo.match.sad import SadMatcher, SadSettings
+from recon.stereo.match.search import SearchSettings
+from recon.stereo.match.sgm import SgmMatcher, SgmSettings
+
+MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
+    "sad": SadMatcher,
+    "sgm": SgmMatcher,
+    "opencv-bm": OpencvBmMatcher,
+    "opencv-sgbm": OpencvSgbmMatcher,
+    "onnx": OnnxMatcher,
+}
+
+
+class MatchingSettings(Settings):
+    """Which matcher, and the settings of each."""
+
+    matcher: str | InstanceOf[Matcher] = Field(
+        default="sad",
+        description="Name of the matcher: sad, sgm, opencv-bm, opencv-sgbm, onnx, or one that an "
+        "installed package registers; in Python also a matcher of your own.",
+    )
+    sad: SadSettings = Field(default_factory=SadSettings, description="Of the matcher `sad`.")
+    sgm: SgmSettings = Field(default_factory=SgmSettings, description="Of the matcher `sgm`.")
+    opencv_bm: OpencvBmSettings = Field(
+        default_factory=OpencvBmSettings, description="Of the matcher `opencv-bm`."
+    )
+    opencv_sgbm: OpencvSgbmSettings = Field(
+        default_factory=OpencvSgbmSettings, description="Of the matcher `opencv-sgbm`."
+    )
+    onnx: OnnxSettings = Field(default_factory=OnnxSettings, description="Of the matcher `onnx`.")
+
+    @field_serializer("matcher")
+    def _written(self, matcher: str | Matcher) -> str:
+        return name_of(matcher)
+
+
+def make_matcher(
+    matcher: str | Matcher, settings: MatchingSettings | None = None, threads: int | None = None
+) -> Matcher:
+    """Make the matcher of a name, or make sure that an object can be used as one.
+
+    Args:
+        matcher: A key of `MATCHERS`, a name that an installed package registers, or an object
+            with the methods of `Matcher`. What a matcher returns that is not ours is checked.
+        settings: The settings of all matchers; it takes its own part.
+        threads: Threads that a matcher of ours may use; all cores by default.
+
+    Raises:
+        SettingsError: There is no such matcher, or it is not one.
+    """
+    settings = settings or MatchingSettings()
+    if not isinstance(matcher, str) or matcher not in MATCHERS:
+        check_matcher(matcher)
+        made = load_registered(matcher) if isinstance(matcher, str) else matcher
+        checked = CheckedMatcher(made, name_of(matcher))
+        return AutoRangeMatcher(checked)
+    own = getattr(settings, field_of(matcher))
+    made = MATCHERS[matcher](own, threads)
+    # A matcher without the setting searches no range; one that is set needs no guess.
+    if getattr(own, "ndisp", 0) is not None:
+        return made
+    return AutoRangeMatcher(made, own.min_disparity_px)
+
+
+def check_matcher(matcher: str | Matcher) -> None:
+    """Check that a matcher exists, without making it.
+
+    Raises:
+        SettingsError: There is no matcher of this name, or the object is none.
+    """
+    if not isinstance(matcher, str):
+        check_object(matcher)
+    elif matcher not in MATCHERS and matcher not in (others := registered_names()):
+        choices = ", ".join(sorted({*MATCHERS, *others}))
+        raise SettingsError("unknown matcher", got=repr(matcher), expected=f"one of: {choices}")
+
+
+def settings_of(matcher: str | Matcher, settings: MatchingSettings) -> Settings | None:
+    """The settings of one matcher; None of a matcher that is not ours."""
+    if not isinstance(matcher, str) or matcher not in MATCHERS:
+        return None
+    own: Settings = getattr(settings, field_of(matcher))
+    return own
+
+
+def searched_ndisp(
+    matcher: str | Matcher, settings: MatchingSettings, pair: RectifiedPair
+) -> int | None:
+    """How many disparities a matcher searches in a pair, before it rounds them.
+
+    Args:
+        matcher: The matcher, or its name.
+        settings: The settings of all matchers.
+        pair: The pair.
+
+    Returns:
+        Their number, or None of a matcher that searches no range, or is not ours.
+    """
+    own = settings_of(matcher, settings)
+    if not isinstance(own, SearchSettings):
+        return None
+    if own.ndisp is None and pair.camera.ndisp is None:
+        return estimate_ndisp(pair, own.min_disparity_px)
+    return own.ndisp_for(pair.camera)
+
+
+def field_of(name: str) -> str:
+    """The field of `MatchingSettings` that a matcher's settings have."""
+    return name.replace("-", "_")

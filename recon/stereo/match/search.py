@@ -1,0 +1,178 @@
+"""What all matchers over a range of disparities share: range, checks and post-processing."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from typing import Annotated, Final
+
+import numpy as np
+from pydantic import AfterValidator, Field
+
+from recon.core.errors import MatchingError
+from recon.core.settings import Settings
+from recon.core.values import Disparity, Reason, RectifiedCamera
+from recon.core.values.arrays import Float32
+from recon.stereo.kernels.opposite import average_opposite
+from recon.stereo.kernels.refine import EQUIANGULAR, ODDS, Refined, Rules, reject
+from recon.stereo.kernels.speckle import find_speckles
+from recon.stereo.match.strips import in_strips
+
+FIT: Final = EQUIANGULAR
+"""How the minimum is placed between whole disparities: the best of the fits for sums of absolute
+differences, whose minimum is pointed."""
+
+LEFT_RIGHT_PX: Final = 1
+"""Largest difference between the disparities of the left and the right view."""
+
+_SIGMA_FLOOR_PX: Final = 0.1
+"""Smallest standard deviation that a disparity is given: noise is not all that makes it wrong."""
+
+_SPECKLE_STEP_PX: Final = 1.0
+"""Largest step of disparity between neighbours of one region."""
+
+_SAME_SURFACE_PX: Final = 1.0
+"""Neighbours that differ by more are not averaged: between them may be a step of depth."""
+
+
+def _odd(value: int) -> int:
+    if value % 2 == 0:
+        raise ValueError("a window needs a pixel in its middle: an odd number")
+    return value
+
+
+OddInt = Annotated[int, AfterValidator(_odd)]
+"""The width of something that has a pixel in its middle."""
+
+UniquenessPercent = Annotated[
+    int,
+    Field(
+        ge=0,
+        le=100,
+        description="By how much the second best cost must exceed the best; 0 = no check. Raise it "
+        "where repeated structures (fences, tiles) leave wrong matches.",
+    ),
+]
+
+
+class SearchSettings(Settings):
+    """Which disparities are searched."""
+
+    min_disparity_px: int = Field(
+        default=0,
+        ge=-4096,
+        le=4096,
+        description="First disparity searched; negative for cameras that converge.",
+    )
+    ndisp: int | None = Field(
+        default=None,
+        ge=3,
+        le=4096,
+        description="Number of disparities searched (OpenCV: rounded up to a multiple of 16). "
+        "none = what the calibration says, or else as far as each pair needs. Time and memory "
+        "grow with it; what is nearer than its last disparity is not found.",
+    )
+
+    def ndisp_for(self, camera: RectifiedCamera) -> int:
+        """Number of disparities to search in the pictures of a camera."""
+        return self.ndisp or camera.ndisp or usual_ndisp(camera.width_px)
+
+    def ndisp_within(self, camera: RectifiedCamera) -> int:
+        """Number of disparities to search, some of which lie within the picture.
+
+        Raises:
+            MatchingError: None does.
+        """
+        ndisp = self.ndisp_for(camera)
+        last = self.min_disparity_px + ndisp - 1
+        if self.min_disparity_px >= camera.width_px or last <= -camera.width_px:
+            raise MatchingError(
+                "no disparity of the range lies within the image",
+                got=f"{self.min_disparity_px} to {last} px",
+                expected=f"some within {1 - camera.width_px} to {camera.width_px - 1} px",
+                hint="check min_disparity_px and ndisp",
+            )
+        return ndisp
+
+
+class MeasuredSettings(SearchSettings):
+    """Settings of the matchers with sub-pixel disparities and uncertainties of their own."""
+
+    uniqueness_percent: UniquenessPercent = 0
+    speckle_size_px: int = Field(
+        default=50,
+        ge=0,
+        description="Regions of fewer pixels are removed; 0 = keep all. Grows with the square of "
+        "the image width.",
+    )
+    average_px: OddInt = Field(
+        default=7,
+        ge=1,
+        le=31,
+        description="Each disparity becomes the mean of the pairs of opposite neighbours, in a "
+        "square of this width, that lie on its surface; odd. 1 = as measured: noisier, for "
+        "comparisons.",
+    )
+
+
+def rules_of(
+    settings: MeasuredSettings,
+    ndisp: int,
+    window_pixels: int,
+    *,
+    min_texture: float = 0.0,
+    odds: float = ODDS,
+) -> Rules:
+    """What the checks ask for, by the settings.
+
+    Args:
+        settings: Of the matcher.
+        ndisp: Number of disparities searched.
+        window_pixels: As in `Rules`.
+        min_texture: `Rules.texture`.
+        odds: As in `Rules`.
+    """
+    return Rules(
+        ndisp=ndisp,
+        minimum=settings.min_disparity_px,
+        fit=FIT,
+        texture=min_texture,
+        uniqueness=settings.uniqueness_percent,
+        left_right=LEFT_RIGHT_PX,
+        window_pixels=window_pixels,
+        sigma_floor_px=_SIGMA_FLOOR_PX,
+        odds=odds,
+    )
+
+
+def finish(refined: Refined, settings: MeasuredSettings, pool: Executor, threads: int) -> Disparity:
+    """The disparity of what was refined: no small regions (reason SPECKLE), averaged.
+
+    Args:
+        refined: Overwritten; a copy of each array would cost more than the search for speckles.
+        settings: Says what a speckle is, and what is averaged.
+        pool: Where to average.
+        threads: Strips of rows averaged at once. The result does not depend on it.
+    """
+    if settings.speckle_size_px >= 2:
+        small = find_speckles(refined.values, _SPECKLE_STEP_PX, settings.speckle_size_px)
+        # A plain number: to look up what an enumeration is takes numba 0.2 ms.
+        reject(small, int(Reason.SPECKLE), refined)
+    if settings.average_px > 1:
+        refined = refined._replace(values=_averaged(refined.values, settings, pool, threads))
+    return Disparity(*refined)
+
+
+def _averaged(values: Float32, settings: MeasuredSettings, pool: Executor, threads: int) -> Float32:
+    """float32 (H, W), the values without the noise that they do not share with neighbours."""
+    averages, radius = np.empty_like(values), settings.average_px // 2
+
+    def average(rows: range) -> None:
+        average_opposite(values, radius, _SAME_SURFACE_PX, rows.start, rows.stop, averages)
+
+    in_strips(pool, threads, average, len(values))
+    return averages
+
+
+def usual_ndisp(width_px: int) -> int:
+    """A number of disparities that suits most rigs: a tenth of the width, in steps of 16."""
+    return 16 * max(1, -(-width_px // 160))

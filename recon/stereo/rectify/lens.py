@@ -1,0 +1,144 @@
+"""Projection and its inverse for raw cameras: one interface to OpenCV's two lens models."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.values import CameraIntrinsics
+from recon.core.values.arrays import Float32, Float64
+
+_ORIGIN: Final = np.zeros(3)
+_LARGEST_MISS_PX: Final = 0.01
+"""Largest reprojection error of a correctly inverted ray."""
+
+# OpenCV inverts a lens model iteratively, and stops early by default (five iterations, 0.01).
+_EXACT: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
+
+
+def project(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
+    """float64 (N, 2), pixels of points (N, 3) in camera axes; NaN at or behind its plane."""
+    return project_with_jacobian(camera, xyz)[0]
+
+
+def project_with_jacobian(
+    camera: CameraIntrinsics, xyz: NDArray[Any]
+) -> tuple[Float64, Float64, Float64]:
+    """Project points, with Jacobians.
+
+    Args:
+        camera: The raw camera.
+        xyz: (N, 3), in camera axes.
+
+    Returns:
+        Pixels float64 (N, 2), NaN for points at or behind the camera's plane; their Jacobians by
+        the point, (N, 2, 3), and by (fx, fy, cx, cy, distortion …), (N, 2, 4 + D).
+    """
+    points = np.ascontiguousarray(xyz, dtype=np.float64).reshape(-1, 1, 3)
+    matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
+    count = distortion.size
+    if camera.model == "fisheye":
+        pixels, J = cv2.fisheye.projectPoints(points, _ORIGIN, _ORIGIN, matrix, distortion)
+        by_point, by_lens = J[:, 11:14], J[:, :8]
+    else:
+        # OpenCV needs at least four distortion coefficients.
+        padded = distortion if count else np.zeros(4)
+        pixels, J = cv2.projectPoints(points, _ORIGIN, _ORIGIN, matrix, padded)
+        by_point, by_lens = J[:, 3:6], J[:, 6 : 10 + count]
+    pixels = pixels.reshape(-1, 2)
+    pixels[points[:, 0, 2] <= 0] = np.nan
+    return pixels, by_point.reshape(-1, 2, 3), by_lens.reshape(len(pixels), 2, -1)
+
+
+def project_into_picture(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
+    """float64 (N, 2), pixels of points (N, 3) inside the image; NaN for all others.
+
+    Far outside the field of view, the distortion polynomial may fold points back into the image;
+    the ray of such a pixel does not lead to the point, and it is NaN too.
+    """
+    pixels = project(camera, xyz)
+    limit = np.array([camera.width_px - 1, camera.height_px - 1])
+    inside = np.asarray(((pixels >= 0) & (pixels <= limit)).all(axis=1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        apart = np.abs(unproject(camera, np.where(inside[:, None], pixels, 0.0)) * xyz[:, 2:] - xyz)
+        true = np.asarray((apart < 1e-3 * np.abs(xyz[:, 2:])).all(axis=1))
+    return np.where((inside & true)[:, None], pixels, np.nan)
+
+
+def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
+    """float64 (N, 3), the rays of pixels (N, 2) in camera axes, with z = 1.
+
+    A ray is NaN where the lens model cannot be inverted (outside the image), or at 90 degrees or
+    more from the optical axis.
+    """
+    points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
+    matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
+    if not len(points):
+        return np.zeros((0, 3))
+    if camera.model == "fisheye":
+        plane = cv2.fisheye.undistortPoints(points, matrix, distortion, criteria=_EXACT)
+    else:
+        plane = cv2.undistortPoints(points, matrix, distortion, criteria=_EXACT)
+    rays = np.concatenate([plane.reshape(-1, 2), np.ones((len(points), 1))], axis=1)
+    # OpenCV marks some failures of the fisheye model with -1e6; of other failures, and of rays at
+    # more than 90 degrees, it returns the ray of another pixel.
+    rays[~(np.abs(rays).max(axis=1) < 1e5)] = np.nan
+    with np.errstate(invalid="ignore"):
+        missed = np.abs(project(camera, rays) - points[:, 0]).max(axis=1) > _LARGEST_MISS_PX
+    rays[missed] = np.nan
+    return rays
+
+
+def sees_all(camera: CameraIntrinsics) -> bool:
+    """Whether the lens model can be inverted along the whole border of the image.
+
+    Distortion polynomials are fitted where points were seen; farther out they may fold back.
+    """
+    w, h = camera.width_px - 1.0, camera.height_px - 1.0
+    t = np.linspace(0, 1, 65)
+    sides = [(0 * t, h * t), (w + 0 * t, h * t), (w * t, 0 * t), (w * t, h + 0 * t)]
+    border = np.concatenate([np.stack(side, axis=1) for side in sides])
+    return bool(np.isfinite(unproject(camera, border)).all())
+
+
+def rectifying_maps(
+    camera: CameraIntrinsics, rotation: Float64, matrix: Float64, size: tuple[int, int]
+) -> tuple[Float32, Float32]:
+    """Remap tables of a rotated pinhole view: columns and rows in the raw image, float32 (H, W).
+
+    Args:
+        camera: The raw camera.
+        rotation: float64 (3, 3), from camera axes to those of the view.
+        matrix: float64 (3, 3) or (3, 4), the pinhole matrix of the view.
+        size: (width, height) of the view, pixels.
+    """
+    if camera.model != "fisheye" and not sees_all(camera):
+        return _without_folds(camera, rotation, matrix, size)
+    make = (
+        cv2.fisheye.initUndistortRectifyMap
+        if camera.model == "fisheye"
+        else cv2.initUndistortRectifyMap
+    )
+    maps = make(
+        np.array(camera.matrix),
+        np.array(camera.distortion),
+        rotation,
+        np.array(matrix[:, :3]),
+        size,
+        cv2.CV_32FC1,
+    )
+    return np.asarray(maps[0]), np.asarray(maps[1])
+
+
+def _without_folds(
+    camera: CameraIntrinsics, rotation: Float64, matrix: Float64, size: tuple[int, int]
+) -> tuple[Float32, Float32]:
+    """Remap tables that are (-1, -1) where the lens model folds back into the image."""
+    x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]).astype(np.float64)
+    xyz = (np.linalg.inv(rotation) @ np.linalg.inv(matrix[:, :3]) @ rays).T
+    pixels = np.nan_to_num(project_into_picture(camera, xyz), nan=-1.0).astype(np.float32)
+    return pixels[:, 0].reshape(x.shape), pixels[:, 1].reshape(x.shape)

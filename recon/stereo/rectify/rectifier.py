@@ -1,0 +1,334 @@
+"""Calibrated rectification: warp both images so that matching pixels lie on the same row."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from recon.core.errors import CalibrationError
+from recon.core.geometry.se3 import angle_rad
+from recon.core.settings import Settings
+from recon.core.values import (
+    CameraIntrinsics,
+    RectifiedCamera,
+    RectifiedPair,
+    StereoCalibration,
+    StereoPair,
+    check_size,
+)
+from recon.core.values.arrays import Bool, Float32, Float64, UInt8
+from recon.stereo.rectify.grey import GreyMode, to_grey
+from recon.stereo.rectify.lens import rectifying_maps, sees_all, unproject
+from recon.stereo.rectify.wide import plan_wide_view
+
+_INTERPOLATIONS: Final = {
+    "linear": cv2.INTER_LINEAR,
+    "cubic": cv2.INTER_CUBIC,
+    "lanczos": cv2.INTER_LANCZOS4,
+}
+# Allows for rounding in identity maps; far below the resolution of the interpolation (1/32 px).
+_BORDER_TOLERANCE_PX: Final = 1e-3
+# At larger angles the views of two pinhole cameras hardly overlap.
+_LARGEST_ANGLE_RAD: Final = math.radians(60)
+# Focal lengths of raw and rectified views differ by a factor of two or three at most.
+_OUT_OF_PROPORTION: Final = 20.0
+
+
+class RectificationSettings(Settings):
+    """Rectification and grey conversion of raw images."""
+
+    alpha: float | None = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Zoom of the rectified views: 0 = only valid pixels, 1 = all source pixels, "
+        "none = OpenCV's default. No effect on rectified input.",
+    )
+    field_of_view_deg: float | None = Field(
+        default=None,
+        ge=10,
+        le=150,
+        description="Horizontal field of view of the rectified views, in place of alpha. none = by "
+        "alpha; 0 of a fisheye keeps the resolution at its centre, at most 120 degrees.",
+    )
+    same_principal_point: bool = Field(
+        default=True,
+        description="Use one principal point for both views, so that disparity 0 is at infinity. "
+        "No effect on rectified input.",
+    )
+    interpolation: Literal["linear", "cubic", "lanczos"] = Field(
+        default="linear", description="Interpolation of source pixels."
+    )
+    grey: GreyMode = Field(
+        default="bt601", description="Weights of the colours in grey images, see `to_grey`."
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Remap tables of one rectified view.
+
+    Attributes:
+        map_x: float32 (H, W), source columns in the raw image.
+        map_y: float32 (H, W), source rows in the raw image.
+    """
+
+    map_x: Float32
+    map_y: Float32
+
+    @property
+    def inside(self) -> Bool:
+        """bool (H, W), True where the source is inside the raw image."""
+        height, width = self.map_x.shape
+        low, e = -_BORDER_TOLERANCE_PX, _BORDER_TOLERANCE_PX
+        return np.asarray(
+            (self.map_x >= low)
+            & (self.map_y >= low)
+            & (self.map_x <= width - 1 + e)
+            & (self.map_y <= height - 1 + e)
+        )
+
+    def warp(self, image: UInt8, interpolation: int) -> UInt8:
+        """Rectify one raw image; pixels without a source are black."""
+        return np.asarray(cv2.remap(image, self.map_x, self.map_y, interpolation))
+
+
+class Rectifier:
+    """Rectifies the pairs of one rig.
+
+    Args:
+        calibration: The raw cameras, or the camera of already rectified images, which are only
+            checked for size and converted to grey.
+        settings: Zoom, interpolation and grey conversion.
+
+    Attributes:
+        camera: Geometry of the rectified views.
+        valid: bool (H, W), where the rectified left view has a source; None = everywhere.
+
+    Raises:
+        CalibrationError: The rig is vertical, left and right are swapped, the cameras diverge by
+            more than 60 degrees or differ in image size, or a rectified view would be empty or of
+            a focal length out of all proportion.
+    """
+
+    def __init__(
+        self,
+        calibration: RectifiedCamera | StereoCalibration,
+        settings: RectificationSettings | None = None,
+    ) -> None:
+        self.settings = settings or RectificationSettings()
+        self.valid: Bool | None = None
+        self._views: tuple[View, View] | None = None
+        if isinstance(calibration, RectifiedCamera):
+            self.camera = calibration
+            return
+        self.camera, self._views = plan_rectification(calibration, self.settings)
+        self.valid = self._views[0].inside
+        self.valid.flags.writeable = False
+        if not (self.valid.any() and self._views[1].inside.any()):
+            raise CalibrationError(
+                "no pixel of the rectified views has a source",
+                hint="check the distortion and the pose of the right camera",
+            )
+
+    def rectify(self, pair: StereoPair) -> RectifiedPair:
+        """Rectify one pair.
+
+        Raises:
+            CalibrationError: The image size differs from that of the calibration.
+        """
+        left, right = self.warp(pair)
+        return RectifiedPair(
+            left=to_grey(left, self.settings.grey),
+            right=to_grey(right, self.settings.grey),
+            camera=self.camera,
+            left_rgb=left if left.ndim == 3 else None,
+            right_rgb=right if right.ndim == 3 else None,
+            valid=self.valid,
+            timestamp_s=pair.timestamp_s,
+            index=pair.index,
+        )
+
+    def warp(self, pair: StereoPair) -> tuple[UInt8, UInt8]:
+        """Rectify both images of a pair, without grey conversion.
+
+        Raises:
+            CalibrationError: The image size differs from that of the calibration.
+        """
+        height_px, width_px = pair.left.shape[:2]
+        check_size(self.camera, width_px, height_px, pair.name or f"frame {pair.index}")
+        if self._views is None:
+            return pair.left, pair.right
+        how = _INTERPOLATIONS[self.settings.interpolation]
+        left, right = self._views
+        return left.warp(pair.left, how), right.warp(pair.right, how)
+
+
+@dataclass(frozen=True, eq=False)
+class RectifyingTurns:
+    """Rectifying rotations of the two cameras, and the rectified camera.
+
+    Attributes:
+        R_left: float64 (3, 3), from the axes of the raw left camera to the rectified axes.
+        R_right: The same for the right camera.
+        camera: Geometry of the rectified views.
+    """
+
+    R_left: Float64
+    R_right: Float64
+    camera: RectifiedCamera
+
+    @property
+    def matrices(self) -> tuple[Float64, Float64]:
+        """float64 (3, 3) pinhole matrices of the left and the right view."""
+        right = self.camera.matrix
+        right[0, 2] = self.camera.cx_right_px
+        return self.camera.matrix, right
+
+    def place(
+        self, calibration: StereoCalibration, pixels: Float64, *, right: bool = False
+    ) -> Float64:
+        """float64 (N, 2), rectified positions of raw pixels (N, 2) of one camera; NaN = none."""
+        camera = calibration.right if right else calibration.left
+        rays = unproject(camera, pixels) @ (self.R_right if right else self.R_left).T
+        flat = (rays / rays[:, 2:]) @ self.matrices[int(right)].T
+        return np.asarray(np.where(rays[:, 2:] > 0, flat[:, :2], np.nan))
+
+
+def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) -> RectifyingTurns:
+    """Compute the rectifying rotations of a rig, and the rectified camera.
+
+    Raises:
+        CalibrationError: See `Rectifier`.
+
+    Ref: Bouguet's method, as in OpenCV's ``stereoRectify``.
+    """
+    _check_rig(calibration)
+    left, right = calibration.left, calibration.right
+    size = (left.width_px, left.height_px)
+    try:
+        if "fisheye" in (left.model, right.model) or not (sees_all(left) and sees_all(right)):
+            R1, R2, P1, P2 = plan_wide_view(
+                calibration, settings.alpha, same_principal_point=settings.same_principal_point
+            )
+        else:
+            R1, R2, P1, P2 = _plan_pinholes(calibration, size, settings)
+    except cv2.error as error:
+        raise CalibrationError("cameras cannot be rectified", got=error.err) from error
+    camera = _camera_of(P1, P2, size)
+    _check_focal(camera, left)
+    return RectifyingTurns(R1, R2, _with_field(camera, settings.field_of_view_deg))
+
+
+def plan_rectification(
+    calibration: StereoCalibration, settings: RectificationSettings
+) -> tuple[RectifiedCamera, tuple[View, View]]:
+    """Compute the rectified camera and the remap tables of its left and right view.
+
+    Raises:
+        CalibrationError: See `Rectifier`.
+    """
+    turns = plan_turns(calibration, settings)
+    size = (turns.camera.width_px, turns.camera.height_px)
+    cameras, rotations = (calibration.left, calibration.right), (turns.R_left, turns.R_right)
+    try:
+        left, right = (
+            View(*rectifying_maps(camera, rotation, matrix, size))
+            for camera, rotation, matrix in zip(cameras, rotations, turns.matrices, strict=True)
+        )
+    except cv2.error as error:
+        raise CalibrationError("cameras cannot be rectified", got=error.err) from error
+    return turns.camera, (left, right)
+
+
+def _plan_pinholes(
+    calibration: StereoCalibration, size: tuple[int, int], settings: RectificationSettings
+) -> tuple[Float64, Float64, Float64, Float64]:
+    left, right = calibration.left, calibration.right
+    R1, R2, P1, P2, *_ = cv2.stereoRectify(
+        left.matrix,
+        left.distortion,
+        right.matrix,
+        right.distortion,
+        size,
+        calibration.T_right_left[:3, :3],
+        calibration.T_right_left[:3, 3:],
+        flags=cv2.CALIB_ZERO_DISPARITY if settings.same_principal_point else 0,
+        alpha=-1 if settings.alpha is None else settings.alpha,
+    )
+    return R1, R2, P1, P2
+
+
+def _camera_of(P1: Float64, P2: Float64, size: tuple[int, int]) -> RectifiedCamera:
+    return RectifiedCamera(
+        focal_px=float(P1[0, 0]),
+        cx_px=float(P1[0, 2]),
+        cy_px=float(P1[1, 2]),
+        cx_right_px=float(P2[0, 2]),
+        baseline_m=float(-P2[0, 3] / P2[0, 0]),
+        width_px=size[0],
+        height_px=size[1],
+    )
+
+
+def _with_field(camera: RectifiedCamera, field_of_view_deg: float | None) -> RectifiedCamera:
+    """Zoom about the image centre to a horizontal field of view; None = unchanged."""
+    if field_of_view_deg is None:
+        return camera
+    x, y = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
+    zoom = camera.width_px / 2 / math.tan(math.radians(field_of_view_deg / 2)) / camera.focal_px
+    return replace(
+        camera,
+        focal_px=camera.focal_px * zoom,
+        cx_px=x + (camera.cx_px - x) * zoom,
+        cy_px=y + (camera.cy_px - y) * zoom,
+        cx_right_px=x + (camera.cx_right_px - x) * zoom,
+    )
+
+
+def _check_focal(camera: RectifiedCamera, raw: CameraIntrinsics) -> None:
+    ratio = camera.focal_px / float(raw.matrix[0, 0])
+    if not 1 / _OUT_OF_PROPORTION < ratio < _OUT_OF_PROPORTION:
+        raise CalibrationError(
+            "the rectified views came out with a focal length out of all proportion",
+            got=f"{camera.focal_px:.4g} px",
+            expected=f"about {raw.matrix[0, 0]:.4g} px as in the raw images",
+            hint="check the distortion coefficients; if they are right, this is an error of recon: "
+            "please report it with the calibration",
+        )
+
+
+def _check_rig(calibration: StereoCalibration) -> None:
+    left, right = calibration.left, calibration.right
+    if (left.width_px, left.height_px) != (right.width_px, right.height_px):
+        raise CalibrationError(
+            "left and right camera differ in image size",
+            got=f"left {left.width_px}x{left.height_px}, right {right.width_px}x{right.height_px}",
+        )
+    x, y, z = calibration.T_right_left[:3, 3]
+    if abs(y) >= abs(x) or abs(z) >= abs(x):
+        raise CalibrationError(
+            "cameras are not side by side",
+            got=f"right camera at ({-x:g}, {-y:g}, {-z:g}) m",
+            expected="mostly along x",
+            hint="rotate the images of a vertical rig by 90 degrees and calibrate again",
+        )
+    apart_rad = float(angle_rad(calibration.T_right_left))
+    if apart_rad > _LARGEST_ANGLE_RAD:
+        raise CalibrationError(
+            "cameras look in different directions",
+            got=f"{math.degrees(apart_rad):.0f} deg",
+            expected=f"at most {math.degrees(_LARGEST_ANGLE_RAD):.0f} deg",
+        )
+    if x > 0:
+        raise CalibrationError(
+            "right camera is to the left of the left camera",
+            got=f"T[0] = {x:g} m",
+            expected="< 0 m",
+            hint="swap left and right",
+        )

@@ -1,0 +1,44 @@
+"""Settings of one frame: what determines a cloud from a pair."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from pydantic import Field
+from typing_extensions import Self
+
+from recon.core.settings import Settings
+from recon.stereo.cloud import CloudSettings, EdgeSettings, FilterSettings
+from recon.stereo.match import Matcher, MatchingSettings, check_matcher
+from recon.stereo.rectify import InspectionSettings, RectificationSettings
+
+NO_FILTER: Final = FilterSettings(voxel_m=None)
+
+
+class StereoSettings(Settings):
+    """Everything that determines the cloud of one frame."""
+
+    rectification: RectificationSettings = RectificationSettings()
+    inspection: InspectionSettings = InspectionSettings()
+    matching: MatchingSettings = MatchingSettings()
+    edges: EdgeSettings = EdgeSettings()
+    cloud: CloudSettings = CloudSettings()
+    filters: FilterSettings = Field(
+        default=NO_FILTER,
+        description="Filters of the cloud of one frame; fusion thins and cleans it anyway.",
+    )
+
+    def with_matcher(self, matcher: str | Matcher | None) -> Self:
+        """The settings with another matcher, by name or as an object; None = unchanged.
+
+        ``config.yaml`` has the name of an object only, so such a run is repeated from Python.
+        `map_sequence` and `run_map` call it from one thread, one pair after the other.
+
+        Raises:
+            SettingsError: There is no matcher of this name, or the object is none.
+        """
+        if matcher is None:
+            return self
+        check_matcher(matcher)
+        matching = self.matching.model_copy(update={"matcher": matcher})
+        return self.model_copy(update={"matching": matching})

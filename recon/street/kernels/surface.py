@@ -1,0 +1,157 @@
+"""Where rays meet triangles: place, orientation, surface coordinates, footprint of the pixel."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.kernels.compiled import kernel
+
+MAX_STRETCH: Final = 24.0
+"""Beyond this ratio of its sides a footprint is widened instead of lengthened."""
+_MIN_COSINE: Final = 1.0 / 400.0
+
+Float64 = NDArray[np.float64]
+
+
+class SurfaceTable(NamedTuple):
+    """Per triangle, all that is linear in a point on it.
+
+    Attributes:
+        anchor: float64 (F, 3), a corner.
+        normal: float64 (F, 3), unit normal of the plane.
+        to_uv: float64 (F, 2, 3); surface coordinates are ``uv + to_uv @ (xyz - anchor)``.
+        uv: float64 (F, 2), at the anchor.
+        to_shading: float64 (F, 3, 3), the same for the shading normal.
+        shading: float64 (F, 3), at the anchor.
+    """
+
+    anchor: Float64
+    normal: Float64
+    to_uv: Float64
+    uv: Float64
+    to_shading: Float64
+    shading: Float64
+
+
+class SurfaceHits(NamedTuple):
+    """Points that rays met, with the footprint of the pixel on the surface.
+
+    Attributes:
+        xyz: float64 (N, 3), metres.
+        normal: float64 (N, 3), unit shading normal towards the viewer.
+        uv: float64 (N, 2), surface coordinates, metres.
+        width: float64 (N,), short side of the footprint, metres.
+        smear: float64 (N, 3), long side of the footprint, metres; 0 when seen straight on.
+        spread: float64 (N, 2), extent of the footprint along u and v.
+    """
+
+    xyz: Float64
+    normal: Float64
+    uv: Float64
+    width: Float64
+    smear: Float64
+    spread: Float64
+
+
+@kernel
+def describe_hits(
+    table: SurfaceTable,
+    faces: NDArray[np.int32],
+    origin: Float64,
+    directions: Float64,
+    pixel: float,
+) -> SurfaceHits:
+    """Describe the points in which rays pierce the planes of their triangles.
+
+    Args:
+        table: Of the scene.
+        faces: int32 (N,), the triangle that each ray meets.
+        origin: float64 (3,), where the rays start.
+        directions: float64 (N, 3), of unit depth, so that their factor is the depth.
+        pixel: Width of a pixel at unit depth (``1 / focal_px``).
+    """
+    n = len(faces)
+    xyz, normals, uvs = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 2))
+    widths, smears, spreads = np.empty(n), np.empty((n, 3)), np.empty((n, 2))
+    local = np.empty(3)
+    for i in range(n):
+        face = faces[i]
+        normal, anchor, ray = table.normal[face], table.anchor[face], directions[i]
+        along, height, length = 0.0, 0.0, 0.0
+        for k in range(3):
+            along += ray[k] * normal[k]
+            height += (anchor[k] - origin[k]) * normal[k]
+            length += ray[k] * ray[k]
+        length = np.sqrt(length)
+        depth = height / along
+        cosine = along / length
+        stretch = 1.0 / max(abs(cosine), _MIN_COSINE)
+        width = depth * pixel * max(stretch / MAX_STRETCH, 1.0)
+        stretch = min(stretch, MAX_STRETCH)
+        # Only what exceeds the short side is a smear; the view's part in the plane has length sin.
+        smear = width * np.sqrt(stretch * stretch - 1.0)
+        smear /= max(np.sqrt(max(1.0 - cosine * cosine, 0.0)), 1e-9)
+        widths[i] = width
+        for k in range(3):
+            xyz[i, k] = origin[k] + depth * ray[k]
+            local[k] = xyz[i, k] - anchor[k]
+            smears[i, k] = smear * (ray[k] / length - cosine * normal[k])
+        size = 0.0
+        for c in range(3):
+            value = table.shading[face, c]
+            for k in range(3):
+                value += table.to_shading[face, c, k] * local[k]
+            normals[i, c] = value
+            size += value * value
+        size = -np.sign(along) / np.sqrt(size)
+        for c in range(3):
+            normals[i, c] *= size
+        for c in range(2):
+            value, square, smeared = table.uv[face, c], 0.0, 0.0
+            for k in range(3):
+                gradient = table.to_uv[face, c, k]
+                value += gradient * local[k]
+                square += gradient * gradient
+                smeared += gradient * smears[i, k]
+            uvs[i, c] = value
+            spreads[i, c] = np.sqrt(square * width * width + smeared * smeared)
+    return SurfaceHits(xyz, normals, uvs, widths, smears, spreads)
+
+
+def describe_hits_reference(
+    table: SurfaceTable,
+    faces: NDArray[np.int32],
+    origin: Float64,
+    directions: Float64,
+    pixel: float,
+) -> SurfaceHits:
+    """The plain-numpy twin of `describe_hits`, all points at once."""
+    plane = table.normal[faces]
+    along = (directions * plane).sum(axis=1)
+    depth = ((table.anchor[faces] - origin) * plane).sum(axis=1) / along
+    xyz = origin + depth[:, None] * directions
+    local = (xyz - table.anchor[faces])[:, :, None]
+
+    view = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    cosine = (view * plane).sum(axis=1)
+    stretch = 1.0 / np.maximum(np.abs(cosine), _MIN_COSINE)
+    width = depth * pixel * np.maximum(stretch / MAX_STRETCH, 1.0)
+    stretch = np.minimum(stretch, MAX_STRETCH)
+    sine = np.maximum(np.sqrt(np.maximum(1.0 - cosine**2, 0.0)), 1e-9)
+    smear = (width * np.sqrt(stretch**2 - 1.0) / sine)[:, None] * (view - cosine[:, None] * plane)
+
+    shading = table.shading[faces] + (table.to_shading[faces] @ local)[:, :, 0]
+    shading *= (-np.sign(along) / np.linalg.norm(shading, axis=1))[:, None]
+    to_uv = table.to_uv[faces]
+    across = np.linalg.norm(to_uv, axis=2) * width[:, None]
+    return SurfaceHits(
+        xyz=xyz,
+        normal=shading,
+        uv=table.uv[faces] + (to_uv @ local)[:, :, 0],
+        width=width,
+        smear=smear,
+        spread=np.hypot(across, (to_uv @ smear[:, :, None])[:, :, 0]),
+    )

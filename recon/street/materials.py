@@ -1,0 +1,303 @@
+"""Procedural materials: from a position on a surface to its colour (Lambertian albedo)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from recon.core.values.arrays import Float64, Int32
+from recon.street.kernels.noise import fractal_noise, lattice_values
+from recon.street.kernels.surface import SurfaceHits
+from recon.street.patterns import both, stripe, stripes, tile_joints, tile_tone
+from recon.street.soup import Material, TriangleSoup
+
+GAMMA: Final = 2.2
+"""Exponent from display values to linear light."""
+_OCTAVES: Final = 7
+_ROUGHNESS: Final = 0.92  # amplitude of each octave relative to the next coarser one
+ROAD_HALF_M: Final = 5.2
+_LANE_HALF_M = 3.05
+
+
+class Grain(NamedTuple):
+    """Grain of a material.
+
+    Attributes:
+        wavelength_m: Coarsest wavelength.
+        contrast: Strength, in the exponent of the brightness.
+    """
+
+    wavelength_m: float
+    contrast: float
+
+
+GRAIN: Final = {
+    Material.PLAIN: Grain(0.6, 0.5),
+    Material.ASPHALT: Grain(0.6, 0.5),
+    Material.PAVING: Grain(0.8, 0.4),
+    Material.KERB: Grain(0.5, 0.45),
+    Material.PLASTER: Grain(2.2, 0.30),
+    Material.BRICK: Grain(1.2, 0.45),
+    Material.GLASS: Grain(1.6, 0.9),
+    Material.DOOR: Grain(0.5, 0.35),
+    Material.ROOF: Grain(0.8, 0.5),
+    Material.CAR_PAINT: Grain(0.5, 0.09),
+    Material.CAR_GLASS: Grain(0.7, 0.09),
+    Material.BARK: Grain(0.25, 1.0),
+    Material.LEAVES: Grain(0.6, 2.0),
+    Material.METAL: Grain(0.3, 0.35),
+    Material.GRASS: Grain(0.7, 0.9),
+    Material.POSTER: Grain(0.35, 0.6),
+}
+_WAVELENGTHS = np.array([GRAIN[m].wavelength_m for m in Material])
+_CONTRASTS = np.array([GRAIN[m].contrast for m in Material])
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Points of one material, the input of its recipe.
+
+    Attributes:
+        uv: float64 (N, 2), metres on the surface.
+        spread: float64 (N, 2), footprint of the pixel along u and v.
+        height_m: float64 (N,), above the road.
+        grain: float64 (N,), noise of mean 0.
+        rgb: float64 (N, 3), base colour as displayed.
+        part: int32 (N,), number of the object.
+    """
+
+    uv: Float64
+    spread: Float64
+    height_m: Float64
+    grain: Float64
+    rgb: Float64
+    part: Int32
+
+    @property
+    def u(self) -> Float64:
+        """float64 (N,)."""
+        return self.uv[:, 0]
+
+    @property
+    def v(self) -> Float64:
+        """float64 (N,)."""
+        return self.uv[:, 1]
+
+
+Recipe = Callable[[Patch], Float64]
+
+
+def albedo(soup: TriangleSoup, faces: Int32, hits: SurfaceHits, seed: int) -> Float64:
+    """Diffuse colour of points.
+
+    Args:
+        soup: The scene.
+        faces: int32 (N,), the triangles hit by the rays.
+        hits: The hit points.
+        seed: Seed of the grain.
+
+    Returns:
+        float64 (N, 3), linear light, in [0, 1].
+    """
+    material = soup.material[faces]
+    grain = fractal_noise(
+        hits.xyz, hits.smear, hits.width, _WAVELENGTHS[material], _OCTAVES, _ROUGHNESS, seed
+    )
+    rgb: Float64 = soup.rgb[faces] ** GAMMA * np.exp(_CONTRASTS[material] * grain)[:, None]
+    part = soup.part[faces]
+    order = np.argsort(material, kind="stable")
+    ends = np.searchsorted(material[order], np.arange(len(Material) + 1))
+    for kind, recipe in RECIPES.items():
+        which = order[ends[kind] : ends[kind + 1]]
+        if len(which):
+            height = hits.xyz[which, 2]
+            uv, spread = hits.uv[which], hits.spread[which]
+            rgb[which] = recipe(Patch(uv, spread, height, grain[which], rgb[which], part[which]))
+    return np.clip(rgb, 0.0, 1.0)
+
+
+def _blend(rgb: Float64, paint: tuple[float, float, float], share: Float64) -> Float64:
+    """Cover a fraction (N,) of each footprint with a display colour."""
+    cover = share[:, None]
+    return np.asarray(rgb * (1.0 - cover) + np.array(paint) ** GAMMA * cover)
+
+
+def _variation(patch: Patch, channel: int) -> Float64:
+    """One random number in [-1, 1) per object."""
+    zero = np.zeros(len(patch.part), dtype=np.int64)
+    return lattice_values(patch.part, zero + channel, zero, 11)
+
+
+def _asphalt(p: Patch) -> Float64:
+    """Wheel tracks, patches, joints and worn markings; u is along the road, v to the left."""
+    v, spread_v = p.v, p.spread[:, 1]
+    tracks = sum(np.exp(-(((v - c) / 0.35) ** 2)) for c in (-2.3, -0.8, 0.8, 2.3))
+    repairs = tile_tone(p.uv, (5.3, 2.1), p.spread, np.zeros(len(v), dtype=int))
+    rgb = p.rgb * (1.0 - 0.12 * np.asarray(tracks) + 0.16 * np.round(repairs * 0.8))[:, None]
+    seam = v - 0.12 * np.sin(0.9 * p.u) - 0.05 * np.sin(3.1 * p.u)
+    tar = both(stripe(seam, 0.35, 0.40, spread_v), stripe(seam, -3.5, -3.46, spread_v))
+    across = p.u + 0.1 * np.sin(2.0 * v) + 0.04 * np.sin(7.0 * v)
+    tar = both(tar, stripes(across, 11.3, 0.04, p.spread[:, 0]))
+    rgb = _blend(rgb, (0.16, 0.16, 0.17), 0.7 * tar)
+    dashes = stripes(p.u, 6.0, 3.0, p.spread[:, 0]) * stripe(v, -0.07, 0.07, spread_v)
+    edges = stripe(np.abs(v), _LANE_HALF_M, _LANE_HALF_M + 0.1, spread_v)
+    bays = stripes(p.u, 6.0, 0.1, p.spread[:, 0])
+    bays = bays * stripe(np.abs(v), _LANE_HALF_M, ROAD_HALF_M, spread_v)
+    gutter = stripe(np.abs(v), ROAD_HALF_M - 0.25, ROAD_HALF_M, spread_v)
+    rgb = _blend(rgb, (0.42, 0.41, 0.39), 0.6 * gutter)
+    worn = np.clip(0.75 + 0.5 * p.grain, 0.0, 0.95)
+    return _blend(rgb, (0.85, 0.85, 0.83), worn * both(both(dashes, edges), bays))
+
+
+def _paving(p: Patch) -> Float64:
+    """Slabs in running bond, with a row of darker setts along the kerb."""
+    tile = (0.6, 0.4)
+    tone = tile_tone(p.uv, tile, p.spread, np.zeros(len(p.uv), dtype=int), bond=0.5)
+    rgb = p.rgb * (1.0 + 0.16 * tone)[:, None]
+    return _blend(rgb, (0.25, 0.24, 0.22), 0.75 * tile_joints(p.uv, tile, 0.016, p.spread, 0.5))
+
+
+def _kerb(p: Patch) -> Float64:
+    """Stones one metre long."""
+    tone = tile_tone(p.uv, (1.0, 1.0), p.spread, np.zeros(len(p.uv), dtype=int))
+    rgb = p.rgb * (1.0 + 0.12 * tone)[:, None]
+    return _blend(rgb, (0.2, 0.2, 0.2), 0.8 * stripes(p.u, 1.0, 0.02, p.spread[:, 0]))
+
+
+def _weather(p: Patch) -> Float64:
+    """Splash marks at the foot of walls, and vertical rain streaks."""
+    foot = np.exp(-np.maximum(p.height_m, 0.0) / 0.5)
+    cell = np.stack([p.u, np.zeros_like(p.u)], axis=1)
+    narrow = np.stack([p.spread[:, 0], np.zeros_like(p.u)], axis=1)
+    streaks = tile_tone(cell, (0.37, 1.0), narrow, p.part)
+    return np.asarray((1.0 - 0.3 * foot) * (1.0 + 0.045 * streaks))
+
+
+def _plaster(p: Patch) -> Float64:
+    return np.asarray(p.rgb * _weather(p)[:, None])
+
+
+def _brick(p: Patch) -> Float64:
+    """Bricks of 24 × 7.5 cm, in areas of slightly different colour."""
+    tile = (0.25, 0.083)
+    tone = 0.28 * tile_tone(p.uv, tile, p.spread, p.part, bond=0.5)
+    tone += 0.07 * tile_tone(p.uv, (0.9, 0.4), p.spread, p.part + 1)
+    rgb = p.rgb * ((1.0 + tone) * _weather(p))[:, None]
+    return _blend(rgb, (0.62, 0.60, 0.56), 0.8 * tile_joints(p.uv, tile, 0.013, p.spread, 0.5))
+
+
+def _glass(p: Patch) -> Float64:
+    """Dark rooms, painted sky reflections, and some curtains."""
+    rgb = p.rgb * np.clip(1.0 + 0.5 * (p.v - 0.7), 0.5, 2.5)[:, None]
+    curtain = (_variation(p, 1) > 0.1) * stripe(p.u % 1.1, 0.0, 0.36, p.spread[:, 0])
+    folds = 0.5 + 0.25 * np.sin(p.u * 42.0) * np.exp(-((p.spread[:, 0] / 0.06) ** 2))
+    blind = 0.35 + 0.6 * _variation(p, 2)
+    blind = stripe(p.v, 1.5 - blind, 9.0, p.spread[:, 1]) * (_variation(p, 3) > 0.2)
+    rgb = _blend(rgb, (0.75, 0.72, 0.66), np.asarray(curtain * folds))
+    return _blend(rgb, (0.66, 0.64, 0.58), 0.8 * np.asarray(blind))
+
+
+def _door(p: Patch) -> Float64:
+    """Two columns of panels and a letter box."""
+    u, v = p.u % 1.1, p.v
+    frame = 1.0 - stripe(np.abs(u - 0.55), 0.08, 0.45, p.spread[:, 0]) * (
+        1.0 - stripes(v, 0.75, 0.14, p.spread[:, 1])
+    )
+    rgb = p.rgb * (0.7 + 0.45 * frame)[:, None]
+    slot = stripe(u, 0.4, 0.7, p.spread[:, 0]) * stripe(v, 1.02, 1.09, p.spread[:, 1])
+    return _blend(rgb, (0.8, 0.75, 0.5), slot)
+
+
+def _roof(p: Patch) -> Float64:
+    """Rows of tiles, each casting a line of shadow."""
+    tone = tile_tone(p.uv, (0.3, 0.35), p.spread, p.part, bond=0.5)
+    rgb = p.rgb * (1.0 + 0.2 * tone)[:, None]
+    return _blend(rgb, (0.1, 0.08, 0.07), 0.6 * stripes(p.v, 0.35, 0.05, p.spread[:, 1]))
+
+
+def _car_paint(p: Patch) -> Float64:
+    """Door gaps, a trim strip, and road dirt at the bottom."""
+    gaps = both(
+        stripe(np.abs(p.u + 0.25), 0.0, 0.012, p.spread[:, 0]),
+        stripe(np.abs(p.u - 0.80), 0.0, 0.012, p.spread[:, 0]),
+    )
+    trim = stripe(p.v, 0.5, 0.56, p.spread[:, 1])
+    dirt = np.exp(-np.maximum(p.height_m - 0.2, 0.0) / 0.18)
+    rgb = p.rgb * (1.0 - 0.35 * dirt)[:, None]
+    return _blend(rgb, (0.06, 0.06, 0.06), 0.8 * both(gaps, trim))
+
+
+def _car_glass(p: Patch) -> Float64:
+    """Dark panes between pillars in the colour of the body."""
+    pillars = stripe(np.abs(p.u + 0.25), 0.0, 0.05, p.spread[:, 0])
+    pillars = both(pillars, stripe(p.v, 1.36, 9.0, p.spread[:, 1]))
+    cover = pillars[:, None]
+    dark = np.array([0.16, 0.18, 0.2]) ** GAMMA * np.exp(0.8 * p.grain)[:, None]
+    dark = dark * (1.0 + 2.0 * np.clip(p.v - 1.0, 0.0, 0.5))[:, None]
+    return np.asarray(dark * (1.0 - cover) + p.rgb * cover)
+
+
+def _leaves(p: Patch) -> Float64:
+    """Leaves; sunlit ones are yellower than those deep in the crown."""
+    tint = np.clip(0.5 + 0.6 * p.grain, 0.0, 1.0)[:, None]
+    return np.asarray(p.rgb * (tint * [1.25, 1.1, 0.7] + (1.0 - tint) * [0.7, 0.85, 0.9]))
+
+
+def _metal(p: Patch) -> Float64:
+    """Seams, so that poles have some texture."""
+    seams = stripes(p.v, 0.9, 0.05, p.spread[:, 1])
+    return _blend(p.rgb, (0.75, 0.74, 0.7), 0.5 * seams)
+
+
+def _poster(p: Patch) -> Float64:
+    """Strongly coloured areas within a white border, and lines of text."""
+    zero = np.zeros(len(p.uv), dtype=np.int64)
+    tones = [tile_tone(p.uv, (0.23, 0.31), p.spread, p.part + k) for k in (0, 1, 2)]
+    rgb = p.rgb * (1.0 + 0.3 * tones[0][:, None] + 0.3 * np.stack(tones, axis=1))
+    print_lines = stripes(p.v, 0.11, 0.03, p.spread[:, 1])
+    print_lines = print_lines * (lattice_values(np.floor(p.v / 0.11), p.part, zero, 3) > -0.3)
+    rgb = _blend(rgb, (0.12, 0.12, 0.14), 0.7 * np.asarray(print_lines))
+    return _blend(rgb, (0.88, 0.88, 0.86), 1.0 - stripe(p.u, 0.05, 50.0, p.spread[:, 0]))
+
+
+RECIPES: Final[dict[Material, Recipe]] = {
+    Material.ASPHALT: _asphalt,
+    Material.PAVING: _paving,
+    Material.KERB: _kerb,
+    Material.PLASTER: _plaster,
+    Material.BRICK: _brick,
+    Material.GLASS: _glass,
+    Material.DOOR: _door,
+    Material.ROOF: _roof,
+    Material.CAR_PAINT: _car_paint,
+    Material.CAR_GLASS: _car_glass,
+    Material.LEAVES: _leaves,
+    Material.METAL: _metal,
+    Material.POSTER: _poster,
+}
+
+
+def sky_colour(directions: Float64, pixel: float, seed: int) -> Float64:
+    """Linear light (N, 3) of the sky: blue above, haze below, clouds.
+
+    Args:
+        directions: (N, 3), z up, any length.
+        pixel: Width of a pixel, radians.
+        seed: Seed of the clouds.
+    """
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    climb = np.clip(unit[:, 2:], 0.0, 1.0)
+    haze = np.exp(-climb / 0.22)
+    blue = np.array([0.36, 0.55, 0.83]) ** GAMMA
+    white = np.array([0.86, 0.89, 0.93]) ** GAMMA
+    flat = unit * [1.0, 1.0, 2.5]
+    n = len(unit)
+    clouds = fractal_noise(
+        flat, np.zeros((n, 3)), np.full(n, pixel), np.full(n, 0.4), 6, 0.65, seed + 5
+    )
+    cover = np.clip(0.35 + 1.1 * clouds, 0.0, 1.0)[:, None]
+    clear = blue + (white - blue) * haze
+    return np.asarray(clear + (white - clear) * 0.85 * cover)

@@ -1,0 +1,109 @@
+"""Settings of a synthetic street drive and its cameras."""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+from pydantic import Field, model_validator
+from typing_extensions import Self
+
+from recon.core.settings import Settings
+
+CORNER_M: Final = 16.0
+"""Radius of the corners of a block."""
+
+_LEAST_SIDE_M: Final = 2 * CORNER_M + 28.0  # two rows of houses, back to back
+
+
+class StreetSettings(Settings):
+    """A street, a rig, and the path of the rig through the street.
+
+    Equal settings give bit-identical images. A longer drive with the same seed continues along
+    the same street.
+    """
+
+    seed: int = Field(default=0, ge=0, lt=2**31, description="Seed of the street.")
+    frames: int = Field(default=40, ge=1, le=2000, description="Number of stereo pairs.")
+    speed_m_per_frame: float = Field(
+        default=1.0, ge=0.0, le=5.0, description="Distance driven between two frames."
+    )
+    frame_rate_hz: float = Field(
+        default=10.0, gt=0.0, description="Frame rate; affects only the timestamps."
+    )
+    path: Literal["curve", "straight", "block"] = Field(
+        default="curve", description="Shape of the street; block = repeated laps around a block."
+    )
+    turn_deg_per_100m: float = Field(
+        default=20.0,
+        ge=-60.0,
+        le=60.0,
+        description="Mean curvature of a curved street; positive = to the left.",
+    )
+    block_m: tuple[float, float] = Field(
+        default=(100.0, 70.0), description="Side lengths of the block for path = block."
+    )
+    repeat_m: float | None = Field(
+        default=None,
+        ge=20.0,
+        le=1000.0,
+        description="Period after which a straight street repeats itself. none = never.",
+    )
+    sway: float = Field(
+        default=1.0,
+        ge=0.0,
+        le=5.0,
+        description="Amount of lateral drift and pitching of the car; 0 = none.",
+    )
+
+    width_px: int = Field(default=640, ge=16, le=8192, description="Image width.")
+    height_px: int = Field(default=240, ge=16, le=8192, description="Image height.")
+    focal_px: float = Field(default=360.0, gt=0.0, description="Focal length.")
+    baseline_m: float = Field(
+        default=0.54, gt=0.0, le=5.0, description="Distance between the cameras."
+    )
+    camera_height_m: float = Field(
+        default=1.65, ge=0.3, le=4.0, description="Height of the cameras above the road."
+    )
+    pitch_deg: float = Field(
+        default=1.0, ge=-30.0, le=30.0, description="Pitch of the mounted rig; positive = down."
+    )
+    yaw_deg: float = Field(
+        default=1.5, ge=-45.0, le=45.0, description="Yaw of the mounted rig; positive = right."
+    )
+    roll_deg: float = Field(
+        default=0.3, ge=-30.0, le=30.0, description="Roll of the mounted rig; positive = clockwise."
+    )
+
+    noise_dn: float = Field(
+        default=1.0,
+        ge=0.0,
+        le=50.0,
+        description="Sensor noise, standard deviation in grey levels (0 to 255).",
+    )
+    right_gain: float = Field(
+        default=1.0,
+        gt=0.0,
+        le=4.0,
+        description="Brightness of the right camera relative to the left.",
+    )
+    right_offset_dn: float = Field(
+        default=0.0, ge=-128.0, le=128.0, description="Grey levels added in the right image."
+    )
+    smooth_edges: bool = Field(
+        default=True,
+        description="Cast four rays instead of one per pixel at edges (antialiasing).",
+    )
+    threads: int = Field(
+        default=0,
+        ge=0,
+        le=256,
+        description="Rendering threads, 0 = one per core; does not affect the result.",
+    )
+
+    @model_validator(mode="after")
+    def _check_shape(self) -> Self:
+        if min(self.block_m) < _LEAST_SIDE_M or max(self.block_m) > 2000.0:
+            raise ValueError(f"block_m: each side must be {_LEAST_SIDE_M:g} to 2000 m")
+        if self.repeat_m is not None and self.path != "straight":
+            raise ValueError("repeat_m: only a straight street can repeat itself")
+        return self

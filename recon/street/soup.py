@@ -1,0 +1,119 @@
+"""Painted triangles, of which every synthetic scene consists."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+
+from recon.core.geometry import se3
+from recon.core.values.arrays import Float64, Int32, UInt8, freeze
+
+
+class Material(IntEnum):
+    """Kinds of surface; `recon.street.materials` has a recipe for each."""
+
+    PLAIN = 0
+    ASPHALT = 1
+    PAVING = 2
+    KERB = 3
+    PLASTER = 4
+    BRICK = 5
+    GLASS = 6
+    DOOR = 7
+    ROOF = 8
+    CAR_PAINT = 9
+    CAR_GLASS = 10
+    BARK = 11
+    LEAVES = 12
+    METAL = 13
+    GRASS = 14
+    POSTER = 15
+
+
+@dataclass(frozen=True)
+class Paint:
+    """Appearance of a surface.
+
+    Attributes:
+        material: The recipe.
+        rgb: Base colour as displayed, each in [0, 1].
+        part: Number of the object, which seeds its variations.
+    """
+
+    material: Material = Material.PLAIN
+    rgb: tuple[float, float, float] = (0.5, 0.5, 0.5)
+    part: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleSoup:
+    """Triangles with their paint; they share no vertices.
+
+    Attributes:
+        vertices: float64 (F, 3, 3), corners, metres.
+        normals: float64 (F, 3, 3), unit normals at the corners, only for shading.
+        uv: float64 (F, 3, 2), texture coordinates of the corners, metres.
+        rgb: float64 (F, 3), base colour.
+        material: uint8 (F,), a `Material`.
+        part: int32 (F,), number of the object.
+    """
+
+    vertices: Float64
+    normals: Float64
+    uv: Float64
+    rgb: Float64
+    material: UInt8
+    part: Int32
+
+    def __post_init__(self) -> None:
+        freeze(self, "vertices", np.float64, (None, 3, 3))
+        n = len(self.vertices)
+        freeze(self, "normals", np.float64, (n, 3, 3))
+        freeze(self, "uv", np.float64, (n, 3, 2))
+        freeze(self, "rgb", np.float64, (n, 3))
+        freeze(self, "material", np.uint8, (n,))
+        freeze(self, "part", np.int32, (n,))
+
+    def __len__(self) -> int:
+        return len(self.vertices)
+
+
+def merge(soups: Iterable[TriangleSoup]) -> TriangleSoup:
+    """All triangles of several soups, in order."""
+    parts = list(soups)
+    names = ("vertices", "normals", "uv", "rgb", "material", "part")
+    return TriangleSoup(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+
+
+def move(soup: TriangleSoup, T_to_from: Float64) -> TriangleSoup:
+    """Transform triangles into other axes."""
+    vertices = se3.apply(T_to_from, soup.vertices.reshape(-1, 3)).reshape(-1, 3, 3)
+    normals = se3.rotate(T_to_from, soup.normals.reshape(-1, 3)).reshape(-1, 3, 3)
+    return replace(soup, vertices=vertices, normals=normals)
+
+
+def painted(
+    vertices: Float64, uv: Float64, paint: Paint, normals: Float64 | None = None
+) -> TriangleSoup:
+    """Triangles (F, 3, 3) with texture coordinates (F, 3, 2), all in one paint.
+
+    Without ``normals`` they are flat-shaded.
+    """
+    n = len(vertices)
+    return TriangleSoup(
+        vertices=vertices,
+        normals=_flat_normals(vertices) if normals is None else normals,
+        uv=uv,
+        rgb=np.tile(np.array(paint.rgb, dtype=np.float64), (n, 1)),
+        material=np.full(n, paint.material, dtype=np.uint8),
+        part=np.full(n, paint.part, dtype=np.int32),
+    )
+
+
+def _flat_normals(vertices: Float64) -> Float64:
+    normal = np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return np.repeat(normal[:, None, :], 3, axis=1)

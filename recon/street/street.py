@@ -1,0 +1,312 @@
+"""Lays out a street from its seed: ground, houses, and the objects between them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from recon.core.geometry import se3
+from recon.core.values import RectifiedCamera, Trajectory
+from recon.core.values.arrays import Float64, freeze
+from recon.street import props
+from recon.street.buildings import draw_plan, house
+from recon.street.materials import ROAD_HALF_M
+from recon.street.path import BEHIND_M, CentreLine, camera_poses, centre_line
+from recon.street.settings import StreetSettings
+from recon.street.soup import Material, Paint, TriangleSoup, merge, move, painted
+
+KERB_M: Final = 0.12  # pavement above road
+_WALL_M: Final = 8.2  # distance of facades from the centre line
+_AHEAD_M: Final = 110.0
+_CAR_LANE_M: Final = 4.15
+_SEEDLINGS: Final = 5
+
+
+@dataclass(frozen=True, eq=False)
+class StreetWorld:
+    """A street, a rig and its path: everything that an image depends on.
+
+    Attributes:
+        settings: The settings it was built from.
+        soup: The scene, street axes (x along the street at its start, y left, z up, road at 0).
+        camera: The rectified rig.
+        T_street_camera: float64 (frames, 4, 4), poses of the left camera.
+        to_sun: float64 (3,), unit vector towards the sun, street axes.
+    """
+
+    settings: StreetSettings
+    soup: TriangleSoup
+    camera: RectifiedCamera
+    T_street_camera: Float64
+    to_sun: Float64
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_street_camera", np.float64, (self.settings.frames, 4, 4))
+        freeze(self, "to_sun", np.float64, (3,))
+
+    @property
+    def T_world_street(self) -> Float64:
+        """float64 (4, 4); world is the first left camera."""
+        return se3.invert(self.T_street_camera[0])
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """True poses of the left camera; the first is the identity."""
+        poses = self.T_world_street @ self.T_street_camera
+        poses[0] = np.eye(4)
+        times = np.arange(self.settings.frames) / self.settings.frame_rate_hz
+        return Trajectory(poses, times)
+
+    @property
+    def T_map_world(self) -> Float64:
+        """float64 (4, 4); map axes: x forward along the first view, y left, z exactly up.
+
+        The origin is that of the world, the first left camera.
+        """
+        forward = self.T_street_camera[0][:3, 2] * [1.0, 1.0, 0.0]
+        forward /= np.linalg.norm(forward)
+        up = np.array([0.0, 0.0, 1.0])
+        R_map_street = np.stack([forward, np.cross(up, forward), up])
+        return se3.make_transform(R_map_street @ self.T_street_camera[0][:3, :3], np.zeros(3))
+
+    def ground_plane(self, index: int) -> Float64:
+        """The road in the axes of a left camera.
+
+        Returns:
+            float64 (4,), ``(a, b, c, d)``: ``a·x + b·y + c·z + d`` is the height above the road.
+        """
+        return np.array(self.T_street_camera[index][2])
+
+
+def build_street(settings: StreetSettings) -> StreetWorld:
+    """Lay out the street for some settings."""
+    length = settings.frames * settings.speed_m_per_frame + _AHEAD_M
+    road = centre_line(settings, length + 60.0)
+    layers: list[Callable[[CentreLine, float, np.random.Generator], Iterator[TriangleSoup]]] = [
+        _houses,
+        _backdrop,
+        _parked_cars,
+        _trees,
+        _furniture,
+    ]
+    parts = [_ground(road)]
+    for number, layer in enumerate(layers):
+        for side in (1.0, -1.0):
+            stream = np.random.default_rng([settings.seed, number, int(side > 0)])
+            parts.extend(layer(road, side, stream))
+    soup = merge(parts)
+    return StreetWorld(
+        settings=settings,
+        soup=soup if settings.repeat_m is None else _repeated(soup, settings.repeat_m, length),
+        camera=rig(settings),
+        T_street_camera=camera_poses(settings, road),
+        to_sun=_sun(settings.seed),
+    )
+
+
+def _repeated(period: TriangleSoup, repeat_m: float, length_m: float) -> TriangleSoup:
+    """Repeat one period of a straight street, beginning behind the start."""
+    shifts = repeat_m * np.arange(-math.ceil(BEHIND_M / repeat_m), math.ceil(length_m / repeat_m))
+    along = [np.array([shift, 0.0, 0.0]) for shift in shifts]
+    return merge([move(period, se3.make_transform(np.eye(3), offset)) for offset in along])
+
+
+def rig(settings: StreetSettings) -> RectifiedCamera:
+    """The rectified cameras of the settings, with both principal points at the image centre."""
+    return RectifiedCamera(
+        focal_px=settings.focal_px,
+        cx_px=(settings.width_px - 1) / 2,
+        cy_px=(settings.height_px - 1) / 2,
+        cx_right_px=(settings.width_px - 1) / 2,
+        baseline_m=settings.baseline_m,
+        width_px=settings.width_px,
+        height_px=settings.height_px,
+    )
+
+
+def _sun(seed: int) -> Float64:
+    """Direction to the sun: high and to one side of the street, so that one row is lit."""
+    rng = np.random.default_rng([seed, 99])
+    azimuth = rng.choice([-1.0, 1.0]) * rng.uniform(1.1, 2.3)
+    climb = rng.uniform(0.75, 1.0)
+    return np.array(
+        [np.cos(climb) * np.cos(azimuth), np.cos(climb) * np.sin(azimuth), np.sin(climb)]
+    )
+
+
+def _ground(road: CentreLine) -> TriangleSoup:
+    """Road, kerbs and pavements in strips of one metre, and the ground beside them."""
+    a, top = ROAD_HALF_M, KERB_M
+    grey = Paint(Material.ASPHALT, (0.40, 0.40, 0.41))
+    strips = [_strip(road, ((-a, 0.0), (a, 0.0)), grey)]
+    for side in (1.0, -1.0):
+        stone = Paint(Material.KERB, (0.58, 0.57, 0.55))
+        slabs = Paint(Material.PAVING, (0.56, 0.54, 0.51))
+        grass = Paint(Material.GRASS, (0.33, 0.38, 0.20))
+        b, c, d = side * (a + 0.15), side * (_WALL_M + 3.0), side * 60.0
+        strips += [
+            _strip(road, ((side * a, 0.0), (side * a, top)), stone),
+            _strip(road, ((side * a, top), (b, top)), stone),
+            _strip(road, ((b, top), (c, top)), slabs),
+            _yard(road, c, grass)
+            if _inside(road, side)
+            else _strip(road, ((c, top), (d, top)), grass),
+        ]
+    return merge(strips)
+
+
+def _strip(road: CentreLine, edges: tuple[tuple[float, float], ...], paint: Paint) -> TriangleSoup:
+    """A band along the road between two edges (lateral, height)."""
+    along = _stations(road)
+    rims, uvs = [], []
+    run = 0.0
+    for lateral, height in edges:
+        xy = road.points(along, np.full(len(along), lateral))
+        rims.append(np.column_stack([xy, np.full(len(along), height)]))
+        across = lateral if edges[0][1] == edges[1][1] else height
+        uvs.append(np.column_stack([along, np.full(len(along), across + run)]))
+    corners, uv = [_band(*pair) for pair in (rims, uvs)]
+    return painted(corners, uv, paint)
+
+
+def _stations(road: CentreLine) -> Float64:
+    """Distances at which the strips of the ground are divided: every metre, and at the ends."""
+    first, last = road.span_m
+    if first < 0.0:  # an open road, whose ground continues beyond the last objects
+        return np.arange(first, float(road.along_m[-1]) - 10.0, 1.0)
+    return np.linspace(first, last, math.ceil(last - first) + 1)
+
+
+def _yard(road: CentreLine, lateral_m: float, paint: Paint) -> TriangleSoup:
+    """The ground inside a block: a fan from its centre to the inner edge of the pavement."""
+    along = _stations(road)
+    rim = road.points(along, np.full(len(along), lateral_m))
+    middle = np.broadcast_to(rim.mean(axis=0), (len(rim) - 1, 2))
+    uv = np.stack([rim[:-1], rim[1:], middle], axis=1)
+    height = np.full((*uv.shape[:2], 1), KERB_M)
+    return painted(np.concatenate([uv, height], axis=2), uv, paint)
+
+
+def _inside(road: CentreLine, side: float) -> bool:
+    """Whether a side of the road is the inside of a block."""
+    return road.loop_m is not None and side > 0
+
+
+def _band(near: Float64, far: Float64) -> Float64:
+    """Triangles (2·(N-1), 3, C) between two polylines (N, C)."""
+    first = np.stack([near[:-1], near[1:], far[1:]], axis=1)
+    second = np.stack([near[:-1], far[1:], far[:-1]], axis=1)
+    return np.concatenate([first, second])
+
+
+def _houses(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
+    """A row of houses with setbacks and occasional gaps for side streets."""
+    at, end = road.span_m
+    while at < end:
+        width = float(rng.uniform(8.0, 15.0))
+        setback = float(rng.choice([0.0, 0.0, rng.uniform(0.3, 1.8)]))
+        gap = float(rng.uniform(5.0, 8.0)) if rng.random() < 0.22 else float(rng.uniform(0.0, 0.15))
+        if _room(road, side, at, width):
+            yield _stand(road, side, at, setback, width, rng)
+        at += width + gap
+
+
+def _backdrop(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
+    """Houses behind the first row, visible through its gaps."""
+    at, end = road.span_m
+    end += 30.0 * (at < 0.0)
+    while at < end:
+        width = float(rng.uniform(11.0, 18.0))
+        if not _inside(road, side) and _room(road, side, at, width):
+            yield _stand(road, side, at, float(rng.uniform(20.0, 28.0)), width, rng)
+        at += width + float(rng.uniform(0.5, 3.0))
+
+
+def _room(road: CentreLine, side: float, at_m: float, width_m: float) -> bool:
+    """Whether a house fits: within the lap or period, and not on the inside of a corner."""
+    if road.span_m[0] < 0.0:
+        return True
+    end_m = at_m + width_m
+    return end_m <= road.span_m[1] and not (_inside(road, side) and road.bends(at_m, end_m))
+
+
+def _stand(
+    road: CentreLine,
+    side: float,
+    at_m: float,
+    setback_m: float,
+    width_m: float,
+    rng: np.random.Generator,
+) -> TriangleSoup:
+    """A house on one side, with its facade on a chord of the curve."""
+    built = house(draw_plan(width_m, rng), rng)
+    T = road.place(at_m + width_m / 2, side * (_WALL_M + setback_m), KERB_M)
+    half = se3.make_transform(np.eye(3), np.array([-width_m / 2, 0.0, 0.0]))
+    if side < 0:
+        T = T @ se3.make_transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    return move(built, T @ half)
+
+
+def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
+    """Parked cars in about half of the bays, most facing in the direction of their lane."""
+    first, end = road.span_m
+    for bay in np.arange(max(first, -18.0), end, 6.0):
+        if rng.random() < 0.45:
+            continue
+        soup, jitter = props.car(rng), rng.normal(0.0, [0.25, 0.1, 0.02])
+        T = road.place(float(bay) + 3.0 + jitter[0], side * _CAR_LANE_M + jitter[1])
+        backwards = (side > 0) != (rng.random() < 0.1)
+        turn = se3.exp_so3(np.array([0.0, 0.0, jitter[2] + np.pi * backwards]))
+        yield move(soup, T @ se3.make_transform(turn, np.zeros(3)))
+
+
+def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
+    """Trees along the kerb, copied from a few models, and a row at the far end."""
+    seedlings = [props.tree(rng) for _ in range(_SEEDLINGS)]
+
+    def grow(at_m: float, lateral_m: float) -> TriangleSoup:
+        turn = se3.exp_so3(np.array([0.0, 0.0, float(rng.uniform(0.0, 2.0 * np.pi))]))
+        T = road.place(at_m, lateral_m, KERB_M) @ se3.make_transform(turn, np.zeros(3))
+        return move(seedlings[int(rng.integers(_SEEDLINGS))], T)
+
+    first, end = road.span_m
+    at = max(first, -10.0) + float(rng.uniform(0.0, 8.0))
+    while at < end:
+        yield grow(at, side * (ROAD_HALF_M + 0.75))
+        at += float(rng.uniform(9.0, 22.0))
+    for lateral in np.arange(1.0, 26.0, 3.2) if first < 0.0 else ():
+        yield grow(end + 8.0 + float(rng.uniform(0.0, 4.0)), side * float(lateral))
+
+
+def _furniture(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
+    """Lamp posts at regular distances; signs, bollards, bins and pillars at random."""
+    kerb = side * (ROAD_HALF_M + 0.45)
+    # Separate random streams, as the number of posts must not change the objects between them.
+    lamps, rng = rng.spawn(2)
+    first, end = road.span_m
+    for at in np.arange(max(first, -12.0) + 12.0 * (side > 0), end, 24.0):
+        yield move(props.lamp_post(side, lamps), road.place(float(at), kerb, KERB_M))
+    at = max(first, -8.0)
+    while at < end:
+        at += float(rng.uniform(2.5, 9.0))
+        kind = rng.random()
+        if kind < 0.3:
+            yield move(props.sign(rng), road.place(at, kerb, KERB_M))
+        elif kind < 0.6:
+            yield from _row_of_bollards(road, at, kerb, rng)
+        elif kind < 0.85:
+            yield move(props.bin_(rng), road.place(at, side * (_WALL_M - 0.6), KERB_M))
+        else:
+            T = road.place(at, side * (ROAD_HALF_M + 1.2), KERB_M)
+            yield move(props.advertising_pillar(rng), T)
+
+
+def _row_of_bollards(
+    road: CentreLine, at_m: float, lateral_m: float, rng: np.random.Generator
+) -> Iterator[TriangleSoup]:
+    for k in range(int(rng.integers(2, 5))):
+        yield move(props.bollard(rng), road.place(at_m + 1.5 * k, lateral_m, KERB_M))

@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import io
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from recon.cli.show.progress import JsonLines, Quiet, RichProgress, choose_viewer
+from recon.map.observer import FrameResult, Observer
+from recon.odometry.protocol import OdometryHealth
+
+
+class Terminal(io.StringIO):
+    """A stream that claims to be a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def frame(index: int, *, ok: bool = True, overlap: float = 0.8) -> FrameResult:
+    health = OdometryHealth(ok=ok, inliers=120, overlap=overlap, notes=("a [bold] note",))
+    return FrameResult(index, 3, 0.25, 0.7, 900, np.eye(4), health)
+
+
+def run(observer: Observer) -> None:
+    observer.on_start("drive [1]", 3)
+    for index in range(3):
+        observer.on_frame(frame(index, ok=index != 1, overlap=float("nan")))
+    observer.on_finish()
+    observer.on_stage("mesh")
+
+
+def lines(stream: io.StringIO) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in stream.getvalue().splitlines()]
+
+
+def test_each_viewer_is_an_observer() -> None:
+    viewers = (Quiet(), JsonLines(io.StringIO()), RichProgress(Console(file=io.StringIO())))
+    assert all(isinstance(viewer, Observer) for viewer in viewers)
+
+
+def test_every_event_is_one_json_line() -> None:
+    stream = io.StringIO()
+    run(JsonLines(stream))
+    events = [line["event"] for line in lines(stream)]
+    assert events == ["start", "frame", "frame", "frame", "finish", "stage"]
+
+
+def test_json_lines_tell_the_frame_and_have_null_for_nan() -> None:
+    stream = io.StringIO()
+    JsonLines(stream).on_frame(frame(1, ok=False, overlap=float("nan")))
+    (told,) = lines(stream)
+    assert told["index"] == 1
+    assert told["measured"] is False
+    assert told["overlap"] is None
+    assert told["position_m"] == [0.0, 0.0, 0.0]
+    assert told["notes"] == ["a [bold] note"]
+
+
+def test_bar_shows_frames_rate_and_lost_poses() -> None:
+    stream = Terminal()
+    run(RichProgress(Console(file=stream, force_terminal=True, width=140)))
+    shown = stream.getvalue()
+    assert "3/3" in shown
+    assert "4.0 fps" in shown  # 0.25 s each
+    assert "1 not trusted" in shown
+    assert "drive [1]" in shown  # a name is no markup
+    assert "mesh" in shown
+
+
+def test_bar_may_be_finished_twice_and_asked_before_its_start() -> None:
+    viewer = RichProgress(Console(file=io.StringIO()))
+    viewer.on_frame(frame(0))
+    viewer.on_finish()
+    run(viewer)
+    viewer.on_finish()
+
+
+def test_quiet_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    run(choose_viewer(quiet=True))
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_terminal_gets_a_bar_and_a_file_json_lines_if_verbose() -> None:
+    assert isinstance(choose_viewer(stream=Terminal()), RichProgress)
+    assert isinstance(choose_viewer(stream=io.StringIO(), verbose=True), JsonLines)
+    assert isinstance(choose_viewer(stream=io.StringIO()), Quiet)
+
+
+def test_progress_goes_to_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
+    run(choose_viewer(verbose=True))
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err

@@ -1,0 +1,75 @@
+"""Settings come from defaults, file and overrides, in that order; unknown ones are errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from recon.commands.config import PAIR_DEFAULTS, ReconConfig, dump_config, load_config
+from recon.core.errors import SettingsError
+
+
+def test_a_dumped_configuration_loads_back_equal(tmp_path: Path) -> None:
+    config = load_config(overrides=["matching.sad.window_px=9", "cloud.max_range_m=null"])
+    (tmp_path / "config.yaml").write_text(dump_config(config))
+    assert load_config(tmp_path / "config.yaml") == config
+
+
+def test_overrides_win_over_the_file_and_the_file_over_defaults(tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text("mesh: {max_depth: 8}\nmatching: {sad: {window_px: 7}}\n")
+    config = load_config(tmp_path / "c.yaml", ["matching.sad.window_px=9"], PAIR_DEFAULTS)
+    assert config.matching.sad.window_px == 9
+    assert config.mesh.max_depth == 8
+    assert config.cloud.max_range_m is None
+
+
+def test_the_last_override_of_a_key_wins() -> None:
+    config = load_config(overrides=["fusion.min_count=2", "fusion.min_count=5"])
+    assert config.fusion.min_count == 5
+
+
+def test_overrides_of_two_keys_of_one_stage_both_count() -> None:
+    config = load_config(overrides=["fusion.min_count=2", "fusion.voxel_m=0.2"])
+    assert (config.fusion.min_count, config.fusion.voxel_m) == (2, 0.2)
+
+
+def test_an_empty_file_gives_the_defaults(tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text("")
+    assert load_config(tmp_path / "c.yaml") == ReconConfig()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("fusion: {voxels_m: 0.1}", r"unknown setting 'fusion\.voxels_m'"),
+        ("fusion: {voxel_m: -1}", r"setting 'fusion\.voxel_m': .*greater than 0.*got -1"),
+        ("fusion: [1", "not a YAML file"),
+        ("- 1\n- 2", "not a mapping"),
+    ],
+)
+def test_a_wrong_file_is_refused_by_name(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text(text)
+    with pytest.raises(SettingsError, match=message) as caught:
+        load_config(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_file_is_not_blamed_for_a_wrong_override(tmp_path: Path) -> None:
+    (tmp_path / "good.yaml").write_text("matching:\n  matcher: sgm\n")
+    with pytest.raises(SettingsError, match=r"^setting 'matching\.sad\.window_px': ") as refused:
+        load_config(tmp_path / "good.yaml", ["matching.sad.window_px=8"])
+    assert "good.yaml" not in str(refused.value)
+
+
+def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"none\.yaml: file does not exist"):
+        load_config(tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize("text", ["fusion.voxel_m", "=3", "fusion.voxel_m=[1"])
+def test_an_override_that_cannot_be_read_is_refused(text: str) -> None:
+    with pytest.raises(SettingsError, match="--set"):
+        load_config(overrides=[text])

@@ -1,0 +1,59 @@
+"""Pairs without a calibration file: what their camera is taken from is said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.commands.config import PAIR_DEFAULTS, load_config
+from recon.commands.pair import PairOptions, run_pair
+from recon.commands.pair_input import KnownCamera, read_uncalibrated_pair
+from recon.core.errors import CalibrationError
+from recon.core.values import RectifiedCamera
+from recon.io.images.image import write_image
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> tuple[Path, Path]:
+    """Blurred noise, 12 pixels further left in the right image."""
+    world = np.random.default_rng(3).integers(0, 256, (120, 260)).astype(np.uint8)
+    world = cv2.GaussianBlur(world, (0, 0), 1.5).astype(np.float64)
+    grey = np.uint8(255 * (world - world.min()) / np.ptp(world))
+    write_image(tmp_path / "left.png", grey[:, :240])
+    write_image(tmp_path / "right.png", grey[:, 12:252])
+    return tmp_path / "left.png", tmp_path / "right.png"
+
+
+def test_focal_length_and_baseline_give_metres(images: tuple[Path, Path]) -> None:
+    given = read_uncalibrated_pair(*images, KnownCamera(focal_px=300, baseline_m=0.2))
+    camera = given.calibration
+    assert isinstance(camera, RectifiedCamera)
+    assert (camera.focal_px, camera.baseline_m) == (300, 0.2)
+    assert (camera.cx_px, camera.cy_px, camera.doffs_px) == (119.5, 59.5, 0)
+    assert (given.notes, given.up_to_scale) == ((), False)
+
+
+def test_a_given_principal_point_is_that_of_both_views(images: tuple[Path, Path]) -> None:
+    known = KnownCamera(focal_px=300, baseline_m=0.2, cx_px=100, cy_px=50)
+    camera = read_uncalibrated_pair(*images, known).calibration
+    assert isinstance(camera, RectifiedCamera)
+    assert (camera.cx_px, camera.cy_px, camera.cx_right_px) == (100, 50, 100)
+
+
+def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(
+    images: tuple[Path, Path], tmp_path: Path
+) -> None:
+    given = read_uncalibrated_pair(*images, KnownCamera(focal_px=300))
+    settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
+    run = run_pair(given, settings, PairOptions("pair", tmp_path / "out"))
+    assert run.summary["up_to_scale"] is True
+    assert run.summary["depth_median_m"] == pytest.approx(300 / 12, rel=0.01)  # in baselines
+    assert [text for text in run.warnings if "in baselines, not in metres" in text]
+
+
+def test_an_unknown_focal_length_is_refused(images: tuple[Path, Path]) -> None:
+    with pytest.raises(CalibrationError, match=r"left\.png: focal length is unknown.*--focal PX"):
+        read_uncalibrated_pair(*images, KnownCamera(baseline_m=0.2))

@@ -1,0 +1,249 @@
+"""The surface of a drive is built from adjoining tiles, and removed where cameras saw through."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon.commands.config import load_config
+from recon.commands.mesh import MeshOptions, run_mesh
+from recon.core.errors import FormatError, MeshingError, OutputError, SettingsError
+from recon.core.values import OccupancyVoxels, PointCloud, TriangleMesh
+from recon.export.mesh import MeshSettings, Plane, open_edges
+from recon.export.mesh.drive_mesh import write_drive_mesh
+from recon.export.mesh.seams import nearest_on_edges
+from recon.export.mesh.tile_store import TileStore
+from recon.io.models.mesh import read_mesh
+from recon.io.models.ply import write_ply
+from recon.io.occupancy.octomap import write_octomap
+from recon.run.directory import RunDirectory
+
+STEP_M = 0.1
+SETTINGS = MeshSettings(tile_m=8.0, overlap_m=1.5, trim_density_quantile=0.0)
+
+
+def street(seed: int = 0) -> PointCloud:
+    """A bumpy street from x = -2 to 11.5 m, 6 m wide, with a wall along it; 1 cm of noise."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(-2, 11.5, STEP_M), np.arange(-3, 3, STEP_M), indexing="ij")
+    z = 0.1 * np.sin(x) + 0.05 * np.cos(2 * y)
+    ground = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    along, up = np.meshgrid(np.arange(-2, 11.5, STEP_M), np.arange(0.3, 2.5, STEP_M), indexing="ij")
+    wall = np.stack([along, np.full_like(along, 3.0), up], axis=-1).reshape(-1, 3)
+    xyz = np.concatenate([ground, wall]) + rng.normal(0, 0.01, (len(ground) + len(wall), 3))
+    normals = np.concatenate(
+        [np.tile([0.0, 0.0, 1.0], (len(ground), 1)), np.tile([0.0, -1.0, 0.0], (len(wall), 1))]
+    )
+    return PointCloud(
+        xyz.astype(np.float32),
+        rgb=np.where(np.arange(len(xyz))[:, None] < len(ground), 90, 200).repeat(3, 1).astype("u1"),
+        normals=normals.astype(np.float32),
+        frame="map",
+    )
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> TileStore:
+    return filled(tmp_path / "tiles")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[TriangleMesh, list[TriangleMesh]]:
+    """The mesh of the street, and its tiles."""
+    folder = tmp_path_factory.mktemp("street")
+    whole, tiles, warnings = written(filled(folder / "tiles"), folder / "out")
+    assert warnings == ()
+    return whole, tiles
+
+
+def filled(folder: Path) -> TileStore:
+    store = TileStore(folder, SETTINGS.tile_m)
+    cloud = street()
+    # As from a drive: in pieces that do not know the tiles.
+    for part in np.array_split(np.arange(len(cloud)), 7):
+        store.put_cloud(cloud.select(part))
+    return store
+
+
+def written(
+    store: TileStore, folder: Path, settings: MeshSettings = SETTINGS, threads: int | None = None
+) -> tuple[TriangleMesh, list[TriangleMesh], tuple[str, ...]]:
+    """The whole mesh, that of each tile, and the warnings."""
+    with RunDirectory(folder) as directory:
+        layer = directory.path("mesh/cloud.ply")
+        write_ply(layer, street())
+        found = write_drive_mesh(store, settings, directory, layer, threads)
+        directory.write_json("run.json", {"files": directory.files()})
+    tiles = [read_mesh(folder / "mesh" / "tiles" / tile.path.name) for tile in found.tiles]
+    return read_mesh(folder / "mesh" / "mesh.ply"), tiles, found.warnings
+
+
+def test_tiles_lie_on_the_surface_and_are_the_whole(
+    made: tuple[TriangleMesh, list[TriangleMesh]],
+) -> None:
+    whole, tiles = made
+    assert len(tiles) == 2
+    assert sum(len(tile.faces) for tile in tiles) == len(whole.faces)
+    np.testing.assert_array_equal(whole.vertices, np.concatenate([t.vertices for t in tiles]))
+    # Within what was sampled; beyond it the surface goes on for two spacings, as it likes.
+    inside = (np.abs(whole.vertices[:, 1]) < 2.5) & (np.abs(whole.vertices[:, 0] - 5) < 6)
+    x, y, z = whole.vertices[inside].T
+    # Noise of 1 cm is smoothed; an octree cell of 0.1 m adds little on a bump of 1 m.
+    assert np.abs(z - 0.1 * np.sin(x) - 0.05 * np.cos(2 * y)).max() < 0.03
+    assert whole.rgb is not None
+    assert set(np.unique(whole.rgb)) >= {90, 200}
+
+
+def test_no_gap_is_left_where_tiles_meet(made: tuple[TriangleMesh, list[TriangleMesh]]) -> None:
+    left, right = made[1]
+    plane = Plane(0, 4.0)
+    borders = [open_edges(mesh, plane) for mesh in (left, right)]
+    assert all(len(border) > 60 for border in borders)
+    for here, there in (borders, borders[::-1]):
+        along = np.linspace(0, 1, 5, dtype=np.float32)[None, :, None]
+        points = (here[:, :1] * (1 - along) + here[:, 1:] * along).reshape(-1, 3)
+        distance_m = nearest_on_edges(points, there).distance_m
+        # Where the rims of street and wall begin, each tile has its own idea, below a voxel.
+        assert distance_m.max() < STEP_M
+        assert np.percentile(distance_m, 95) < 1e-4
+
+
+def test_tiles_made_at_once_are_those_made_one_by_one(store: TileStore, tmp_path: Path) -> None:
+    alone, together = (written(store, tmp_path / str(n), threads=n)[0] for n in (1, 3))
+    np.testing.assert_array_equal(together.vertices, alone.vertices)
+    np.testing.assert_array_equal(together.faces, alone.faces)
+
+
+def test_a_target_is_that_of_all_tiles(store: TileStore, tmp_path: Path) -> None:
+    settings = SETTINGS.model_copy(update={"target_faces": 4000})
+    whole, _, _ = written(store, tmp_path / "out", settings)
+    assert 3000 < len(whole.faces) < 5000
+
+
+def test_what_hangs_where_cameras_looked_is_cut_off(store: TileStore, tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    ball = rng.normal(0, 1, (3000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    ghost = PointCloud(
+        (0.5 * ball + [1.0, 0.0, 1.6]).astype(np.float32),
+        rgb=np.full((3000, 3), 255, np.uint8),
+        normals=ball.astype(np.float32),
+        frame="map",
+    )
+    store.put_cloud(ghost)
+    cells = np.stack(np.meshgrid(*[np.arange(-8, 20)] * 2, np.arange(3, 13), indexing="ij"), -1)
+    free = cells.reshape(-1, 3).astype(np.int32)
+    store.put_voxels(OccupancyVoxels(free, np.full(len(free), -1, np.float32), 0.2))
+    kept = SETTINGS.model_copy(update={"free_space": False})
+    assert (written(store, tmp_path / "kept", kept)[0].vertices[:, 2] > 1.0).sum() > 500
+    whole = written(store, tmp_path / "cut")[0]
+    above = whole.vertices[(whole.vertices[:, 2] > 1.0) & (whole.vertices[:, 1] < 2.5)]
+    assert len(above) == 0
+
+
+def test_tiles_with_too_few_points_are_told_in_one_line(store: TileStore, tmp_path: Path) -> None:
+    stray = np.array([[60, 60, 0], [61, 60, 0], [90, 90, 0]], dtype=np.float32)
+    cloud = street().select(np.arange(3))
+    store.put_cloud(PointCloud(stray, rgb=cloud.rgb, normals=cloud.normals, frame="map"))
+    warnings = written(store, tmp_path / "out")[2]
+    assert len(warnings) == 1
+    assert warnings[0].startswith("no surface in 2 of 4 tiles, 0.0% of the points (too few points")
+
+
+def test_a_store_without_a_surface_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(MeshingError, match="no part of the map gives a surface"):
+        written(TileStore(tmp_path / "none", 8.0), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_store_gives_each_point_to_one_tile_and_its_margins(store: TileStore) -> None:
+    cloud = street()
+    assert store.total == len(cloud)
+    for tile in store.tiles:
+        low, high = store.bounds_m(tile)
+        inside = ((cloud.xyz[:, :2] >= low) & (cloud.xyz[:, :2] < high)).all(axis=1)
+        assert store.points(tile) == inside.sum()
+        wide = store.cloud_in(tile, 1.5)
+        assert wide is not None
+        near = ((cloud.xyz[:, :2] >= low - 1.5) & (cloud.xyz[:, :2] < high + 1.5)).all(axis=1)
+        assert len(wide) == near.sum()
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """The folder of a run with a map of the street, and its OctoMap."""
+    folder = tmp_path / "run"
+    write_ply(folder / "map" / "cloud.ply", street())
+    keys = np.unique(np.floor(street().xyz / 0.2).astype(np.int32), axis=0)
+    voxels = OccupancyVoxels(keys, np.full(len(keys), 2, np.float32), 0.2)
+    write_octomap(folder / "map" / "octomap", voxels)
+    (folder / "config.yaml").write_text("mesh: {tile_m: 8.0}\n")
+    record = {"command": "map", "T_map_world": np.eye(4).tolist()}
+    (folder / "run.json").write_text(json.dumps(record))
+    return folder
+
+
+def mesh_of(run: Path, *settings: str) -> dict[str, Any]:
+    config = load_config(None, ["mesh.tile_m=8", "mesh.overlap_m=1.5", *settings])
+    return run_mesh(run, config, MeshOptions(out=run.parent / "mesh", formats=("ply", "glb")))
+
+
+def test_the_map_of_a_run_is_meshed_with_its_free_space(run: Path) -> None:
+    summary = mesh_of(run)
+    assert summary["tiles"] == 2
+    assert summary["warnings"] == []
+    folder = run.parent / "mesh" / "mesh"
+    assert len(read_mesh(folder / "mesh.glb").faces) == summary["faces"]
+    layers = re.findall(r'filename="(.*?)"', (folder / "mesh.mlp").read_text())
+    assert layers == ["tiles/tile_0_0.ply", "tiles/tile_1_0.ply", "cloud.ply"]
+    assert all((folder / str(layer)).is_file() for layer in layers)
+
+
+def test_one_tile_is_the_mesh_itself(run: Path) -> None:
+    summary = mesh_of(run, "mesh.tile_m=100")
+    assert summary["tiles"] == 1
+    folder = run.parent / "mesh" / "mesh"
+    layers = re.findall(r'filename="(.*?)"', (folder / "mesh.mlp").read_text())
+    assert layers == ["mesh.ply", "cloud.ply"]
+    assert sorted(p.name for p in folder.iterdir() if p.is_file()) == [
+        "cloud.ply", "mesh.glb", "mesh.mlp", "mesh.ply",
+    ]  # fmt: skip
+
+
+def test_a_run_without_octomap_is_meshed_with_a_warning(run: Path) -> None:
+    (run / "map" / "octomap.ot").unlink()
+    assert "free space is not known" in mesh_of(run)["warnings"][0]
+
+
+def test_the_cloud_of_a_run_is_taken_as_it_is(run: Path) -> None:
+    assert mesh_of(run)["points"] == len(street())
+    copied = run.parent / "mesh" / "mesh" / "cloud.ply"
+    assert copied.read_bytes() == (run / "map" / "cloud.ply").read_bytes()
+
+
+def test_a_damaged_map_leaves_the_earlier_mesh(run: Path) -> None:
+    mesh_of(run)
+    out = run.parent / "mesh"
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    whole = (run / "map" / "octomap.ot").read_bytes()
+    (run / "map" / "octomap.ot").write_bytes(whole[:-5])
+    with pytest.raises(FormatError, match=r"octomap\.ot: the OctoMap is truncated"):
+        mesh_of(run)
+    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def test_the_run_itself_is_never_replaced(run: Path) -> None:
+    with pytest.raises(SettingsError, match="replace the run"):
+        run_mesh(run, load_config(None, []), MeshOptions(out=run))
+    assert (run / "map" / "cloud.ply").is_file()
+
+
+def test_a_folder_that_cannot_be_written_is_told(store: TileStore, tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(OutputError):
+        written(store, tmp_path / "out")

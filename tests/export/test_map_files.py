@@ -1,0 +1,209 @@
+"""The files of a map, written tile by tile, are those of the whole map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.commands.config import load_config
+from recon.core.errors import MappingError, OutputError
+from recon.core.geometry.se3 import apply
+from recon.core.geometry.transform import transform_cloud
+from recon.core.values import FREE, OCCUPIED, UNKNOWN, PointCloud
+from recon.export.cloud_sample import CloudSample
+from recon.export.files import write_map
+from recon.export.ground_store import GroundStore, Window
+from recon.io.models.ply import read_ply, write_ply_tiles
+from recon.io.occupancy.nav2 import read_nav2
+from recon.io.occupancy.octomap import write_octomap
+from recon.map import (
+    GroundSettings,
+    add_floors,
+    drop_undecided,
+    estimate_ground_surface,
+    find_floors,
+    flatten,
+)
+from recon.map.sequence import MappedSequence, map_sequence
+from recon.run.directory import RunDirectory
+from recon.run.stopwatch import Stopwatch
+from recon.sources.synthetic import SyntheticSource
+from recon.street import StreetSettings
+
+STREET = StreetSettings(frames=20, width_px=192, height_px=72, focal_px=110.0)
+SETTINGS = ["submaps.length_m=4", "submaps.tile_m=6.4", "fusion.min_count=1"]
+
+
+@pytest.fixture(scope="module")
+def mapped() -> MappedSequence:
+    return map_sequence(SyntheticSource(STREET), load_config(None, SETTINGS))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[RunDirectory]:
+    with RunDirectory(tmp_path / "run") as directory:
+        yield directory
+
+
+def test_the_cloud_of_tiles_is_the_cloud(mapped: MappedSequence, folder: RunDirectory) -> None:
+    written = write_map(mapped, folder, Stopwatch())
+    whole = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
+    back = read_ply(folder.path("map/cloud.ply"))
+    assert written.points == len(back) == len(written.cloud) > 1000
+    assert back.frame == "map"
+    for name in ("xyz", "normals", "rgb"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(whole, name))
+
+
+def test_the_octomap_of_tiles_is_that_of_the_whole(
+    mapped: MappedSequence, folder: RunDirectory
+) -> None:
+    written = write_map(mapped, folder, Stopwatch())
+    assert written.voxels == len(mapped.voxels) > 1000
+    whole = write_octomap(folder.path("whole"), drop_undecided(mapped.voxels, mapped.config.grid))
+    for theirs, end in zip(whole, ("bt", "ot"), strict=True):
+        assert folder.path(f"map/octomap.{end}").read_bytes() == theirs.read_bytes()
+
+
+def test_the_grid_of_tiles_is_that_of_the_whole(
+    mapped: MappedSequence, folder: RunDirectory
+) -> None:
+    config = mapped.config
+    cloud = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
+    path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
+    floor = add_floors(cloud, find_floors(mapped.voxels), config.ground)
+    ground = estimate_ground_surface(floor, path_m, config.ground)
+    whole = flatten(mapped.voxels, ground, config.grid)
+    narrow = load_config(None, [*SETTINGS, "grid.vehicle_width_m=0"])
+    written = write_map(replace(mapped, config=narrow), folder, Stopwatch()).grid
+    # Beyond the voxels, there is a margin of at least 5 m around the path.
+    low = np.minimum(whole.origin_m, np.floor((path_m.min(axis=0)[:2] - 5) / 0.2) * 0.2)
+    np.testing.assert_allclose(written.origin_m, low, atol=1e-9)
+    margin = np.rint((np.array(whole.origin_m) - low) / 0.2).astype(int)
+    rows, columns = (
+        slice(n, n + size) for n, size in zip(margin[::-1], whole.cells.shape, strict=True)
+    )
+    beyond = written.cells.copy()
+    beyond[rows, columns] = UNKNOWN
+    assert (beyond == UNKNOWN).all()
+    written = replace(written, cells=written.cells[rows, columns])
+    # The height of the camera is a median over tiles in place of one over the drive, so a voxel
+    # at the very edge of the height band may change sides.
+    for value in (OCCUPIED, FREE):
+        ours, theirs = written.cells == value, whole.cells == value
+        assert (ours & theirs).sum() >= 0.995 * (ours | theirs).sum() > 100
+
+
+def test_the_vehicle_frees_its_own_track_alone(
+    mapped: MappedSequence, folder: RunDirectory
+) -> None:
+    narrow = load_config(None, [*SETTINGS, "grid.vehicle_width_m=0"])
+    seen = write_map(replace(mapped, config=narrow), folder, Stopwatch()).grid
+    grid = write_map(mapped, folder, Stopwatch()).grid
+    np.testing.assert_array_equal(read_nav2(folder.path("map/grid.yaml")).cells, grid.cells)
+    path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)[:, :2]
+    columns, rows = np.floor((path_m - grid.origin_m) / 0.2).astype(int).T
+    assert (seen.cells[rows, columns] == UNKNOWN).sum() >= 2  # the camera does not see its start
+    trusted = np.array([record.ok for record in mapped.health])
+    assert (grid.cells[rows, columns] == FREE)[trusted].all()
+    changed = np.argwhere(grid.cells != seen.cells)[:, ::-1]
+    centres = (changed + 0.5) * 0.2 + np.array(grid.origin_m)
+    away = np.linalg.norm(centres[:, None] - path_m, axis=2).min(axis=1)
+    # Half of 0.6 m from the path, or half of the 1 m between two poses.
+    assert len(changed) > 0
+    assert away.max() < np.hypot(0.3, 0.55)
+
+
+def test_a_map_too_large_for_an_octomap_has_all_else(
+    mapped: MappedSequence, folder: RunDirectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = write_map(mapped, folder, Stopwatch())
+    monkeypatch.setattr("recon.io.occupancy.octomap.KEY_LIMIT", 20)
+    folder.path("map/octomap.bt").unlink()
+    folder.path("map/octomap.ot").unlink()
+    written = write_map(mapped, folder, Stopwatch())
+    assert written.voxels == whole.voxels
+    [warning] = written.warnings
+    assert "no OctoMap" in warning
+    np.testing.assert_array_equal(written.grid.cells, whole.grid.cells)
+    assert not [name for name in folder.files() if "octomap" in name]
+
+
+def test_an_empty_height_band_is_told(mapped: MappedSequence, folder: RunDirectory) -> None:
+    config = load_config(None, [*SETTINGS, "grid.min_height_m=2", "grid.max_height_m=1"])
+    with pytest.raises(MappingError, match="height band"):
+        write_map(replace(mapped, config=config), folder, Stopwatch())
+
+
+def _random_cloud(seed: int, points: int) -> PointCloud:
+    rng = np.random.default_rng(seed)
+    return PointCloud(rng.uniform(-20, 20, (points, 3)).astype(np.float32), frame="map")
+
+
+def test_a_sample_keeps_all_of_a_small_cloud() -> None:
+    sample, cloud = CloudSample(1000, 0.1), _random_cloud(0, 900)
+    sample.add(cloud)
+    kept = sample.cloud()
+    assert kept is not None
+    np.testing.assert_array_equal(kept.xyz, cloud.xyz)
+
+
+def test_a_sample_of_a_large_cloud_is_small_and_even() -> None:
+    sample = CloudSample(2000, 0.1)
+    for seed in range(20):
+        sample.add(_random_cloud(seed, 1500))
+    kept = sample.cloud()
+    assert kept is not None
+    assert 1000 < len(kept) <= 2000
+    octants = np.bincount((kept.xyz > 0) @ [1, 2, 4], minlength=8)
+    # As many in each eighth of the cube as chance allows: 3 standard deviations of a share of 1/8.
+    assert np.abs(octants / len(kept) - 1 / 8).max() < 3 * np.sqrt(7 / 64 / len(kept))
+
+
+def test_a_sample_of_nothing_is_nothing() -> None:
+    assert CloudSample(10, 0.1).cloud() is None
+
+
+def test_the_ground_of_a_window_is_looked_for_in_its_points_alone(tmp_path: Path) -> None:
+    store = GroundStore(tmp_path, GroundSettings())
+    up, east = np.float32([0, 0, 1]), np.float32([1, 0, 0])
+    xyz = np.float32([[1, 1, 0], [2, 2, 0], [30, 1, 0], [3, 3, 0]])
+    store.put_cloud((0, 0), PointCloud(xyz, normals=np.stack([up, up, up, east]), frame="map"))
+    store.put_floors((0, 0), np.float32([[5.5, 5.5, 0.1], [40, 1, 0]]))
+    found = store.cloud_in(Window((0.0, 0.0), (10.0, 10.0)))
+    np.testing.assert_array_equal(found.xyz, np.float32([[1, 1, 0], [2, 2, 0], [5.5, 5.5, 0.1]]))
+    assert len(store.cloud_in(Window((60.0, 60.0), (70.0, 70.0)))) == 0
+
+
+def test_a_path_that_leaves_a_window_and_comes_back_is_in_pieces() -> None:
+    path = np.array([[-5, 1, 0], [1, 1, 0], [2, 1, 0], [12, 1, 0], [15, 1, 0], [3, 2, 0]], float)
+    inside = Window((0.0, 0.0), (10.0, 10.0)).path(path)
+    gap = [np.nan] * 3
+    np.testing.assert_array_equal(inside, [[1, 1, 0], [2, 1, 0], gap, [3, 2, 0]])
+
+
+def test_tiles_in_one_file_are_read_as_one_cloud(tmp_path: Path) -> None:
+    tiles = [_random_cloud(seed, 7 + 100 * seed) for seed in range(4)]
+    assert write_ply_tiles(tmp_path / "a.ply", iter(tiles), frame="map") == 628
+    back = read_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(back.xyz, np.concatenate([tile.xyz for tile in tiles]))
+    assert back.frame == "map"
+
+
+def test_a_file_of_no_tiles_has_no_points(tmp_path: Path) -> None:
+    assert write_ply_tiles(tmp_path / "a.ply", iter([]), frame="map") == 0
+    assert b"element vertex 0\n" in (tmp_path / "a.ply").read_bytes()
+
+
+def test_tiles_that_end_in_an_error_leave_no_file(tmp_path: Path) -> None:
+    def tiles() -> Iterator[PointCloud]:
+        yield _random_cloud(0, 10)
+        raise OutputError("disk full")
+
+    with pytest.raises(OutputError):
+        write_ply_tiles(tmp_path / "a.ply", tiles(), frame="map")
+    assert list(tmp_path.iterdir()) == []

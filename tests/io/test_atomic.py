@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from recon.core.errors import FormatError, OutputError
+from recon.io.atomic import atomic_path, write_bytes, write_text
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def write_half_and_raise(target: Path, error: BaseException) -> None:
+    with atomic_path(target) as temporary:
+        temporary.write_text("half")
+        raise error
+
+
+def test_text_appears_whole_under_its_name_and_nothing_else_stays(tmp_path: Path) -> None:
+    write_text(tmp_path / "run" / "a.txt", "größe\n")
+    assert (tmp_path / "run" / "a.txt").read_bytes() == "größe\n".encode()
+    assert names(tmp_path / "run") == ["a.txt"]
+
+
+def test_the_temporary_shares_folder_and_suffixes_with_the_target(tmp_path: Path) -> None:
+    with atomic_path(tmp_path / "map.tar.gz") as temporary:
+        assert temporary.parent == tmp_path
+        assert temporary.suffixes == [".tar", ".gz"]
+        assert not temporary.exists()
+        temporary.write_bytes(b"x")
+
+
+def test_the_target_is_untouched_while_the_block_runs(tmp_path: Path) -> None:
+    target = tmp_path / "a.txt"
+    write_text(target, "old")
+    with atomic_path(target) as temporary:
+        temporary.write_text("new")
+        assert target.read_text() == "old"
+    assert target.read_text() == "new"
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, FormatError])
+def test_a_failing_block_keeps_the_old_file_and_leaves_no_temporary(
+    tmp_path: Path, error: type[BaseException]
+) -> None:
+    target = tmp_path / "a.txt"
+    write_text(target, "old")
+    with pytest.raises(error):
+        write_half_and_raise(target, error("stop"))
+    assert target.read_text() == "old"
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_a_disk_error_names_the_target_not_the_temporary(tmp_path: Path) -> None:
+    target = tmp_path / "a.bin"
+    with pytest.raises(OutputError, match=r"a\.bin: cannot write.*No space left") as caught:
+        write_half_and_raise(target, OSError(28, "No space left on device", ".x-a.bin"))
+    assert caught.value.where == target
+    assert names(tmp_path) == []
+
+
+def test_a_file_in_place_of_a_folder_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=r"file/a\.txt: cannot write the file \(got"):
+        write_bytes(tmp_path / "file" / "a.txt", b"")
+
+
+def test_a_folder_in_place_of_the_file_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").mkdir()
+    with pytest.raises(OutputError, match="Is a directory"):
+        write_text(tmp_path / "a.txt", "text")
+    assert names(tmp_path) == ["a.txt"]
+
+
+def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="No such file"), atomic_path(tmp_path / "a.txt"):
+        pass
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
+def test_permissions_follow_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0o022)
+    try:
+        write_text(tmp_path / "a.txt", "text")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o644

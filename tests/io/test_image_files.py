@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from recon.core.errors import FormatError, OutputError, ShapeError
+from recon.io.images.image import read_grey_levels, read_image, read_levels, write_image
+
+SHAPES = st.one_of(
+    st.tuples(st.integers(1, 9), st.integers(1, 9)),
+    st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3)),
+)
+
+
+def picture(*shape: int, dtype: str = "u1") -> np.ndarray:
+    top = np.iinfo(dtype).max
+    return np.random.default_rng(7).integers(0, top, shape, dtype=dtype, endpoint=True)
+
+
+@settings(max_examples=30)
+@given(
+    image=st.sampled_from(["u1", "u2"]).flatmap(lambda t: arrays(t, SHAPES)),
+    suffix=st.sampled_from([".png", ".tif"]),
+)
+def test_lossless_formats_give_back_every_level(
+    image: np.ndarray, suffix: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / f"levels{suffix}"
+    write_image(path, image)
+    np.testing.assert_array_equal(read_levels(path), image)
+
+
+@pytest.mark.parametrize(("suffix", "shape"), [(".pgm", (5, 7)), (".ppm", (5, 7, 3))])
+@pytest.mark.parametrize("dtype", ["u1", "u2"])
+def test_netpbm_gives_back_every_level(
+    tmp_path: Path, suffix: str, shape: tuple[int, ...], dtype: str
+) -> None:
+    image = picture(*shape, dtype=dtype)
+    write_image(tmp_path / f"a{suffix}", image)
+    np.testing.assert_array_equal(read_levels(tmp_path / f"a{suffix}"), image)
+
+
+def test_colours_are_red_green_blue_in_memory_and_right_in_the_file(tmp_path: Path) -> None:
+    image = np.zeros((2, 2, 3), dtype=np.uint8)
+    image[:, :, 0] = 255
+    write_image(tmp_path / "red.ppm", image)
+    assert (tmp_path / "red.ppm").read_bytes().endswith(b"\xff\x00\x00" * 4)
+    np.testing.assert_array_equal(read_image(tmp_path / "red.ppm"), image)
+
+
+def test_sixteen_bits_are_scaled_over_their_whole_range(tmp_path: Path) -> None:
+    levels = np.array([[0, 128, 129, 257, 32768, 65535]], dtype=np.uint16)
+    write_image(tmp_path / "a.png", levels)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), [[0, 0, 1, 1, 128, 255]])
+
+
+def test_alpha_is_dropped(tmp_path: Path) -> None:
+    bgra = picture(4, 5, 4)
+    cv2.imwrite(str(tmp_path / "a.png"), bgra)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), bgra[:, :, 2::-1])
+
+
+def test_jpeg_is_read_close_to_what_was_written(tmp_path: Path) -> None:
+    ramp = np.tile(np.arange(0, 256, 4, dtype=np.uint8), (32, 1))
+    write_image(tmp_path / "a.jpg", ramp)
+    # 8 levels: a smooth ramp at OpenCV's default quality of 95.
+    assert np.abs(read_image(tmp_path / "a.jpg").astype(int) - ramp).max() <= 8
+
+
+def test_grey_stored_as_three_equal_channels_is_grey_and_colours_are_refused(
+    tmp_path: Path,
+) -> None:
+    grey = picture(4, 5)
+    write_image(tmp_path / "grey.png", np.repeat(grey[:, :, None], 3, axis=2))
+    np.testing.assert_array_equal(read_grey_levels(tmp_path / "grey.png"), grey)
+    write_image(tmp_path / "rgb.png", picture(4, 5, 3))
+    with pytest.raises(FormatError, match=r"rgb\.png: image is in colour"):
+        read_grey_levels(tmp_path / "rgb.png")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".pgm", ".tif"])
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.5, 0.9, 0.99])
+def test_a_truncated_picture_is_refused_wherever_it_was_cut(
+    tmp_path: Path, suffix: str, share: float
+) -> None:
+    path = tmp_path / f"000007{suffix}"
+    write_image(path, picture(60, 80))
+    content = path.read_bytes()
+    path.write_bytes(content[: max(1, int(len(content) * share))])
+    with pytest.raises(FormatError, match=rf"000007\{suffix}: ") as caught:
+        read_image(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("shape", [(16, 18), (16, 18, 3)])
+def test_a_bmp_is_read_whole_or_not_at_all(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    pixels = picture(*shape)
+    content = cv2.imencode(".bmp", pixels if pixels.ndim == 2 else pixels[:, :, ::-1])[1].tobytes()
+    path = tmp_path / "a.bmp"
+    path.write_bytes(content)
+    np.testing.assert_array_equal(read_image(path), pixels)
+    for cut in (1, 40, len(content) - 30):
+        path.write_bytes(content[:-cut])
+        with pytest.raises(FormatError, match=r"a\.bmp: BMP image is truncated"):
+            read_image(path)
+
+
+@settings(max_examples=40)
+@given(cut=st.integers(1, 400), suffix=st.sampled_from([".png", ".jpg"]))
+def test_no_cut_passes_unseen(
+    cut: int, suffix: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / f"cut{suffix}"
+    write_image(path, picture(16, 16, 3))
+    content = path.read_bytes()
+    path.write_bytes(content[: -min(cut, len(content) - 1)])
+    with pytest.raises(FormatError):
+        read_image(path)
+
+
+def test_a_flipped_bit_in_a_png_is_seen(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    write_image(path, picture(20, 20))
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(bytes(content))
+    with pytest.raises(FormatError, match=r"damaged \(got checksum of chunk b'IDAT' differs\)"):
+        read_image(path)
+
+
+def test_a_jpeg_with_an_embedded_preview_is_still_seen_to_be_truncated(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    write_image(path, picture(40, 40))
+    content = path.read_bytes()
+    preview = b"\xff\xd8preview\xff\xd9"
+    segment = b"\xff\xe1" + (len(preview) + 2).to_bytes(2, "big") + preview
+    path.write_bytes(content[:2] + segment + content[2:])
+    assert read_image(path).shape == (40, 40)
+    path.write_bytes(content[:2] + segment + content[2:-50])
+    with pytest.raises(FormatError, match="no end-of-image marker"):
+        read_image(path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"P5\n# a comment\n2 2\n255\nabcd", b"P2\n2 2\n255\n97 98 99 100\n", b"P5 2 2 255 abcd"],
+)
+def test_pgm_is_read_binary_and_ascii_with_comments(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.pgm").write_bytes(content)
+    np.testing.assert_array_equal(read_image(tmp_path / "a.pgm"), [[97, 98], [99, 100]])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "file does not exist"),
+        (b"", "file is empty"),
+        (b"hello, I am text", r"not an image \(expected PNG, JPEG, PGM, PPM, BMP or TIFF\)"),
+        (b"\x89PNG\r\n\x1a\n", "PNG image is truncated"),
+        (b"\xff\xd8\xff\xe0", "JPEG image is truncated"),
+        (b"P5\n4 4\n255\nabc", r"PGM/PPM image is truncated or damaged \(got 3 of 16 samples\)"),
+        (b"P2\n2 2\n255\n1 2 3\n", r"got 3 of 4 samples"),
+        (b"P5\nfour", "no readable header"),
+        (b"BM", "BMP image is truncated"),
+        (b"BM" + bytes(52), "image cannot be decoded"),
+        (b"II*\x00garbage", "image cannot be decoded"),
+    ],
+)
+def test_what_is_no_picture_is_one_clear_line(
+    tmp_path: Path, content: bytes | None, message: str
+) -> None:
+    path = tmp_path / "left.png"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(FormatError, match=rf"left\.png: .*{message}"):
+        read_image(path)
+
+
+def test_a_damaged_tiff_is_told_by_the_error_alone(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write_image(tmp_path / "a.tif", picture(60, 80))
+    content = (tmp_path / "a.tif").read_bytes()
+    (tmp_path / "a.tif").write_bytes(content[: len(content) // 2])
+    with pytest.raises(FormatError, match=r"a\.tif: image cannot be decoded"):
+        read_image(tmp_path / "a.tif")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_floating_point_pixels_are_refused(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.tif"), np.ones((3, 3), dtype=np.float32))
+    with pytest.raises(FormatError, match=r"pixel type.*got float32, expected 8 or 16 bits"):
+        read_image(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(
+    ("name", "image", "error"),
+    [
+        ("a.xyz", picture(3, 3), OutputError),
+        ("a", picture(3, 3), OutputError),
+        ("a.pgm", picture(3, 3, 3), OutputError),
+        ("a.ppm", picture(3, 3), OutputError),
+        ("a.jpg", picture(3, 3, dtype="u2"), OutputError),
+        ("a.png", picture(3, 3).astype(np.float32), ShapeError),
+        ("a.png", picture(3, 3, 4), ShapeError),
+        ("a.png", picture(0, 3), ShapeError),
+    ],
+)
+def test_what_a_format_cannot_hold_is_refused_and_nothing_is_written(
+    tmp_path: Path, name: str, image: np.ndarray, error: type[Exception]
+) -> None:
+    with pytest.raises(error):
+        write_image(tmp_path / name, image)
+    assert list(tmp_path.iterdir()) == []

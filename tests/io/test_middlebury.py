@@ -1,0 +1,295 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.core.errors import CalibrationError, FormatError
+from recon.core.geometry.triangulation import depth_from_disparity
+from recon.evaluation.middlebury.scenes import find_scenes, read_scored_scene
+from recon.io.images.image import write_image
+from recon.io.images.pfm import write_pfm
+from recon.io.middlebury.calib import nominal_camera_2005, read_middlebury_calib
+from recon.io.middlebury.layout import Layout, find_layout, full_size_factor
+from recon.io.middlebury.scene import read_middlebury_scene, stand_in_camera
+from recon.io.middlebury.truth import cross_check
+
+CALIB = """cam0=[999.421 0 294.182; 0 999.421 252.932; 0 0 1]
+cam1=[999.421 0 326.96; 0 999.421 252.932; 0 0 1]
+doffs=32.778
+baseline=193.001
+width=24
+height=12
+ndisp=70
+isint=0
+vmin=5
+vmax=60
+"""
+NAN = float("nan")
+
+
+def picture(height: int, width: int) -> np.ndarray:
+    return np.random.default_rng(3).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def make_2014(folder: Path, **change: str) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in ("im0.png", "im1.png"):
+        write_image(folder / name, picture(12, 24))
+    text = CALIB
+    for key, value in change.items():
+        kept = [line for line in text.splitlines() if not line.startswith(f"{key}=")]
+        text = "\n".join(kept + ([f"{key}={value}"] if value else [])) + "\n"
+    (folder / "calib.txt").write_text(text)
+    return folder
+
+
+def test_calib_txt_gives_metres_and_doffs(tmp_path: Path) -> None:
+    calib = read_middlebury_calib(make_2014(tmp_path) / "calib.txt")
+    assert calib.camera.baseline_m == pytest.approx(0.193001)
+    assert calib.camera.doffs_px == pytest.approx(32.778)
+    assert (calib.camera.ndisp, calib.isint, calib.vmin_px, calib.vmax_px) == (70, False, 5, 60)
+    # Z = baseline·f/(d + doffs), with the numbers of the file.
+    depth = depth_from_disparity(np.array([10.0]), calib.camera)
+    assert depth[0] == pytest.approx(0.193001 * 999.421 / 42.778, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"cam1": ""}, FormatError, "calibration has no 'cam1'"),
+        ({"baseline": ""}, FormatError, "calibration has no 'baseline'"),
+        ({"baseline": "0"}, CalibrationError, "baseline is not positive"),
+        ({"baseline": "wide"}, FormatError, r"'baseline' is not a finite number \(got wide"),
+        ({"width": "nan"}, FormatError, "'width' is not a finite number"),
+        ({"cam0": "[1 2 3]"}, FormatError, "'cam0' is not a 3x3 matrix"),
+        ({"cam0": "[nan 0 1; 0 1 1; 0 0 1]"}, FormatError, "'cam0' has a value .* not finite"),
+        ({"doffs": "31"}, CalibrationError, r"doffs is not .* \(got 31, expected 32\.778"),
+        ({"cam1": "[500 0 1; 0 500 1; 0 0 1]"}, CalibrationError, "different focal lengths"),
+        ({"width": "25"}, CalibrationError, r"another size .*got 24x12, expected 25x12"),
+    ],
+)
+def test_a_bad_calib_txt_is_one_clear_line_with_the_file(
+    tmp_path: Path, change: dict[str, str], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=rf"calib\.txt: .*{message}"):
+        read_middlebury_scene(make_2014(tmp_path, **change))
+
+
+def test_resizing_doffs_is_what_the_publishers_half_size_file_says() -> None:
+    # Motorcycle, Q to H: doffs 32.778 and 65.555.
+    camera = stand_in_camera(741, 497, 70)
+    assert camera.resized(1482, 994).ndisp == 140
+
+
+@pytest.mark.parametrize(
+    ("collection", "factor"), [("trainingQ", 4), ("trainingH", 2), ("trainingF", 1)]
+)
+def test_full_size_factor_follows_the_collection(
+    tmp_path: Path, collection: str, factor: float
+) -> None:
+    scene = read_middlebury_scene(make_2014(tmp_path / collection / "Motorcycle"))
+    assert (scene.name, scene.full_size_factor) == ("Motorcycle", factor)
+    assert scene.truth is None
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "factor"),
+    [
+        ("Piano", (705, 480), 4), ("Piano", (1410, 960), 2), ("Piano", (2820, 1920), 1),
+        ("ArtL", (347, 277), 4), ("ArtL", (694, 554), 2), ("ArtL", (1388, 1108), 1),
+        ("Teddy", (450, 375), 4), ("Teddy", (1800, 1500), 1), ("Jadeplant", (658, 497), 4),
+        ("Adirondack-perfect", (2880, 1988), 1), ("artroom1", (1920, 1080), 1),
+        ("mine", (640, 480), 1),
+    ],
+)  # fmt: skip
+def test_full_size_factor_elsewhere_follows_the_name_of_the_scene(
+    name: str, size: tuple[int, int], factor: float
+) -> None:
+    layout = Layout("im0", "im1", "disp0", "disp1", calibrated=True)
+    assert full_size_factor(layout, *size, Path("anywhere") / name) == factor
+
+
+def test_truth_in_pfm_makes_a_scene_without_its_calibration(tmp_path: Path) -> None:
+    folder = make_2014(tmp_path / "Adirondack-perfect")
+    (folder / "calib.txt").unlink()
+    write_pfm(folder / "disp0.pfm", np.full((12, 24), 4.0, np.float32))
+    scene = read_middlebury_scene(folder)
+    assert (scene.camera, scene.ndisp) == (None, None)
+    assert scene.truth is not None
+
+
+def test_truth_of_2006_may_lie_above_folders_of_light_and_exposure(tmp_path: Path) -> None:
+    inner = tmp_path / "Aloe" / "Illum1" / "Exp2"
+    inner.mkdir(parents=True)
+    for view in ("view1.png", "view5.png"):
+        write_image(inner / view, picture(370, 30))
+    write_image(tmp_path / "Aloe" / "disp1.png", np.full((370, 30), 9, np.uint8))
+    (tmp_path / "Aloe" / "dmin.txt").write_text("150\n")
+    scene = read_middlebury_scene(inner)
+    assert scene.truth is not None
+    assert (scene.truth.values == 3).all()
+    assert scene.camera is not None
+    assert scene.camera.doffs_px == pytest.approx(50)
+    assert list(find_scenes(tmp_path)) == ["Aloe/Illum1/Exp2"]
+    assert read_scored_scene("Aloe/Illum1/Exp2", inner, None) is not None
+
+
+def test_tsukuba_as_published_is_read(tmp_path: Path) -> None:
+    for column in (1, 2, 3, 4, 5):
+        write_image(tmp_path / f"scene1.row3.col{column}.ppm", picture(288, 384))
+    write_image(tmp_path / "truedisp.row3.col3.pgm", np.full((288, 384), 160, np.uint8))
+    truth = read_middlebury_scene(tmp_path).truth
+    assert truth is not None
+    assert (truth.values == 10).all()
+
+
+def test_eval3_truth_has_nan_for_inf_and_the_mask_of_its_file(tmp_path: Path) -> None:
+    folder = make_2014(tmp_path)
+    values = np.full((12, 24), 5.0, dtype=np.float32)
+    values[0, 0] = NAN
+    write_pfm(folder / "disp0GT.pfm", values)
+    mask = np.full((12, 24), 255, dtype=np.uint8)
+    mask[1, 1], mask[2, 2] = 128, 0
+    write_image(folder / "mask0nocc.png", mask)
+    truth = read_middlebury_scene(folder).truth
+    assert truth is not None
+    np.testing.assert_array_equal(truth.values, values)
+    assert {tuple(at) for at in np.argwhere(~truth.nonocc)} == {(0, 0), (1, 1), (2, 2)}
+
+
+def test_truth_of_2014_without_a_mask_is_cross_checked(tmp_path: Path) -> None:
+    folder = make_2014(tmp_path)
+    left = np.full((12, 24), 4.0, dtype=np.float32)
+    right = left.copy()
+    right[:, 10] = 9.0
+    write_pfm(folder / "disp0.pfm", left)
+    write_pfm(folder / "disp1.pfm", right)
+    truth = read_middlebury_scene(folder).truth
+    assert truth is not None
+    hidden = [0, 1, 2, 3, 14]  # out of the right view, and where the right truth is another
+    np.testing.assert_array_equal(np.flatnonzero(~truth.nonocc[5]), hidden)
+
+
+def test_cross_check_asks_the_right_view_at_x_minus_d() -> None:
+    left = np.array([[2.0, 2.0, 2.0, 1.0, NAN]], dtype=np.float32)
+    right = np.array([[2.5, NAN, 1.0, 1.0, 1.0]], dtype=np.float32)
+    assert cross_check(left, right, 1.0).tolist() == [[False, False, True, True, False]]
+    assert cross_check(left, right, 0.4).tolist() == [[False, False, False, True, False]]
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "truth", "size", "scale", "generation"),
+    [
+        ("im3.png", "im4.png", "disp3.pgm", (288, 384), 16, "2001"),
+        ("im2.ppm", "im6.ppm", "disp2.pgm", (383, 434), 8, "2001"),
+        ("im2.png", "im6.png", "disp2.png", (383, 434), 8, "2001"),
+        ("im0.png", "im1.png", "disp0.pgm", (216, 284), 8, "2001"),
+        ("im2.png", "im6.png", "disp2.png", (375, 450), 4, "2003"),
+        ("im2.png", "im6.png", "disp2.png", (750, 900), 2, "2003"),
+        ("view1.png", "view5.png", "disp1.png", (370, 463), 3, "2005"),
+        ("view1.png", "view5.png", "disp1.png", (555, 695), 2, "2005"),
+    ],
+)
+def test_older_scenes_are_told_apart_and_their_truth_scaled(
+    tmp_path: Path,
+    left: str,
+    right: str,
+    truth: str,
+    size: tuple[int, int],
+    scale: int,
+    generation: str,
+) -> None:
+    for name in (left, right):
+        write_image(tmp_path / name, picture(*size))
+    write_image(tmp_path / truth, np.tile(np.arange(size[1]) % 200, (size[0], 1)).astype(np.uint8))
+    scene = read_middlebury_scene(tmp_path)
+    assert scene.generation == generation
+    assert scene.truth is not None
+    np.testing.assert_allclose(scene.truth.values[0, :3], [NAN, 1 / scale, 2 / scale], rtol=1e-6)
+    assert scene.camera is None
+
+
+def test_a_scene_of_2005_gets_its_nominal_camera_from_dmin(tmp_path: Path) -> None:
+    for name in ("view1.png", "view5.png"):
+        write_image(tmp_path / name, picture(370, 463))
+    (tmp_path / "dmin.txt").write_text("200")
+    scene = read_middlebury_scene(tmp_path)
+    assert scene.camera == nominal_camera_2005(463, 370, 200, 3)
+    assert scene.camera.focal_px == pytest.approx(3740 / 3)
+    assert scene.camera.doffs_px == pytest.approx(200 / 3)
+    assert scene.camera.baseline_m == 0.16
+
+
+def test_nominal_camera_gives_one_depth_at_every_size() -> None:
+    full, third = nominal_camera_2005(1389, 1110, 200, 1), nominal_camera_2005(463, 370, 200, 3)
+    depths = [
+        depth_from_disparity(np.array([disparity]), camera)[0]
+        for disparity, camera in ((120.0, full), (40.0, third))
+    ]
+    assert depths[0] == pytest.approx(depths[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("missing", ["im0.png", "im1.png"])
+def test_a_missing_picture_is_named(tmp_path: Path, missing: str) -> None:
+    folder = make_2014(tmp_path)
+    (folder / missing).unlink()
+    with pytest.raises(FormatError, match=rf"image is missing \(expected {missing}\)"):
+        read_middlebury_scene(folder)
+
+
+def test_pictures_and_truth_of_different_sizes_are_named(tmp_path: Path) -> None:
+    folder = make_2014(tmp_path)
+    write_pfm(folder / "disp0.pfm", np.ones((12, 23), dtype=np.float32))
+    with pytest.raises(FormatError, match=r"disp0\.pfm: size.*got 23x12, expected 24x12"):
+        read_middlebury_scene(folder)
+    write_image(folder / "im1.png", picture(12, 23))
+    with pytest.raises(FormatError, match=r"differ in size \(got im0 24x12, im1 23x12\)"):
+        read_middlebury_scene(folder)
+
+
+def test_another_folder_is_no_scene(tmp_path: Path) -> None:
+    assert find_layout(tmp_path) is None
+    with pytest.raises(FormatError, match=r"folder is not a Middlebury scene.*im0 and im1"):
+        read_middlebury_scene(tmp_path)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("scene", "generation", "shape", "highest_px"),
+    [
+        ("2001/Tsukuba", "2001", (288, 384), 16),
+        ("2003/Cones", "2003", (375, 450), 60),
+        ("2005/Art", "2005", (370, 463), 85),
+        ("2005/Dolls", "2005", (370, 463), 85),
+        ("2006/Aloe", "2005", (370, 427), 85),
+        ("MiddEval3/trainingQ/ArtL", "2014", (277, 347), 64),
+        ("MiddEval3/trainingQ/Jadeplant", "2014", (497, 659), 160),
+        ("MiddEval3/trainingQ/Pipes", "2014", (485, 735), 75),
+    ],
+)
+def test_real_truth_lies_within_what_is_promised(
+    recon_data: Path, scene: str, generation: str, shape: tuple[int, int], highest_px: float
+) -> None:
+    read = read_middlebury_scene(recon_data / "middlebury" / scene)
+    assert (read.generation, read.pair.left.shape[:2]) == (generation, shape)
+    assert read.truth is not None
+    known = np.isfinite(read.truth.values)
+    assert known.mean() > 0.75
+    assert 0 < read.truth.values[known].min() < read.truth.values[known].max() < highest_px
+    assert 0.7 < read.truth.nonocc[known].mean() < 1
+    if read.camera is not None and read.camera.ndisp is not None:
+        assert read.camera.ndisp == highest_px
+
+
+@pytest.mark.real
+def test_real_half_size_scenes_have_twice_the_doffs_and_no_truth(recon_data: Path) -> None:
+    folder = recon_data / "middlebury" / "MiddEval3"
+    half, quarter = (
+        read_middlebury_scene(folder / f"training{size}" / "Motorcycle") for size in "HQ"
+    )
+    assert half.camera is not None
+    assert quarter.camera is not None
+    assert half.camera.doffs_px == pytest.approx(2 * quarter.camera.doffs_px, abs=2e-3)
+    assert (half.full_size_factor, quarter.full_size_factor, half.truth) == (2, 4, None)

@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recon.core.errors import FormatError
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.values import Trajectory
+from recon.io.trajectory import (
+    read_kitti_poses,
+    read_trajectory,
+    read_tum,
+    write_kitti_poses,
+    write_tum,
+)
+
+IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0\n"
+
+
+def random_trajectory(seed: int, length: int) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    # Rotation vectors up to a half turn and beyond: the quaternion's sign and pole are met.
+    poses = [
+        make_transform(exp_so3(rng.uniform(-np.pi, np.pi, 3)), rng.uniform(-5e3, 5e3, 3))
+        for _ in range(length)
+    ]
+    times = np.cumsum(rng.uniform(0, 1, length)) + 1.3e9
+    return Trajectory(np.stack(poses), times)
+
+
+TRAJECTORIES = st.builds(random_trajectory, st.integers(0, 2**31), st.integers(1, 8))
+
+
+@settings(max_examples=30)
+@given(trajectory=TRAJECTORIES)
+def test_kitti_poses_lose_nothing_that_matters(
+    trajectory: Trajectory, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "poses_kitti.txt"
+    write_kitti_poses(path, trajectory)
+    read = read_kitti_poses(path, trajectory.timestamps_s)
+    # 13 digits of numbers up to 5 km: below a micrometre.
+    np.testing.assert_allclose(read.T_world_camera, trajectory.T_world_camera, rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(read.timestamps_s, trajectory.timestamps_s)
+
+
+@settings(max_examples=30)
+@given(trajectory=TRAJECTORIES)
+def test_tum_poses_lose_nothing_that_matters(
+    trajectory: Trajectory, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "poses_tum.txt"
+    write_tum(path, trajectory)
+    read = read_tum(path)
+    np.testing.assert_allclose(read.T_world_camera, trajectory.T_world_camera, rtol=0, atol=1e-8)
+    # A float64 near 1.3e9 seconds resolves 2.4e-7.
+    np.testing.assert_allclose(read.timestamps_s, trajectory.timestamps_s, rtol=0, atol=1e-6)
+
+
+def test_tum_line_is_time_position_and_quaternion_xyzw_with_positive_w(tmp_path: Path) -> None:
+    quarter_turn = make_transform(exp_so3(np.array([0, np.pi / 2, 0])), np.array([1.0, 2.0, 3.0]))
+    write_tum(tmp_path / "t.txt", Trajectory(quarter_turn[None], np.array([0.5])))
+    numbers = [float(word) for word in (tmp_path / "t.txt").read_text().split()]
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(numbers, [0.5, 1, 2, 3, 0, half, 0, half], atol=1e-12)
+
+
+def test_a_quaternion_and_its_negative_are_one_rotation(tmp_path: Path) -> None:
+    (tmp_path / "t.txt").write_text(
+        "0 0 0 0 0.1 0.2 0.3 0.9273618\n1 0 0 0 -0.1 -0.2 -0.3 -0.9273618\n"
+    )
+    first, second = read_tum(tmp_path / "t.txt").T_world_camera
+    np.testing.assert_allclose(first, second, rtol=0, atol=1e-12)
+
+
+def test_quaternions_of_few_digits_still_give_rotations(tmp_path: Path) -> None:
+    (tmp_path / "t.txt").write_text("# groundtruth\n0 0 0 0 0.57 0.57 0.57 0.16\n")
+    rotation = read_tum(tmp_path / "t.txt").T_world_camera[0, :3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-12)
+
+
+def test_kitti_rotations_of_few_digits_become_orthonormal(tmp_path: Path) -> None:
+    (tmp_path / "p.txt").write_text("0.9998 -0.02 0 1 0.02 0.9998 0 2 0 0 1 3\n")
+    pose = read_kitti_poses(tmp_path / "p.txt").T_world_camera[0]
+    np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(pose[:3, 3], [1, 2, 3])
+
+
+def test_kitti_poses_without_times_are_one_second_apart(tmp_path: Path) -> None:
+    (tmp_path / "p.txt").write_text(IDENTITY * 3)
+    assert read_kitti_poses(tmp_path / "p.txt").timestamps_s.tolist() == [0, 1, 2]
+
+
+def test_the_kind_is_told_by_the_columns(tmp_path: Path) -> None:
+    trajectory = random_trajectory(1, 4)
+    write_tum(tmp_path / "tum.txt", trajectory)
+    write_kitti_poses(tmp_path / "kitti.txt", trajectory)
+    tum = read_trajectory(tmp_path / "tum.txt")
+    kitti = read_trajectory(tmp_path / "kitti.txt", trajectory.timestamps_s)
+    np.testing.assert_allclose(tum.T_world_camera, kitti.T_world_camera, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", ": file is empty"),
+        (IDENTITY + "1 0 0 0 0 1 0 0 0 0 1\n", ":2: wrong number of columns .got 11, expected 12"),
+        (IDENTITY + IDENTITY.replace("1 0\n", "1 nan\n"), ":2: number is not finite"),
+        (IDENTITY.replace("1 0 0 0 0", "2 0 0 0 0"), ":1: pose is not a rigid transform"),
+        (IDENTITY.replace("1 0\n", "-1 0\n"), ":1: pose is not a rigid transform"),
+        ("0 " * 11 + "0\n", ":1: pose is not a rigid transform"),
+        (IDENTITY + "0 0 0 0 0 0 0 1\n", ":2: wrong number of columns .got 8, expected 12"),
+        ("1 2 3\n", ":1: wrong number of columns .got 3, expected 12 or 8"),
+        ("0 0 0 0 0 0 0 0\n", ":1: quaternion is not of unit length .got 0"),
+        ("0 0 0 0 0 0 0 2\n", ":1: quaternion is not of unit length .got 2"),
+        ("2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", ":2: time runs backwards"),
+        ("1 0 0 x 0 0 0 1\n", ":1: not a number"),
+    ],
+)
+def test_a_bad_trajectory_is_one_line_that_names_the_place(
+    tmp_path: Path, text: str, message: str
+) -> None:
+    (tmp_path / "poses.txt").write_text(text)
+    with pytest.raises(FormatError, match=rf"poses\.txt{message}"):
+        read_trajectory(tmp_path / "poses.txt")
+
+
+def test_a_number_of_poses_that_is_not_that_of_the_times_is_told(tmp_path: Path) -> None:
+    (tmp_path / "p.txt").write_text(IDENTITY * 2)
+    with pytest.raises(FormatError, match=r"p\.txt: numbers of poses .*\(got 2 poses, expected 3"):
+        read_trajectory(tmp_path / "p.txt", np.arange(3.0))
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(
+    ("drive", "frames", "length_m"), [("kitti_raw_0013", 144, 173), ("kitti_06_51", 51, 60)]
+)
+def test_real_drives_have_their_published_length(
+    recon_data: Path, drive: str, frames: int, length_m: float
+) -> None:
+    trajectory = read_trajectory(recon_data / "driven" / drive / "poses.txt")
+    assert len(trajectory) == frames
+    assert abs(trajectory.path_length_m - length_m) < 1
+
+
+@pytest.mark.parametrize(
+    "line", ["1 0 0 1e30 0 1 0 0 0 0 1 0", "0.5 0 -1e30 0 0 0 0 1"], ids=["kitti", "tum"]
+)
+def test_a_place_that_is_none_on_earth_is_refused(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "path.txt"
+    path.write_text(line + "\n")
+    with pytest.raises(FormatError, match=r"path\.txt:1: position .*got 1e\+30 m"):
+        read_trajectory(path)

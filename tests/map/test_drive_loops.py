@@ -1,0 +1,214 @@
+"""Loops of a drive: the same from memory, from files and after an interruption; and undone drift.
+
+Each place is a wall of its own, 10 m ahead, and the drive is one lap and a bit of a circle.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.core.errors import FormatError, OutputError
+from recon.core.geometry import se3
+from recon.core.values import (
+    Disparity,
+    PointCloud,
+    RectifiedCamera,
+    RectifiedPair,
+    Trajectory,
+)
+from recon.map import drive_loops
+from recon.map.drive_loops import DriveLoops, KeyframeFiles, LoopWatch
+from recon.map.submap_store import SubmapEntry
+from recon.places import LoopSettings
+from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
+from recon.places.graph import close_loops
+from recon.stereo.frame import ReconstructedFrame
+from tests.run.pools import observed_pool
+
+CAMERA = RectifiedCamera(200.0, 159.5, 59.5, 159.5, 0.5, 320, 120)
+LAP = 60
+FRAMES = LAP + 8
+STEP_M = 2.0
+ALL_MEASURED = [True] * FRAMES
+
+
+def _frame(index: int) -> ReconstructedFrame:
+    rng = np.random.default_rng(index % LAP)
+    noise = cv2.GaussianBlur(rng.normal(size=(120, 320)), (0, 0), 2.0)
+    grey = np.clip(128 + 60 * noise / noise.std(), 0, 255).astype(np.uint8)
+    values = np.tile(np.linspace(9.0, 11.0, 320, dtype=np.float32), (120, 1))
+    ones = np.ones_like(values)
+    disparity = Disparity(values, ones, 0.3 * ones, np.zeros(values.shape, np.uint8))
+    pair = RectifiedPair(grey, grey, CAMERA, index=index)
+    return ReconstructedFrame(pair, disparity, PointCloud(np.zeros((0, 3), np.float32)))
+
+
+def _circle(share: float = 0.0) -> Trajectory:
+    """The path; with a share, each step is too long by that much."""
+    turn = 2 * math.pi / LAP
+    step = se3.make_transform(
+        se3.exp_so3(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, STEP_M * (1.0 + share)])
+    )
+    poses = [np.eye(4)]
+    for _ in range(FRAMES - 1):
+        poses.append(poses[-1] @ step)
+    if share:  # odometry is not wrong in the same way everywhere, or even a circle would close
+        tilt = se3.make_transform(se3.exp_so3(np.array([0.0, 0.03, 0.0])), np.zeros(3))
+        poses[LAP // 2 :] = [
+            poses[LAP // 2] @ tilt @ se3.invert(poses[LAP // 2]) @ T for T in poses[LAP // 2 :]
+        ]
+    return Trajectory(np.stack(poses), 0.1 * np.arange(FRAMES))
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[ReconstructedFrame]:
+    return [_frame(k) for k in range(FRAMES)]
+
+
+def _watch(frames, path: Trajectory, folder: Path | None = None, upto: int = FRAMES) -> LoopWatch:
+    watch = LoopWatch(LoopSettings(), folder)
+    for frame, T in zip(frames[:upto], path.T_world_camera, strict=False):
+        watch.add(frame, T, measured=True)
+    watch.settle()
+    return watch
+
+
+@pytest.fixture(scope="module")
+def closed(frames) -> DriveLoops:
+    path = _circle(0.01)
+    return _watch(frames, path).close(path)
+
+
+def _pairs(loops: DriveLoops) -> list[tuple[int, int, bytes]]:
+    return [(o.first, o.last, o.T_first_last.tobytes()) for o in loops.closure.closed]
+
+
+def test_a_lap_closes(closed):
+    truth = _circle()
+
+    before, after = (
+        np.linalg.norm(path.positions_m[-1] - truth.positions_m[-1])
+        for path in (closed.odometry, closed.closure.trajectory)
+    )
+    assert before > 1.0
+    # 1 % of the 14 m after the end of the lap, which no loop can tell, and 5 cm of the loops.
+    assert after < 0.2
+    assert {(o.first, o.last) for o in closed.closure.closed} <= {
+        (k, LAP + k) for k in range(FRAMES - LAP)
+    }
+
+
+def test_figures_say_what_was_closed(closed):
+    figures = closed.figures()
+
+    assert figures["keyframes"] == FRAMES
+    assert figures["closed"] == len(closed.closure.closed) >= 5
+    assert figures["largest_correction_m"] == pytest.approx(closed.corrections_m.max())
+    assert len(closed.edges()["closed"]) == figures["closed"]
+    assert closed.warnings() == []
+
+
+def test_submaps_move_with_their_middle_frames(closed):
+    entries = [SubmapEntry(0, 0, 30, 0, 0), SubmapEntry(1, 30, 38, 0, 0)]
+
+    corrections = closed.submap_corrections(entries)
+    assert corrections is not None
+    for T, middle in zip(corrections, (15, 49), strict=True):
+        old = closed.odometry.T_world_camera[middle]
+        assert np.allclose(T @ old, closed.closure.trajectory.T_world_camera[middle], atol=1e-9)
+
+
+def test_a_drive_without_loops_stays_as_it_is(frames):
+    path = _circle(0.01)
+
+    loops = _watch(frames, path, upto=40).close(
+        Trajectory(path.T_world_camera[:40], path.timestamps_s[:40])
+    )
+    assert loops.closure.trajectory is loops.odometry
+    assert loops.submap_corrections([SubmapEntry(0, 0, 40, 0, 0)]) is None
+
+
+def test_files_give_the_same_loops_as_memory(frames, closed, tmp_path):
+    loops = _watch(frames, closed.odometry, tmp_path).close(closed.odometry)
+
+    assert _pairs(loops) == _pairs(closed)
+    assert len(list(tmp_path.glob("keyframe_*.zip"))) == FRAMES
+
+
+@pytest.mark.parametrize(("checkpoint", "killed"), [(30, 30), (30, 35), (64, 67)])
+def test_an_interrupted_drive_gives_the_same_loops(frames, closed, tmp_path, checkpoint, killed):
+    path = closed.odometry
+    _watch(frames, path, tmp_path, upto=killed)
+    resumed = LoopWatch(LoopSettings(), tmp_path)
+    resumed.restore(path.T_world_camera[:checkpoint], ALL_MEASURED[:checkpoint])
+    for frame, T in zip(frames[checkpoint:], path.T_world_camera[checkpoint:], strict=True):
+        resumed.add(frame, T, measured=True)
+
+    loops = resumed.close(path)
+    assert _pairs(loops) == _pairs(closed)
+    assert loops.figures() == closed.figures()
+    assert np.array_equal(
+        loops.closure.trajectory.T_world_camera, closed.closure.trajectory.T_world_camera
+    )
+
+
+def test_a_full_disk_is_told_although_another_thread_met_it(frames, tmp_path, monkeypatch):
+    def full(self: KeyframeFiles, stored: StoredKeyframe) -> None:
+        raise OutputError("the disk is full")
+
+    monkeypatch.setattr(KeyframeFiles, "put", full)
+    with pytest.raises(OutputError, match="full"):
+        _watch(frames, _circle(), tmp_path, upto=1)
+
+
+def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):
+    looked: list[int] = []
+    pool, dropped = observed_pool()
+
+    def slow(self: LoopDetector, frame: int, *_: object, **__: object) -> None:
+        looked.append(frame)
+        dropped.wait(30)
+
+    monkeypatch.setattr(LoopDetector, "add", slow)
+    monkeypatch.setattr(drive_loops, "ThreadPoolExecutor", pool)
+    watch = LoopWatch(LoopSettings())
+    for frame in frames[:4]:
+        watch.add(frame, np.eye(4), measured=True)
+    while not looked:
+        time.sleep(0.001)
+    watch.stop()
+    assert looked == [0]
+
+
+def test_a_damaged_keyframe_is_told(frames, tmp_path):
+    _watch(frames, _circle(), tmp_path, upto=3)
+    (tmp_path / "keyframe_000000001.zip").write_bytes(b"not a keyframe")
+
+    with pytest.raises(FormatError, match="keyframe_000000001"):
+        list(KeyframeFiles(tmp_path))
+
+
+def test_loops_that_contradict_odometry_are_a_warning(closed):
+    """The settings believe odometry to the millimetre, so that bending it is impossible."""
+    strict = LoopSettings.parse({"drift": {"share": 1e-6, "turn_deg": 1e-5}})
+    path = closed.odometry
+    refused = close_loops(path, path.distances_m, list(closed.closure.closed), strict)
+    loops = DriveLoops(path, refused, FRAMES, len(closed.closure.closed), {})
+
+    assert refused.trajectory is path
+    assert "none closed" in loops.warnings()[0]
+
+
+@pytest.mark.parametrize(("times", "warned"), [(2, False), (3, True)])
+def test_places_where_the_drive_cannot_have_been_are_a_warning(times, warned):
+    path = _circle()
+    nothing = close_loops(path, path.distances_m, [], LoopSettings())
+    loops = DriveLoops(path, nothing, FRAMES, 0, {CONTRADICTED: times})
+
+    assert [("alike" in text) for text in loops.warnings()] == [True] * warned

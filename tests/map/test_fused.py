@@ -1,0 +1,187 @@
+"""Fusion averages the measurements of frames, and counts frames, not points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.core.errors import MappingError
+from recon.core.geometry.triangulation import depth_sigma
+from recon.core.values import PointCloud, RectifiedCamera
+from recon.map.fused import FusionSettings, MapBuilder, fusion_range_m
+
+
+def _cloud(xyz: np.ndarray, **fields: np.ndarray) -> PointCloud:
+    return PointCloud(np.asarray(xyz, np.float32), frame="world", **fields)
+
+
+def _build(*clouds: PointCloud, **settings: float | None) -> MapBuilder:
+    builder = MapBuilder(FusionSettings(**settings))
+    for cloud in clouds:
+        builder.integrate(cloud)
+    return builder
+
+
+def _wall(seed: int, n: int = 3000, noise: float = 0.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-2, 2, (n, 3))
+    points[:, 2] = 5.05 + noise * rng.normal(size=n)
+    return points
+
+
+def test_count_is_the_number_of_frames_and_not_of_points() -> None:
+    points = np.full((40, 3), 0.05)
+    fused = _build(_cloud(points), _cloud(points)).cloud(min_count=1)
+    assert fused.count is not None
+    assert fused.count.tolist() == [2]
+
+
+def test_voxels_seen_too_rarely_are_not_exported() -> None:
+    often, once = np.full((1, 3), 0.05), np.full((1, 3), 1.05)
+    builder = _build(_cloud(np.vstack([often, once])), _cloud(often), _cloud(often), min_count=3)
+    assert len(builder) == 2
+    assert builder.cloud().xyz.tolist() == pytest.approx(np.float32(often))
+    assert len(builder.cloud(min_count=1)) == 2
+
+
+def test_precise_voxels_need_one_frame_less() -> None:
+    xyz = np.array([[0.05, 0.05, 0.05], [1.05, 1.05, 1.05]])
+    # Two frames of 0.1 m make 0.071 m, two of 0.15 m make 0.106 m.
+    cloud = _cloud(xyz, sigma_m=np.array([0.1, 0.15], np.float32))
+    for limit_m, exported in ((0.08, 1), (0.07, 0), (0.11, 2), (None, 0)):
+        builder = _build(cloud, cloud, min_count=3, precise_sigma_m=limit_m)
+        assert len(builder.cloud()) == exported
+    once = _build(cloud, min_count=3, precise_sigma_m=10.0)
+    assert len(once.cloud()) == 0
+    assert len(once.cloud(min_count=1)) == 2
+
+
+def test_precise_points_pull_the_mean_by_the_square_of_their_precision() -> None:
+    xyz = np.array([[0.02, 0.05, 0.05], [0.07, 0.05, 0.05]])
+    sigma = np.array([0.1, 0.2], np.float32)
+    fused = _build(_cloud(xyz, sigma_m=sigma)).cloud(1)
+    assert fused.xyz[0, 0] == pytest.approx((4 * 0.02 + 0.07) / 5, abs=1e-6)
+    assert fused.weight is not None
+    assert fused.weight[0] == pytest.approx(100 + 25, rel=1e-5)
+
+
+def test_precision_is_bounded_and_hopeless_points_are_left_out() -> None:
+    xyz = np.array([[0.05, 0.05, 0.05], [0.05, 0.05, 0.05], [3.0, 3.0, 3.0]])
+    sigma = np.array([1e-9, 0.02, 5.0], np.float32)
+    fused = _build(_cloud(xyz, sigma_m=sigma), min_sigma_m=0.02, max_sigma_m=1.0).cloud(1)
+    assert len(fused) == 1
+    assert fused.weight is not None
+    assert fused.weight[0] == pytest.approx(2 / 0.02**2, rel=1e-5)
+
+
+def test_points_without_confidence_do_not_count() -> None:
+    xyz = np.array([[0.05, 0.05, 0.05], [1.05, 0.05, 0.05]])
+    fused = _build(_cloud(xyz, confidence=np.array([0.5, 0.0], np.float32))).cloud(1)
+    assert fused.xyz[:, 0] == pytest.approx([0.05], abs=1e-6)
+    assert fused.confidence is not None
+    assert fused.confidence.tolist() == [0.5]
+
+
+def test_sigma_shrinks_with_frames_and_not_with_points_of_one_frame() -> None:
+    def sigma(points: int, frames: int) -> float:
+        xyz = np.full((points, 3), 0.05)
+        cloud = _cloud(xyz, sigma_m=np.full(points, 0.1, np.float32))
+        fused = _build(*[cloud] * frames).cloud(1).sigma_m
+        assert fused is not None
+        return float(fused[0])
+
+    assert sigma(1, 1) == pytest.approx(0.1, rel=1e-5)
+    assert sigma(50, 1) == pytest.approx(0.1, rel=1e-5)
+    assert sigma(50, 4) == pytest.approx(0.05, rel=1e-5)
+
+
+def test_fusing_a_noisy_wall_is_more_precise_than_a_frame() -> None:
+    frames = [_cloud(_wall(seed, 20_000, noise=0.01)) for seed in range(8)]
+    error = _build(*frames).cloud().xyz[:, 2] - 5.05
+    # 160 000 points on 1600 voxels (5 standard deviations thick): 0.01 / sqrt(100) = 0.001.
+    assert 0.0005 < np.sqrt((error**2).mean()) < 0.0015
+
+
+def test_normals_are_unit_vectors_and_keep_their_side() -> None:
+    rng = np.random.default_rng(0)
+    normals = np.array([0.0, 0.0, -1.0]) + rng.normal(0, 0.2, (3000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    fused = _build(_cloud(_wall(1), normals=normals.astype(np.float32))).cloud(1).normals
+    assert fused is not None
+    np.testing.assert_allclose(np.linalg.norm(fused, axis=1), 1, atol=1e-5)  # float32
+    assert (fused[:, 2] < -0.5).all()
+
+
+def test_voxels_whose_normals_cancel_are_left_out() -> None:
+    normals = np.array([[0, 0, 1], [0, 0, -1], [0, 1, 0]], np.float32)
+    xyz = np.array([[0.05, 0.05, 0.05], [0.05, 0.05, 0.05], [1.05, 0.05, 0.05]])
+    assert _build(_cloud(xyz, normals=normals)).cloud(1).xyz[:, 0] == pytest.approx([1.05])
+
+
+def test_colours_are_averaged_by_weight() -> None:
+    rgb = np.array([[0, 100, 255], [200, 100, 255]], np.uint8)
+    confidence = np.array([0.25, 0.75], np.float32)
+    cloud = _cloud(np.full((2, 3), 0.05), rgb=rgb, confidence=confidence)
+    fused = _build(cloud).cloud(1).rgb
+    assert fused is not None
+    assert fused.tolist() == [[150, 100, 255]]
+
+
+def test_what_one_cloud_does_not_have_the_map_does_not_have() -> None:
+    xyz = np.full((1, 3), 0.05)
+    with_colour = _cloud(xyz, rgb=np.zeros((1, 3), np.uint8))
+    assert _build(with_colour).cloud(1).rgb is not None
+    fused = _build(with_colour, _cloud(xyz)).cloud(1)
+    assert fused.rgb is None
+    assert fused.normals is None
+    assert fused.sigma_m is None
+
+
+def test_empty_frames_and_an_empty_map_are_fine() -> None:
+    empty = _cloud(np.zeros((0, 3)))
+    assert len(_build().cloud()) == 0
+    assert len(_build(empty).cloud(1)) == 0
+    assert len(_build(empty, _cloud(np.full((1, 3), 0.05))).cloud(1)) == 1
+
+
+def test_the_map_does_not_depend_on_how_its_stores_grew() -> None:
+    points = _wall(3, 5000)
+    halves = [_cloud(points[:2500]), _cloud(points[2500:])]
+    whole = _build(_cloud(points)).cloud(1)
+    parts = _build(*halves).cloud(1)
+    # Same points, same order; float32 sums in the same order are the same bits.
+    np.testing.assert_array_equal(whole.xyz, parts.xyz)
+
+
+def test_a_million_voxels_are_held() -> None:
+    steps = np.arange(0.05, 10, 0.1)
+    grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    builder = _build(*(_cloud(part) for part in np.array_split(grid, 4)))
+    assert len(builder) == 1_000_000
+    np.testing.assert_allclose(builder.cloud(1).xyz, grid, atol=1e-5)  # float32
+
+
+@pytest.mark.parametrize(
+    ("cloud", "words"),
+    [
+        (PointCloud(np.zeros((1, 3), np.float32)), "world axes"),
+        (_cloud([[np.nan, 0, 0]]), "not finite"),
+        (_cloud([[1e9, 0, 0]]), "too far"),
+        (_cloud([[0, 0, 0]], sigma_m=np.array([np.nan], np.float32)), "not finite"),
+    ],
+)
+def test_clouds_that_would_spoil_the_map_are_refused(cloud: PointCloud, words: str) -> None:
+    with pytest.raises(MappingError, match=words):
+        _build(cloud)
+
+
+def test_fusion_range_is_where_the_nominal_error_reaches_its_limit() -> None:
+    camera = RectifiedCamera(700.0, 320.0, 120.0, 320.0, 0.5, 640, 240)
+    settings = FusionSettings(max_depth_error_m=0.2, nominal_error_px=0.3)
+    range_m = fusion_range_m(camera, settings)
+    assert depth_sigma(np.array([range_m]), 0.3, camera)[0] == pytest.approx(0.2, rel=1e-6)
+
+
+def test_without_a_limit_fusion_has_no_range() -> None:
+    camera = RectifiedCamera(700.0, 320.0, 120.0, 320.0, 0.5, 640, 240)
+    assert fusion_range_m(camera, FusionSettings(max_depth_error_m=None)) == np.inf

@@ -1,0 +1,131 @@
+"""The ground is followed over slopes and gaps, and not up walls or onto roofs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from recon.core.errors import MappingError
+from recon.core.values import PointCloud
+from recon.map.ground import GroundSettings, GroundSurface, estimate_ground_surface
+
+CAMERA_M = 1.6
+PATH = np.stack([np.arange(0, 60, 1.0), np.zeros(60), np.zeros(60)], axis=1)
+
+
+def _slope(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A hill along the drive, and a road that hangs to the side."""
+    return 2.0 * np.sin(x / 15) + 0.05 * y
+
+
+def _ground(seed: int = 0, n: int = 60_000) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(0, 60, n), rng.uniform(-12, 12, n)
+    return np.stack([x, y, _slope(x, y) + rng.normal(0, 0.03, n)], axis=1)
+
+
+def _path() -> np.ndarray:
+    path = PATH.copy()
+    path[:, 2] = _slope(path[:, 0], path[:, 1]) + CAMERA_M
+    return path
+
+
+def _surface(points: np.ndarray, **settings: float) -> GroundSurface:
+    cloud = PointCloud(points.astype(np.float32), frame="map")
+    return estimate_ground_surface(cloud, _path(), GroundSettings(**settings))
+
+
+def _error(surface: GroundSurface, half_width: float = 10.0) -> np.ndarray:
+    rng = np.random.default_rng(9)
+    x, y = rng.uniform(1, 59, 3000), rng.uniform(-half_width, half_width, 3000)
+    return surface.height_at(np.stack([x, y], axis=1)) - _slope(x, y)
+
+
+def test_slopes_are_followed() -> None:
+    surface = _surface(_ground())
+    assert surface.camera_height_m == pytest.approx(CAMERA_M, abs=0.03)
+    # Slope up to 13 % and 25 points per cell: what is left is smoothing over curvature.
+    assert np.abs(_error(surface)).max() < 0.1
+
+
+def test_boxes_and_walls_do_not_lift_the_ground() -> None:
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(10, 16, 20_000), rng.uniform(3, 6, 20_000)
+    roof = np.stack([x, y, _slope(x, y) + 1.5], axis=1)
+    x = rng.uniform(0, 60, 40_000)
+    wall = np.stack([x, np.full(40_000, 9.0), _slope(x, 9.0) + rng.uniform(0, 4, 40_000)], axis=1)
+    clear = _ground()
+    under = (clear[:, 0] > 10) & (clear[:, 0] < 16) & (clear[:, 1] > 3) & (clear[:, 1] < 6)
+    surface = _surface(np.vstack([clear[~under], roof, wall]))
+    # The foot of the wall lies within the window and lifts its own cells a little.
+    assert np.abs(_error(surface, half_width=7.5)).max() < 0.15
+
+
+def test_normals_tell_the_ground_from_the_rest() -> None:
+    ground = _ground(n=20_000)
+    hedge = ground + np.array([0, 0, 0.25])
+    normals = np.zeros((40_000, 3), np.float32)
+    normals[:20_000, 2] = 1
+    normals[20_000:, 1] = 1
+    cloud = PointCloud(np.vstack([ground, hedge]).astype(np.float32), normals=normals, frame="map")
+    surface = estimate_ground_surface(cloud, _path(), GroundSettings())
+    assert np.abs(_error(surface)).max() < 0.15
+    without = _surface(np.vstack([ground, hedge]))
+    assert np.abs(np.nanmean(_error(without))) > 2 * abs(np.nanmean(_error(surface)))
+
+
+def test_heights_are_carried_over_small_gaps_and_not_over_large_ones() -> None:
+    points = _ground()
+    small = (np.abs(points[:, 1]) > 3) & (np.abs(points[:, 1]) < 5)
+    assert np.isfinite(_error(_surface(points[~small]))).all()
+    large = np.abs(points[:, 1]) > 3
+    surface = _surface(points[~large], max_gap_m=2.0)
+    assert np.isnan(surface.height_at(np.array([[30.0, 9.5], [30.0, -9.5]]))).all()
+    assert np.isfinite(surface.height_at(np.array([[30.0, 2.0], [30.0, -2.0]]))).all()
+
+
+def test_nothing_is_known_beyond_the_reach() -> None:
+    surface = _surface(_ground(), reach_m=5.0)
+    assert math.isnan(surface.height_at(np.array([[30.0, 9.0]]))[0])
+    assert math.isnan(surface.height_at(np.array([[1e4, -1e4]]))[0])
+
+
+def test_a_path_without_ground_gives_an_unknown_surface() -> None:
+    surface = _surface(np.zeros((0, 3)))
+    assert np.isnan(surface.heights_m).all()
+    assert math.isnan(surface.camera_height_m)
+
+
+def test_a_given_camera_height_needs_no_measuring() -> None:
+    surface = _surface(_ground(), camera_height_m=CAMERA_M)
+    assert surface.camera_height_m == CAMERA_M
+    assert np.abs(_error(surface)).max() < 0.1
+
+
+def test_one_frame_is_a_path_too() -> None:
+    cloud = PointCloud(_ground().astype(np.float32), frame="map")
+    surface = estimate_ground_surface(cloud, _path()[30:31], GroundSettings())
+    assert surface.height_at(np.array([[33.0, 2.0]]))[0] == pytest.approx(
+        float(_slope(np.array(33.0), np.array(2.0))), abs=0.1
+    )
+
+
+def test_height_is_linear_between_centres_of_cells() -> None:
+    surface = GroundSurface(np.array([[0.0, 1.0], [2.0, np.nan]]), 1.0, (10.0, 20.0))
+    places = np.array([[10.5, 20.5], [11.0, 20.5], [10.5, 21.0], [11.5, 21.5], [10.0, 20.0]])
+    heights = surface.height_at(places)
+    assert heights[:3].tolist() == [0.0, 0.5, 1.0]
+    assert math.isnan(heights[3])
+    assert heights[4] == 0.0  # outside of the centres: the nearest cell's
+
+
+@pytest.mark.parametrize(
+    ("frame", "positions", "words"),
+    [("world", PATH, "map axes"), ("map", np.zeros((0, 3)), "path is empty")],
+)
+def test_wrong_input_is_refused(frame: str, positions: np.ndarray, words: str) -> None:
+    cloud = PointCloud(np.zeros((0, 3), np.float32), frame=frame)  # type: ignore[arg-type]
+    with pytest.raises(MappingError, match=words):
+        estimate_ground_surface(cloud, positions, GroundSettings())

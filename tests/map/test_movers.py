@@ -1,0 +1,109 @@
+"""Moving objects leave no ghosts: later rays through a cell free it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from recon.core.geometry.se3 import make_transform
+from recon.core.values import FREE, OCCUPIED, OccupancyGrid, PointCloud
+from recon.map import (
+    GridSettings,
+    GroundSurface,
+    OccupancyBuilder,
+    OccupancySettings,
+    flatten,
+    thin_rays,
+)
+from recon.map.axes import AXES_MAP_WORLD
+
+HEIGHT_M, WALL_M = 1.6, 20.0
+T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
+GROUND = GroundSurface(np.full((60, 60), -HEIGHT_M), 1.0, (-15.0, -30.0))
+CAR_M = np.array([1.8, 1.4, 4.0])  # wide, high, long
+DEPTH_ERROR = 0.0015
+
+
+def _look(car_m: tuple[float, float] | None, z_m: float, seed: int) -> PointCloud:
+    """Points of a camera at z in a street that ends at a wall; the car's rear is at (x, z)."""
+    u, v = np.meshgrid(np.linspace(-0.7, 0.7, 210), np.linspace(-0.25, 0.25, 75))
+    rays = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3)
+    with np.errstate(divide="ignore"):
+        depth = np.minimum(WALL_M - z_m, np.where(rays[:, 1] > 0, HEIGHT_M / rays[:, 1], np.inf))
+    if car_m is not None:
+        depth = np.minimum(depth, _box_depth(rays, car_m[0], car_m[1] - z_m))
+    sigma = DEPTH_ERROR * depth**2
+    seen = depth + np.random.default_rng(seed).normal(size=len(depth)) * sigma
+    return PointCloud((rays * seen[:, None]).astype("f4"), sigma_m=sigma.astype("f4"))
+
+
+def _box_depth(rays: np.ndarray, x_m: float, z_m: float) -> np.ndarray:
+    """Depth at which rays meet the car; infinite where they miss it (slabs)."""
+    low = np.array([x_m - CAR_M[0] / 2, HEIGHT_M - CAR_M[1], z_m])
+    high = np.array([x_m + CAR_M[0] / 2, HEIGHT_M, z_m + CAR_M[2]])
+    with np.errstate(divide="ignore"):
+        ends = np.stack([low / rays, high / rays])
+    enter, leave = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
+    return np.where((enter < leave) & (enter > 0), enter, np.inf)
+
+
+def _grid(cars: list[tuple[float, float] | None], step_m: float = 0.0) -> OccupancyGrid:
+    """The grid after frames with the car at these places; the camera moves on by steps."""
+    settings = OccupancySettings()
+    builder = OccupancyBuilder(settings, T_MAP_WORLD)
+    for index, car in enumerate(cars):
+        z_m = index * step_m
+        pose = make_transform(np.eye(3), np.array([0.0, 0.0, z_m]))
+        builder.integrate(thin_rays(_look(car, z_m, index), settings).cloud(), pose)
+    return flatten(builder.voxels(), GROUND, GridSettings())
+
+
+def _cells(grid: OccupancyGrid, forward_m: tuple[float, float], left_m: tuple[float, float]):
+    """The cells of a rectangle of the map."""
+    (x0, x1), (y0, y1) = (
+        np.rint((np.array(span) - origin) / grid.resolution_m).astype(int)
+        for span, origin in zip((forward_m, left_m), grid.origin_m, strict=True)
+    )
+    return grid.cells[y0:y1, x0:x1]
+
+
+CROSSING = [(x, 9.0) for x in np.arange(-7.0, 7.1, 0.7)]
+LEADING = [(0.0, 6.0 + 0.8 * n) for n in range(18)]
+
+
+def test_a_car_that_crosses_leaves_a_free_street() -> None:
+    track = _cells(_grid([*CROSSING, *[None] * 3]), (9.0, 13.0), (-4.0, 4.0))
+    assert (track == OCCUPIED).sum() == 0
+    assert (track == FREE).mean() > 0.98
+
+
+def test_a_parked_car_that_drives_away_is_forgotten() -> None:
+    place = (9.0, 13.0), (-1.4, 1.4)
+    parked = [(0.0, 9.0)] * 20
+    away = [(x, 9.0) for x in np.arange(0.0, 7.1, 0.7)]
+    before, after = _grid(parked), _grid([*parked, *away, *[None] * 20])
+    assert (_cells(before, *place) == OCCUPIED).sum() > 8
+    assert (_cells(after, *place) == OCCUPIED).sum() == 0
+    assert (_cells(after, *place) == FREE).mean() > 0.98
+
+
+def test_a_car_ahead_leaves_no_trail() -> None:
+    # It drives on faster than the camera: where its rear was, later rays reach its new rear.
+    grid = _grid(LEADING, step_m=0.3)
+    trail = _cells(grid, (6.0, 17.0), (-1.4, 1.4))
+    assert (trail == OCCUPIED).sum() == 0
+    assert (trail == FREE).mean() > 0.95
+    assert (_cells(grid, (19.2, 20.4), (-1.0, 1.0)) == OCCUPIED).any()  # where it is now
+
+
+def test_a_car_that_stops_where_it_was_free_is_found_within_a_second() -> None:
+    stopped = [(0.0, 9.05)] * 10
+    # Ten frames; until then, what was free is at least no longer called so.
+    place = (9.0, 9.2), (-0.8, 0.8)
+    assert (_cells(_grid([*[None] * 20, *stopped]), *place) == OCCUPIED).all()
+    assert not (_cells(_grid([*[None] * 20, *stopped[:4]]), *place) == FREE).any()
+
+
+def test_what_stands_still_stays() -> None:
+    grid = _grid([*CROSSING, *[None] * 8])
+    wall = _cells(grid, (19.6, 20.4), (-6.0, 6.0))
+    assert (wall == OCCUPIED).any(axis=1).mean() > 0.95

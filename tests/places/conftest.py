@@ -1,0 +1,133 @@
+"""A drive around a block and one past alike houses: some frames of each, with exact disparity."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from recon.core.geometry import se3
+from recon.core.values import Disparity, Reason, RectifiedPair, Trajectory
+from recon.places.detector import KeyframeMemory, LoopDetector
+from recon.places.drift import doubtful_path
+from recon.places.keyframe import Keyframe, make_keyframe
+from recon.places.settings import LoopSettings
+from recon.street.render import StreetCamera
+from recon.street.settings import CORNER_M, StreetSettings
+from recon.street.street import build_street
+
+RIG = {"width_px": 320, "height_px": 120, "focal_px": 180.0, "smooth_edges": False}
+BLOCK_M = (80.0, 60.0)
+LAP_M = 2 * sum(BLOCK_M) - 8 * CORNER_M + 2 * math.pi * CORNER_M
+LAP = 168
+"""Frames of a lap: frame 168 stands where frame 0 stood."""
+PERIOD = 40
+"""Frames after which the repeated street looks the same."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Frames of a drive, with its true path."""
+
+    camera: StreetCamera
+
+    @property
+    def truth(self) -> Trajectory:
+        return self.camera.world.trajectory
+
+    def pair(self, frame: int) -> RectifiedPair:
+        left, right = (
+            np.rint(side @ [0.299, 0.587, 0.114]).astype(np.uint8)
+            for side in (self.camera.pair(frame).left, self.camera.pair(frame).right)
+        )
+        return RectifiedPair(left, right, self.camera.world.camera, index=frame)
+
+    def disparity(self, frame: int) -> Disparity:
+        """The truth where both cameras see, with an error of a quarter of a pixel."""
+        truth = self.camera.disparity_truth(frame)
+        noise = np.random.default_rng(frame).normal(0.0, 0.25, truth.values.shape)
+        values = np.where(truth.nonocc, truth.values + noise, np.nan).astype(np.float32)
+        valid = np.isfinite(values)
+        return Disparity(
+            values,
+            valid.astype(np.float32),
+            np.where(valid, 0.25, np.nan).astype(np.float32),
+            np.where(valid, Reason.VALID, Reason.OCCLUDED).astype(np.uint8),
+        )
+
+    def motion(self, first: int, last: int) -> np.ndarray:
+        poses = self.truth.T_world_camera
+        return se3.invert(poses[first]) @ poses[last]
+
+
+class Filmed:
+    """A drive whose frames are rendered once, when they are first asked for."""
+
+    def __init__(self, settings: StreetSettings) -> None:
+        self.drive = Drive(StreetCamera(build_street(settings)))
+        self._frames: dict[int, tuple[RectifiedPair, Disparity]] = {}
+
+    @property
+    def truth(self) -> Trajectory:
+        return self.drive.truth
+
+    def frame(self, index: int) -> tuple[RectifiedPair, Disparity]:
+        if index not in self._frames:
+            self._frames[index] = (self.drive.pair(index), self.drive.disparity(index))
+        return self._frames[index]
+
+    def keyframe(self, index: int) -> Keyframe:
+        return make_keyframe(index, *self.frame(index), LoopSettings().keyframes)
+
+    def detect(self, frames, path: Trajectory, settings: LoopSettings | None = None, lost=()):
+        """A detector that has seen some frames, their poses being those of ``path``."""
+        settings = settings or LoopSettings()
+        measured = ~np.isin(np.arange(len(path)), list(lost))
+        path_m = doubtful_path(path.T_world_camera, measured, settings.drift)
+        detector = LoopDetector(settings, KeyframeMemory())
+        for k in frames:
+            pair, disparity = self.frame(k)
+            pose = path.T_world_camera[k]
+            detector.add(k, pair, disparity, pose, path_m=path_m[k], measured=bool(measured[k]))
+        return detector, path_m
+
+
+@pytest.fixture(scope="session")
+def block() -> Filmed:
+    return Filmed(
+        StreetSettings(
+            path="block",
+            block_m=BLOCK_M,
+            frames=LAP + 20,
+            speed_m_per_frame=LAP_M / LAP,
+            seed=1,
+            **RIG,
+        )
+    )
+
+
+@pytest.fixture(scope="session")
+def alike() -> Filmed:
+    return Filmed(
+        StreetSettings(
+            path="straight",
+            repeat_m=60.0,
+            frames=60,
+            speed_m_per_frame=60.0 / PERIOD,
+            seed=2,
+            **RIG,
+        )
+    )
+
+
+def drifted(truth: Trajectory, *, share: float, turn_deg_per_m: float) -> Trajectory:
+    """A path with a constant scale and rotation error in each step."""
+    poses = [np.eye(4)]
+    for step in se3.invert(truth.T_world_camera[:-1]) @ truth.T_world_camera[1:]:
+        length = float(np.linalg.norm(step[:3, 3]))
+        turn = se3.exp_so3(np.radians([0.1, 1.0, 0.0]) * turn_deg_per_m * length)
+        longer = se3.make_transform(step[:3, :3] @ turn, step[:3, 3] * (1.0 + share))
+        poses.append(poses[-1] @ longer)
+    return Trajectory(np.stack(poses), truth.timestamps_s)

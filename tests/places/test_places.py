@@ -1,0 +1,98 @@
+"""Questions to all places at once give what questions to each would give."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recon.core.geometry import se3
+from recon.places.drift import drift_over
+from recon.places.places import Place, Places, WordIndex
+from recon.places.settings import LoopSettings
+
+pictures = st.lists(st.sets(st.integers(0, 30)), max_size=20)
+
+
+def _sorted(words) -> np.ndarray:
+    return np.array(sorted(words), np.uint32)
+
+
+@given(pictures, st.sets(st.integers(0, 30)))
+def test_likeness_is_the_share_of_words_in_common(known, asked):
+    index = WordIndex()
+    for words in known:
+        index.add(_sorted(words))
+
+    expected = [
+        len(words & asked) / np.sqrt(len(words) * len(asked)) if words and asked else 0.0
+        for words in known
+    ]
+    np.testing.assert_allclose(index.likeness(_sorted(asked)), expected, rtol=1e-12)
+
+
+def test_likeness_is_that_of_the_right_picture_among_many():
+    rng = np.random.default_rng(0)
+    pictures = [np.unique(rng.integers(0, 1 << 20, 20, np.uint32)) for _ in range(900)]
+    index = WordIndex()
+    for words in pictures:
+        index.add(words)
+
+    for number in (0, 255, 256, 511, 512, 700, 899):
+        alike = index.likeness(pictures[number])
+        assert alike[number] == 1.0
+        assert np.delete(alike, number).max() < 0.2
+
+
+def _place(frame: int, x_m: float, path_m: float, turned_deg: float = 0.0) -> Place:
+    R = se3.exp_so3(np.array([0.0, np.radians(turned_deg), 0.0]))
+    T = se3.make_transform(R, np.array([x_m, 0.0, 0.0]))
+    return Place(frame, T, path_m, np.zeros(0, np.uint32))
+
+
+def test_a_place_is_near_if_odometry_could_be_so_wrong():
+    settings = LoopSettings()
+    seen, drift = settings.candidates, settings.drift
+    reach_m = seen.view_m + drift.sigmas * drift_over(100.0, drift).position_m
+    turn_deg = seen.view_deg + np.degrees(drift.sigmas * drift_over(100.0, drift).angle_rad)
+    places = Places()
+    for share in (0.0, 0.99, 1.01):
+        places.add(_place(len(places), share * reach_m, 0.0))
+    for share in (0.99, 1.01):
+        places.add(_place(len(places), 0.0, 0.0, share * turn_deg))
+    places.add(_place(9, 0.0, 100.0 - 0.9 * seen.min_path_m))
+
+    near = places.near(_place(10, 0.0, 100.0), settings)
+    assert near.tolist() == [True, True, False, True, False, False]
+
+
+def test_places_keep_what_they_are_given_beyond_their_first_size():
+    places = Places()
+    for k in range(200):
+        places.add(_place(k, float(k), 2.0 * k))
+
+    assert places.frames == list(range(200))
+    assert np.array_equal(places.path_m, 2.0 * np.arange(200))
+    assert np.array_equal(places.T_world_camera[:, 0, 3], np.arange(200.0))
+
+
+@pytest.mark.slow
+def test_a_question_after_ten_kilometres_takes_milliseconds():
+    rng = np.random.default_rng(0)
+    places = Places()
+    for k in range(6700):
+        words = np.unique(rng.integers(0, 1 << 22, 2000, np.uint32))
+        places.add(Place(k, np.eye(4), 1.5 * k, words))
+    asked = Place(6700, np.eye(4), 1.5 * 6700, words)
+
+    seconds = []
+    for _ in range(5):
+        start = time.perf_counter()
+        places.near(asked, LoopSettings())
+        places.likeness(asked)
+        seconds.append(time.perf_counter() - start)
+    # Ten milliseconds on an idle core; comparing image with image takes half a second.
+    assert min(seconds) < 0.1

@@ -1,0 +1,96 @@
+"""Small values shared by the tests of all reports."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from recon.core.values import (
+    Disparity,
+    OccupancyGrid,
+    PointCloud,
+    Reason,
+    RectifiedCamera,
+    RectifiedPair,
+    Trajectory,
+    TriangleMesh,
+)
+from recon.core.values.arrays import Float64
+from recon.odometry.protocol import OdometryHealth
+
+HEIGHT_PX, WIDTH_PX = 24, 60
+
+
+@pytest.fixture
+def pair() -> RectifiedPair:
+    left = np.random.default_rng(0).integers(0, 256, (HEIGHT_PX, WIDTH_PX), dtype=np.uint8)
+    camera = RectifiedCamera(50.0, 30.0, 12.0, 30.0, 0.5, WIDTH_PX, HEIGHT_PX)
+    return RectifiedPair(left, left, camera, index=7)
+
+
+@pytest.fixture
+def disparity() -> Disparity:
+    values = np.tile(np.linspace(1, 10, WIDTH_PX, dtype=np.float32), (HEIGHT_PX, 1))
+    everything = np.ones_like(values)
+    full = Disparity(values, everything, everything, np.zeros(values.shape, dtype=np.uint8))
+    border = np.zeros(values.shape, dtype=bool)
+    border[:, :15] = True  # a quarter
+    return full.reject(border, Reason.BORDER)
+
+
+@pytest.fixture
+def nothing_found() -> Disparity:
+    """A disparity map without any value."""
+    nan = np.full((HEIGHT_PX, WIDTH_PX), np.nan, dtype=np.float32)
+    reason = np.full(nan.shape, Reason.LOW_TEXTURE, dtype=np.uint8)
+    return Disparity(nan, np.zeros_like(nan), nan, reason)
+
+
+@pytest.fixture
+def trajectory() -> Trajectory:
+    """Eleven frames, one metre each, straight ahead."""
+    T = np.tile(np.eye(4), (11, 1, 1))
+    T[:, 2, 3] = np.arange(11)
+    return Trajectory(T, np.arange(11.0))
+
+
+@pytest.fixture
+def T_map_world() -> Float64:
+    """Camera axes turned so that x is forward and z up."""
+    T = np.zeros((4, 4))
+    T[0, 2], T[1, 0], T[2, 1], T[3, 3] = 1, -1, -1, 1
+    return T
+
+
+@pytest.fixture
+def health() -> list[OdometryHealth]:
+    """One record per frame of `trajectory`; frame 5 has no measurement."""
+    good = OdometryHealth(tracks=200, inliers=150, overlap=0.8, correction_m=0.01)
+    bad = OdometryHealth(ok=False, notes=("too few <tracks>",))
+    return [bad if frame == 5 else good for frame in range(11)]
+
+
+@pytest.fixture
+def grid() -> OccupancyGrid:
+    cells = np.full((20, 30), -1, dtype=np.int8)
+    cells[5:15, 5:25] = 0
+    cells[5, 5:25] = 100
+    return OccupancyGrid(cells, 0.5, (-1.0, -5.0))
+
+
+@pytest.fixture
+def cloud() -> PointCloud:
+    generator = np.random.default_rng(1)
+    xyz = generator.uniform(0, 10, (2000, 3)).astype(np.float32)
+    return PointCloud(xyz, rgb=generator.integers(0, 256, (2000, 3), dtype=np.uint8), frame="map")
+
+
+@pytest.fixture
+def mesh() -> TriangleMesh:
+    """A flat sheet of 2 × 19 × 19 triangles."""
+    x, y = np.meshgrid(np.arange(20.0), np.arange(20.0), indexing="ij")
+    vertices = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3).astype(np.float32)
+    number = np.arange(400, dtype=np.int32).reshape(20, 20)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    return TriangleMesh(vertices, faces, rgb=np.full((400, 3), 90, dtype=np.uint8))

@@ -1,0 +1,184 @@
+"""Ten common faults of recordings, injected into a drive without faults."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from recon.core.errors import CalibrationError
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.values import (
+    CameraIntrinsics,
+    RectifiedCamera,
+    SequenceTruth,
+    StereoCalibration,
+    StereoPair,
+)
+from recon.core.values.arrays import Float64
+from recon.sources import StereoSource
+
+
+@dataclass(frozen=True, eq=False)
+class Spoiled:
+    """A source with modified pairs of another one; ``take(i)`` gives pair i."""
+
+    camera: RectifiedCamera | StereoCalibration
+    count: int
+    take: Callable[[int], StereoPair]
+    name: str = "spoiled"
+    description: str = "a drive with a planted fault"
+    truth: SequenceTruth | None = None
+    files: Sequence[Path] = ()
+
+    @property
+    def calibration(self) -> RectifiedCamera | StereoCalibration:
+        return self.camera
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return self.frames()
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        return (replace(self.take(index), index=index) for index in range(start, self.count))
+
+
+def at(source: StereoSource, index: int) -> StereoPair:
+    return next(iter(source.frames(index)))
+
+
+def rectified(source: StereoSource) -> RectifiedCamera:
+    assert isinstance(source.calibration, RectifiedCamera)
+    return source.calibration
+
+
+def changed(
+    source: StereoSource, change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> Spoiled:
+    def take(index: int) -> StereoPair:
+        pair = at(source, index)
+        left, right = change(pair.left, pair.right)
+        return replace(pair, left=left, right=right)
+
+    return Spoiled(rectified(source), len(source), take)
+
+
+def turned(source: StereoSource, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Spoiled:
+    """The right camera turned about x and z: its image is another view from the same place."""
+    camera = rectified(source)
+    K = camera.matrix.copy()
+    K[0, 2] = camera.cx_right_px
+    R = exp_so3(np.radians([pitch_deg, 0.0, roll_deg]))
+    H = K @ R @ np.linalg.inv(K)
+    size = (camera.width_px, camera.height_px)
+    return changed(source, lambda left, right: (left, warped(right, H, size)))
+
+
+def unrectified(
+    source: StereoSource, left_rad: Float64, right_rad: Float64, pitch_deg: float = 0.0
+) -> Spoiled:
+    """Cameras rotated relative to their rectified orientation, and calibrated so.
+
+    The right one is off its calibration by ``pitch_deg``.
+    """
+    camera = rectified(source)
+    K, R_left, R_right = camera.matrix, exp_so3(left_rad), exp_so3(right_rad)
+    error = exp_so3(np.radians([pitch_deg, 0.0, 0.0]))
+    warps = [K @ R @ np.linalg.inv(K) for R in (R_left, error @ R_right)]
+    size = (camera.width_px, camera.height_px)
+    lens = CameraIntrinsics(K, np.zeros(0), *size)
+    centre_m = np.array([camera.baseline_m, 0.0, 0.0])
+    T_right_left = make_transform(R_right @ R_left.T, -R_right @ centre_m)
+    pictures = changed(
+        source, lambda left, right: (warped(left, warps[0], size), warped(right, warps[1], size))
+    )
+    return replace(pictures, camera=StereoCalibration(lens, lens, T_right_left))
+
+
+def warped(image: np.ndarray, H: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    return np.asarray(cv2.warpPerspective(image, H, size))
+
+
+def gain(source: StereoSource, factor: float) -> Spoiled:
+    return changed(source, lambda left, right: (left, cv2.convertScaleAbs(right, alpha=factor)))
+
+
+def lag(source: StereoSource, frames: int) -> Spoiled:
+    def take(index: int) -> StereoPair:
+        return replace(at(source, index + frames), right=at(source, index).right)
+
+    return Spoiled(rectified(source), len(source) - frames, take)
+
+
+def row_shift(source: StereoSource, rows: int) -> Spoiled:
+    return changed(source, lambda left, right: (left, np.roll(right, rows, axis=0)))
+
+
+def duplicated(source: StereoSource, every: int = 5) -> Spoiled:
+    """Every fifth frame is written twice, with increasing times."""
+    order = [k for k in range(len(source)) for _ in range(2 if k % every == every - 1 else 1)]
+    step_s = at(source, 1).timestamp_s - at(source, 0).timestamp_s
+
+    def take(index: int) -> StereoPair:
+        return replace(at(source, order[index]), timestamp_s=index * step_s)
+
+    return Spoiled(rectified(source), len(order), take)
+
+
+def wrong_size(source: StereoSource) -> Spoiled:
+    """The images are half as large as those that were calibrated."""
+    half = changed(source, lambda left, right: (left[::2, ::2].copy(), right[::2, ::2].copy()))
+
+    def take(index: int) -> StereoPair:
+        pair = half.take(index)
+        raise CalibrationError(
+            "images have another size than the calibration",
+            where=pair.name,
+            got=f"{pair.left.shape[1]}x{pair.left.shape[0]}",
+        )
+
+    return replace(half, take=take)
+
+
+def silently_wrong_size(source: StereoSource) -> Spoiled:
+    """The same, with a calibration file that does not contain the image size."""
+    half = changed(source, lambda left, right: (left[::2, ::2].copy(), right[::2, ::2].copy()))
+    height, width = half.take(0).left.shape[:2]
+    return replace(half, camera=replace(rectified(half), width_px=width, height_px=height))
+
+
+def blur(right: np.ndarray) -> np.ndarray:
+    return np.asarray(cv2.GaussianBlur(right, (0, 0), 2.0))
+
+
+FAULTS: dict[str, tuple[str, Callable[[StereoSource], Spoiled]]] = {
+    "swapped": ("swapped", lambda s: changed(s, lambda left, right: (right, left))),
+    "lag of three frames": ("lag", lambda s: lag(s, 3)),
+    "rows 2 px down": ("rows", lambda s: row_shift(s, 2)),
+    "roll of 1 degree": ("rows", lambda s: turned(s, roll_deg=1.0)),
+    "gain of 1.4": ("gain", lambda s: gain(s, 1.4)),
+    "duplicated frames": ("duplicates", duplicated),
+    "baseline times ten": (
+        "baseline",
+        lambda s: replace(
+            changed(s, lambda left, right: (left, right)),
+            camera=replace(rectified(s), baseline_m=10 * rectified(s).baseline_m),
+        ),
+    ),
+    "right camera blurred": ("blur", lambda s: changed(s, lambda left, right: (left, blur(right)))),
+    "both cameras blurred": (
+        "blur",
+        lambda s: changed(s, lambda left, right: (blur(left), blur(right))),
+    ),
+    "right camera black": (
+        "black",
+        lambda s: changed(s, lambda left, right: (left, np.zeros_like(right))),
+    ),
+    "wrong size": ("size", wrong_size),
+    "wrong size untold": ("size", silently_wrong_size),
+}

@@ -1,0 +1,196 @@
+"""The audit finds each injected fault, and nothing in a drive without faults."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.commands.config import load_config
+from recon.core.values import StereoCalibration, StereoPair
+from recon.io.cameras.calibration import read_calibration
+from recon.rig.audit.run import mend_calibration, run_audit
+from recon.sources import StereoSource, open_source
+from recon.sources.synthetic import SyntheticSource
+from recon.street import StreetSettings
+from tests.rig.audit import faults
+from tests.sources import drives
+
+CONFIG = load_config()
+FRAMES = 10
+
+
+@pytest.fixture(scope="module")
+def street() -> faults.Spoiled:
+    """A rendered drive without a fault, kept in memory."""
+    size = StreetSettings(
+        seed=5, frames=FRAMES, width_px=400, height_px=136, focal_px=225.0, threads=1
+    )
+    source = SyntheticSource(size)
+    pairs: list[StereoPair] = list(source)
+    return faults.Spoiled(source.calibration, FRAMES, pairs.__getitem__)
+
+
+def codes(source: StereoSource, *, quick: bool = False) -> set[str]:
+    return {finding.code for finding in run_audit(source, CONFIG, quick=quick).findings}
+
+
+def test_a_clean_drive_is_good_and_its_figures_are_right(street: faults.Spoiled) -> None:
+    audit = run_audit(street, CONFIG)
+    assert (audit.verdict, audit.findings) == ("good", ())
+    assert audit.figures["gain"] == pytest.approx(1, abs=0.02)
+    assert audit.figures["row_error_rms_px"] < 0.1
+    # 1 m a frame, ten frames a second.
+    assert audit.figures["speed_m_per_s"] == pytest.approx(10, rel=0.05)
+    assert audit.figures["frames_read"] == FRAMES
+    assert run_audit(street, CONFIG, quick=True).verdict == "good"
+
+
+@pytest.mark.parametrize("fault", faults.FAULTS)
+def test_each_planted_fault_is_found_and_no_other(street: faults.Spoiled, fault: str) -> None:
+    code, plant = faults.FAULTS[fault]
+    audit = run_audit(plant(street), CONFIG)
+    assert [finding.code for finding in audit.findings] == [code]
+    assert audit.verdict != "good"
+    assert all("\n" not in finding.text for finding in audit.findings)
+
+
+@pytest.mark.parametrize("matcher", ["sad", "sgm"])
+def test_sgm_is_not_advised_to_those_who_use_it(street: faults.Spoiled, matcher: str) -> None:
+    config = load_config(None, [f"matching.matcher={matcher}"])
+    (finding,) = run_audit(faults.gain(street, 1.4), config).findings
+    assert ("match with sgm" in finding.text) == (matcher != "sgm")
+
+
+@pytest.mark.parametrize("fault", faults.FAULTS)
+def test_a_quick_look_finds_what_spoils_every_frame(street: faults.Spoiled, fault: str) -> None:
+    code, plant = faults.FAULTS[fault]
+    assert code in codes(plant(street), quick=True)
+
+
+@pytest.mark.parametrize("pitch_deg", [0.3, -0.3])
+def test_mending_brings_a_pitch_back_under_a_third_of_a_pixel(
+    street: faults.Spoiled, tmp_path: Path, pitch_deg: float
+) -> None:
+    assert_mended(faults.turned(street, pitch_deg=pitch_deg, roll_deg=0.2), tmp_path)
+
+
+def assert_mended(spoiled: faults.Spoiled, folder: Path) -> None:
+    before = run_audit(spoiled, CONFIG)
+    assert "rows" in {finding.code for finding in before.findings}
+    path = folder / "mended.yaml"
+    mend_calibration(spoiled, CONFIG, before, path)
+    height_px, width_px = spoiled.take(0).left.shape[:2]
+    mended = read_calibration(path, width_px, height_px)
+    assert isinstance(mended, StereoCalibration)
+    assert mended.baseline_m == pytest.approx(spoiled.camera.baseline_m, rel=1e-9)
+    after = run_audit(replace(spoiled, camera=mended), CONFIG)
+    assert "rows" not in {finding.code for finding in after.findings}
+    assert abs(after.figures["row_error_mean_px"]) < 0.3
+    assert after.figures["row_error_rms_px"] < 0.3
+    assert before.figures["row_error_rms_px"] > 5 * after.figures["row_error_rms_px"]
+    # Mending what is mended changes next to nothing.
+    assert abs(after.figures["mend_pitch_deg"]) < 0.02
+
+
+def test_a_rig_that_is_not_rectified_is_mended_too(street: faults.Spoiled, tmp_path: Path) -> None:
+    """Both raw cameras look elsewhere than the rectified ones; the right one is off by 0.3°."""
+    left_rad, right_rad = np.radians([[-0.8, 2.0, 0.6], [1.1, -1.5, -0.7]])
+    assert codes(faults.unrectified(street, left_rad, right_rad)) == set()
+    assert_mended(faults.unrectified(street, left_rad, right_rad, pitch_deg=0.3), tmp_path)
+
+
+def test_half_a_frame_of_skew_is_measured(street: faults.Spoiled) -> None:
+    """Pairs of a drive at half speed stand in: every other frame, the right one in between."""
+
+    def take(index: int) -> StereoPair:
+        return replace(street.take(2 * index), right=street.take(2 * index + 1).right)
+
+    audit = run_audit(faults.Spoiled(street.camera, FRAMES // 2, take), CONFIG)
+    assert audit.figures["time_skew_frames"] == pytest.approx(0.5, abs=0.1)
+    assert "skew" in {finding.code for finding in audit.findings}
+
+
+def test_a_frozen_camera_is_found(street: faults.Spoiled) -> None:
+    def take(index: int) -> StereoPair:
+        return replace(street.take(index), right=street.take(min(index, 4)).right)
+
+    findings = run_audit(replace(street, take=take), CONFIG).findings
+    frozen = next(finding for finding in findings if finding.code == "frozen")
+    assert frozen.fatal
+    assert "the right camera is frozen for 5 frames" in frozen.text
+
+
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize("drive", ["kitti_raw_0013", "kitti_06_51"])
+def test_nothing_is_found_on_real_drives(recon_data: Path, drive: str) -> None:
+    source = open_source(recon_data / "driven" / drive)
+    assert run_audit(source, CONFIG).findings == ()
+    assert run_audit(source, CONFIG, quick=True).findings == ()
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("scene", ["Motorcycle", "Piano", "Playroom", "Recycle", "Teddy"])
+def test_nothing_is_found_on_scenes_of_one_pair(recon_data: Path, scene: str) -> None:
+    source = open_source(recon_data / "middlebury/MiddEval3/trainingQ" / scene)
+    assert run_audit(source, CONFIG).findings == ()
+
+
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", faults.FAULTS)
+@pytest.mark.parametrize("drive", ["kitti_raw_0013", "kitti_06_51"])
+def test_each_planted_fault_is_found_on_real_drives(
+    recon_data: Path, drive: str, fault: str
+) -> None:
+    code, plant = faults.FAULTS[fault]
+    assert code in codes(plant(open_source(recon_data / "driven" / drive)))
+
+
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.parametrize("drive", ["kitti_raw_0013", "kitti_06_51"])
+def test_a_real_drive_is_mended(recon_data: Path, tmp_path: Path, drive: str) -> None:
+    source = open_source(recon_data / "driven" / drive)
+    assert_mended(faults.turned(source, pitch_deg=0.3), tmp_path)
+
+
+def test_a_source_of_one_pair_is_measured_too(street: faults.Spoiled) -> None:
+    audit = run_audit(replace(street, count=1), CONFIG)
+    assert audit.verdict == "good"
+    assert audit.figures["frames_read"] == 1
+    assert audit.figures["row_error_rms_px"] < 0.2
+
+
+def test_a_black_picture_now_and_then_is_no_black_camera(street: faults.Spoiled) -> None:
+    def take(index: int) -> StereoPair:
+        pair = street.take(index)
+        return replace(pair, right=np.zeros_like(pair.right)) if index == 4 else pair
+
+    assert "black" not in codes(replace(street, take=take))
+
+
+def test_frames_that_are_missing_are_told_with_the_place(
+    street: faults.Spoiled, tmp_path: Path
+) -> None:
+    pairs = [street.take(index) for index in (0, 1, 2, 3, 7, 8, 9)]
+    pairs = [replace(pair, index=k) for k, pair in enumerate(pairs)]
+    grey = [replace(p, left=p.left[:, :, 0], right=p.right[:, :, 0]) for p in pairs]
+    source = open_source(drives.write_kitti(grey, faults.rectified(street), tmp_path))
+    findings = {finding.code: finding.text for finding in run_audit(source, CONFIG).findings}
+    assert "missing at 1 places, at most 0.40 s after frame 3" in findings["gaps"]
+
+
+def test_noise_is_no_frozen_camera() -> None:
+    rng = np.random.default_rng(0)
+    scene = rng.integers(20, 200, (64, 96))
+    pairs = [
+        StereoPair(*(np.uint8(scene + rng.normal(0, 1, (2, 64, 96))).clip(0, 255)), 0.1 * k, k)
+        for k in range(8)
+    ]
+    camera = faults.RectifiedCamera(60.0, 47.5, 31.5, 47.5, 0.1, 96, 64)
+    found = codes(faults.Spoiled(camera, 8, pairs.__getitem__))
+    assert not found & {"frozen", "duplicates"}

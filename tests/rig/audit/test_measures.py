@@ -1,0 +1,191 @@
+"""The measures of an audit, each on data with a known answer."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recon.core.geometry.se3 import exp_so3
+from recon.core.values import RectifiedCamera
+from recon.rig.audit import (
+    AuditSettings,
+    Finding,
+    RepeatCounter,
+    align_rows,
+    count_aligned,
+    measure_gain,
+    measure_sharpness,
+    measure_speed,
+    measure_time_skew,
+    mend_rig,
+    verdict_of,
+)
+from recon.rig.audit.alignment import turn_features
+from recon.rig.audit.sample import plan_centres, plan_stretches
+
+CAMERA = RectifiedCamera(500.0, 319.5, 199.5, 330.5, 0.3, 640, 400)
+
+
+def features(
+    rng: np.random.Generator, pitch_rad: float, roll_rad: float, wrong: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Features of a right camera that is turned from where rows correspond; some are wrong."""
+    left = rng.uniform([20, 20], [620, 380], (400, 2))
+    right = left - np.column_stack([rng.uniform(2, 60, 400), np.zeros(400)])
+    right[:, 0] += CAMERA.doffs_px
+    centre = np.array([CAMERA.cx_right_px, CAMERA.cy_px])
+    rays = np.column_stack([(right - centre) / CAMERA.focal_px, np.ones(400)])
+    off = rays @ exp_so3(np.array([pitch_rad, 0.0, roll_rad]))
+    right = off[:, :2] / off[:, 2:] * CAMERA.focal_px + centre
+    right += rng.normal(0, 0.2, right.shape)
+    right[:wrong] = rng.uniform([0, 0], [640, 400], (wrong, 2))
+    return left.astype(np.float32), right.astype(np.float32)
+
+
+@settings(max_examples=30)
+@given(
+    pitch_deg=st.floats(-1.5, 1.5),
+    roll_deg=st.floats(-2, 2),
+    wrong=st.integers(0, 150),
+    seed=st.integers(0, 100),
+)
+def test_the_turn_that_mends_rows_is_found_among_wrong_matches(
+    pitch_deg: float, roll_deg: float, wrong: int, seed: int
+) -> None:
+    turn = np.radians([pitch_deg, roll_deg])
+    left, right = features(np.random.default_rng(seed), *turn, wrong)
+    alignment = align_rows(left, right, CAMERA)
+    assert alignment is not None
+    # 0.2 px of noise over hundreds of features: a hundredth of a pixel, or 0.002 degrees.
+    assert np.degrees(alignment.pitch_rad) == pytest.approx(pitch_deg, abs=0.02)
+    assert np.degrees(alignment.roll_rad) == pytest.approx(roll_deg, abs=0.02)
+    assert alignment.residual_px == pytest.approx(0.2, abs=0.06)
+    assert alignment.agreeing >= 400 - wrong - 4
+    assert count_aligned(left, right, CAMERA) >= 0.95 * (400 - wrong)
+
+
+def test_rows_that_correspond_have_no_error_but_noise() -> None:
+    left, right = features(np.random.default_rng(1), 0.0, 0.0)
+    alignment = align_rows(left, right, CAMERA)
+    assert alignment is not None
+    assert alignment.rms_px < 0.05  # the noise of 0.2 px is taken away
+    assert alignment.spread_px == pytest.approx(0.2, abs=0.03)
+
+
+def test_too_few_features_tell_no_rows() -> None:
+    left, right = features(np.random.default_rng(2), 0.0, 0.0)
+    assert align_rows(left[:11], right[:11], CAMERA) is None
+    assert count_aligned(left[:1], right[:1], CAMERA) == 0
+
+
+def test_a_mended_rig_projects_to_the_same_rows() -> None:
+    turn = np.radians([0.5, -0.8])
+    left, right = features(np.random.default_rng(3), *turn)
+    alignment = align_rows(left, right, CAMERA)
+    assert alignment is not None
+    rig = mend_rig(CAMERA, alignment, np.eye(3))
+    # Where the mended calibration says that a point lies is where the turned camera saw it.
+    xyz = np.array([[0.4, -0.3, 6.0], [-1.0, 0.8, 9.0], [2.0, 0.1, 20.0]])
+    seen = xyz @ rig.T_right_left[:3, :3].T + rig.T_right_left[:3, 3]
+    uv = (seen @ rig.right.matrix.T)[:, :2] / seen[:, 2:]
+    rows = turn_features(uv.astype(np.float32), CAMERA, turn)[:, 1]
+    expected = CAMERA.cy_px + CAMERA.focal_px * xyz[:, 1] / xyz[:, 2]
+    np.testing.assert_allclose(rows, expected, atol=0.1)
+    assert rig.baseline_m == pytest.approx(CAMERA.baseline_m)
+
+
+def texture(seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    boxes = np.full((300, 400), 90.0)
+    for _ in range(200):
+        x, y = rng.integers(0, 380), rng.integers(0, 280)
+        boxes[y : y + rng.integers(5, 60), x : x + rng.integers(5, 60)] = rng.uniform(30, 150)
+    return np.asarray(np.clip(boxes + rng.normal(0, 1, boxes.shape), 0, 255).astype(np.uint8))
+
+
+def test_sharpness_falls_with_blur_and_not_with_brightness() -> None:
+    image = texture()
+    sharp = measure_sharpness(image)
+    blurred = [measure_sharpness(cv2.GaussianBlur(image, (0, 0), s)) for s in (0.7, 1.2, 2.0, 3.0)]
+    assert sharp > blurred[0] > blurred[1] > blurred[2] > blurred[3]
+    dark = cv2.convertScaleAbs(image, alpha=0.5)
+    assert measure_sharpness(np.asarray(dark)) == pytest.approx(sharp, abs=0.03)
+    assert measure_sharpness(np.full((64, 64), 7, np.uint8)) == 0
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.0, 1.4, 1.8])
+def test_gain_is_measured_although_bright_surfaces_saturate(factor: float) -> None:
+    left = cv2.convertScaleAbs(texture(), alpha=1.4)  # up to 210: saturates beyond 1.2
+    right = cv2.convertScaleAbs(left, alpha=factor)
+    rng = np.random.default_rng(0)
+    uv = rng.uniform([10, 10], [390, 290], (500, 2)).astype(np.float32)
+    gains = measure_gain(np.asarray(left), np.asarray(right), uv, uv)
+    assert np.median(gains) == pytest.approx(factor, rel=0.02)
+
+
+def test_a_late_camera_is_measured_by_the_rows_that_move() -> None:
+    rng = np.random.default_rng(0)
+    flow = rng.uniform(-12, 12, 2000)
+    error = 0.4 * flow + rng.normal(0, 0.3, 2000)
+    error[:150] = rng.uniform(-10, 10, 150)
+    found = measure_time_skew(error, flow)
+    assert found is not None
+    assert found[0] == pytest.approx(0.4, abs=0.01)
+    assert abs(found[0] - 0.4) < 5 * found[1] < 0.02
+    assert measure_time_skew(error, 0.01 * flow) is None
+
+
+def test_speed_is_that_of_the_rig_and_scales_with_the_baseline() -> None:
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack(
+        [rng.uniform(-4, 4, 300), rng.uniform(-2, 2, 300), rng.uniform(5, 25, 300)]
+    )
+
+    def seen(points: np.ndarray, cx_px: float) -> np.ndarray:
+        uv = CAMERA.focal_px * points[:, :2] / points[:, 2:] + np.array([cx_px, CAMERA.cy_px])
+        return np.asarray(uv, dtype=np.float32)
+
+    left = seen(xyz, CAMERA.cx_px)
+    right = seen(xyz - np.array([CAMERA.baseline_m, 0, 0]), CAMERA.cx_right_px)
+    later = seen(xyz - np.array([0.1, 0.0, 1.2]), CAMERA.cx_px)
+    moved_m = measure_speed(left, right, later, CAMERA)
+    assert moved_m == pytest.approx(np.hypot(0.1, 1.2), rel=0.01)
+    assert measure_speed(left[:10], right[:10], later[:10], CAMERA) is None
+
+
+def test_repeats_are_counted_apart_from_frozen_cameras() -> None:
+    pictures = [texture(seed) for seed in range(8)]
+    counter = RepeatCounter()
+    for left, right in ((0, 0), (1, 0), (2, 0), (3, 0), (4, 4), (4, 4), (5, 5)):
+        counter.add(pictures[left], pictures[right])
+    assert (counter.steps, counter.both, counter.frozen) == (6, 1, [0, 3])
+    counter.restart()
+    counter.add(pictures[5], pictures[5])
+    assert counter.both == 1
+
+
+def test_the_verdict_is_that_of_the_worst_finding() -> None:
+    small, large = Finding("gain", False, "dark"), Finding("rows", True, "off")
+    assert verdict_of([]) == "good"
+    assert verdict_of([small]) == "usable"
+    assert verdict_of([small, large, small]) == "not usable"
+
+
+@given(frames=st.integers(1, 5000), quick=st.booleans())
+def test_what_is_looked_at_lies_within_the_drive(frames: int, quick: bool) -> None:
+    limits = AuditSettings()
+    stretches = plan_stretches(frames, limits, quick=quick)
+    assert stretches[0][0] >= 0
+    assert stretches[-1][1] <= frames
+    assert all(before[1] <= after[0] for before, after in pairwise(stretches))
+    assert sum(stop - start for start, stop in stretches) <= limits.frames
+    if quick:
+        assert stretches[-1][1] <= 300
+    centres = plan_centres(stretches, limits, quick=quick)
+    assert centres
+    assert all(any(start <= centre < stop for start, stop in stretches) for centre in centres)

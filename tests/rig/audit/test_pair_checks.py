@@ -1,0 +1,144 @@
+"""One pair: inputs that give no cloud, or one of the wrong scale, are reported."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.commands.config import PAIR_DEFAULTS, load_config
+from recon.commands.mesh import MeshOptions, run_mesh
+from recon.commands.pair import PairInput, PairOptions, PairRun, run_pair
+from recon.core.errors import FormatError, MappingError, MatchingError, SettingsError
+from recon.core.values import RectifiedCamera, StereoPair
+from recon.rig.audit.pair_checks import check_coverage
+
+CAMERA = RectifiedCamera(300.0, 160.0, 120.0, 160.0, 0.1, 320, 240)
+
+
+@pytest.fixture(scope="module")
+def pair() -> StereoPair:
+    """Blurred noise, 12 pixels further left in the right image."""
+    world = np.random.default_rng(3).integers(0, 256, (240, 340)).astype(np.uint8)
+    world = cv2.normalize(cv2.GaussianBlur(world, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX)
+    world = np.asarray(world, np.uint8)
+    return StereoPair(world[:, :320], world[:, 12:332], name="left.png")
+
+
+def run(
+    pair: StereoPair, out: Path, camera: RectifiedCamera = CAMERA, command: str = "disparity"
+) -> PairRun:
+    settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
+    return run_pair(PairInput(pair, camera), settings, PairOptions(command, out))
+
+
+def test_stages_that_take_long_are_told_when_they_begin(pair: StereoPair, tmp_path: Path) -> None:
+    told: list[str] = []
+    options = PairOptions("pair", tmp_path / "out", on_stage=told.append)
+    run_pair(PairInput(pair, CAMERA), load_config(None, ["mesh.max_depth=5"]), options)
+    assert told == ["match", "mesh"]  # there is no report to write
+
+
+def test_a_good_pair_is_not_warned_of(pair: StereoPair, tmp_path: Path) -> None:
+    assert run(pair, tmp_path / "out").warnings == ()
+
+
+def test_pictures_that_show_nothing_are_refused_and_leave_nothing(
+    pair: StereoPair, tmp_path: Path
+) -> None:
+    dark = replace(pair, right=np.zeros_like(pair.right))
+    with pytest.raises(MatchingError, match=r"^left\.png: no pixel .* right camera shows nothing"):
+        run(dark, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_pair_without_a_point_is_refused_with_its_depths(
+    pair: StereoPair, tmp_path: Path
+) -> None:
+    settings = load_config(None, ["cloud.max_range_m=1"], PAIR_DEFAULTS)
+    options = PairOptions("pair", tmp_path / "out")
+    # 300 px and 0.1 m at 12 px: 2.5 m.
+    with pytest.raises(MappingError, match=r"the cloud is empty .* at 2\.\d+ to 2\.5 m.* to 1 m"):
+        run_pair(PairInput(pair, CAMERA), settings, options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_same_picture_twice_is_refused_as_such(pair: StereoPair, tmp_path: Path) -> None:
+    with pytest.raises(MatchingError, match="left and right are the same picture"):
+        run(replace(pair, right=pair.left), tmp_path / "out")
+
+
+def test_pictures_of_two_things_are_said_to_be_hardly_a_pair(
+    pair: StereoPair, tmp_path: Path
+) -> None:
+    other = replace(pair, right=np.ascontiguousarray(pair.right[::-1]))
+    (said,) = run(other, tmp_path / "out").warnings
+    assert said.startswith("only ")
+    assert "same moment" in said
+
+
+@pytest.mark.parametrize(
+    ("camera", "word"),
+    [
+        (replace(CAMERA, baseline_m=100.0), "baseline is implausible: 100 m"),
+        (replace(CAMERA, cx_px=310.0, cx_right_px=310.0), "calibration is of another size"),
+    ],
+)
+def test_a_calibration_that_gives_a_cloud_of_wrong_size_is_warned_of(
+    pair: StereoPair, tmp_path: Path, camera: RectifiedCamera, word: str
+) -> None:
+    run_ = run(pair, tmp_path / "pair", camera, "pair")
+    assert any(word in line for line in run_.warnings)
+    assert run_.summary["warnings"] == list(run_.warnings)
+    # Nobody asked for depth here.
+    assert run(pair, tmp_path / "disparity", camera).warnings == ()
+
+
+def test_the_summary_says_how_much_of_the_cloud_the_mesh_covers(
+    pair: StereoPair, tmp_path: Path
+) -> None:
+    result = run(pair, tmp_path / "out", command="pair")
+    # One plane: all but a rim of two pixels.
+    assert 0.95 < result.summary["mesh_coverage"] <= 1
+    assert not [text for text in result.warnings if "mesh" in text]
+
+
+def test_a_mesh_that_leaves_out_much_of_the_cloud_is_warned_of() -> None:
+    assert check_coverage(0.8) == ()
+    (warning,) = check_coverage(0.003)
+    assert "covers 0.3 % of the cloud (points within 0.5 % of their depth)" in warning
+
+
+def test_the_run_of_a_pair_is_meshed_again_as_the_pair_was(
+    pair: StereoPair, tmp_path: Path
+) -> None:
+    settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
+    options = PairOptions("pair", tmp_path / "run", formats=("glb",))
+    first = run_pair(PairInput(pair, CAMERA), settings, options)
+    assert (tmp_path / "run" / "mesh" / "mesh.glb").is_file()
+    again = run_mesh(
+        tmp_path / "run", settings, MeshOptions(tmp_path / "again", formats=("glb", "obj"))
+    )
+    assert again["mesh_coverage"] == pytest.approx(first.summary["mesh_coverage"], abs=1e-3)
+    for name in ("mesh.ply", "mesh.glb"):
+        files = [tmp_path / run / "mesh" / name for run in ("run", "again")]
+        assert files[0].read_bytes() == files[1].read_bytes()
+    project = (tmp_path / "again" / "mesh" / "mesh.mlp").read_text()
+    assert "0 -1 0 0" in project  # camera axes, turned upright
+
+
+def test_a_pair_run_that_does_not_name_its_camera_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text('{"command": "pair"}')
+    (tmp_path / "summary.json").write_text('{"focal_px": null}')
+    with pytest.raises(FormatError, match="does not describe its camera"):
+        run_mesh(tmp_path, load_config(), MeshOptions(tmp_path / "out"))
+
+
+def test_an_unknown_format_is_refused_before_the_work(pair: StereoPair, tmp_path: Path) -> None:
+    options = PairOptions("pair", tmp_path / "run", formats=("fbx",))
+    with pytest.raises(SettingsError, match=r"--format: unknown mesh format .*fbx"):
+        run_pair(PairInput(pair, CAMERA), load_config(), options)
+    assert not (tmp_path / "run").exists()

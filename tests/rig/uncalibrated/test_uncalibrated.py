@@ -1,0 +1,241 @@
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.core.errors import CalibrationError
+from recon.core.geometry.projection import map_pixels
+from recon.core.geometry.se3 import exp_so3
+from recon.io.middlebury.scene import read_middlebury_scene
+from recon.rig.uncalibrated import UncalibratedSettings, rectify_pictures, rectify_uncalibrated
+from recon.stereo.rectify import PairFeatures, epipolar_lines, match_again, match_exactly, to_grey
+
+SIZE = (640, 480)
+K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+
+
+def scene(
+    baseline: tuple[float, float, float] = (-0.15, 0.01, 0.02),
+    turn: tuple[float, float, float] = (0.03, -0.05, 0.04),
+    sigma_px: float = 0.0,
+    *,
+    flat: bool = False,
+    count: int = 500,
+) -> PairFeatures:
+    """Points before two pinholes that are turned against each other."""
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform((-2, -1.5, 2), (2, 1.5, 8), (count, 3))
+    if flat:
+        xyz[:, 2] = 4 + 0.3 * xyz[:, 0]
+    left = xyz @ K.T
+    right = (xyz @ exp_so3(np.array(turn)).T + baseline) @ K.T
+    both = [p[:, :2] / p[:, 2:] + rng.normal(0, sigma_px, (count, 2)) for p in (left, right)]
+    seen = np.all([(p > 0).all(axis=1) & (p < SIZE).all(axis=1) for p in both], axis=0)
+    return PairFeatures(*(p[seen].astype(np.float32) for p in both))
+
+
+def corners_of(H: np.ndarray) -> np.ndarray:
+    return map_pixels(H, np.array([[0.0, 0], [639, 0], [639, 479], [0, 479]]))
+
+
+def test_exact_matches_come_onto_exact_rows() -> None:
+    found = rectify_uncalibrated(scene(), SIZE)
+    # float32 pixels.
+    assert np.abs(found.rows_px).max() < 0.01
+    assert len(found.features) == found.matches
+
+
+def test_with_noise_rows_are_off_by_no_more_than_noise() -> None:
+    found = rectify_uncalibrated(scene(sigma_px=0.3), SIZE)
+    truth = scene()
+    rows = (
+        map_pixels(found.H_left, truth.left_uv)[:, 1]
+        - map_pixels(found.H_right, truth.right_uv)[:, 1]
+    )
+    assert np.abs(rows).mean() < 0.1
+    # Rows of both images are noisy: mean |N(0, 0.3 sqrt 2)|.
+    assert found.held_out_px == pytest.approx(0.34, rel=0.3)
+
+
+def test_wrong_matches_do_no_harm() -> None:
+    good = scene(sigma_px=0.2)
+    rng = np.random.default_rng(1)
+    wrong = rng.permutation(len(good))[: len(good) // 4]
+    right = good.right_uv.copy()
+    right[wrong] = rng.uniform(0, SIZE, (len(wrong), 2))
+    found = rectify_uncalibrated(PairFeatures(good.left_uv, right), SIZE)
+    truth = scene()
+    rows = (
+        map_pixels(found.H_left, truth.left_uv)[:, 1]
+        - map_pixels(found.H_right, truth.right_uv)[:, 1]
+    )
+    assert np.abs(rows).mean() < 0.15
+
+
+def test_pictures_stay_upright_in_size_and_disparities_positive() -> None:
+    found = rectify_uncalibrated(scene(), SIZE)
+    for H in (found.H_left, found.H_right):
+        upper_left, upper_right, lower_right, lower_left = corners_of(H)
+        assert upper_left[0] < upper_right[0]
+        assert upper_left[1] < lower_left[1]
+        area = 0.5 * abs(
+            np.linalg.det(np.stack([lower_right - upper_left, upper_right - lower_left]))
+        )
+        assert area == pytest.approx(640 * 480, rel=0.25)
+    assert found.disparity_px[0] == pytest.approx(4.0, abs=0.5)
+    assert found.disparity_px[1] > 20
+
+
+def test_near_points_have_the_larger_disparity() -> None:
+    """Cameras that are only shifted: disparity orders points as depth does, to a slant."""
+    xyz = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 8), (400, 3))
+    left, right = (q @ K.T for q in (xyz, xyz + np.array([-0.2, 0.02, 0.0])))
+    features = PairFeatures(*((p[:, :2] / p[:, 2:]).astype(np.float32) for p in (left, right)))
+    found = rectify_uncalibrated(features, SIZE)
+    disparity = (
+        map_pixels(found.H_left, features.left_uv)[:, 0]
+        - map_pixels(found.H_right, features.right_uv)[:, 0]
+    )
+    assert np.corrcoef(disparity, 1 / xyz[:, 2])[0, 1] > 0.99
+
+
+def test_epipolar_lines_pass_through_the_partners() -> None:
+    features = scene()
+    found = rectify_uncalibrated(features, SIZE)
+    left, right = (uv[:5].astype(float) for uv in (features.left_uv, features.right_uv))
+    in_left, in_right = epipolar_lines(found.fundamental, left, right, SIZE)
+    for pixels, lines in ((left, in_left), (right, in_right)):
+        for pixel, line in zip(pixels, lines, strict=True):
+            inside = line[np.isfinite(line).all(axis=1)]
+            a, b = inside[0], inside[-1]
+            across = np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a)
+            assert abs((pixel - a) @ across) < 0.1
+
+
+def test_a_flat_scene_is_refused() -> None:
+    with pytest.raises(CalibrationError, match=r"scene is flat.*100 % of the matches"):
+        rectify_uncalibrated(scene(flat=True, sigma_px=0.1), SIZE)
+
+
+def test_a_camera_in_view_of_the_other_is_refused() -> None:
+    with pytest.raises(CalibrationError, match=r"sees the other camera.*side by side"):
+        rectify_uncalibrated(scene(baseline=(0.01, 0.0, -0.5), turn=(0, 0, 0)), SIZE)
+
+
+def test_too_few_matches_are_refused() -> None:
+    with pytest.raises(CalibrationError, match=r"too few matched features.*at least 40"):
+        rectify_uncalibrated(scene(count=30), SIZE)
+
+
+def test_matches_without_any_geometry_are_refused() -> None:
+    rng = np.random.default_rng(2)
+    left, right = rng.uniform(0, SIZE, (2, 300, 2)).astype(np.float32)
+    settings = UncalibratedSettings(min_features=60)
+    with pytest.raises(CalibrationError):
+        rectify_uncalibrated(PairFeatures(left, right), SIZE, settings)
+
+
+def test_exact_features_know_places_to_a_third_of_a_pixel_under_a_homography() -> None:
+    rng = np.random.default_rng(5)
+    picture = cv2.GaussianBlur(rng.integers(0, 256, (240, 320), dtype=np.uint8), (0, 0), 2.0)
+    picture = cv2.normalize(picture, None, 0, 255, cv2.NORM_MINMAX)
+    H = np.array([[1.05, 0.08, -9], [-0.05, 0.97, 6], [1e-4, -5e-5, 1]])
+    warped = cv2.warpPerspective(picture, H, (320, 240), flags=cv2.INTER_CUBIC)
+    found = match_exactly(picture, warped)
+    apart = np.linalg.norm(map_pixels(H, found.left_uv) - found.right_uv, axis=1)
+    assert len(found) > 100
+    assert np.median(apart) < 0.33
+
+
+def test_blank_pictures_have_no_features() -> None:
+    blank = np.full((100, 100), 90, np.uint8)
+    assert len(match_exactly(blank, blank)) == 0
+
+
+def picture_of(seed: int, size: tuple[int, int]) -> np.ndarray:
+    """A texture with detail of many sizes."""
+    rng, total = np.random.default_rng(seed), np.zeros(size[::-1])
+    for sigma in (1.0, 2.0, 4.0):
+        noise = cv2.GaussianBlur(rng.normal(size=size[::-1]), (0, 0), sigma)
+        total += noise / noise.std()
+    return np.clip(128 + 30 * total, 0, 255).astype(np.uint8)
+
+
+def planes_pair(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A rectified pair: three upright planes at different depths; and its disparity."""
+    width, height = size
+    disparity = np.zeros((height, width))
+    for n, values in enumerate(((30.0, 10.0), (14.0, 14.0), (6.0, 24.0))):
+        rows = slice(n * height // 3, (n + 1) * height // 3)
+        disparity[rows] = np.linspace(*values, width)[None]
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    right = picture_of(0, (width + 80, height))[:, 40:-40]
+    at = (u - disparity).astype(np.float32)
+    return cv2.remap(right, at, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), right, disparity
+
+
+def true_rows(found, A: np.ndarray, B: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+    """Row of each pixel less that of its true partner, after both warps and the rectification."""
+    v, u = np.nonzero(np.isfinite(disparity))
+    left = map_pixels(found.H_left @ A, np.stack([u, v], axis=1))
+    right = map_pixels(found.H_right @ B, np.stack([u - disparity[v, u], v], axis=1))
+    return np.asarray(left[:, 1] - right[:, 1])
+
+
+def shaken(size: tuple[int, int], reach: float, rng: np.random.Generator) -> np.ndarray:
+    """A homography that moves each corner by up to a share of the width."""
+    width, height = size
+    border = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    moved = border + rng.uniform(-reach, reach, (4, 2)) * width
+    return np.asarray(cv2.getPerspectiveTransform(border, moved.astype(np.float32)))
+
+
+@pytest.mark.parametrize("warp", ["none", "turned", "shifted", "weak", "strong"])
+def test_a_pair_under_known_homographies_comes_back_onto_rows(warp: str) -> None:
+    size, rng = (400, 300), np.random.default_rng(7)
+    left, right, disparity = planes_pair(size)
+    turn = np.vstack([cv2.getRotationMatrix2D((200, 150), 2.0, 1.0), [0, 0, 1]])
+    A, B = {
+        "none": (np.eye(3), np.eye(3)),
+        "turned": (np.eye(3), turn),
+        "shifted": (np.eye(3), np.array([[1.0, 0, 3], [0, 1, 9], [0, 0, 1]])),
+        "weak": (shaken(size, 0.02, rng), shaken(size, 0.02, rng)),
+        "strong": (shaken(size, 0.1, rng), shaken(size, 0.1, rng)),
+    }[warp]
+    seen = tuple(cv2.warpPerspective(p, H, size) for p, H in ((left, A), (right, B)))
+    found = rectify_pictures([seen], UncalibratedSettings(features=1500))
+    rows = true_rows(found, A, B, disparity)
+    assert np.abs(rows).mean() < 0.3
+
+
+def test_matches_of_pictures_made_alike_are_places_in_those_recorded() -> None:
+    size, rng = (320, 240), np.random.default_rng(7)
+    picture = picture_of(1, size)
+    A, B = shaken(size, 0.08, rng), shaken(size, 0.08, rng)
+    seen = [cv2.warpPerspective(picture, H, size) for H in (A, B)]
+    found = match_again(*seen, np.linalg.inv(A), np.linalg.inv(B), 800)
+    back = [map_pixels(np.linalg.inv(H), uv) for H, uv in ((A, found.left_uv), (B, found.right_uv))]
+    assert len(found) > 100
+    assert np.median(np.linalg.norm(back[0] - back[1], axis=1)) < 0.2
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("reach", [0.0, 0.06, 0.12])
+@pytest.mark.parametrize("name", ["Jadeplant", "Motorcycle", "Pipes", "Teddy"])
+def test_warped_middlebury_pairs_come_back_onto_rows_by_their_truth(
+    recon_data: Path, name: str, reach: float
+) -> None:
+    found = read_middlebury_scene(recon_data / "middlebury" / "MiddEval3" / "trainingQ" / name)
+    left, right = to_grey(found.pair.left), to_grey(found.pair.right)
+    size, rng = left.shape[::-1], np.random.default_rng(3)
+    A, B = shaken(size, reach, rng), shaken(size, reach, rng)
+    seen = tuple(cv2.warpPerspective(p, H, size) for p, H in ((left, A), (right, B)))
+    assert found.truth is not None
+    rows = true_rows(rectify_pictures([seen]), A, B, found.truth.values)
+    sys.stdout.write(f"{name} by {reach}: mean row error {np.abs(rows).mean():.3f} px\n")
+    # Motorcycle and Pipes are 0.3 px off as they are published.
+    assert np.abs(rows).mean() <= 0.7

@@ -1,0 +1,141 @@
+"""A memory limit is parsed, divided and enforced."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.commands.config import ReconConfig, load_config
+from recon.commands.map import MapOptions, run_map
+from recon.commands.resume import MapRequest, plan_map
+from recon.core.errors import MemoryLimitError, SettingsError
+from recon.core.geometry.se3 import make_transform
+from recon.core.values import PointCloud
+from recon.map import SubmapBuilder
+from recon.map.axes import AXES_MAP_WORLD
+from recon.map.drive_map import DriveMap
+from recon.map.submap_store import SubmapStore
+from recon.run import memory
+from recon.run.memory import MemorySettings, memory_overrides, parse_size_mb
+from recon.sources import open_source
+from recon.sources.synthetic import SyntheticSource
+from recon.street import StreetSettings
+from tests.scenery.kitti import write_kitti
+
+T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
+STREET = StreetSettings(
+    frames=12, width_px=256, height_px=96, focal_px=150.0, speed_m_per_frame=0.5
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "size_mb"),
+    [("2G", 2000), ("1.5 GB", 1500), ("1500M", 1500), ("800mb", 800), ("640", 640)],
+)
+def test_a_size_is_read_in_its_unit(text: str, size_mb: float) -> None:
+    assert parse_size_mb(text) == size_mb
+    assert load_config(None, memory_overrides(text)).memory.limit_mb == size_mb
+
+
+@pytest.mark.parametrize("text", ["", "2T", "-1G", "G", "0", "1e3M", "two"])
+def test_what_is_no_size_is_refused(text: str) -> None:
+    with pytest.raises(SettingsError, match="cannot read this size"):
+        memory_overrides(text)
+
+
+def test_without_a_limit_nothing_is_cut_and_nothing_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "peak_memory_mb", lambda: 1e9)
+    free = MemorySettings()
+    free.check("frame 0")
+    assert (free.submap_bytes, free.tile_bytes) == (None, None)
+
+
+def test_what_takes_more_than_the_limit_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    limited = MemorySettings(limit_mb=500)
+    monkeypatch.setattr(memory, "peak_memory_mb", lambda: 499.9)
+    limited.check("frame 7")
+    monkeypatch.setattr(memory, "peak_memory_mb", lambda: 512.0)
+    with pytest.raises(MemoryLimitError, match=r"^frame 7: .*got 512 MB.*at most 500 MB") as told:
+        limited.check("frame 7")
+    assert "\n" not in str(told.value)
+
+
+def _along_a_wall(config: ReconConfig) -> SubmapStore:
+    """Twelve frames along a wall, 1 m apart."""
+    rng = np.random.default_rng(1)
+    store = SubmapStore()
+    builder = SubmapBuilder(
+        config.submaps, config.fusion, config.occupancy, T_MAP_WORLD, config.memory.submap_bytes
+    )
+    for z in range(12):
+        xyz = np.stack(
+            [np.full(2000, 2.03), rng.uniform(-1, 1, 2000), rng.uniform(2, 9, 2000)], axis=1
+        ).astype(np.float32)
+        T = make_transform(np.eye(3), np.array([0.0, 0.0, float(z)]))
+        world = PointCloud(xyz + np.float32([0, 0, z]), frame="world")
+        builder.integrate(world, PointCloud(xyz), T)
+        if builder.full:
+            store.add(builder.close())
+    store.add(builder.close())
+    return store
+
+
+def test_a_limit_cuts_submaps_and_tiles_smaller_and_the_map_stays_the_same() -> None:
+    free, limited = load_config(None, []), load_config(None, ["memory.limit_mb=4"])
+    stores = [_along_a_wall(config) for config in (free, limited)]
+    assert len(stores[0]) == 1
+    assert len(stores[1]) > 3
+    maps = [
+        # The limit is that of a map alone here: the libraries of the test take more.
+        DriveMap(store, free.model_copy(update={"memory": _Unwatched(limit_mb=limit)}), T_MAP_WORLD)
+        for store, limit in zip(stores, (None, 4), strict=True)
+    ]
+    assert maps[1].cloud_tile_m < maps[0].cloud_tile_m
+    assert maps[1].occupancy_tile_cells < maps[0].occupancy_tile_cells
+    for name in ("cloud", "voxels"):
+        whole, cut = (getattr(drive_map, name)() for drive_map in maps)
+        assert len(whole) == len(cut) > 1000
+    whole, cut = (drive_map.cloud() for drive_map in maps)
+    order, other = np.lexsort(whole.xyz.T.round(3)), np.lexsort(cut.xyz.T.round(3))
+    # Sums of single precision in another order.
+    np.testing.assert_allclose(whole.xyz[order], cut.xyz[other], atol=2e-5)
+    whole_voxels, cut_voxels = (drive_map.voxels() for drive_map in maps)
+    order, other = np.lexsort(whole_voxels.keys.T), np.lexsort(cut_voxels.keys.T)
+    np.testing.assert_array_equal(whole_voxels.keys[order], cut_voxels.keys[other])
+    np.testing.assert_allclose(whole_voxels.log_odds[order], cut_voxels.log_odds[other], atol=1e-5)
+
+
+class _Unwatched(MemorySettings):
+    """Cuts as a limit does, and never stops."""
+
+    def check(self, where: str) -> None: ...
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("drive")
+    write_kitti(SyntheticSource(STREET), folder)
+    return folder
+
+
+def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    peaks = iter([400.0] * 6)
+    monkeypatch.setattr(memory, "peak_memory_mb", lambda: next(peaks, 600.0))
+    out = tmp_path / "run"
+    request = MapRequest(drive, mesh=False, out=out, memory_limit="500M")
+    overrides = ["checkpoints.every_frames=4", "submaps.length_m=4"]
+    request, config = plan_map(request, None, overrides)
+    options = MapOptions(out=out, mesh=False, arguments=request.arguments())
+    with pytest.raises(MemoryLimitError, match=r"got 600 MB.*--resume .* larger --memory-limit"):
+        run_map(open_source(drive), config, options)
+    resumed, config = plan_map(MapRequest(None, resume=out, memory_limit="700M"), None, [])
+    assert config.memory.limit_mb == 700
+    assert config.submaps.length_m == 4
+    assert resumed.source == drive
+    run = run_map(open_source(drive), config, MapOptions(out=out, mesh=False, resume=True))
+    assert run.summary["frames"] == STREET.frames
+    assert "limit_mb: 700" in (out / "config.yaml").read_text()

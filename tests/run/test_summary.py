@@ -1,0 +1,61 @@
+"""Summaries contain only valid JSON values, and list the lost frames."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+
+from recon.odometry import OdometryHealth
+from recon.odometry.health import health_warnings
+from recon.run.stopwatch import Stopwatch
+from recon.run.summary import cost, plain
+
+
+@dataclass(frozen=True)
+class Figures:
+    error: float
+    bad: dict[float, float]
+    lengths: tuple[float, ...]
+
+
+def test_plain_values_survive_json_and_nan_becomes_null() -> None:
+    figures = Figures(error=math.nan, bad={0.5: 1.25, 2.0: math.inf}, lengths=(50.0, 100.0))
+    expected = {"error": None, "bad": {"0.5": 1.25, "2.0": None}, "lengths": [50.0, 100.0]}
+    assert json.loads(json.dumps(plain(figures), allow_nan=False)) == expected
+
+
+def test_lost_frames_are_named_by_stretches() -> None:
+    good, lost = OdometryHealth(), OdometryHealth(ok=False, notes=("dark",))
+    lines = health_warnings([good, lost, lost, good, lost, *[good] * 30])
+    assert [line.split(":")[0] for line in lines] == ["frames 1-2", "frame 4"]
+    assert all("dark" in line for line in lines)
+
+
+def test_a_drive_with_many_lost_frames_is_called_what_it_is_first() -> None:
+    good, lost = OdometryHealth(), OdometryHealth(ok=False, notes=("dark",))
+    first, *others = health_warnings([good, *[lost] * 3, *[good] * 16])
+    assert first.startswith("PATH AND MAP ARE NOT TO BE TRUSTED")
+    assert "3 of 20 frames" in first
+    assert len(others) == 1
+
+
+def test_a_healthy_drive_has_no_warning() -> None:
+    assert health_warnings([OdometryHealth()] * 3) == []
+
+
+def test_cost_sums_the_parts_of_a_stage() -> None:
+    watch = Stopwatch()
+    for _ in range(2):
+        with watch.stage("match"):
+            pass
+    figures = cost(watch, 1.5)
+    assert figures["seconds"] == 1.5
+    assert list(figures["stages"]) == ["match"]
+    assert 10 < figures["peak_memory_mb"] < 100_000
+
+
+def test_what_is_wrong_with_frames_is_told_once() -> None:
+    good, warned = OdometryHealth(), OdometryHealth(warnings=("rows are off",))
+    lines = health_warnings([warned, good, warned, good])
+    assert lines == ["frames 0-2: rows are off"]

@@ -1,0 +1,167 @@
+"""Compiled, vectors do what their plain numpy does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numba import njit
+from numba.core.errors import TypingError
+
+from recon.stereo.kernels import lanes
+from recon.stereo.kernels.lanes import LANES
+from recon.stereo.kernels.squares import transpose
+
+KINDS = (np.uint8, np.uint16)
+
+
+@njit
+def add(a: Any, b: Any, out: Any) -> None:
+    lanes.store(out, 1, lanes.load(a, 2) + lanes.load(b, 0))
+
+
+@njit
+def subtract(a: Any, b: Any, out: Any) -> None:
+    lanes.store(out, 1, lanes.load(a, 2) - lanes.load(b, 0))
+
+
+@njit
+def compare(a: Any, b: Any, out: Any) -> None:
+    x, y = lanes.load(a, 2), lanes.load(b, 0)
+    lanes.store(out, 0, lanes.least(x, y))
+    lanes.store(out, LANES, lanes.where_equal(x, y, x, lanes.splat(a[0])))
+    lanes.store(out, 2 * LANES, lanes.distance(x, y))
+    lanes.store(out, 3 * LANES, lanes.where_less(x, y, y, x))
+
+
+@njit
+def resize(a: Any, b: Any, out: Any) -> None:
+    x = lanes.load(a, 2)
+    lanes.store(out, 0, lanes.fit(x, out))
+    lanes.store(out, LANES, lanes.fit(lanes.splat(a[0]), out))
+
+
+@njit
+def number(a: Any, b: Any, out: Any) -> None:
+    lanes.store(out, LANES, lanes.ramp(a[0]))
+
+
+@njit
+def compare_bytes(a: Any, b: Any, out: Any) -> None:
+    x, y = lanes.load(a, 2), lanes.load(b, 0)
+    lanes.store(out, 0, lanes.mean(x, y))
+    lanes.store(out, LANES, lanes.differing_bits(x, y))
+
+
+@njit
+def scale(a: Any, b: Any, out: Any) -> None:
+    product = lanes.load(a, 2) * lanes.load(b, 0)
+    lanes.store(out, 0, product)
+    lanes.store(out, LANES, product >> lanes.splat(np.uint16(3)))
+
+
+@njit
+def shorten(a: Any, b: Any, out: Any) -> None:
+    lanes.store(out, 2, lanes.narrow(lanes.load(a, 2)))
+
+
+@njit
+def move_rows(a: Any, b: Any, out: Any) -> None:
+    lanes.store_row(out, 2, 1, lanes.load_row(a, 1, 3))
+
+
+@njit
+def move_block(a: Any, b: Any, out: Any) -> None:
+    transpose(a, 1, 2, out, 2, 3)
+
+
+@njit
+def look_beside(a: Any, b: Any, out: Any) -> None:
+    x, y = lanes.load(a, 2), lanes.load(b, 0)
+    lanes.store(out, 0, lanes.put_before(x, y))
+    lanes.store(out, LANES, lanes.put_after(x, y))
+    lanes.store(out, 2 * LANES, lanes.spread_lowest(x))
+
+
+def assert_same(function: Callable[..., None], a: Any, b: Any, kind: Any) -> None:
+    compiled, plain = np.zeros((2, 5 * LANES), kind)
+    function(a, b, compiled)
+    getattr(function, "py_func", function)(a, b, plain)
+    np.testing.assert_array_equal(compiled, plain)
+
+
+def arrays(kind: Any) -> st.SearchStrategy[Any]:
+    # Few values make ties, the whole range makes overflows.
+    values = st.one_of(st.integers(0, 3), st.integers(0, int(np.iinfo(kind).max)))
+    return hnp.arrays(kind, LANES + 5, elements=values)
+
+
+@given(st.data())
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("function", [add, subtract, compare, look_beside])
+def test_vectors_of_one_kind_do_as_numpy_does(
+    function: Callable[..., None], kind: Any, data: st.DataObject
+) -> None:
+    assert_same(function, data.draw(arrays(kind)), data.draw(arrays(kind)), kind)
+
+
+@given(arrays(np.uint8))
+def test_bytes_are_widened_as_numpy_does(a: Any) -> None:
+    assert_same(resize, a, a, np.uint16)
+
+
+@given(arrays(np.uint8), arrays(np.uint8))
+def test_bytes_are_compared_as_numpy_does(a: Any, b: Any) -> None:
+    assert_same(compare_bytes, a, b, np.uint8)
+
+
+@given(arrays(np.uint16), arrays(np.uint16))
+def test_values_are_scaled_and_narrowed_as_numpy_does(a: Any, b: Any) -> None:
+    assert_same(scale, a, b, np.uint16)
+    assert_same(shorten, a, b, np.uint8)
+
+
+def test_means_are_rounded_up_and_bits_counted() -> None:
+    a, b = np.array([[0, 1, 255], [1, 1, 254]], np.uint8)
+    assert lanes.mean(a, b).tolist() == [1, 1, 255]
+    assert lanes.differing_bits(a, b).tolist() == [1, 0, 1]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rows_are_read_and_written_where_they_are(kind: Any) -> None:
+    a, out = np.arange(2 * (LANES + 5), dtype=kind).reshape(2, -1), np.zeros((3, LANES + 2), kind)
+    move_rows(a, a, out)
+    np.testing.assert_array_equal(out[2, 1:-1], a[1, 3 : 3 + LANES])
+    assert np.count_nonzero(out) == LANES
+
+
+def test_blocks_are_transposed_and_nothing_else_is_written() -> None:
+    a = np.random.default_rng(0).integers(1, 256, (LANES + 3, LANES + 7), dtype=np.uint8)
+    out = np.zeros((LANES + 4, LANES + 5), np.uint8)
+    move_block(a, a, out)
+    np.testing.assert_array_equal(out[2:-2, 3:-2], a[1:-2, 2:-5].T)
+    assert np.count_nonzero(out) == LANES**2
+
+
+def test_neighbours_of_the_ends_come_from_the_other_vector() -> None:
+    a, b = np.arange(LANES, dtype=np.uint8), np.arange(100, 100 + LANES, dtype=np.uint8)
+    assert lanes.put_before(a, b).tolist() == [99 + LANES, *range(LANES - 1)]
+    assert lanes.put_after(a, b).tolist() == [*range(1, LANES), 100]
+
+
+def test_rows_that_are_not_contiguous_are_refused_by_the_compiler() -> None:
+    if not hasattr(move_rows, "py_func"):
+        pytest.skip("the compiler is switched off")
+    a, out = np.zeros((2, 2 * LANES + 10), np.uint8), np.zeros((3, LANES + 2), np.uint8)
+    with pytest.raises(TypingError):
+        move_rows(a[:, ::2], a, out)
+
+
+@given(arrays(np.uint16))
+def test_numbers_follow_each_other_as_in_numpy(a: Any) -> None:
+    assert_same(number, a, a, np.uint16)

@@ -1,0 +1,223 @@
+"""The compiled checks equal their reference, and the codes are those of the values."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from recon.core.values import Reason
+from recon.stereo.kernels import refine
+from recon.stereo.kernels.minima import NO_COST, Minima
+from recon.stereo.kernels.refine import (
+    EQUIANGULAR,
+    PARABOLA,
+    REFINED_BYTES,
+    WRONG_PX,
+    Refined,
+    Rules,
+    refine_minima,
+    refined_in,
+    reject,
+)
+from recon.stereo.kernels.refine_reference import refine_minima_reference
+
+RULES = Rules(
+    ndisp=8,
+    minimum=0,
+    fit=EQUIANGULAR,
+    texture=0.0,
+    uniqueness=0,
+    left_right=1,
+    window_pixels=25,
+    sigma_floor_px=0.1,
+)
+
+
+def refine_all(minima: Minima, texture: np.ndarray, rules: Rules) -> Refined:
+    shape = minima.winner.shape
+    refined = refined_in(np.empty(REFINED_BYTES * minima.winner.size, np.uint8), *shape)
+    refine_minima(minima, texture, rules, 0, len(texture), refined)
+    return refined
+
+
+def one_pixel(costs: tuple[int, int, int, int]) -> Minima:
+    """A row of eight pixels whose candidate 3 won with ``costs``."""
+    return Minima(
+        winner=np.full((1, 8), 3, np.uint16),
+        costs=np.tile(np.array(costs, np.uint16)[:, None, None], (1, 1, 8)),
+        right_winner=np.full((1, 8), 3, np.uint16),
+    )
+
+
+def refine_one(minima: Minima, rules: Rules = RULES) -> tuple[float, float, float, int]:
+    refined = refine_all(minima, np.ones((1, 8), np.float32), rules)
+    value, confidence, sigma, reason = (part[0, 5].item() for part in refined)
+    return value, confidence, sigma, reason
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> tuple[Minima, np.ndarray, Rules]:
+    height, width = draw(st.tuples(st.integers(1, 4), st.integers(1, 9)))
+    ndisp, minimum = draw(st.integers(1, 9)), draw(st.integers(-4, 4))
+    x = np.arange(width)
+    low = np.clip(x - minimum - (width - 1), 0, ndisp)
+    high = np.clip(x - minimum, -1, ndisp - 1)
+    share = draw(hnp.arrays(np.float64, (height, width), elements=st.floats(0, 1)))
+    inside = np.rint(low + share * np.maximum(high - low, 0))
+    winner = np.where(low <= high, inside, ndisp)
+    cost = st.one_of(st.integers(0, 40), st.just(NO_COST))
+    costs = np.sort(draw(hnp.arrays(np.uint16, (4, height, width), elements=cost)), axis=0)
+    right = draw(hnp.arrays(np.uint16, (height, width), elements=st.integers(0, ndisp)))
+    grey = st.one_of(st.floats(0, 4, width=32), st.just(math.nan))
+    texture = draw(hnp.arrays(np.float32, (height, width), elements=grey))
+    rules = RULES._replace(
+        ndisp=ndisp,
+        minimum=minimum,
+        fit=draw(st.integers(0, 2)),
+        texture=draw(st.sampled_from([0.0, 2.0])),
+        uniqueness=draw(st.sampled_from([0, 15])),
+        left_right=draw(st.integers(-1, 1)),
+    )
+    return Minima(winner.astype(np.uint16), costs, right), texture, rules
+
+
+LEFT_RIGHT_OR_OCCLUDED = (
+    Minima(
+        winner=np.array([[2, 3]], np.uint16),
+        costs=np.zeros((4, 1, 2), np.uint16),
+        right_winner=np.zeros((1, 2), np.uint16),
+    ),
+    np.zeros((1, 2), np.float32),
+    RULES._replace(ndisp=3, minimum=-3, left_right=0, fit=0),
+)
+"""Once found by chance, where the kernel and its reference gave different reasons."""
+
+
+@given(cases())
+@example(LEFT_RIGHT_OR_OCCLUDED)
+def test_refinement_equals_its_reference(case: tuple[Minima, np.ndarray, Rules]) -> None:
+    found, expected = refine_all(*case), refine_minima_reference(*case)
+    np.testing.assert_array_equal(found.reason, expected.reason)
+    # The kernel computes in float32, its reference in float64. Costs are exact in both.
+    u = 2.0**-24
+    # An offset of 1 at most (two operations), added to a candidate below 13 (the third).
+    np.testing.assert_allclose(found.values, expected.values, rtol=0, atol=(2 + 13) * u)
+    # Odds: 5 operations for sigma, its cube 17, the margin's 2; half of these under the root, and
+    # 3 more. What odds are off by is so much of the confidence, or less; the quotient adds 2.
+    np.testing.assert_allclose(found.confidence, expected.confidence, rtol=0, atol=16 * u)
+    # The variance is off by so much of that of a wrong disparity, and by 12 operations of its own.
+    wrong = np.maximum(expected.sigma_px, WRONG_PX) ** 2
+    variance_off = 16 * u * wrong + 12 * u * expected.sigma_px**2
+    known = expected.reason == refine.VALID
+    sigma_off = np.abs(found.sigma_px - expected.sigma_px)[known]
+    bound = variance_off / (2 * expected.sigma_px) + 2 * u * expected.sigma_px
+    assert (sigma_off <= bound[known]).all()
+
+
+@given(cases())
+def test_results_lie_within_their_bounds(case: tuple[Minima, np.ndarray, Rules]) -> None:
+    minima, _, rules = case
+    refined = refine_all(*case)
+    kept = refined.reason == refine.VALID
+    np.testing.assert_array_equal(np.isfinite(refined.values), kept)
+    np.testing.assert_array_equal(np.isfinite(refined.sigma_px), kept)
+    assert (refined.confidence[~kept] == 0).all()
+    assert ((refined.confidence >= 0) & (refined.confidence <= 1)).all()
+    # The floor is float64 in the rules and float32 in the result.
+    assert (refined.sigma_px[kept] >= np.float32(rules.sigma_floor_px)).all()
+    assert (refined.sigma_px[kept] <= refine.SIGMA_LARGEST_PX).all()
+    whole = minima.winner[kept] + float(rules.minimum)
+    assert (np.abs(refined.values[kept] - whole) <= 0.5).all()
+
+
+def test_codes_are_those_of_the_values() -> None:
+    names = ("VALID", "LOW_TEXTURE", "AMBIGUOUS", "LEFT_RIGHT", "OCCLUDED", "OUT_OF_RANGE")
+    for name in (*names, "BORDER"):
+        assert getattr(refine, name) == Reason[name]
+
+
+def test_vertex_of_two_equal_slopes_is_found_exactly() -> None:
+    # Costs of |d - 3.25| · 40 + 10 at 2, 3 and 4.
+    value, _, _, reason = refine_one(one_pixel((20, 60, 40, 100)))
+    assert reason == Reason.VALID
+    assert value == 3.25
+
+
+def test_vertex_of_a_parabola_is_found_exactly() -> None:
+    # Costs of 16·(d - 3.25)² + 9 at 2, 3 and 4.
+    value, *_ = refine_one(one_pixel((10, 34, 18, 100)), RULES._replace(fit=PARABOLA))
+    assert value == 3.25
+
+
+@pytest.mark.parametrize(("claimant", "reason"), [(None, Reason.OCCLUDED), (4, Reason.LEFT_RIGHT)])
+def test_pixel_is_occluded_where_no_pixel_of_the_right_view_has_its_match(
+    claimant: int | None, reason: Reason
+) -> None:
+    minima = one_pixel((20, 60, 40, 100))
+    # Left pixel 5 looks at right pixel 2, which has its match elsewhere (2 + 6 = 8).
+    minima.right_winner[:] = 8
+    minima.right_winner[0, 2] = 6
+    if claimant is not None:
+        minima.right_winner[0, claimant] = 5 - claimant
+    assert refine_one(minima)[3] == reason
+
+
+def test_second_best_within_the_margin_is_ambiguous() -> None:
+    rules = RULES._replace(uniqueness=10)
+    assert refine_one(one_pixel((20, 60, 40, 22)), rules)[3] == Reason.AMBIGUOUS
+    assert refine_one(one_pixel((20, 60, 40, 23)), rules)[3] == Reason.VALID
+
+
+def test_confidence_grows_with_the_margin_and_is_zero_without_a_second_best() -> None:
+    close, far = (refine_one(one_pixel((20, 60, 40, n)))[1] for n in (30, 100))
+    assert 0 < close < far < 1
+    assert refine_one(one_pixel((20, 60, 40, NO_COST)))[1] == 0
+
+
+def test_confidence_is_the_odds_of_margin_and_noise() -> None:
+    _, confidence, _, _ = refine_one(one_pixel((20, 60, 40, 100)), RULES._replace(odds=3))
+    margin = (100 - 20) / (25 + 20)
+    # Slope 40, vertex 10, 25 pixels; the floor is 0.1.
+    noise_px = 0.5 * np.pi * 10 / (40 * 5)
+    sigma_px = np.hypot(0.1, noise_px)
+    # 1e-5: float32.
+    assert confidence / (1 - confidence) == pytest.approx(
+        3 * (margin / sigma_px**3) ** 0.5, rel=1e-5
+    )
+
+
+def test_sigma_is_that_of_right_and_wrong_together() -> None:
+    _, confidence, sigma_px, _ = refine_one(one_pixel((20, 60, 40, 100)))
+    right_px = np.hypot(0.1, 0.5 * np.pi * 10 / (40 * 5))
+    expected = confidence * right_px**2 + (1 - confidence) * refine.WRONG_PX**2
+    # 1e-5: float32.
+    assert sigma_px**2 == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize(("costs", "sigma_px"), [((20, 20, 20, 100), 2.0), ((0, 50, 50, 100), 0.1)])
+def test_sigma_is_the_limit_without_slope_and_the_floor_without_noise_or_doubt(
+    costs: tuple[int, int, int, int], sigma_px: float
+) -> None:
+    # 1e-4: with such odds the confidence is 1 to float32, and 1e-9 short of it.
+    sure = RULES._replace(odds=1e9)
+    assert refine_one(one_pixel(costs), sure)[2] == pytest.approx(sigma_px, abs=1e-4)
+
+
+def test_sigma_of_a_pixel_without_a_second_best_is_that_of_a_wrong_one() -> None:
+    assert refine_one(one_pixel((20, 60, 40, NO_COST)))[2] == refine.WRONG_PX
+
+
+def test_rejected_pixels_have_nothing_left_but_a_reason() -> None:
+    refined = refine_all(one_pixel((2, 6, 6, 20)), np.ones((1, 8), np.float32), RULES)
+    mask = np.arange(8)[None] >= 6
+    reject(mask, Reason.SPECKLE, refined)
+    np.testing.assert_array_equal(refined.reason == Reason.SPECKLE, mask)
+    assert np.isnan(refined.values[mask]).all()
+    assert np.isnan(refined.sigma_px[mask]).all()
+    assert (refined.confidence[mask] == 0).all()
+    assert np.isfinite(refined.values[0, 5])

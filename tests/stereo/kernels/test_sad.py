@@ -1,0 +1,154 @@
+"""The compiled search equals its twin, for any image, window and range."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
+
+from recon.stereo.kernels.half_windows import (
+    Search,
+    empty_scratch,
+    empty_views,
+    lay_out,
+    widest_block,
+)
+from recon.stereo.kernels.lanes import LANES
+from recon.stereo.kernels.minima import NO_COST, Minima, empty_minima
+from recon.stereo.kernels.sad import sad_minima
+from recon.stereo.kernels.sad_reference import sad_minima_reference
+from recon.stereo.kernels.tiles import Tiles, make_tiles
+
+Image = NDArray[np.uint8]
+
+
+def everything(shape: tuple[int, int], search: Search) -> Tiles:
+    return make_tiles(shape, (shape[0], widest_block(search, shape[1])), search.ndisp)
+
+
+def search_all(
+    left: Image, right: Image, search: Search, tiles: Tiles | None = None, strips: int = 1
+) -> Minima:
+    minima = empty_minima(*left.shape)
+    tiles = tiles or everything(left.shape, search)
+    views = empty_views(search, tiles.width, *left.shape)
+    lay_out(left, right, search, 0, views)
+    scratch = empty_scratch(search, tiles.width)
+    edges = np.linspace(0, len(left), strips + 1).astype(int)
+    for first, end in itertools.pairwise(edges):
+        sad_minima(views, search, tiles, int(first), int(end), scratch, minima)
+    return minima
+
+
+def assert_equal(found: Minima, expected: Minima) -> None:
+    for name in Minima._fields:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+
+
+@st.composite
+def pairs(
+    draw: st.DrawFn, rows: tuple[int, int] = (1, 9), columns: tuple[int, int] = (1, 13)
+) -> tuple[Image, Image]:
+    shape = draw(st.tuples(st.integers(*rows), st.integers(*columns)))
+    # Few grey levels make ties, many make overflows.
+    levels = draw(st.sampled_from([1, 3, 255]))
+    grey = hnp.arrays(np.uint8, shape, elements=st.integers(0, levels))
+    return draw(grey), draw(grey)
+
+
+searches = st.builds(
+    Search,
+    ndisp=st.integers(1, 18),
+    minimum=st.integers(-16, 16),
+    radius=st.integers(0, 4),
+    rows_radius=st.integers(0, 4),
+    cost_cap=st.sampled_from([1, 20, 255]),
+    lean=st.integers(-2, 2),
+)
+
+
+@given(pairs(), searches)
+def test_search_equals_its_twin(pair: tuple[Image, Image], search: Search) -> None:
+    tiles = everything(pair[0].shape, search)
+    assert_equal(search_all(*pair, search), sad_minima_reference(*pair, search, tiles))
+
+
+@st.composite
+def tilings(draw: st.DrawFn, shape: tuple[int, int], search: Search) -> Tiles:
+    height = draw(st.integers(max(search.rows_radius, 1), 9))
+    size = (height, draw(st.integers(1, 40)))
+    tiles = make_tiles(shape, size, search.ndisp)
+    return tiles._replace(offered=draw(hnp.arrays(np.bool_, tiles.offered.shape)))
+
+
+@given(st.data(), pairs((1, 14), (1, 40)), searches, st.integers(1, 3))
+def test_what_is_not_offered_is_as_if_it_did_not_exist(
+    data: st.DataObject, pair: tuple[Image, Image], search: Search, strips: int
+) -> None:
+    search = search._replace(ndisp=data.draw(st.integers(1, 28)))
+    tiles = data.draw(tilings(pair[0].shape, search))
+    found = search_all(*pair, search, tiles, min(strips, len(pair[0])))
+    assert_equal(found, sad_minima_reference(*pair, search, tiles))
+
+
+@given(pairs(), searches, st.integers(2, 4))
+def test_strips_do_not_change_the_result(
+    pair: tuple[Image, Image], search: Search, strips: int
+) -> None:
+    assert_equal(search_all(*pair, search, None, strips), search_all(*pair, search))
+
+
+@pytest.mark.parametrize("lean", [0, 1, -2])
+@pytest.mark.parametrize(("ndisp", "minimum"), [(64, 0), (65, -40), (33, 20), (100, 60)])
+def test_wide_pictures_are_searched_in_vectors(ndisp: int, minimum: int, lean: int) -> None:
+    rng = np.random.default_rng(ndisp + lean)
+    # Few grey levels, so that vectors and runs have equal costs to decide between.
+    left, right = rng.integers(0, 4, (2, 5, 3 * LANES + 35), dtype=np.uint8)
+    search = Search(ndisp, minimum, 2, 1, cost_cap=2, lean=lean)
+    assert ndisp + 2 * abs(lean) > LANES
+    tiles = everything(left.shape, search)
+    expected = sad_minima_reference(left, right, search, tiles)
+    assert_equal(search_all(left, right, search), expected)
+
+
+@given(pairs(), searches, st.integers(1, 12))
+def test_blocks_do_not_change_the_result(
+    pair: tuple[Image, Image], search: Search, block: int
+) -> None:
+    shape = pair[0].shape
+    narrow = make_tiles(shape, (shape[0], block), search.ndisp)
+    assert_equal(search_all(*pair, search, narrow), search_all(*pair, search))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
+def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
+    grey = np.zeros(shape, np.uint8)
+    search = Search(ndisp=4, minimum=0, radius=3, rows_radius=3, cost_cap=31, lean=0)
+    minima = search_all(grey, grey, search)
+    assert_equal(minima, sad_minima_reference(grey, grey, search, everything(shape, search)))
+    assert (minima.winner == 0).all()
+
+
+# One row: the sums over a column fit into bytes, those over two do not.
+@pytest.mark.parametrize(("radius", "rows_radius"), [(7, 7), (1, 0), (4, 0)])
+def test_largest_costs_do_not_overflow(radius: int, rows_radius: int) -> None:
+    left, right = np.full((40, 40), 255, np.uint8), np.zeros((40, 40), np.uint8)
+    search = Search(3, 0, radius, rows_radius, cost_cap=255, lean=0)
+    costs = search_all(left, right, search).costs[0]
+    assert (costs == (2 * radius + 1) * 2 * (rows_radius + 1) * 255).all()
+    assert costs.max() < NO_COST
+
+
+def test_pixels_without_a_candidate_have_no_winner() -> None:
+    grey = np.zeros((2, 8), np.uint8)
+    search = Search(ndisp=3, minimum=5, radius=1, rows_radius=1, cost_cap=31, lean=0)
+    minima = search_all(grey, grey, search)
+    # Disparity 5 needs a right pixel at x - 5.
+    assert (minima.winner[:, :5] == 3).all()
+    assert (minima.winner[:, 5:] == 0).all()
+    assert (minima.costs[:, :, :5] == NO_COST).all()

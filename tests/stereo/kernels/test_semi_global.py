@@ -1,0 +1,183 @@
+"""The compiled semi-global search equals its twin, for any image, window and range."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
+
+from recon.stereo.kernels.census import Descriptor
+from recon.stereo.kernels.minima import Minima, empty_minima
+from recon.stereo.kernels.path_costs import (
+    Views,
+    Window,
+    column_offsets,
+    empty_planes,
+    scaled_window,
+    write_views,
+)
+from recon.stereo.kernels.path_rows import Paths
+from recon.stereo.kernels.semi_global import (
+    ROWS,
+    Scratch,
+    bands_of,
+    empty_scratch,
+    scratch_bytes,
+    semi_global_minima,
+)
+from recon.stereo.kernels.semi_global_reference import semi_global_minima_reference
+
+Image = NDArray[np.uint8]
+
+
+def make_views(left: Image, right: Image, window: Window, paths: Paths) -> Views:
+    descriptor = Descriptor(127, 1, 2)
+    views = Views(left, *empty_planes(*left.shape, descriptor.planes, window.radius, paths.ndisp))
+    offsets = column_offsets(window, paths.ndisp, paths.minimum)
+    write_views(right, descriptor, offsets, range(len(left)), views)
+    return views
+
+
+def search(
+    views: Views, window: Window, paths: Paths, strips: int = 1, columns: int | None = None
+) -> Minima:
+    minima = empty_minima(*views.grey.shape)
+    edges = np.linspace(0, len(views.grey), strips + 1).astype(int).tolist()
+    for first, end in itertools.pairwise(edges):
+        scratch = empty_scratch(views.grey.shape[1], paths)
+        if columns:
+            scratch = Scratch(np.zeros(scratch_bytes(columns, paths), np.uint8), columns)
+        semi_global_minima(views, window, paths, range(first, end), scratch, minima)
+    return minima
+
+
+def assert_equal(found: Minima, expected: Minima) -> None:
+    for name in Minima._fields:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+
+
+@st.composite
+def pairs(draw: st.DrawFn) -> tuple[Image, Image]:
+    shape = draw(st.tuples(st.integers(1, 7), st.integers(1, 9)))
+    # Few grey levels make ties, many make overflows.
+    levels = draw(st.sampled_from([1, 3, 255]))
+    grey = hnp.arrays(np.uint8, shape, elements=st.integers(0, levels))
+    return draw(grey), draw(grey)
+
+
+@st.composite
+def windows(draw: st.DrawFn) -> tuple[Window, Paths]:
+    radius, rows_radius, cap = draw(
+        st.tuples(st.integers(0, 3), st.integers(0, 3), st.sampled_from([0, 16, 120]))
+    )
+    small, more = draw(st.tuples(st.integers(1, 40), st.integers(0, 80)))
+    # The largest that a path cost leaves: cost + small + large <= 254.
+    top = 254 - 2 * small - more
+    window = scaled_window(radius, rows_radius, cap, cap + 14, top / (cap + 14))
+    paths = Paths(
+        ndisp=draw(st.sampled_from([1, 2, 3, 4, 5, 17, 70, 260])),
+        minimum=draw(st.integers(-6, 6)),
+        small=small,
+        large=small + more,
+        large_at_edge=small,
+        edge=draw(st.sampled_from([0, 12, 255])),
+        overlap=100,
+        side_overlap=100,
+    )
+    return window, paths
+
+
+@settings(max_examples=60)
+@given(pairs(), windows())
+def test_search_equals_its_twin(pair: tuple[Image, Image], rules: tuple[Window, Paths]) -> None:
+    window, paths = rules
+    views = make_views(*pair, window, paths)
+    expected = semi_global_minima_reference(views, window, paths)
+    assert_equal(search(views, window, paths), expected)
+
+
+@settings(max_examples=30)
+@given(pairs(), windows(), st.integers(2, 4))
+def test_strips_that_overlap_wholly_do_not_change_the_result(
+    pair: tuple[Image, Image], rules: tuple[Window, Paths], strips: int
+) -> None:
+    window, paths = rules
+    views = make_views(*pair, window, paths)
+    assert_equal(search(views, window, paths, strips), search(views, window, paths))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
+def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
+    grey = np.zeros(shape, np.uint8)
+    paths, window = (
+        Paths(4, 0, 10, 50, 20, 12, overlap=4, side_overlap=4),
+        scaled_window(2, 2, 16, 30, 3.0),
+    )
+    minima = search(make_views(grey, grey, window, paths), window, paths)
+    assert (minima.winner == 0).all()
+    assert (minima.right_winner == 0).all()
+
+
+def test_few_rows_of_overlap_change_little() -> None:
+    rng = np.random.default_rng(0)
+    left = rng.integers(0, 256, (80, 60), dtype=np.uint8)
+    right = np.roll(left, -5, axis=1)
+    paths, window = (
+        Paths(16, 0, 10, 50, 20, 12, overlap=8, side_overlap=8),
+        scaled_window(1, 1, 16, 30, 3.0),
+    )
+    views = make_views(left, right, window, paths)
+    whole, strips = search(views, window, paths), search(views, window, paths, strips=4)
+    assert (whole.winner == strips.winner).mean() > 0.99
+
+
+@pytest.mark.parametrize("shape", [(3 * ROWS + 5, 70), (2 * ROWS, 64)])
+@pytest.mark.parametrize("overlap", [4 * ROWS, 2 * ROWS + 1])
+def test_a_picture_of_several_blocks_equals_the_twin(shape: tuple[int, int], overlap: int) -> None:
+    """Paths from above go on from block to block; those from below reach through all below."""
+    rng = np.random.default_rng(1)
+    left, right = rng.integers(0, 256, (2, *shape), dtype=np.uint8)
+    paths = Paths(9, -2, 10, 50, 20, 12, overlap=max(overlap, shape[0]), side_overlap=70)
+    window = scaled_window(1, 2, 16, 30, 3.0)
+    views = make_views(left, right, window, paths)
+    expected = semi_global_minima_reference(views, window, paths)
+    assert_equal(search(views, window, paths, strips=2), expected)
+
+
+@pytest.mark.parametrize("minimum", [-70, 0, 3])
+@pytest.mark.parametrize("side_overlap", [0, 9])
+def test_bands_equal_the_twin_that_begins_paths_at_their_sides(
+    minimum: int, side_overlap: int
+) -> None:
+    """The right view is put together from all bands."""
+    rng = np.random.default_rng(2)
+    left, right = rng.integers(0, 256, (2, 9, 300), dtype=np.uint8)
+    right[:, :200] = left[:, 20:220]
+    paths = Paths(70, minimum, 10, 50, 20, 12, overlap=9, side_overlap=side_overlap)
+    window = scaled_window(2, 2, 16, 30, 3.0)
+    views = make_views(left, right, window, paths)
+    for strips, columns in ((1, 64), (2, 128)):
+        bands = bands_of(300, columns, window, paths)
+        expected = semi_global_minima_reference(views, window, paths, bands)
+        assert len(bands) > 1
+        assert_equal(search(views, window, paths, strips, columns), expected)
+
+
+@given(st.integers(0, 15), st.integers(0, 15), st.integers(1, 207), st.floats(0.05, 6.0))
+def test_a_scaled_window_stays_within_its_widths(
+    radius: int, rows_radius: int, largest: int, levels: float
+) -> None:
+    levels = min(levels, 250 / largest)
+    window = scaled_window(radius, rows_radius, 14, largest, levels)
+    across = ((2 * radius + 1) * largest) >> window.row_shift
+    most = across * (2 * rows_radius + 1)
+    assert across <= 255
+    assert most * window.factor <= 65535
+    assert most * window.factor >> window.shift == window.top <= 250
+    # What is said of the scale is what the largest cost becomes, but for bits that were cut.
+    assert window.levels * largest == pytest.approx(window.top, rel=0.1, abs=1.5)

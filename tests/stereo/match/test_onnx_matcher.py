@@ -1,0 +1,160 @@
+"""The ONNX matcher with a tiny network built in the test."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.core import optional
+from recon.core.errors import FormatError, MatchingError, MissingDependencyError, SettingsError
+from recon.core.values import Disparity, Reason, RectifiedPair
+from recon.io.middlebury.scene import stand_in_camera
+from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
+
+onnx = pytest.importorskip("onnx", reason="the package onnx builds the network: pip install onnx")
+pytest.importorskip("onnxruntime", reason="extra onnx: pip install 'recon[onnx]'")
+
+
+def write_network(
+    path: Path,
+    inputs: list[str],
+    nodes: list[tuple[list[str], str, str]],
+    shape: tuple[int | None, ...] = (1, 1, None, None),
+) -> Path:
+    """A network of simple nodes, (inputs, output, operator), with inputs of a declared shape."""
+    helper, number = onnx.helper, onnx.TensorProto.FLOAT
+    graph = helper.make_graph(
+        [helper.make_node(kind, given, [made]) for given, made, kind in nodes],
+        "tiny",
+        [helper.make_tensor_value_info(name, number, shape) for name in inputs],
+        [helper.make_tensor_value_info(nodes[-1][1], number, None)],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    onnx.save(model, str(path))
+    return path
+
+
+@pytest.fixture
+def difference(tmp_path: Path) -> Path:
+    """Gives ``left - right``: a "disparity" that a test can predict."""
+    return write_network(
+        tmp_path / "net.onnx", ["left", "right"], [(["left", "right"], "d", "Sub")]
+    )
+
+
+def pair_of(left: int, right: int, shape: tuple[int, int] = (40, 60)) -> RectifiedPair:
+    images = (np.full(shape, level, np.uint8) for level in (left, right))
+    return RectifiedPair(*images, stand_in_camera(shape[1], shape[0]))
+
+
+def match(model: Path, pair: RectifiedPair, **settings: object) -> Disparity:
+    return OnnxMatcher(OnnxSettings(model=model, **settings), threads=1).match(pair)
+
+
+def test_the_network_decides_the_disparity(difference: Path) -> None:
+    disparity = match(difference, pair_of(30, 10), std=(1 / 255,))
+    assert disparity.values.shape == (40, 60)
+    assert np.nanmin(disparity.values) == pytest.approx(20, abs=1e-3)
+    assert np.nanmax(disparity.values) == pytest.approx(20, abs=1e-3)
+    # Left of column 20 the match lies beside the right image.
+    assert (disparity.reason[:, :19] == Reason.BORDER).all()
+    assert disparity.valid[:, 21:].all()
+
+
+def test_mean_and_scale_are_what_the_settings_say(difference: Path) -> None:
+    settings = {"mean": (0.2,), "std": (0.5 / 255,), "output_scale": -1.0}
+    disparity = match(difference, pair_of(10, 15), **settings)
+    assert np.nanmedian(disparity.values) == pytest.approx(10, abs=1e-3)
+
+
+def test_a_network_of_another_size_gives_disparities_in_pixels_of_the_picture(
+    difference: Path,
+) -> None:
+    fixed = {"std": (1 / 255,), "width_px": 30, "height_px": 20}
+    # 8 pixels of an image half as wide are 16 of the image.
+    assert np.nanmedian(match(difference, pair_of(18, 10), **fixed).values) == pytest.approx(16)
+
+
+def test_one_stacked_input_is_fed_where_the_network_has_one(tmp_path: Path) -> None:
+    nodes = [(["both"], "d", "ReduceMean")]
+    path = write_network(tmp_path / "one.onnx", ["both"], nodes, (1, None, None, None))
+    model = onnx.load(str(path))
+    model.graph.node[0].attribute.extend(
+        [onnx.helper.make_attribute("axes", [1]), onnx.helper.make_attribute("keepdims", 1)]
+    )
+    onnx.save(model, str(path))
+    disparity = match(path, pair_of(4, 8), std=(1 / 255,))
+    assert np.nanmedian(disparity.values) == pytest.approx(6, abs=1e-3)
+
+
+def test_what_is_not_finite_is_no_match(tmp_path: Path) -> None:
+    path = write_network(tmp_path / "log.onnx", ["left", "right"], [
+        (["left", "right"], "x", "Sub"), (["x"], "d", "Log"),
+    ])  # fmt: skip
+    disparity = match(path, pair_of(10, 30))
+    assert (disparity.reason == Reason.AMBIGUOUS).all()
+
+
+def test_the_size_and_the_channels_that_a_network_declares_are_kept(tmp_path: Path) -> None:
+    nodes = [(["left", "right"], "x", "Sub"), (["x"], "d", "ReduceMean")]
+    path = write_network(tmp_path / "fixed.onnx", ["left", "right"], nodes, (1, 3, 20, 30))
+    model = onnx.load(str(path))
+    model.graph.node[1].attribute.extend(
+        [onnx.helper.make_attribute("axes", [1]), onnx.helper.make_attribute("keepdims", 1)]
+    )
+    onnx.save(model, str(path))
+    disparity = match(path, pair_of(18, 10), mean=(0.1, 0.1, 0.1), std=(1 / 255,))
+    # 8 pixels of an image half as wide are 16 of the image.
+    assert np.nanmedian(disparity.values) == pytest.approx(16)
+
+
+def test_a_network_that_gives_no_map_or_takes_other_inputs_is_refused(
+    difference: Path, tmp_path: Path
+) -> None:
+    colours = write_network(
+        tmp_path / "colours.onnx",
+        ["left", "right"],
+        [(["left", "right"], "d", "Sub")],
+        (1, 3, None, None),
+    )
+    with pytest.raises(MatchingError, match="not a disparity map"):
+        match(colours, pair_of(1, 2))
+    three = write_network(tmp_path / "three.onnx", ["a", "b", "c"], [(["a", "b", "c"], "d", "Sum")])
+    with pytest.raises(MatchingError, match="number of inputs"):
+        match(three, pair_of(1, 2))
+    with pytest.raises(MatchingError, match="no such output"):
+        match(difference, pair_of(1, 2), output=3)
+    with pytest.raises(SettingsError, match="more numbers than the network has channels"):
+        match(difference, pair_of(1, 2), mean=(0.1, 0.2, 0.3))
+
+
+def test_a_file_that_is_no_network_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "bad.onnx").write_bytes(b"no network")
+    with pytest.raises(FormatError, match=r"bad\.onnx"):
+        match(tmp_path / "bad.onnx", pair_of(1, 2))
+    with pytest.raises(FormatError, match="does not exist"):
+        match(tmp_path / "none.onnx", pair_of(1, 2))
+
+
+def test_without_a_network_the_setting_is_named() -> None:
+    with pytest.raises(SettingsError, match=r"matching\.onnx\.model"):
+        OnnxMatcher(OnnxSettings()).match(pair_of(1, 2))
+
+
+def test_settings_that_contradict_each_other_are_refused() -> None:
+    for values in ({"width_px": 8}, {"mean": (0.1, 0.2)}, {"std": (0.0,)}):
+        with pytest.raises(SettingsError):
+            OnnxSettings.parse(values)
+
+
+def test_without_the_extra_the_pip_line_is_told(
+    difference: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def absent(name: str) -> None:
+        raise ModuleNotFoundError(name)
+
+    monkeypatch.setattr(optional, "import_module", absent)
+    with pytest.raises(MissingDependencyError, match=r"recon\[onnx\]"):
+        match(difference, pair_of(1, 2))

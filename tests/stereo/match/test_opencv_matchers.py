@@ -1,0 +1,120 @@
+"""OpenCV's matchers as baselines: conventions converted, and the same search range as ours."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.core.errors import MatchingError, SettingsError
+from recon.core.values import Disparity, Reason, RectifiedPair
+from recon.io.middlebury.scene import stand_in_camera
+from recon.stereo.match.opencv import (
+    OpencvBmMatcher,
+    OpencvBmSettings,
+    OpencvSgbmMatcher,
+    OpencvSgbmSettings,
+)
+
+NAMES = ("opencv-bm", "opencv-sgbm")
+SETTINGS = {"opencv-bm": OpencvBmSettings, "opencv-sgbm": OpencvSgbmSettings}
+MATCHERS = {"opencv-bm": OpencvBmMatcher, "opencv-sgbm": OpencvSgbmMatcher}
+
+
+def shifted_pair(shift_px: int, shape: tuple[int, int] = (60, 160)) -> RectifiedPair:
+    """Noise, seen by the right camera ``shift_px`` further left."""
+    height, width = shape
+    world = np.random.default_rng(3).integers(0, 256, (height, width + 64), dtype=np.uint8)
+    world = cv2.GaussianBlur(world, (3, 3), 0)
+    left, right = world[:, 32 : 32 + width], world[:, 32 + shift_px : 32 + shift_px + width]
+    return RectifiedPair(left, right, stand_in_camera(width, height, 32))
+
+
+def match(name: str, pair: RectifiedPair, *, pad: bool = True, **settings: object) -> Disparity:
+    return MATCHERS[name](SETTINGS[name](pad=pad, **settings)).match(pair)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("shift_px", [0, 7, 20])
+def test_a_shift_is_found_in_pixels_wherever_the_right_picture_reaches(
+    name: str, shift_px: int
+) -> None:
+    disparity = match(name, shifted_pair(shift_px))
+    found = disparity.values[5:-5, shift_px + 5 : -5]
+    # A 16th is OpenCV's step; ten of them allow for the bias of its sub-pixel fit.
+    assert np.nanmax(np.abs(found - shift_px)) < 10 / 16
+    assert np.isfinite(found).mean() > 0.95
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_without_padding_a_strip_as_wide_as_the_range_is_unknown(name: str) -> None:
+    assert not SETTINGS[name]().pad  # the baseline is OpenCV as it comes
+    assert np.isnan(match(name, shifted_pair(7), pad=False).values[:, :31]).all()
+    assert np.isfinite(match(name, shifted_pair(7)).values[5:-5, 12:31]).mean() > 0.95
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_negative_range_finds_negative_disparities(name: str) -> None:
+    disparity = match(name, shifted_pair(-6), min_disparity_px=-16)
+    assert np.nanmedian(disparity.values) == pytest.approx(-6, abs=0.1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_opencv_could_not_match_is_nan_with_a_reason(name: str) -> None:
+    rng = np.random.default_rng(5)
+    left, right = (rng.integers(0, 256, (60, 160), dtype=np.uint8) for _ in range(2))
+    disparity = match(name, RectifiedPair(left, right, stand_in_camera(160, 60, 32)))
+    assert np.isnan(disparity.values).mean() > 0.5
+    assert Reason.AMBIGUOUS in disparity.reason
+    assert not (disparity.values < 0).any()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_is_matched_with_what_lies_beside_the_right_picture(name: str) -> None:
+    values = match(name, shifted_pair(20)).values
+    there = np.arange(values.shape[1]) - values
+    assert np.nanmin(there) >= -0.5
+    assert np.nanmax(there) <= values.shape[1] - 0.5
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pixels_without_a_picture_are_border(name: str) -> None:
+    pair = shifted_pair(7)
+    valid = np.ones(pair.left.shape, dtype=bool)
+    valid[:10] = False
+    disparity = match(name, RectifiedPair(pair.left, pair.right, pair.camera, valid=valid))
+    assert (disparity.reason[:10] == Reason.BORDER).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (3, 3)])
+def test_tiny_pictures_are_no_error(name: str, shape: tuple[int, int]) -> None:
+    image = np.full(shape, 90, np.uint8)
+    pair = RectifiedPair(image, image, stand_in_camera(shape[1], shape[0]))
+    assert match(name, pair).values.shape == shape
+
+
+def test_a_refusal_of_opencv_is_an_error_of_ours() -> None:
+    pair = shifted_pair(0, (6, 20))
+    with pytest.raises(MatchingError, match="20x6"):
+        match("opencv-bm", pair, pad=False, block_px=21)
+
+
+@pytest.mark.parametrize("range_px", [{"min_disparity_px": -4096}, {"ndisp": 4096}])
+def test_a_range_beyond_16_bits_is_refused(range_px: dict[str, int]) -> None:
+    with pytest.raises(MatchingError, match="exceed the range of OpenCV"):
+        match("opencv-sgbm", shifted_pair(0), **range_px)
+
+
+def test_the_modes_of_the_semi_global_matcher_differ() -> None:
+    left = cv2.GaussianBlur(shifted_pair(0).left, (9, 9), 0)
+    right = np.roll(left, -5, axis=1) // 2 + 60
+    pair = RectifiedPair(left, right.astype(np.uint8), stand_in_camera(160, 60, 32))
+    maps = [match("opencv-sgbm", pair, mode=mode).values for mode in ("hh", "3way", "sgbm")]
+    assert not np.array_equal(maps[0], maps[1], equal_nan=True)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_even_window_is_refused(name: str) -> None:
+    with pytest.raises(SettingsError, match="odd"):
+        SETTINGS[name].parse({"block_px": 6})
