@@ -27,11 +27,38 @@ from typing import Any, Protocol
 import numpy as np
 
 from recon.map import Store
-from recon.map.arrays import from_text, to_text
 
 COMMITS = 10
 READS = 30
 Record = tuple[str, int, dict[str, Any]]
+
+
+def split(tree: Any) -> tuple[str, list[np.ndarray[Any, Any]]]:
+    """A tree as JSON, and its arrays."""
+    arrays: list[np.ndarray[Any, Any]] = []
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            arrays.append(value)
+            return {"array": len(arrays) - 1}
+        if isinstance(value, dict):
+            return {name: plain(item) for name, item in value.items()}
+        return [plain(item) for item in value] if isinstance(value, list) else value
+
+    return json.dumps(plain(tree)), arrays
+
+
+def joined(text: str, array: Callable[[int], np.ndarray[Any, Any]]) -> Any:
+    """The tree again."""
+
+    def restored(value: Any) -> Any:
+        if isinstance(value, dict):
+            if value.keys() == {"array"}:
+                return array(value["array"])
+            return {name: restored(item) for name, item in value.items()}
+        return [restored(item) for item in value] if isinstance(value, list) else value
+
+    return restored(json.loads(text))
 
 
 class _Backend(Protocol):
@@ -79,7 +106,7 @@ class _Npz:
         self._save: Callable[..., None] = np.savez_compressed if compress else np.savez
 
     def put(self, kind: str, key: int, tree: dict[str, Any]) -> None:
-        text, arrays = to_text(tree)
+        text, arrays = split(tree)
         path = self._folder / f"{kind}_{key:06d}.npz"
         with (self._folder / "new").open("wb") as file:
             self._save(file, text=np.array(text), **{f"a{n}": a for n, a in enumerate(arrays)})
@@ -94,7 +121,7 @@ class _Npz:
 
     def get(self, kind: str, key: int) -> dict[str, Any]:
         with np.load(self._folder / f"{kind}_{key:06d}.npz") as file:
-            return from_text(str(file["text"]), lambda number: file[f"a{number}"])
+            return joined(str(file["text"]), lambda number: file[f"a{number}"])
 
     def count(self) -> int:
         return len(list(self._folder.glob("rays_*.npz")))
@@ -108,7 +135,7 @@ class _Zarr:
         self._group = zarr.open_group(folder / "map.zarr", mode="a")
 
     def put(self, kind: str, key: int, tree: dict[str, Any]) -> None:
-        text, arrays = to_text(tree)
+        text, arrays = split(tree)
         group = self._group.require_group(kind).create_group(str(key), overwrite=True)
         group.attrs["text"] = text
         for number, array in enumerate(arrays):
@@ -124,7 +151,7 @@ class _Zarr:
 
     def get(self, kind: str, key: int) -> dict[str, Any]:
         group = self._group[f"{kind}/{key}"]
-        return from_text(group.attrs["text"], lambda number: group[str(number)][...])
+        return joined(group.attrs["text"], lambda number: group[str(number)][...])
 
     def count(self) -> int:
         return len(list(self._group["rays"].group_keys()))

@@ -13,15 +13,9 @@ from recon.core.errors import FormatError, OutputError
 FORMAT: Final = 1
 """Number of the format; it grows with every change that older versions cannot read."""
 _OURS: Final = 0x7265636E  # "recn"
-_PAGE_BYTES: Final = 1 << 14
-_RECORDS: Final = """CREATE TABLE record (
-    id INTEGER PRIMARY KEY, kind TEXT NOT NULL, key TEXT NOT NULL, tree TEXT NOT NULL,
-    checksum INTEGER NOT NULL, UNIQUE (kind, key)
-)"""
-_ARRAYS: Final = """CREATE TABLE array (
-    record INTEGER NOT NULL, number INTEGER NOT NULL, dtype TEXT NOT NULL, shape TEXT NOT NULL,
-    layout TEXT NOT NULL, codec TEXT NOT NULL, content BLOB NOT NULL,
-    PRIMARY KEY (record, number)
+_TABLE: Final = """CREATE TABLE record (
+    kind TEXT NOT NULL, key TEXT NOT NULL, tree TEXT NOT NULL, checksum INTEGER NOT NULL,
+    content BLOB NOT NULL, PRIMARY KEY (kind, key)
 )"""
 _ROOM: Final = "check that the folder is writable and the disk is not full"
 
@@ -48,12 +42,10 @@ def closed_on_error(database: sqlite3.Connection) -> Iterator[sqlite3.Connection
 
 def make_tables(database: sqlite3.Connection) -> None:
     """Make an empty file a store."""
-    database.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
     database.execute("BEGIN")
     database.execute(f"PRAGMA application_id = {_OURS}")
     database.execute(f"PRAGMA user_version = {FORMAT}")
-    database.execute(_RECORDS)
-    database.execute(_ARRAYS)
+    database.execute(_TABLE)
     database.execute("COMMIT")
 
 
@@ -93,7 +85,7 @@ def check_format(database: sqlite3.Connection, path: Path) -> None:
             expected=f"at most {FORMAT}",
             hint="update recon",
         )
-    if ours != _OURS or tables != {_RECORDS, _ARRAYS}:
+    if ours != _OURS or tables != {_TABLE}:
         raise FormatError("not a map of recon", where=path)
 
 

@@ -15,7 +15,7 @@ from typing_extensions import Self
 
 from recon.core.errors import FormatError
 from recon.io.files import reading
-from recon.map.arrays import PackedArray, from_text, pack, to_text, unpack
+from recon.map.arrays import from_bytes, to_bytes
 from recon.map.cache import Cache
 from recon.map.database import (
     begin_to_read,
@@ -113,9 +113,8 @@ class Store:
         Raises:
             OutputError: It cannot be written.
         """
-        text, arrays = to_text(tree)
-        packed = [pack(array, compress=compress) for array in arrays]
-        self._insert(kind, _name(key), text, packed)
+        text, content = to_bytes(tree, compress=compress)
+        self._insert(kind, _name(key), text, content)
 
     def get(self, kind: str, key: Key) -> dict[str, Any]:
         """A record. Its arrays are read-only; it may be shared, so copy before changing it.
@@ -133,12 +132,10 @@ class Store:
         """
         name = _name(key)
         with self._reading():
-            with self._lock:
-                text, checksum, rows = self._rows(kind, name)
-            packed = [_array(*row) for row in rows]
-            if _checksum(kind, name, text, packed) != checksum:
+            text, checksum, content = self._row(kind, name)
+            if _checksum(kind, name, text, content) != checksum:
                 raise FormatError("a record of the map is damaged", got=f"{kind} {name}")
-            return from_text(text, lambda number: unpack(packed[number]))
+            return from_bytes(text, content)
 
     def delete(self, kind: str, key: Key | None = None) -> None:
         """Delete a record, or all of a kind; it need not exist.
@@ -146,10 +143,11 @@ class Store:
         Raises:
             OutputError: The file cannot be written.
         """
-        keys = self.keys(kind) if key is None else [key]
         with self._lock, writing(self.path):
-            for each in keys:
-                self._remove(kind, _name(each))
+            for each in self.keys(kind) if key is None else [key]:
+                where = (kind, _name(each))
+                self._database.execute("DELETE FROM record WHERE kind = ? AND key = ?", where)
+                self.cache.drop((kind, each))
 
     def keys(self, kind: str) -> list[Key]:
         """The keys of a kind, in order.
@@ -194,10 +192,9 @@ class Store:
             OutputError: The other one cannot be written.
         """
         for key in self.keys(kind) if keys is None else keys:
-            with self._lock, self._reading():
-                text, _, rows = self._rows(kind, _name(key))
-                packed = [_array(*row) for row in rows]
-            other._insert(kind, _name(key), text, packed)
+            with self._reading():
+                text, _, content = self._row(kind, _name(key))
+            other._insert(kind, _name(key), text, content)
 
     def commit(self) -> None:
         """Make everything so far permanent, all of it or, after an error, nothing.
@@ -242,48 +239,24 @@ class Store:
     ) -> None:
         self.close()
 
-    def _insert(self, kind: str, name: str, text: str, packed: list[PackedArray]) -> None:
-        checksum = _checksum(kind, name, text, packed)
+    def _insert(self, kind: str, name: str, text: str, content: bytes) -> None:
+        checksum = _checksum(kind, name, text, content)
         with self._lock, writing(self.path):
-            self._remove(kind, name)
-            row = self._database.execute(
-                "INSERT INTO record (kind, key, tree, checksum) VALUES (?, ?, ?, ?)",
-                (kind, name, text, checksum),
-            ).lastrowid
-            self._database.executemany(
-                "INSERT INTO array VALUES (?, ?, ?, ?, ?, ?, ?)",
-                (
-                    (
-                        row,
-                        number,
-                        a.dtype,
-                        ",".join(map(str, a.shape)),
-                        a.layout,
-                        a.codec,
-                        a.content,
-                    )
-                    for number, a in enumerate(packed)
-                ),
+            self._database.execute(
+                "INSERT OR REPLACE INTO record VALUES (?, ?, ?, ?, ?)",
+                (kind, name, text, checksum, content),
             )
-
-    def _remove(self, kind: str, name: str) -> None:
-        query = "SELECT id FROM record WHERE kind = ? AND key = ?"
-        found = self._database.execute(query, (kind, name)).fetchone()
-        if found is not None:
-            self._database.execute("DELETE FROM array WHERE record = ?", found)
-            self._database.execute("DELETE FROM record WHERE id = ?", found)
             self.cache.drop((kind, _key(name)))
 
-    def _rows(self, kind: str, name: str) -> tuple[str, int, list[tuple[Any, ...]]]:
-        """Text, checksum and arrays of a record."""
-        found = self._database.execute(
-            "SELECT id, tree, checksum FROM record WHERE kind = ? AND key = ?", (kind, name)
-        ).fetchone()
+    def _row(self, kind: str, name: str) -> tuple[str, int, bytes]:
+        """Text, checksum and content of a record."""
+        query = "SELECT tree, checksum, content FROM record WHERE kind = ? AND key = ?"
+        with self._lock:
+            found: tuple[str, int, bytes] | None
+            found = self._database.execute(query, (kind, name)).fetchone()
         if found is None:
             raise FormatError("the map lacks a record", got=f"{kind} {name}")
-        query = """SELECT dtype, shape, layout, codec, content FROM array
-            WHERE record = ? ORDER BY number"""
-        return found[1], found[2], self._database.execute(query, found[:1]).fetchall()
+        return found
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
@@ -300,15 +273,5 @@ def _key(name: str) -> Key:
     return numbers if len(numbers) > 1 else numbers[0]
 
 
-def _array(dtype: str, shape: str, layout: str, codec: str, content: bytes) -> PackedArray:
-    lengths = tuple(map(int, shape.split(","))) if shape else ()
-    return PackedArray(dtype, lengths, layout, codec, content)
-
-
-def _checksum(kind: str, name: str, text: str, arrays: list[PackedArray]) -> int:
-    """CRC-32 of a record with all that describes it."""
-    found = zlib.crc32(f"{kind} {name} {text}".encode())
-    for array in arrays:
-        head = f"{array.dtype} {array.shape} {array.layout} {array.codec}"
-        found = zlib.crc32(array.content, zlib.crc32(head.encode(), found))
-    return found
+def _checksum(kind: str, name: str, text: str, content: bytes) -> int:
+    return zlib.crc32(content, zlib.crc32(f"{kind} {name} {text}".encode()))

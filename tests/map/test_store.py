@@ -294,7 +294,7 @@ def _view(path: Path) -> None:
         database.execute("DROP TABLE record")
         database.execute(
             "CREATE VIEW record AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id FROM n) "
-            "SELECT id, 'rays' AS kind, '0' AS key, '' AS tree, 0 AS checksum FROM n"
+            "SELECT 'rays' AS kind, id AS key, '' AS tree, 0 AS checksum, '' AS content FROM n"
         )
     database.close()
 
