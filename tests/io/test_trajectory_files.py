@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.core.errors import FormatError
+from recon.core.errors import FormatError, ReconError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
+from recon.io.cameras.euroc import read_euroc_truth
 from recon.io.trajectory import (
     read_kitti_poses,
     read_trajectory,
@@ -155,3 +156,10 @@ def test_a_place_that_is_none_on_earth_is_refused(tmp_path: Path, line: str) -> 
     path.write_text(line + "\n")
     with pytest.raises(FormatError, match=r"path\.txt:1: position .*got 1e\+30 m"):
         read_trajectory(path)
+
+
+def test_a_truth_without_a_rotation_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "data.csv"
+    path.write_text("#t\n1,0,0,0,1,0,0,0\n2,0,0,1,0,0,0,0\n")
+    with pytest.raises(ReconError, match=r"data\.csv: pose 1 is not finite"):
+        read_euroc_truth(path)

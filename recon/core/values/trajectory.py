@@ -28,7 +28,7 @@ class Trajectory:
         freeze(self, "timestamps_s", np.float64, (len(self.T_world_camera),))
         broken = ~np.isfinite(self.T_world_camera).all(axis=(1, 2))
         if broken.any():
-            raise ShapeError("pose is not finite", where=f"pose {int(np.argmax(broken))}")
+            raise ShapeError(f"pose {int(np.argmax(broken))} is not finite")
 
     def __repr__(self) -> str:
         seconds = self.timestamps_s[-1] - self.timestamps_s[0] if len(self) else 0.0

@@ -238,7 +238,7 @@ def test_path_length_adds_the_steps() -> None:
 def test_a_pose_that_is_not_finite_is_named_by_its_number() -> None:
     poses = np.stack([np.eye(4)] * 3)
     poses[1, 0, 3] = NAN
-    with pytest.raises(ShapeError, match="pose 1: pose is not finite"):
+    with pytest.raises(ShapeError, match="pose 1 is not finite"):
         trajectory(T_world_camera=poses)
 
 
