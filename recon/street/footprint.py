@@ -35,7 +35,12 @@ def footprint(
     """
     low, (rows, columns), resolution_m = raster
     origin = (float(low[0] * resolution_m), float(low[1] * resolution_m))
-    outlines = se3.apply(T_map_street, _outlines(world.soup.vertices, band_m, resolution_m / 4.0))
+    vertices = se3.apply(T_map_street, world.soup.vertices.reshape(-1, 3)).reshape(-1, 3, 3)
+    ends = vertices[..., :2].min(axis=1), vertices[..., :2].max(axis=1)
+    far_end = np.array([low[0] + columns, low[1] + rows]) * resolution_m
+    near = ((ends[1] >= origin) & (ends[0] <= far_end)).all(axis=1)
+    outlines = _outlines(world.soup.vertices[near], band_m, resolution_m / 4.0)
+    outlines = se3.apply(T_map_street, outlines)
     cells = np.floor(outlines[:, :2] / resolution_m).astype(int) - low
     inside = ((cells >= 0) & (cells < (columns, rows))).all(axis=1)
     occupied = np.zeros((rows, columns), dtype=np.bool_)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,8 @@ def boxes(low: Any, high: Any, paint: Paint) -> TriangleSoup:
     a, b = np.broadcast_arrays(*np.atleast_2d(low, high))
     x, y, z = (np.eye(3)[k] * (b - a) for k in range(3))
     sides = [(a, x, z), (a, y, z), (a + y, x, z), (a + x, y, z), (a + z, x, y), (a, x, y)]
-    return merge([quads(p, u, v, paint) for p, u, v in sides])
+    origins, edges_u, edges_v = (np.concatenate(part) for part in zip(*sides, strict=True))
+    return quads(origins, edges_u, edges_v, paint)
 
 
 def frustum(low: Any, high: Any, inset: tuple[float, float, float], paint: Paint) -> TriangleSoup:
@@ -131,15 +133,12 @@ def bumpy_ball(
         seed: Seed of the shape.
         splits: Number of times that the faces of an icosahedron are split in four.
     """
-    directions = icosphere(splits)
-    flat, places = np.unique(directions.reshape(-1, 3), axis=0, return_inverse=True)
+    flat, places = _icosphere_corners(splits)
     hills = value_noise_reference(flat / wavelength, seed)
     hills += 0.5 * value_noise_reference(flat * (2.0 / wavelength), seed + 1)
     surface = flat * (1.0 + bump * hills)[:, None] * np.asarray(radii_m)
-    corners = surface[places.ravel()].reshape(-1, 3, 3)
-    return painted(
-        corners, corners[..., :2].copy(), paint, _smooth_normals(corners, places.ravel())
-    )
+    corners = surface[places].reshape(-1, 3, 3)
+    return painted(corners, corners[..., :2].copy(), paint, _smooth_normals(corners, places))
 
 
 def _smooth_normals(corners: Float64, places: NDArray[np.int64]) -> Float64:
@@ -148,6 +147,13 @@ def _smooth_normals(corners: Float64, places: NDArray[np.int64]) -> Float64:
     total = np.zeros((int(places.max()) + 1, 3))
     np.add.at(total, places, np.repeat(flat, 3, axis=0))
     return _unit(total)[places].reshape(-1, 3, 3)
+
+
+@cache
+def _icosphere_corners(splits: int) -> tuple[Float64, NDArray[np.int64]]:
+    """The different corners (N, 3) of a unit sphere, and the one of each corner of its faces."""
+    flat, places = np.unique(icosphere(splits).reshape(-1, 3), axis=0, return_inverse=True)
+    return flat, places.ravel()
 
 
 def icosphere(splits: int) -> Float64:

@@ -30,9 +30,9 @@ def frozen_array(
     Raises:
         ShapeError: ``value`` is not an array, or has the wrong dtype or shape.
     """
-    expected = f"{np.dtype(dtype).name} {_shape_text(shape)}"
     if not isinstance(value, np.ndarray):
-        raise ShapeError(f"{name} is not an array", got=type(value).__name__, expected=expected)
+        got, expected = type(value).__name__, _field_text(dtype, shape)
+        raise ShapeError(f"{name} is not an array", got=got, expected=expected)
     fits = len(value.shape) == len(shape) and all(
         want is None or want == have for want, have in zip(shape, value.shape, strict=True)
     )
@@ -40,7 +40,7 @@ def frozen_array(
         raise ShapeError(
             f"{name} has the wrong dtype or shape",
             got=f"{value.dtype.name} {value.shape}",
-            expected=expected,
+            expected=_field_text(dtype, shape),
         )
     view: NDArray[Any] = value.view()
     view.flags.writeable = False
@@ -107,6 +107,7 @@ def extent_text(xyz: NDArray[Any]) -> str:
     return ", ".join(f"{axis} {low:.4g} to {high:.4g}" for axis, low, high in ends) + " m"
 
 
-def _shape_text(shape: tuple[int | None, ...]) -> str:
+def _field_text(dtype: DTypeLike, shape: tuple[int | None, ...]) -> str:
     names = iter("NMKL")
-    return "(" + ", ".join(next(names) if n is None else str(n) for n in shape) + ")"
+    lengths = ", ".join(next(names) if n is None else str(n) for n in shape)
+    return f"{np.dtype(dtype).name} ({lengths})"
