@@ -19,7 +19,6 @@ from recon.map.settings import DriveSettings
 from recon.rig.audit.settings import AuditedSettings
 from recon.rig.calibrate import CalibrationSettings
 from recon.rig.capture import CaptureSettings
-from recon.rig.uncalibrated import UncalibratedSettings
 from recon.sources.settings import SourceSettings
 from recon.stereo.cloud import ANY_SCALE
 from recon.stereo.match import MatchingSettings, name_of, settings_of
@@ -36,7 +35,6 @@ class ReconConfig(DriveSettings, AuditedSettings, PaperConfig):
     source: SourceSettings = SourceSettings()
     capture: CaptureSettings = CaptureSettings()
     calibration: CalibrationSettings = CalibrationSettings()
-    uncalibrated: UncalibratedSettings = UncalibratedSettings()
     mesh: MeshSettings = MeshSettings()
     street: StreetSettings = StreetSettings()
 

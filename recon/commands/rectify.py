@@ -31,7 +31,6 @@ from recon.run.summary import cost, plain
 from recon.sources.files import read_pair
 from recon.sources.picture_pairs import PicturePairs, pair_pictures
 from recon.stereo.rectify import (
-    PairFeatures,
     Rectifier,
     epipolar_curves,
     epipolar_lines,
@@ -39,6 +38,9 @@ from recon.stereo.rectify import (
     plan_turns,
     to_grey,
 )
+
+_UNCALIBRATED_PAIRS: Final = 8
+"""Pairs of a folder whose features are matched where there is no calibration."""
 
 _WARN_ROW_PX: Final = 0.5
 # A row error above this multiple of the median is a false match, not a calibration error.
@@ -111,13 +113,13 @@ def run_rectify(left: str, right: str, config: ReconConfig, options: RectifyOpti
             first = read_pair(*pictures.pairs[0])
             cameras = kitti_cameras_of(pictures.pairs[0][0])
             plan = _by_file(options, config, first, cameras) if options.calibration else None
-            plan = plan or _by_features(pictures, config, first)
+            plan = plan or _by_features(pictures, first)
         with watch.stage("rectify"):
             for pair, (left_path, right_path) in _pairs(pictures):
                 warped = plan.warp(pair)
                 write_image(directory.path(f"left/{_rectified_name(left_path)}"), warped[0])
                 write_image(directory.path(f"right/{_rectified_name(right_path)}"), warped[1])
-        run = _measure(plan, first, config)
+        run = _measure(plan, first)
         run.summary["pairs"] = len(pictures.pairs)
         run.summary["frames_left_out"] = len(pictures.lonely)
         run.summary["warnings"] = _warnings(run.summary, pictures)
@@ -192,16 +194,15 @@ def _by_file(
     )
 
 
-def _by_features(pictures: PicturePairs, config: ReconConfig, first: StereoPair) -> _Plan:
+def _by_features(pictures: PicturePairs, first: StereoPair) -> _Plan:
     """Rectification by homographies from feature matches; depth has no scale."""
-    settings = config.uncalibrated
     height, width = first.left.shape[:2]
     size = (width, height)
-    step = max(1, len(pictures.pairs) // settings.pairs)
-    some = replace(pictures, pairs=pictures.pairs[::step][: settings.pairs])
+    step = max(1, len(pictures.pairs) // _UNCALIBRATED_PAIRS)
+    some = replace(pictures, pairs=pictures.pairs[::step][:_UNCALIBRATED_PAIRS])
     greys = [(to_grey(pair.left), to_grey(pair.right)) for pair, _ in _pairs(some)]
     try:
-        result = rectify_pictures(greys, settings)
+        result = rectify_pictures(greys)
     except CalibrationError as error:
         if len(pictures.pairs) > 1:
             raise
@@ -274,13 +275,9 @@ def _pairs(pictures: PicturePairs) -> Iterator[tuple[StereoPair, tuple[Path, Pat
         yield pair, files
 
 
-def _features(pair: StereoPair, count: int) -> PairFeatures:
-    return match_exactly(to_grey(pair.left), to_grey(pair.right), count)
-
-
-def _measure(plan: _Plan, first: StereoPair, config: ReconConfig) -> RectifyRun:
+def _measure(plan: _Plan, first: StereoPair) -> RectifyRun:
     """Measure the row alignment of the first pair by feature matches."""
-    found = _features(first, config.uncalibrated.features)
+    found = match_exactly(to_grey(first.left), to_grey(first.right))
     raw = (found.left_uv.astype(np.float64), found.right_uv.astype(np.float64))
     left, right = plan.place(*raw)
     rows = np.abs(left[:, 1] - right[:, 1])

@@ -137,20 +137,22 @@ def _contains(part: str, name: str) -> bool:
     return part in name
 
 
-def _groups(drive: Settings, pair: Settings, prefix: str = "") -> Iterator[SettingGroup]:
-    """The groups of a model, each before those inside it."""
+def _groups(
+    drive: Settings, pair: Settings, prefix: str = "", purpose: str | None = None
+) -> Iterator[SettingGroup]:
+    """The groups of a model, each before those inside it; ``purpose`` stands for its docstring."""
     own, inside = [], []
     for name, field in type(drive).model_fields.items():
         value, paired = getattr(drive, name), getattr(pair, name)
         if isinstance(value, Settings):
-            inside.append((value, paired, f"{prefix}{name}."))
+            inside.append((value, paired, f"{prefix}{name}.", field.description))
         else:
             own.append(_entry(f"{prefix}{name}", field, value, paired))
     if own:
-        purpose = (type(drive).__doc__ or "").partition("\n")[0].replace("``", "`")
-        yield SettingGroup(prefix.removesuffix("."), purpose, tuple(own))
-    for value, paired, below in inside:
-        yield from _groups(value, paired, below)
+        about = purpose or (type(drive).__doc__ or "").partition("\n")[0].replace("``", "`")
+        yield SettingGroup(prefix.removesuffix("."), about, tuple(own))
+    for group in inside:
+        yield from _groups(*group)
 
 
 def _entry(name: str, field: FieldInfo, drive: Any, pair: Any) -> SettingEntry:

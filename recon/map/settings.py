@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from pydantic import Field
 
 from recon.map.axes import AxesSettings
@@ -19,14 +17,13 @@ from recon.run.memory import MemorySettings
 from recon.stereo.cloud import FilterSettings
 from recon.stereo.settings import StereoSettings
 
-NO_ISLANDS: Final = FilterSettings(voxel_m=None, radius_m=0.3, radius_neighbours=2)
-
 
 class DriveSettings(StereoSettings):
     """Everything that determines the map of a drive."""
 
     map_filters: FilterSettings = Field(
-        default=NO_ISLANDS, description="Filters of the fused cloud on export."
+        default=FilterSettings(radius_m=0.3),
+        description="Filters of the fused cloud on export, in this order; none turns one off.",
     )
     odometry: OdometrySettings = OdometrySettings()
     loops: LoopSettings = LoopSettings()

@@ -74,8 +74,9 @@ class FrameReconstructor:
             rectified = self._rectifier.rectify(pair)
         with stage("match"):
             disparity = self._matcher.match(rectified)
-        with stage("edges"):
-            disparity = remove_flying_edges(disparity, config.edges)
+        if config.cloud.remove_flying_edges:
+            with stage("edges"):
+                disparity = remove_flying_edges(disparity)
         return rectified, disparity
 
     def inspect(self, pair: RectifiedPair) -> tuple[str, ...]:
@@ -84,12 +85,12 @@ class FrameReconstructor:
         Raises:
             CalibrationError: Left and right are swapped.
         """
-        settings = self._config.inspection
-        if settings.every is None or pair.index % settings.every:
+        every = self._config.rectification.inspect_every
+        if every is None or pair.index % every:
             return ()
         with self._stopwatch.stage("inspect"):
-            found = inspect_pair(pair, settings)
-        return check_inspection(found, settings, where=f"frame {pair.index}")
+            found = inspect_pair(pair)
+        return check_inspection(found, where=f"frame {pair.index}")
 
     def reconstruct(self, pair: StereoPair) -> ReconstructedFrame:
         """Reconstruct one pair.

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from pydantic import Field
 from typing_extensions import Self
 
 from recon.core.settings import Settings
-from recon.stereo.cloud import CloudSettings, EdgeSettings, FilterSettings
+from recon.stereo.cloud import CloudSettings, FilterSettings
 from recon.stereo.match import Matcher, MatchingSettings, check_matcher
-from recon.stereo.rectify import InspectionSettings, RectificationSettings
-
-NO_FILTER: Final = FilterSettings(voxel_m=None)
+from recon.stereo.rectify import RectificationSettings
 
 
 class StereoSettings(Settings):
     """Everything that determines the cloud of one frame."""
 
     rectification: RectificationSettings = RectificationSettings()
-    inspection: InspectionSettings = InspectionSettings()
     matching: MatchingSettings = MatchingSettings()
-    edges: EdgeSettings = EdgeSettings()
     cloud: CloudSettings = CloudSettings()
     filters: FilterSettings = Field(
-        default=NO_FILTER,
-        description="Filters of the cloud of one frame; fusion thins and cleans it anyway.",
+        default=FilterSettings(),
+        description="Filters of the cloud of one frame, in this order; none turns one off. "
+        "Fusion thins and cleans the clouds of a drive anyway.",
     )
 
     def with_matcher(self, matcher: str | Matcher | None) -> Self:

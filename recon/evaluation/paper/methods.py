@@ -39,9 +39,7 @@ TITLES: Final[Mapping[str, str]] = MappingProxyType(
     }
 )
 # Keeps every point of the printed method, regardless of range and uncertainty.
-_EVERY_POINT: Final = CloudSettings(
-    min_range_m=0.0, max_range_m=None, max_relative_sigma=None, normals_radius_px=None
-)
+_EVERY_POINT: Final = CloudSettings(min_range_m=0.0, max_range_m=None, max_relative_sigma=None)
 
 
 @dataclass(frozen=True)
@@ -132,7 +130,8 @@ def apply_method(
     pair = _printed_pair(experiment)
     disparity = matcher.match(pair)
     pair = replace(pair, camera=camera_of_table_1(pair.camera))
-    return _result(method, experiment, pair, disparity, back_project(disparity, pair, _EVERY_POINT))
+    cloud = back_project(disparity, pair, _EVERY_POINT, normals=False)
+    return _result(method, experiment, pair, disparity, cloud)
 
 
 def try_patches(

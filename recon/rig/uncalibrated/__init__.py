@@ -2,14 +2,12 @@
 
 from recon.rig.uncalibrated.rectify import (
     UncalibratedRectification,
-    UncalibratedSettings,
     rectify_pictures,
     rectify_uncalibrated,
 )
 
 __all__ = [
     "UncalibratedRectification",
-    "UncalibratedSettings",
     "rectify_pictures",
     "rectify_uncalibrated",
 ]

@@ -8,15 +8,13 @@ from typing import Final
 
 import cv2
 import numpy as np
-from pydantic import Field
 
 from recon.core.errors import CalibrationError
 from recon.core.geometry.projection import map_pixels
-from recon.core.settings import Settings
 from recon.core.values.arrays import Bool, Float64, UInt8
 from recon.rig.uncalibrated.fundamental import epipoles, find_fundamental, level_homographies
 from recon.rig.uncalibrated.shaping import shape_views
-from recon.stereo.rectify.features import match_again, match_exactly
+from recon.stereo.rectify.features import MOST_FEATURES, match_again, match_exactly
 from recon.stereo.rectify.inspect import PairFeatures
 
 Size = tuple[int, int]
@@ -27,28 +25,17 @@ _FEWEST_AT_FIRST: Final = 12
 _HELD_OUT: Final = 4  # every fourth feature is held out of the fit and measures its error
 
 
-class UncalibratedSettings(Settings):
-    """Rectification of pairs without calibration."""
+_MIN_FEATURES: Final = 40
+"""Minimum number of matches that agree on one geometry."""
 
-    features: int = Field(default=8000, ge=100, description="Maximum number of features per image.")
-    min_features: int = Field(
-        default=40, ge=16, description="Minimum number of matches that agree on one geometry."
-    )
-    inlier_px: float = Field(
-        default=1.0,
-        gt=0,
-        description="Largest distance of an inlier from its epipolar line, in pixels.",
-    )
-    flat_share: float = Field(
-        default=0.9,
-        gt=0,
-        le=1,
-        description="Share of matches on one plane from which the scene counts as flat.",
-    )
-    max_row_px: float = Field(
-        default=2.0, gt=0, description="Largest mean row error of an accepted result, in pixels."
-    )
-    pairs: int = Field(default=8, ge=1, description="Number of pairs used of a folder.")
+_INLIER_PX: Final = 1.0
+"""Largest distance of an inlier from its epipolar line."""
+
+_FLAT_SHARE: Final = 0.9
+"""Share of matches on one plane from which the scene counts as flat."""
+
+_MAX_ROW_PX: Final = 2.0
+"""Largest mean row error of an accepted result."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +64,7 @@ class UncalibratedRectification:
 
 
 def rectify_pictures(
-    pairs: Sequence[tuple[UInt8, UInt8]], settings: UncalibratedSettings | None = None
+    pairs: Sequence[tuple[UInt8, UInt8]], count: int = MOST_FEATURES
 ) -> UncalibratedRectification:
     """Find homographies that align the rows of images of uncalibrated cameras.
 
@@ -85,23 +72,21 @@ def rectify_pictures(
 
     Args:
         pairs: uint8 (H, W) left and right, of one pair or of several pairs of one rig.
-        settings: Features and limits.
+        count: Maximum number of features per image.
 
     Raises:
         CalibrationError: See `rectify_uncalibrated`.
     """
-    settings = settings or UncalibratedSettings()
     height, width = pairs[0][0].shape
-    matched = _joined([match_exactly(left, right, settings.features) for left, right in pairs])
+    matched = _joined([match_exactly(left, right, count) for left, right in pairs])
     # The initial guess may rest on few matches: the second round checks it.
-    few = settings.model_copy(update={"min_features": _FEWEST_AT_FIRST})
-    H = _fit(matched, (width, height), few)[:2]
-    again = _joined([match_again(left, right, *H, settings.features) for left, right in pairs])
-    return rectify_uncalibrated(again, (width, height), settings)
+    H = _fit(matched, (width, height), _FEWEST_AT_FIRST)[:2]
+    again = _joined([match_again(left, right, *H, count) for left, right in pairs])
+    return rectify_uncalibrated(again, (width, height))
 
 
 def rectify_uncalibrated(
-    features: PairFeatures, size: Size, settings: UncalibratedSettings | None = None
+    features: PairFeatures, size: Size, min_features: int = _MIN_FEATURES
 ) -> UncalibratedRectification:
     """Find homographies that align the rows of matches of uncalibrated cameras.
 
@@ -112,7 +97,7 @@ def rectify_uncalibrated(
     Args:
         features: Matches of one pair, or of several pairs of one rig.
         size: (width, height) of the images.
-        settings: Limits.
+        min_features: Fewest matches that must agree on one geometry.
 
     Raises:
         CalibrationError: Too few matches agree, the scene is flat, one camera is in the view of
@@ -120,22 +105,21 @@ def rectify_uncalibrated(
 
     Ref: Hartley 1999, "Theory and practice of projective rectification".
     """
-    settings = settings or UncalibratedSettings()
     used = np.arange(len(features)) % _HELD_OUT != 0
     held_out_px = float("nan")
-    if used.sum() >= 2 * settings.min_features:
-        trial = _fit(_some(features, used), size, settings)
-        held_out_px = _held_out(trial[:2], _some(features, ~used), settings)
-    H_left, H_right, F, agreeing = _fit(features, size, settings)
+    if used.sum() >= 2 * min_features:
+        trial = _fit(_some(features, used), size, min_features)
+        held_out_px = _held_out(trial[:2], _some(features, ~used))
+    H_left, H_right, F, agreeing = _fit(features, size, min_features)
     left, right = (
         map_pixels(H, uv) for H, uv in ((H_left, agreeing.left_uv), (H_right, agreeing.right_uv))
     )
     rows = left[:, 1] - right[:, 1]
-    if float(np.abs(rows).mean()) > settings.max_row_px:
+    if float(np.abs(rows).mean()) > _MAX_ROW_PX:
         raise CalibrationError(
             "rows cannot be aligned",
             got=f"{np.abs(rows).mean():.1f} px mean row error",
-            expected=f"at most {settings.max_row_px:g} px",
+            expected=f"at most {_MAX_ROW_PX:g} px",
             hint="lenses with distortion need a calibration: recon calibrate",
         )
     low, high = np.percentile(left[:, 0] - right[:, 0], (1, 99))
@@ -163,27 +147,25 @@ def _some(features: PairFeatures, which: Bool) -> PairFeatures:
 
 
 def _fit(
-    features: PairFeatures, size: Size, settings: UncalibratedSettings
+    features: PairFeatures, size: Size, min_features: int
 ) -> tuple[Float64, Float64, Float64, PairFeatures]:
     """Homographies, the fundamental matrix, and the matches that agree with it."""
-    F, agreeing = _fundamental(features, settings)
-    _check_depth(agreeing, settings)
+    F, agreeing = _fundamental(features, min_features)
+    _check_depth(agreeing)
     _check_epipoles(F, size)
     H_left, H_right = shape_views(*level_homographies(F, size), agreeing, size)
     _check_torn(H_left, H_right, size)
     return H_left, H_right, F, agreeing
 
 
-def _fundamental(
-    features: PairFeatures, settings: UncalibratedSettings
-) -> tuple[Float64, PairFeatures]:
+def _fundamental(features: PairFeatures, min_features: int) -> tuple[Float64, PairFeatures]:
     left, right = features.left_uv.astype(np.float64), features.right_uv.astype(np.float64)
-    F, agreeing = find_fundamental(left, right, settings.inlier_px)
-    if F is None or agreeing.sum() < settings.min_features:
+    F, agreeing = find_fundamental(left, right, _INLIER_PX)
+    if F is None or agreeing.sum() < min_features:
         raise CalibrationError(
             "too few matched features agree on one camera geometry",
             got=f"{int(agreeing.sum())} of {len(features)} matches",
-            expected=f"at least {settings.min_features}",
+            expected=f"at least {min_features}",
             hint="are these two views of the same scene, with texture?",
         )
     return F, _some(features, agreeing)
@@ -217,27 +199,23 @@ def _seen(side: str, got: str) -> CalibrationError:
     )
 
 
-def _held_out(
-    homographies: tuple[Float64, Float64], features: PairFeatures, settings: UncalibratedSettings
-) -> float:
+def _held_out(homographies: tuple[Float64, Float64], features: PairFeatures) -> float:
     """Mean absolute row error of held-out matches, without outliers; NaN = none."""
     H_left, H_right = homographies
     left, right = map_pixels(H_left, features.left_uv), map_pixels(H_right, features.right_uv)
     rows = np.abs(left[:, 1] - right[:, 1])
-    good = rows < 4 * settings.inlier_px
+    good = rows < 4 * _INLIER_PX
     return float(rows[good].mean()) if good.any() else float("nan")
 
 
-def _check_depth(features: PairFeatures, settings: UncalibratedSettings) -> None:
+def _check_depth(features: PairFeatures) -> None:
     """Raise if the scene is planar: this does not determine the geometry of the cameras."""
-    _, mask = cv2.findHomography(
-        features.left_uv, features.right_uv, cv2.USAC_MAGSAC, settings.inlier_px
-    )
+    _, mask = cv2.findHomography(features.left_uv, features.right_uv, cv2.USAC_MAGSAC, _INLIER_PX)
     share = 0.0 if mask is None else float(np.mean(mask))
-    if share > settings.flat_share:
+    if share > _FLAT_SHARE:
         raise CalibrationError(
             "the scene is flat and does not determine the camera geometry",
             got=f"{100 * share:.0f} % of the matches on one plane",
-            expected=f"at most {100 * settings.flat_share:g} %",
+            expected=f"at most {100 * _FLAT_SHARE:g} %",
             hint="use a scene with both near and far objects, or calibrate: recon calibrate",
         )

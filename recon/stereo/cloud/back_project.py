@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Final
 
 import numpy as np
 from pydantic import Field
@@ -12,34 +13,58 @@ from recon.core.settings import Settings
 from recon.core.values import Disparity, PointCloud, RectifiedCamera, RectifiedPair
 from recon.stereo.kernels import points
 
+_NORMALS_RADIUS_PX: Final = 3
+"""Half width of the window that gives a point its normal."""
+
 
 class CloudSettings(Settings):
     """Which pixels become points."""
 
-    min_range_m: float = Field(default=0.1, ge=0, description="Nearest depth kept.")
+    remove_flying_edges: bool = Field(
+        default=True,
+        description="Drop pixels that float between a foreground and its background. Turn it off "
+        "to see what the matcher found.",
+    )
+    min_range_m: float = Field(
+        default=0.1, ge=0, description="Nearest depth kept. Set it to hide a bonnet or gripper."
+    )
     max_range_m: float | None = Field(
-        default=30.0, gt=0, description="Farthest depth kept; null = no limit."
+        default=30.0,
+        gt=0,
+        description="Farthest depth kept; none = no limit. The error of a depth grows with its "
+        "square.",
     )
     max_relative_sigma: float | None = Field(
-        default=0.1, gt=0, description="Largest sigma_z / Z kept; null = no limit."
+        default=0.1,
+        gt=0,
+        description="Largest standard deviation of a depth kept, as a share of it; none = no "
+        "limit. Smaller for fewer, more certain points.",
     )
-    min_confidence: float = Field(default=0.0, ge=0, le=1, description="Least confidence kept.")
-    stride: int = Field(default=1, ge=1, le=16, description="Every n-th row and column is used.")
-    normals_radius_px: int | None = Field(
-        default=3,
+    min_confidence: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="Least confidence kept: the probability that a match is right. Raise it where "
+        "wrong points matter more than missing ones.",
+    )
+    stride: int = Field(
+        default=1,
         ge=1,
-        le=20,
-        description="Half width of the window that gives a point its normal; null = no normals.",
+        le=16,
+        description="Every n-th row and column is used. Raise it for speed with large images.",
     )
 
 
-def back_project(disparity: Disparity, pair: RectifiedPair, settings: CloudSettings) -> PointCloud:
+def back_project(
+    disparity: Disparity, pair: RectifiedPair, settings: CloudSettings, *, normals: bool = True
+) -> PointCloud:
     """Points of the pixels that have a disparity, ``Z = f·b / (d + doffs)``.
 
     Args:
         disparity: The disparity of ``pair``.
         pair: Provides the camera, the colours and the pixels valid after rectification.
         settings: Range, confidence and thinning.
+        normals: Whether points get normals, which takes as long as the rest.
 
     Returns:
         A cloud in camera axes with colours, ``sigma_m`` (``sigma_z = Z²·sigma_d / (f·b)``),
@@ -55,11 +80,11 @@ def back_project(disparity: Disparity, pair: RectifiedPair, settings: CloudSetti
             got=f"disparity {disparity.values.shape}",
             expected=f"{pair.left.shape}",
         )
-    found = points.make_points(_maps(disparity, pair), _rules(pair.camera, settings))
+    found = points.make_points(_maps(disparity, pair), _rules(pair.camera, settings, normals))
     return PointCloud(
         xyz=found.xyz,
         rgb=found.colours,
-        normals=None if settings.normals_radius_px is None else found.normals,
+        normals=found.normals if normals else None,
         sigma_m=found.sigma,
         confidence=found.confidence,
         frame="camera",
@@ -76,7 +101,7 @@ def _maps(disparity: Disparity, pair: RectifiedPair) -> points.Maps:
     )
 
 
-def _rules(camera: RectifiedCamera, settings: CloudSettings) -> points.PointRules:
+def _rules(camera: RectifiedCamera, settings: CloudSettings, normals: bool) -> points.PointRules:
     return points.PointRules(
         focal=float(camera.focal_px),
         cx=float(camera.cx_px),
@@ -88,7 +113,7 @@ def _rules(camera: RectifiedCamera, settings: CloudSettings) -> points.PointRule
         relative_sigma=_or_infinity(settings.max_relative_sigma),
         confidence=settings.min_confidence,
         stride=settings.stride,
-        radius=settings.normals_radius_px or 0,
+        radius=_NORMALS_RADIUS_PX if normals else 0,
     )
 
 

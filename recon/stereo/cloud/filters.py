@@ -1,9 +1,9 @@
-"""Filters of clouds: voxel downsampling, outlier removal, normals."""
+"""Filters of clouds: voxel downsampling and outlier removal."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,57 +14,49 @@ from recon.core.values import PointCloud
 from recon.core.values.arrays import Float32
 from recon.stereo.cloud import open3d_clouds
 
-_MIN_POINTS_OF_A_PLANE = 3
+_STATISTICAL_SIGMAS: Final = 2.0
+"""Limit of the statistical filter, in standard deviations of the mean distance."""
+
+_RADIUS_NEIGHBOURS: Final = 2
+"""Neighbours that a point needs within the radius: fewer are an island."""
 
 
 class FilterSettings(Settings):
-    """Which filters are applied to a cloud, in this order; null turns one off.
-
-    The defaults suit one frame of a drive: outlier removal takes several times as long as voxel
-    downsampling and gains about two per cent of precision, while the map drops points that few
-    frames saw anyway.
-    """
+    """Which filters are applied to a cloud, in this order; none turns one off."""
 
     voxel_m: float | None = Field(
-        default=0.1, gt=0, description="Edge of the voxels that points are averaged in."
+        default=None,
+        gt=0,
+        description="Edge of the voxels that points are averaged in. Set it for fewer points.",
     )
     statistical_neighbours: int | None = Field(
-        default=None, ge=1, le=1000, description="Neighbours of the statistical outlier filter."
-    )
-    statistical_sigmas: float = Field(
-        default=2.0,
-        gt=0,
-        description="Limit of that filter, in standard deviations of the mean distance.",
+        default=None,
+        ge=1,
+        le=1000,
+        description="Neighbours of the statistical outlier filter, which drops points that are "
+        "farther from them than most. Several times as slow as the others; for one pair, or a "
+        "map with noise in the air.",
     )
     radius_m: float | None = Field(
-        default=None, gt=0, description="Radius of the radius outlier filter."
-    )
-    radius_neighbours: int = Field(
-        default=4, ge=1, description="Neighbours that a point needs within that radius."
-    )
-    normals_neighbours: int | None = Field(
-        default=None, ge=3, le=1000, description="Estimate new normals from so many points."
+        default=None,
+        gt=0,
+        description="Points with fewer than two others within this radius are dropped. About "
+        "three voxels; larger drops larger islands.",
     )
 
 
-#: For the cloud of one pair, whose scale is unknown: no filter with a length in metres.
-ANY_SCALE = FilterSettings(voxel_m=None, statistical_neighbours=20)
+ANY_SCALE: Final = FilterSettings(statistical_neighbours=20)
+"""For the cloud of one pair, whose scale is unknown: no filter with a length in metres."""
 
 
-def filter_cloud(
-    cloud: PointCloud,
-    settings: FilterSettings,
-    viewpoint_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> PointCloud:
-    """Thin a cloud, drop its outliers, and estimate its normals.
+def filter_cloud(cloud: PointCloud, settings: FilterSettings) -> PointCloud:
+    """Thin a cloud and drop its outliers.
 
     Downsampling comes first, which makes the neighbour searches cheap and evenly spaced.
 
     Args:
         cloud: Any cloud.
         settings: The filters and their settings.
-        viewpoint_m: The camera, in the frame of the cloud. Estimated normals point to it if the
-            cloud had none to agree with.
 
     Returns:
         A cloud in the same frame. In a voxel every attribute is averaged (``sigma_m`` too: the
@@ -77,15 +69,12 @@ def filter_cloud(
         cloud = voxel_downsample(cloud, settings.voxel_m)
     if settings.statistical_neighbours is not None:
         keep = open3d_clouds.statistical_inliers(
-            cloud.xyz, settings.statistical_neighbours, settings.statistical_sigmas
+            cloud.xyz, settings.statistical_neighbours, _STATISTICAL_SIGMAS
         )
         cloud = cloud.select(keep)
     if settings.radius_m is not None:
-        cloud = cloud.select(
-            open3d_clouds.radius_inliers(cloud.xyz, settings.radius_neighbours, settings.radius_m)
-        )
-    if settings.normals_neighbours is not None:
-        cloud = with_normals(cloud, settings.normals_neighbours, viewpoint_m)
+        keep = open3d_clouds.radius_inliers(cloud.xyz, _RADIUS_NEIGHBOURS, settings.radius_m)
+        cloud = cloud.select(keep)
     return cloud
 
 
@@ -103,26 +92,6 @@ def voxel_downsample(cloud: PointCloud, voxel_m: float) -> PointCloud:
     parts = dict(zip(names, np.split(means, widths, axis=1), strict=True)) if names else {}
     fields: dict[str, Any] = {name: _restored(name, parts[name]) for name in names}
     return replace(cloud, xyz=xyz, **fields)
-
-
-def with_normals(
-    cloud: PointCloud, neighbours: int, viewpoint_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> PointCloud:
-    """Estimate normals from nearest neighbours.
-
-    Args:
-        cloud: Any cloud; with fewer than three points it is returned unchanged.
-        neighbours: Number of neighbours, the point included.
-        viewpoint_m: See `filter_cloud`.
-    """
-    if len(cloud) < _MIN_POINTS_OF_A_PLANE:
-        return cloud
-    normals = open3d_clouds.estimate_normals(cloud.xyz, neighbours)
-    towards = np.asarray(viewpoint_m, dtype=np.float32) - cloud.xyz
-    if cloud.normals is not None:
-        towards = cloud.normals
-    away = np.einsum("ij,ij->i", normals, towards) < 0
-    return replace(cloud, normals=np.where(away[:, None], -normals, normals))
 
 
 #: Attributes of a point except its position, and the dtype that a mean is converted to.

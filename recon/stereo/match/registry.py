@@ -47,15 +47,11 @@ class MatchingSettings(Settings):
         description="Name of the matcher: sad, sgm, opencv-bm, opencv-sgbm, onnx, or one that an "
         "installed package registers; in Python also a matcher of your own.",
     )
-    sad: SadSettings = Field(default_factory=SadSettings, description="Of the matcher `sad`.")
-    sgm: SgmSettings = Field(default_factory=SgmSettings, description="Of the matcher `sgm`.")
-    opencv_bm: OpencvBmSettings = Field(
-        default_factory=OpencvBmSettings, description="Of the matcher `opencv-bm`."
-    )
-    opencv_sgbm: OpencvSgbmSettings = Field(
-        default_factory=OpencvSgbmSettings, description="Of the matcher `opencv-sgbm`."
-    )
-    onnx: OnnxSettings = Field(default_factory=OnnxSettings, description="Of the matcher `onnx`.")
+    sad: SadSettings = SadSettings()
+    sgm: SgmSettings = SgmSettings()
+    opencv_bm: OpencvBmSettings = OpencvBmSettings()
+    opencv_sgbm: OpencvSgbmSettings = OpencvSgbmSettings()
+    onnx: OnnxSettings = OnnxSettings()
 
     @field_serializer("matcher")
     def _written(self, matcher: str | Matcher) -> str:

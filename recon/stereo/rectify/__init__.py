@@ -4,7 +4,6 @@ from recon.stereo.rectify.epipolar import epipolar_curves, epipolar_lines
 from recon.stereo.rectify.features import match_again, match_exactly
 from recon.stereo.rectify.grey import GreyMode, to_grey
 from recon.stereo.rectify.inspect import (
-    InspectionSettings,
     PairFeatures,
     PairInspection,
     check_inspection,
@@ -21,7 +20,6 @@ from recon.stereo.rectify.rectifier import (
 
 __all__ = [
     "GreyMode",
-    "InspectionSettings",
     "PairFeatures",
     "PairInspection",
     "RectificationSettings",

@@ -18,7 +18,11 @@ _ROWS_APART: Final = 12.0
 _CONTRAST: Final = 0.02  # half of OpenCV's default: weak features are still located accurately
 
 
-def match_exactly(left: UInt8, right: UInt8, count: int = 8000) -> PairFeatures:
+MOST_FEATURES: Final = 8000
+"""Maximum number of features per image, where a caller does not say."""
+
+
+def match_exactly(left: UInt8, right: UInt8, count: int = MOST_FEATURES) -> PairFeatures:
     """Mutual best matches of SIFT features that pass the ratio test.
 
     Slower than `match_features`, but subpixel accurate and robust to rotation, scale and slant
@@ -44,7 +48,7 @@ def match_exactly(left: UInt8, right: UInt8, count: int = 8000) -> PairFeatures:
 
 
 def match_again(
-    left: UInt8, right: UInt8, H_left: Float64, H_right: Float64, count: int = 8000
+    left: UInt8, right: UInt8, H_left: Float64, H_right: Float64, count: int = MOST_FEATURES
 ) -> PairFeatures:
     """Match images that homographies roughly align, for more and better matches.
 

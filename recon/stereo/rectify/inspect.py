@@ -10,10 +10,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from pydantic import Field
 
 from recon.core.errors import CalibrationError
-from recon.core.settings import Settings
 from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Bool, Float32, UInt8, freeze
 from recon.stereo.rectify import opencv_features
@@ -25,26 +23,17 @@ _OUTLIER_PX: Final = 3.0
 """A feature whose row error differs from that of the others by more than this is a wrong match."""
 
 
-class InspectionSettings(Settings):
-    """When a pair counts as not rectified."""
+_FEATURES: Final = 1000
+"""Maximum number of features per image."""
 
-    every: int | None = Field(default=50, ge=1, description="Check every n-th frame; null = none.")
-    features: int = Field(
-        default=1000, ge=50, le=20000, description="Maximum number of features per image."
-    )
-    min_features: int = Field(
-        default=40, ge=8, description="Minimum number of matched features for a verdict."
-    )
-    warn_row_px: float = Field(
-        default=1.0, gt=0.0, description="Median row error that gives a warning, in pixels."
-    )
-    swapped_share: float = Field(
-        default=0.8,
-        gt=0.5,
-        le=1.0,
-        description="Share of near features with negative disparity from which the cameras count "
-        "as swapped.",
-    )
+_MIN_FEATURES: Final = 40
+"""With fewer matched features there is no verdict."""
+
+_WARN_ROW_PX: Final = 1.0
+"""Median row error that gives a warning, in pixels."""
+
+_SWAPPED_SHARE: Final = 0.8
+"""Share of near features with negative disparity from which the cameras count as swapped."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,16 +76,14 @@ class PairInspection:
     negative_share: float
 
 
-def inspect_pair(pair: RectifiedPair, settings: InspectionSettings | None = None) -> PairInspection:
+def inspect_pair(pair: RectifiedPair) -> PairInspection:
     """Measure how well a pair is rectified.
 
     Args:
         pair: A pair that should be rectified.
-        settings: Number of features.
     """
-    settings = settings or InspectionSettings()
-    features = match_features(pair.left, pair.right, settings.features)
-    return inspect_features(features, pair.camera.doffs_px, settings.min_features)
+    features = match_features(pair.left, pair.right, _FEATURES)
+    return inspect_features(features, pair.camera.doffs_px)
 
 
 def match_features(left: UInt8, right: UInt8, count: int) -> PairFeatures:
@@ -111,7 +98,7 @@ def match_features(left: UInt8, right: UInt8, count: int) -> PairFeatures:
 
 
 def inspect_features(
-    features: PairFeatures, doffs_px: float = 0.0, min_features: int = 40
+    features: PairFeatures, doffs_px: float = 0.0, min_features: int = _MIN_FEATURES
 ) -> PairInspection:
     """Measure how well matched features fit a rectified pair.
 
@@ -132,20 +119,17 @@ def inspect_features(
     return PairInspection(len(rows), middle, spread, int(near.sum()), negative)
 
 
-def check_inspection(
-    inspection: PairInspection, settings: InspectionSettings, where: str | None = None
-) -> tuple[str, ...]:
+def check_inspection(inspection: PairInspection, where: str | None = None) -> tuple[str, ...]:
     """Warnings about a pair; none if it is good or has too few features.
 
     Args:
         inspection: Result of `inspect_pair`.
-        settings: Limits.
         where: Name of the frame or drive, for the message.
 
     Raises:
         CalibrationError: Left and right are swapped, so no depth is possible.
     """
-    if inspection.negative_share >= settings.swapped_share:
+    if inspection.negative_share >= _SWAPPED_SHARE:
         raise CalibrationError(
             "left and right images are swapped",
             where=where,
@@ -154,11 +138,11 @@ def check_inspection(
             expected="farther left",
             hint="give the left camera's images first (or un-mirror the images)",
         )
-    if abs(inspection.row_error_px) >= settings.warn_row_px:
+    if abs(inspection.row_error_px) >= _WARN_ROW_PX:
         line = (
             "rows of left and right are not aligned: the right image is "
             f"{abs(inspection.row_error_px):.0f} px too {_side(inspection.row_error_px)} (expected "
-            f"under {settings.warn_row_px:g} px); depth will be poor or wrong: rectify the "
+            f"under {_WARN_ROW_PX:g} px); depth will be poor or wrong: rectify the "
             "images, or recalibrate the cameras"
         )
         return (line,)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final
 
 import cv2
 import numpy as np
@@ -26,11 +26,6 @@ from recon.stereo.rectify.grey import GreyMode, to_grey
 from recon.stereo.rectify.lens import rectifying_maps, sees_all, unproject
 from recon.stereo.rectify.wide import plan_wide_view
 
-_INTERPOLATIONS: Final = {
-    "linear": cv2.INTER_LINEAR,
-    "cubic": cv2.INTER_CUBIC,
-    "lanczos": cv2.INTER_LANCZOS4,
-}
 # Allows for rounding in identity maps; far below the resolution of the interpolation (1/32 px).
 _BORDER_TOLERANCE_PX: Final = 1e-3
 # At larger angles the views of two pinhole cameras hardly overlap.
@@ -47,7 +42,8 @@ class RectificationSettings(Settings):
         ge=0,
         le=1,
         description="Zoom of the rectified views: 0 = only valid pixels, 1 = all source pixels, "
-        "none = OpenCV's default. No effect on rectified input.",
+        "none = OpenCV's default. Raise it where the borders matter. No effect on rectified "
+        "input.",
     )
     field_of_view_deg: float | None = Field(
         default=None,
@@ -56,16 +52,16 @@ class RectificationSettings(Settings):
         description="Horizontal field of view of the rectified views, in place of alpha. none = by "
         "alpha; 0 of a fisheye keeps the resolution at its centre, at most 120 degrees.",
     )
-    same_principal_point: bool = Field(
-        default=True,
-        description="Use one principal point for both views, so that disparity 0 is at infinity. "
-        "No effect on rectified input.",
-    )
-    interpolation: Literal["linear", "cubic", "lanczos"] = Field(
-        default="linear", description="Interpolation of source pixels."
-    )
     grey: GreyMode = Field(
-        default="bt601", description="Weights of the colours in grey images, see `to_grey`."
+        default="bt601",
+        description="Weights of the colours in grey images: bt601 as usual, mean = equal, paper = "
+        "as the seed paper prints them.",
+    )
+    inspect_every: int | None = Field(
+        default=50,
+        ge=1,
+        description="Every how many frames features show whether left and right are swapped or "
+        "their rows do not correspond; none = never.",
     )
 
 
@@ -93,9 +89,9 @@ class View:
             & (self.map_y <= height - 1 + e)
         )
 
-    def warp(self, image: UInt8, interpolation: int) -> UInt8:
+    def warp(self, image: UInt8) -> UInt8:
         """Rectify one raw image; pixels without a source are black."""
-        return np.asarray(cv2.remap(image, self.map_x, self.map_y, interpolation))
+        return np.asarray(cv2.remap(image, self.map_x, self.map_y, cv2.INTER_LINEAR))
 
 
 class Rectifier:
@@ -104,7 +100,7 @@ class Rectifier:
     Args:
         calibration: The raw cameras, or the camera of already rectified images, which are only
             checked for size and converted to grey.
-        settings: Zoom, interpolation and grey conversion.
+        settings: Zoom and grey conversion.
 
     Attributes:
         camera: Geometry of the rectified views.
@@ -164,9 +160,8 @@ class Rectifier:
         check_size(self.camera, width_px, height_px, pair.name or f"frame {pair.index}")
         if self._views is None:
             return pair.left, pair.right
-        how = _INTERPOLATIONS[self.settings.interpolation]
         left, right = self._views
-        return left.warp(pair.left, how), right.warp(pair.right, how)
+        return left.warp(pair.left), right.warp(pair.right)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,11 +208,9 @@ def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) 
     size = (left.width_px, left.height_px)
     try:
         if "fisheye" in (left.model, right.model) or not (sees_all(left) and sees_all(right)):
-            R1, R2, P1, P2 = plan_wide_view(
-                calibration, settings.alpha, same_principal_point=settings.same_principal_point
-            )
+            R1, R2, P1, P2 = plan_wide_view(calibration, settings.alpha)
         else:
-            R1, R2, P1, P2 = _plan_pinholes(calibration, size, settings)
+            R1, R2, P1, P2 = _plan_pinholes(calibration, size, settings.alpha)
     except cv2.error as error:
         raise CalibrationError("cameras cannot be rectified", got=error.err) from error
     camera = _camera_of(P1, P2, size)
@@ -247,7 +240,7 @@ def plan_rectification(
 
 
 def _plan_pinholes(
-    calibration: StereoCalibration, size: tuple[int, int], settings: RectificationSettings
+    calibration: StereoCalibration, size: tuple[int, int], alpha: float | None
 ) -> tuple[Float64, Float64, Float64, Float64]:
     left, right = calibration.left, calibration.right
     R1, R2, P1, P2, *_ = cv2.stereoRectify(
@@ -258,8 +251,8 @@ def _plan_pinholes(
         size,
         calibration.T_right_left[:3, :3],
         calibration.T_right_left[:3, 3:],
-        flags=cv2.CALIB_ZERO_DISPARITY if settings.same_principal_point else 0,
-        alpha=-1 if settings.alpha is None else settings.alpha,
+        flags=cv2.CALIB_ZERO_DISPARITY,
+        alpha=-1 if alpha is None else alpha,
     )
     return R1, R2, P1, P2
 

@@ -20,7 +20,7 @@ Box = tuple[Float64, Float64]
 
 
 def plan_wide_view(
-    calibration: StereoCalibration, alpha: float | None, *, same_principal_point: bool
+    calibration: StereoCalibration, alpha: float | None
 ) -> tuple[Float64, Float64, Float64, Float64]:
     """Rotations and projections of the rectified views, like ``stereoRectify`` for pinholes.
 
@@ -47,13 +47,10 @@ def plan_wide_view(
     boxes = [_boxes(left, R_left), _boxes(right, R_right)]
     inner, outer = (_common([pair[kind] for pair in boxes]) for kind in (0, 1))
     focal = _focal(inner, outer, size, alpha, float(left.matrix[0, 0]))
-    middles = [_middle(pair[0]) for pair in boxes]
-    if same_principal_point:
-        middles = [_middle(inner)] * 2
-    y = _middle(inner)[1]
-    for P, middle in ((P_left, middles[0]), (P_right, middles[1])):
+    x, y = _middle(inner)
+    for P in (P_left, P_right):
         P[0, 0] = P[1, 1] = focal
-        P[0, 2] = (size[0] - 1) / 2 - focal * middle[0]
+        P[0, 2] = (size[0] - 1) / 2 - focal * x
         P[1, 2] = (size[1] - 1) / 2 - focal * y
     P_right[0, 3] = -focal * calibration.baseline_m
     return R_left, R_right, P_left, P_right

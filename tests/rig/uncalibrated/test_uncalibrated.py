@@ -11,7 +11,7 @@ from recon.core.errors import CalibrationError
 from recon.core.geometry.projection import map_pixels
 from recon.core.geometry.se3 import exp_so3
 from recon.io.middlebury.scene import read_middlebury_scene
-from recon.rig.uncalibrated import UncalibratedSettings, rectify_pictures, rectify_uncalibrated
+from recon.rig.uncalibrated import rectify_pictures, rectify_uncalibrated
 from recon.stereo.rectify import PairFeatures, epipolar_lines, match_again, match_exactly, to_grey
 
 SIZE = (640, 480)
@@ -134,9 +134,8 @@ def test_too_few_matches_are_refused() -> None:
 def test_matches_without_any_geometry_are_refused() -> None:
     rng = np.random.default_rng(2)
     left, right = rng.uniform(0, SIZE, (2, 300, 2)).astype(np.float32)
-    settings = UncalibratedSettings(min_features=60)
     with pytest.raises(CalibrationError):
-        rectify_uncalibrated(PairFeatures(left, right), SIZE, settings)
+        rectify_uncalibrated(PairFeatures(left, right), SIZE, min_features=60)
 
 
 def test_exact_features_know_places_to_a_third_of_a_pixel_under_a_homography() -> None:
@@ -207,7 +206,7 @@ def test_a_pair_under_known_homographies_comes_back_onto_rows(warp: str) -> None
         "strong": (shaken(size, 0.1, rng), shaken(size, 0.1, rng)),
     }[warp]
     seen = tuple(cv2.warpPerspective(p, H, size) for p, H in ((left, A), (right, B)))
-    found = rectify_pictures([seen], UncalibratedSettings(features=1500))
+    found = rectify_pictures([seen], count=1500)
     rows = true_rows(found, A, B, disparity)
     assert np.abs(rows).mean() < 0.3
 

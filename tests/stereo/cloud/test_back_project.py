@@ -174,8 +174,8 @@ def test_a_lone_pixel_has_a_normal_towards_the_camera() -> None:
 
 
 def test_normals_can_be_left_out() -> None:
-    settings = ALL.model_copy(update={"normals_radius_px": None})
-    assert back_project(as_disparity(np.full((40, 64), 6.0)), make_pair(), settings).normals is None
+    disparity = as_disparity(np.full((40, 64), 6.0))
+    assert back_project(disparity, make_pair(), ALL, normals=False).normals is None
 
 
 def test_no_disparity_gives_an_empty_cloud() -> None:

@@ -50,7 +50,7 @@ def full(number: float, shape: tuple[int, ...] = SHAPE) -> np.ndarray:
 
 def test_an_object_is_taken_where_a_name_is() -> None:
     mine = Flat()
-    config = recon.load_config(overrides=["edges.enabled=false"]).with_matcher(mine)
+    config = recon.load_config(overrides=["cloud.remove_flying_edges=false"]).with_matcher(mine)
     for found in (
         recon.match(image(), image(), matcher=mine),
         recon.reconstruct(image(), image(), CAMERA, matcher=mine).disparity,

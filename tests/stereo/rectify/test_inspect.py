@@ -9,14 +9,12 @@ import pytest
 from recon.core.errors import CalibrationError
 from recon.core.values import RectifiedCamera, RectifiedPair
 from recon.stereo.rectify.inspect import (
-    InspectionSettings,
     PairFeatures,
     check_inspection,
     inspect_features,
     inspect_pair,
 )
 
-SETTINGS = InspectionSettings()
 CAMERA = RectifiedCamera(
     focal_px=300.0,
     cx_px=199.5,
@@ -49,68 +47,68 @@ def swapped(pair: RectifiedPair) -> RectifiedPair:
 
 
 def test_a_good_pair_has_rows_that_correspond_and_no_negative_disparity() -> None:
-    found = inspect_pair(make_pair(), SETTINGS)
+    found = inspect_pair(make_pair())
     assert found.features > 100
     # A tenth of a pixel: cubic interpolation and one grey level of noise.
     assert abs(found.row_error_px) < 0.1
     assert 0.0 <= found.row_spread_px < 0.3
     assert found.negative_share < 0.02
-    assert check_inspection(found, SETTINGS) == ()
+    assert check_inspection(found) == ()
 
 
 @pytest.mark.parametrize("row_px", [-5.0, -1.7, 1.7, 5.0, 20.0])
 def test_rows_that_are_off_are_measured_and_said(row_px: float) -> None:
-    found = inspect_pair(make_pair(row_px=row_px), SETTINGS)
+    found = inspect_pair(make_pair(row_px=row_px))
     assert found.row_error_px == pytest.approx(row_px, abs=0.2)
-    (line,) = check_inspection(found, SETTINGS)
+    (line,) = check_inspection(found)
     assert "rows of left and right are not aligned" in line
     assert f"{abs(row_px):.0f} px too {'low' if row_px > 0 else 'high'}" in line
 
 
 def test_swapped_eyes_are_an_error_that_says_so() -> None:
-    found = inspect_pair(swapped(make_pair()), SETTINGS)
+    found = inspect_pair(swapped(make_pair()))
     assert found.negative_share > 0.98
     with pytest.raises(CalibrationError, match="frame 7: left and right images are swapped"):
-        check_inspection(found, SETTINGS, where="frame 7")
+        check_inspection(found, where="frame 7")
 
 
 def test_eyes_that_are_swapped_and_misaligned_are_still_swapped() -> None:
-    found = inspect_pair(swapped(make_pair(row_px=5.0)), SETTINGS)
+    found = inspect_pair(swapped(make_pair(row_px=5.0)))
     with pytest.raises(CalibrationError, match="swapped"):
-        check_inspection(found, SETTINGS)
+        check_inspection(found)
 
 
 def test_exposure_between_the_eyes_changes_nothing() -> None:
     pair = make_pair(row_px=2.0)
     darker = replace(pair, right=(pair.right // 2).astype(np.uint8))
-    assert inspect_pair(darker, SETTINGS).row_error_px == pytest.approx(2.0, abs=0.3)
+    assert inspect_pair(darker).row_error_px == pytest.approx(2.0, abs=0.3)
 
 
 def test_a_scene_at_infinity_does_not_tell_the_eyes_apart() -> None:
-    found = inspect_pair(make_pair(disparity_px=0.3), SETTINGS)
+    found = inspect_pair(make_pair(disparity_px=0.3))
     assert np.isnan(found.negative_share)
-    assert check_inspection(found, SETTINGS) == ()
+    assert check_inspection(found) == ()
 
 
 def test_offset_principal_points_do_not_look_like_swapped_eyes() -> None:
     """Middlebury's doffs: a far point may have a negative disparity in a good pair."""
     pair = make_pair(disparity_px=-12.0)
     crossed = replace(pair, camera=replace(CAMERA, cx_right_px=CAMERA.cx_px + 30.0))
-    assert inspect_pair(crossed, SETTINGS).negative_share < 0.02
+    assert inspect_pair(crossed).negative_share < 0.02
 
 
 @pytest.mark.parametrize("level", [0, 255])
 def test_pictures_without_features_tell_nothing(level: int) -> None:
     blank = np.full((240, 400), level, np.uint8)
-    found = inspect_pair(RectifiedPair(blank, blank, CAMERA), SETTINGS)
+    found = inspect_pair(RectifiedPair(blank, blank, CAMERA))
     assert found.features == 0
     assert np.isnan(found.row_error_px)
-    assert check_inspection(found, SETTINGS) == ()
+    assert check_inspection(found) == ()
 
 
 def test_pictures_of_different_scenes_tell_nothing() -> None:
     strangers = replace(make_pair(seed=1), right=make_pair(seed=2).right)
-    assert check_inspection(inspect_pair(strangers, SETTINGS), SETTINGS) == ()
+    assert check_inspection(inspect_pair(strangers)) == ()
 
 
 def test_wrong_matches_do_not_move_the_row_error() -> None:
