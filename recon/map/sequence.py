@@ -27,7 +27,7 @@ from recon.odometry import (
     Odometry,
     OdometryFrame,
     OdometryHealth,
-    OdometrySettings,
+    PriorSettings,
     find_axes,
     first_moving,
     make_odometry,
@@ -176,7 +176,7 @@ def map_sequence(
 
     used = None
     if prior is not None and known_poses is None:
-        used = _axes_of(prior, source, reconstructor, config.odometry)
+        used = _axes_of(prior, source, reconstructor, config.odometry.prior)
     odometry = _odometry(config, source, known_poses, prior, used)
     looking = config.loops.enabled and known_poses is None
     loops = LoopWatch(config.loops, work.loops, work.stopwatch) if looking else None
@@ -296,15 +296,15 @@ def _axes_of(
     prior: Trajectory,
     source: StereoSource,
     reconstructor: FrameReconstructor,
-    settings: OdometrySettings,
+    settings: PriorSettings,
 ) -> UsedPrior:
     """The axes of a prior: those set, else those that explain the first motions in the images."""
     start = 0
     if isinstance(source, StampedSource):
-        MotionPrior(prior, settings.prior).check_covers(source.stamps_s)
-        start = first_moving(prior, source.stamps_s, settings.prior)
-    if settings.prior.axes != "auto":
-        return UsedPrior(settings.prior.axes, "settings")
+        MotionPrior(prior, settings).check_covers(source.stamps_s)
+        start = first_moving(prior, source.stamps_s, settings)
+    if settings.axes != "auto":
+        return UsedPrior(settings.axes, "settings")
     frames = (OdometryFrame(*reconstructor.match(pair)) for pair in source.frames(start))
     found = find_axes(prior, frames, settings)
     if found is None:

@@ -5,7 +5,7 @@ from recon.odometry.prior import MotionPrior
 from recon.odometry.prior_axes import FoundAxes, find_axes, first_moving
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
 from recon.odometry.registry import ODOMETRIES, make_odometry
-from recon.odometry.settings import OdometrySettings
+from recon.odometry.settings import OdometrySettings, PriorSettings
 
 __all__ = [
     "ODOMETRIES",
@@ -17,6 +17,7 @@ __all__ = [
     "OdometryHealth",
     "OdometryResult",
     "OdometrySettings",
+    "PriorSettings",
     "find_axes",
     "first_moving",
     "make_odometry",

@@ -8,6 +8,7 @@ moved accordingly, do not match what is seen there.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import cv2
 import numpy as np
@@ -18,12 +19,28 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.geometry.triangulation import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float64, UInt8
-from recon.odometry.settings import AgreementSettings
 
 Int64 = NDArray[np.int64]
 
 _LEAST_NOISE = 0.5
 """Grey values: rounding alone leaves 0.3."""
+
+
+_STRIDE_PX: Final = 5
+"""Every n-th row and column is sampled."""
+
+_PATCH_PX: Final = 48
+"""Edge of a patch."""
+
+_MIN_PIXELS: Final = 24
+"""Least number of samples with a disparity in a patch."""
+
+_MIN_TEXTURE: Final = 3.0
+"""A patch is used if its mean squared gradient, in the direction in which it is smallest, exceeds
+that of the noise by this factor."""
+
+_MIN_CORRELATION: Final = 0.6
+"""Least correlation of a patch that agrees."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +91,6 @@ def explain_motion(
     left: UInt8,
     T_before_now: Float64,
     camera: RectifiedCamera,
-    settings: AgreementSettings,
 ) -> Agreement:
     """Count the patches of the last picture that match where a motion takes them in this one.
 
@@ -88,17 +104,16 @@ def explain_motion(
         left: uint8 (H, W), this picture.
         T_before_now: float64 (4, 4), the motion in question.
         camera: The rectified camera.
-        settings: Patches, texture, correlation.
     """
-    samples = _sample(before, left, T_before_now, camera, settings)
+    samples = _sample(before, left, T_before_now, camera)
     count = np.bincount(samples.patch)
     noise = (noise_sigma(before.left), noise_sigma(left))
-    telling = (count >= settings.min_pixels) & _textured(samples, count, noise[0], settings)
+    telling = (count >= _MIN_PIXELS) & _textured(samples, count, noise[0])
     # A picture that shows little more than noise where the patches should be is blind.
     blind = _power(samples, samples.now, count) < 2.0 * noise[1] ** 2
     if not telling.any() or blind[telling].mean() > 0.5:
         return Agreement(0, float("nan"))
-    agreeing = _correlation(samples, count, noise)[telling] >= settings.min_correlation
+    agreeing = _correlation(samples, count, noise)[telling] >= _MIN_CORRELATION
     return Agreement(int(telling.sum()), float(agreeing.mean()))
 
 
@@ -126,10 +141,9 @@ def _sample(
     left: UInt8,
     T_before_now: Float64,
     camera: RectifiedCamera,
-    settings: AgreementSettings,
 ) -> _Samples:
     """Every n-th pixel with a disparity that stays in the picture."""
-    step, (height, width) = settings.stride_px, left.shape
+    step, (height, width) = _STRIDE_PX, left.shape
     # Slopes need a neighbour on either side.
     row, column = np.nonzero(before.disparity.valid[1:-1:step, 1:-1:step])
     row, column = 1 + step * row, 1 + step * column
@@ -142,8 +156,8 @@ def _sample(
     grey = before.left.astype(np.int16)
     right, down = (grey[row, column + 1], grey[row + 1, column])
     slope = np.stack([right - grey[row, column - 1], down - grey[row - 1, column]], axis=1)
-    patch = (row // settings.patch_px) * -(-width // settings.patch_px)
-    patch += column // settings.patch_px
+    patch = (row // _PATCH_PX) * -(-width // _PATCH_PX)
+    patch += column // _PATCH_PX
     return _Samples(
         patch, grey[row, column].astype(np.float64), _interpolated(left, u, v), 0.5 * slope
     )
@@ -160,15 +174,13 @@ def _interpolated(image: UInt8, u: Float64, v: Float64) -> Float64:
     return grey.reshape(-1)[: len(u)]
 
 
-def _textured(
-    samples: _Samples, count: Int64, sigma: float, settings: AgreementSettings
-) -> NDArray[np.bool_]:
+def _textured(samples: _Samples, count: Int64, sigma: float) -> NDArray[np.bool_]:
     """bool (P,), patches with gradients in every direction that exceed the noise."""
     x, y = samples.slope.T
     xx, yy, xy = (_mean(samples, values, count) for values in (x * x, y * y, x * y))
     least = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
     # Half the difference of two noisy values has half their variance.
-    return np.asarray(least > settings.min_texture * 0.5 * sigma**2)
+    return np.asarray(least > _MIN_TEXTURE * 0.5 * sigma**2)
 
 
 def _correlation(samples: _Samples, count: Int64, noise: tuple[float, float]) -> Float64:

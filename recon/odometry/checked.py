@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,7 +19,18 @@ from recon.odometry.protocol import (
     pose_in,
     tree_of,
 )
-from recon.odometry.settings import TrustSettings
+
+_MAX_SIGMA_M: Final = 0.05
+"""Largest standard deviation of a trusted motion."""
+
+_MAX_SIGMA_SHARE: Final = 0.05
+"""Share of the motion's length that is added to it."""
+
+_MIN_TELLING: Final = 8
+"""With fewer usable patches the images say nothing."""
+
+MIN_SHARE: Final = 0.6
+"""Least share of patches that must agree with a trusted motion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +53,10 @@ class CheckedOdometry:
 
     Args:
         odometry: Finds the poses.
-        settings: What is trusted.
     """
 
-    def __init__(self, odometry: Odometry, settings: TrustSettings) -> None:
+    def __init__(self, odometry: Odometry) -> None:
         self._odometry = odometry
-        self._settings = settings
         self._state: CheckedState | None = None
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
@@ -88,21 +97,19 @@ class CheckedOdometry:
         self, health: OdometryHealth, before: Sight, frame: OdometryFrame, T_before_now: Float64
     ) -> list[str]:
         """What speaks against a motion; empty where it is to be trusted."""
-        settings = self._settings
         length_m = float(np.linalg.norm(T_before_now[:3, 3]))
-        if health.sigma_m > settings.max_sigma_m + settings.max_sigma_share * length_m:
+        if health.sigma_m > _MAX_SIGMA_M + _MAX_SIGMA_SHARE * length_m:
             return [f"the motion is known to {health.sigma_m:.2f} m only"]
-        camera, agreement = frame.pair.camera, settings.agreement
-        found = explain_motion(before, frame.pair.left, T_before_now, camera, agreement)
-        if found.telling >= agreement.min_telling:
-            return _contradiction(found.share, found.telling, agreement.min_share)
+        found = explain_motion(before, frame.pair.left, T_before_now, frame.pair.camera)
+        if found.telling >= _MIN_TELLING:
+            return _contradiction(found.share, found.telling)
         # A visual motion has passed the test of its uncertainty; any other has no other evidence.
         if np.isfinite(health.sigma_m):
             return []
         return [f"only {found.telling} patches of the picture can tell one motion from another"]
 
 
-def _contradiction(share: float, telling: int, min_share: float) -> list[str]:
-    if share >= min_share:
+def _contradiction(share: float, telling: int) -> list[str]:
+    if share >= MIN_SHARE:
         return []
     return [f"only {100 * share:.0f} % of {telling} patches of the picture moved like that"]

@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.values.arrays import Bool, Float32, UInt8
-from recon.odometry.settings import CornerSettings
+
+_CELL_PX: Final = 40
+"""Edge of a cell of the image."""
+
+_PER_CELL: Final = 3
+"""Corners that a cell may hold."""
+
+_DISTANCE_PX: Final = 6
+"""Least distance between two corners."""
+
+_BLOCK_PX: Final = 5
+"""Edge of the neighbourhood that the corner score is computed in."""
+
+_MIN_SCORE: Final = 2e-4
+"""Least eigenvalue of the gradients' covariance, OpenCV's scale."""
+
+_BORDER_PX: Final = 8
+"""Corners nearer to the border are not used."""
 
 
-def find_corners(grey: UInt8, taken_uv: Float32, settings: CornerSettings) -> Float32:
+def find_corners(grey: UInt8, taken_uv: Float32) -> Float32:
     """The best corners of each cell of a picture, away from those already tracked.
 
     Cells keep one strongly textured region from taking all features: only features spread over the
@@ -20,7 +39,6 @@ def find_corners(grey: UInt8, taken_uv: Float32, settings: CornerSettings) -> Fl
         grey: uint8 (H, W).
         taken_uv: float32 (N, 2), columns and rows of features already tracked; they count
             towards the limit of their cell.
-        settings: Cell size, number and quality of corners.
 
     Returns:
         float32 (M, 2), columns and rows, pixels.
@@ -28,40 +46,38 @@ def find_corners(grey: UInt8, taken_uv: Float32, settings: CornerSettings) -> Fl
     Ref:
         Shi and Tomasi, "Good features to track", CVPR 1994.
     """
-    score = cv2.cornerMinEigenVal(grey, settings.block_px, ksize=3)
-    v, u = np.nonzero(_peaks(score, settings) & _free(grey.shape, taken_uv, settings))
-    cells = _cell_of(np.stack([u, v], axis=1), grey.shape, settings)
+    score = cv2.cornerMinEigenVal(grey, _BLOCK_PX, ksize=3)
+    v, u = np.nonzero(_peaks(score) & _free(grey.shape, taken_uv))
+    cells = _cell_of(np.stack([u, v], axis=1), grey.shape)
     order = np.lexsort((u, v, -score[v, u], cells))
     rank = _rank_in_group(cells[order])
-    missing = settings.per_cell - _count_per_cell(taken_uv, grey.shape, settings)
+    missing = _PER_CELL - _count_per_cell(taken_uv, grey.shape)
     keep = order[rank < missing[cells[order]]]
     return np.stack([u[keep], v[keep]], axis=1).astype(np.float32)
 
 
-def _peaks(score: Float32, settings: CornerSettings) -> Bool:
+def _peaks(score: Float32) -> Bool:
     """Local maxima of the score that are good enough and away from the border."""
-    size = 2 * settings.distance_px + 1
+    size = 2 * _DISTANCE_PX + 1
     peak = score >= cv2.dilate(score, np.ones((size, size), np.uint8))
-    peak &= score > settings.min_score
+    peak &= score > _MIN_SCORE
     inside = np.zeros_like(peak)
-    border = settings.border_px
+    border = _BORDER_PX
     inside[border : -border or None, border : -border or None] = True
     return np.asarray(peak & inside)
 
 
-def _free(shape: tuple[int, ...], taken_uv: Float32, settings: CornerSettings) -> Bool:
+def _free(shape: tuple[int, ...], taken_uv: Float32) -> Bool:
     """Pixels away from every feature already tracked."""
     free = np.ones(shape, np.uint8)
     for u, v in np.rint(taken_uv).astype(int).tolist():
-        cv2.circle(free, (u, v), settings.distance_px, 0, -1)
+        cv2.circle(free, (u, v), _DISTANCE_PX, 0, -1)
     return free.astype(np.bool_)
 
 
-def _cell_of(
-    uv: NDArray[np.generic], shape: tuple[int, ...], settings: CornerSettings
-) -> NDArray[np.int64]:
+def _cell_of(uv: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.int64]:
     """Number of the cell of each pixel (N, 2)."""
-    size = settings.cell_px
+    size = _CELL_PX
     columns = -(-shape[1] // size)
     u = np.clip(np.rint(uv[:, 0]).astype(np.int64), 0, shape[1] - 1)
     v = np.clip(np.rint(uv[:, 1]).astype(np.int64), 0, shape[0] - 1)
@@ -69,12 +85,10 @@ def _cell_of(
     return cell
 
 
-def _count_per_cell(
-    uv: Float32, shape: tuple[int, ...], settings: CornerSettings
-) -> NDArray[np.int64]:
-    size = settings.cell_px
+def _count_per_cell(uv: Float32, shape: tuple[int, ...]) -> NDArray[np.int64]:
+    size = _CELL_PX
     cells = -(-shape[0] // size) * -(-shape[1] // size)
-    return np.bincount(_cell_of(uv, shape, settings), minlength=cells)
+    return np.bincount(_cell_of(uv, shape), minlength=cells)
 
 
 def _rank_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:

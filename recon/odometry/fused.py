@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -11,7 +11,15 @@ from recon.core.geometry.se3 import apply, as_step, as_transform, invert, orthon
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
 from recon.odometry.covariance import covariance_of, step_covariance
-from recon.odometry.gate import Correction, Verdict, icp_covariance, icp_may_help, judge
+from recon.odometry.gate import (
+    MIN_OVERLAP,
+    Correction,
+    Verdict,
+    best_covariance,
+    icp_covariance,
+    icp_may_help,
+    judge,
+)
 from recon.odometry.kiss_icp import IcpAlignment, KissIcp, KissIcpOptions
 from recon.odometry.points import select_points
 from recon.odometry.prior import MotionPrior
@@ -22,9 +30,44 @@ from recon.odometry.protocol import (
     finite_in,
     pose_in,
 )
-from recon.odometry.settings import FusedSettings, VisualSettings
+from recon.odometry.settings import OdometrySettings
 from recon.odometry.surfaces import describe_surfaces, fit_surfaces
 from recon.odometry.visual import VisualEstimate, VisualOdometry
+
+_SOURCE_SHARE: Final = 0.8
+"""Points farther than this share of the range are not aligned, but go into the map."""
+
+_VOXEL_M: Final = 0.3
+"""Edge of a voxel of the map of ICP."""
+
+_THRESHOLD_M: Final = 0.3
+"""Scale of the robust kernel; points pair up to thrice as far."""
+
+_LOST_THRESHOLD_M: Final = 1.0
+"""That scale where there is no visual prior."""
+
+_ITERATIONS: Final = 50
+"""ICP steps at most."""
+
+_CONVERGENCE: Final = 1e-3
+"""Length of a step below which it is the last."""
+
+_MIN_POINTS: Final = 300
+"""Frames with fewer points keep the visual pose."""
+
+_SURFACE_M: Final = 1.0
+"""Edge of the cells in which surfaces are fitted to the map."""
+
+_LOST_SIGMA_M: Final = 0.05
+"""Standard deviation of an extrapolated translation, times the number of frames since the last
+visual motion."""
+
+_LOST_SIGMA_DEG: Final = 0.3
+"""That of an extrapolated rotation, likewise."""
+
+_OFFSET_FRAMES: Final = 30
+"""Frames over which the mean ICP correction is estimated, and then subtracted: a constant one comes
+from the bias of stereo depth with range, not from the motion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,23 +94,20 @@ class FusedOdometry:
     """Visual odometry as the prior of every frame, and gated corrections by kiss-icp.
 
     Args:
-        settings: Points, ICP and the gate.
-        visual: The visual odometry.
+        settings: Range of the points, and how often ICP runs.
         prior: How the camera moved by other means.
     """
 
-    def __init__(
-        self, settings: FusedSettings, visual: VisualSettings, prior: MotionPrior | None = None
-    ) -> None:
+    def __init__(self, settings: OdometrySettings, prior: MotionPrior | None = None) -> None:
         self._settings = settings
-        self._visual = VisualOdometry(visual, prior)
+        self._visual = VisualOdometry(prior)
         self._icp = KissIcp(
             KissIcpOptions(
-                max_range_m=settings.points.max_range_m,
-                source_range_m=settings.icp.source_range_m,
-                voxel_m=settings.icp.voxel_m,
-                iterations=settings.icp.iterations,
-                convergence=settings.icp.convergence,
+                max_range_m=settings.max_range_m,
+                source_range_m=_SOURCE_SHARE * settings.max_range_m,
+                voxel_m=_VOXEL_M,
+                iterations=_ITERATIONS,
+                convergence=_CONVERGENCE,
             )
         )
         self._T_visual = np.eye(4)
@@ -78,8 +118,7 @@ class FusedOdometry:
         self._mapped = False
         self._frames = 0
         # Until ICP has run, it is assumed to be as good as it can be.
-        gate = settings.gate
-        self._icp_covariance = step_covariance(gate.icp_floor_m, gate.icp_floor_deg)
+        self._icp_covariance = best_covariance()
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
         """Register the next frame.
@@ -90,7 +129,7 @@ class FusedOdometry:
         and the map is not updated.
         """
         prior = self._prior(self._visual.track(frame))
-        due = self._frames % self._settings.icp.every == 0
+        due = self._frames % self._settings.icp_every == 0
         self._frames += 1
         if due or not prior.seen or self._icp_may_help(prior):
             result = self._with_icp(prior, frame)
@@ -126,23 +165,22 @@ class FusedOdometry:
 
     def _icp_may_help(self, prior: _Prior) -> bool:
         """Whether ICP, if as certain as the last time, would change the prior."""
-        return icp_may_help(prior.covariance, self._icp_covariance, self._settings.gate)
+        return icp_may_help(prior.covariance, self._icp_covariance)
 
     def _with_icp(self, prior: _Prior, frame: OdometryFrame) -> OdometryResult:
         """The prior with ICP's correction; the frame is added to ICP's map."""
-        points = select_points(frame, self._settings.points)
+        points = select_points(frame, self._settings.max_range_m)
         result = self._corrected(prior, points)
-        if result.health.ok and len(points) >= self._settings.icp.min_points:
+        if result.health.ok and len(points) >= _MIN_POINTS:
             self._icp.update(points.xyz, result.T_world_camera)
             self._mapped = True
         return result
 
     def _prior(self, visual: VisualEstimate) -> _Prior:
-        gate = self._settings.gate
         self._lost = 0 if visual.information is not None else self._lost + 1
         T = self._T_world_camera @ invert(self._T_visual) @ visual.result.T_world_camera
         if visual.information is None:
-            sigmas = self._lost * np.array([gate.lost_sigma_m, gate.lost_sigma_deg])
+            sigmas = self._lost * np.array([_LOST_SIGMA_M, _LOST_SIGMA_DEG])
             return _Prior(orthonormalise(T), step_covariance(*sigmas.tolist()), visual)
         covariance = covariance_of(visual.information)
         return _Prior(orthonormalise(T), covariance, visual)
@@ -150,30 +188,30 @@ class FusedOdometry:
     def _corrected(self, prior: _Prior, points: PointCloud) -> OdometryResult:
         """The prior, moved by the part of ICP's correction that passes the gate."""
         health = prior.visual.result.health
-        if not self._mapped or len(points) < self._settings.icp.min_points:
+        if not self._mapped or len(points) < _MIN_POINTS:
             note = "no map for ICP yet" if not self._mapped else "too few points for ICP"
             health = replace(health, icp_points=len(points), notes=(*health.notes, note))
             return OdometryResult(prior.T_world_camera, health)
         alignment = self._align(prior, points)
         correction = self._measure(prior, alignment)
-        verdict = judge(correction, self._offset, prior.covariance, self._settings.gate)
+        verdict = judge(correction, self._offset, prior.covariance)
         self._learn_offset(prior, correction)
-        self._icp_covariance = icp_covariance(correction.after, self._settings.gate)
+        self._icp_covariance = icp_covariance(correction.after)
         T = orthonormalise(prior.T_world_camera @ as_transform(verdict.step))
         return OdometryResult(T, _health(health, alignment, correction, verdict))
 
     def _align(self, prior: _Prior, points: PointCloud) -> IcpAlignment:
         """ICP from the prior; from an extrapolated one with a wider threshold first."""
-        icp, T = self._settings.icp, prior.T_world_camera
+        T = prior.T_world_camera
         if not prior.seen:
-            T = self._icp.align(points.xyz, T, icp.lost_threshold_m).T_world_camera
-        return self._icp.align(points.xyz, T, icp.threshold_m)
+            T = self._icp.align(points.xyz, T, _LOST_THRESHOLD_M).T_world_camera
+        return self._icp.align(points.xyz, T, _THRESHOLD_M)
 
     def _measure(self, prior: _Prior, alignment: IcpAlignment) -> Correction:
         """What ICP would change, and how the frame fits the map before and after."""
         T_prior_icp = invert(prior.T_world_camera) @ alignment.T_world_camera
         near = apply(invert(prior.T_world_camera), self._icp.map_points())
-        surfaces = describe_surfaces(near, self._settings.icp.surface_m)
+        surfaces = describe_surfaces(near, _SURFACE_M)
         return Correction(
             step=as_step(T_prior_icp),
             before=fit_surfaces(alignment.source, surfaces),
@@ -182,9 +220,9 @@ class FusedOdometry:
 
     def _learn_offset(self, prior: _Prior, correction: Correction) -> None:
         """Average ICP's corrections of good priors: their mean is a bias, not a motion."""
-        if prior.seen and correction.after.overlap >= self._settings.gate.min_overlap:
+        if prior.seen and correction.after.overlap >= MIN_OVERLAP:
             self._measured += 1
-            share = 1.0 / min(self._measured, self._settings.gate.offset_frames)
+            share = 1.0 / min(self._measured, _OFFSET_FRAMES)
             self._offset = (1.0 - share) * self._offset + share * correction.step
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -11,33 +11,44 @@ from recon.core.values.arrays import Float64
 from recon.odometry.kiss_icp import KissIcp, KissIcpOptions
 from recon.odometry.points import all_points
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
-from recon.odometry.settings import KissSettings
+
+_VOXEL_M: Final = 0.5
+"""Edge of a voxel of the map."""
+
+_INITIAL_THRESHOLD_M: Final = 2.0
+"""First value of the adaptive threshold."""
+
+_MIN_MOTION_M: Final = 0.1
+"""Deviations from the motion model below this do not change the threshold."""
+
+_MIN_POINTS: Final = 1000
+"""Frames with fewer points are skipped."""
 
 
 class KissOdometry:
     """Gives kiss-icp every point, as with a LiDAR; on dense stereo clouds it underestimates motion.
 
     Args:
-        settings: Range, voxel, threshold.
+        max_range_m: Farther points are not used.
     """
 
-    def __init__(self, settings: KissSettings) -> None:
-        self._settings = settings
+    def __init__(self, max_range_m: float) -> None:
+        self._max_range_m = max_range_m
         self._icp = KissIcp(
             KissIcpOptions(
-                max_range_m=settings.max_range_m,
-                source_range_m=settings.max_range_m,
-                voxel_m=settings.voxel_m,
-                initial_threshold_m=settings.initial_threshold_m,
-                min_motion_m=settings.min_motion_m,
+                max_range_m=max_range_m,
+                source_range_m=max_range_m,
+                voxel_m=_VOXEL_M,
+                initial_threshold_m=_INITIAL_THRESHOLD_M,
+                min_motion_m=_MIN_MOTION_M,
             )
         )
         self._poses: list[Float64] = []
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
         """Register the next frame; one with too few points is extrapolated."""
-        points = all_points(frame, self._settings.max_range_m)
-        if len(points) < self._settings.min_points:
+        points = all_points(frame, self._max_range_m)
+        if len(points) < _MIN_POINTS:
             note = f"{len(points)} points are too few for ICP; the last motion goes on"
             health = OdometryHealth(ok=not self._poses, icp_points=len(points), notes=(note,))
             return self._keep(self._extrapolated(), health)

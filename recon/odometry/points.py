@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import cv2
 import numpy as np
 
@@ -10,10 +12,21 @@ from recon.core.geometry.triangulation import depth_from_disparity, depth_sigma
 from recon.core.values import Disparity, PointCloud
 from recon.core.values.arrays import Bool, Float32, UInt8
 from recon.odometry.protocol import OdometryFrame
-from recon.odometry.settings import PointSettings
+
+_MIN_GRADIENT: Final = 100.0
+"""Least horizontal gradient, 3x3 Sobel of grey values."""
+
+_MAX_DISPARITY_STEP_PX: Final = 0.5
+"""Largest difference between a disparity and the median around it."""
+
+_MIN_RANGE_M: Final = 1.0
+"""Nearer points are not used."""
+
+_MAX_SIGMA_M: Final = 1.0
+"""Points with a less certain depth are not used."""
 
 
-def select_points(frame: OdometryFrame, settings: PointSettings) -> PointCloud:
+def select_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
     """Near, textured points whose disparity agrees with its neighbours.
 
     Dense stereo clouds are smeared along the rays where there is little texture, and extend the
@@ -21,7 +34,7 @@ def select_points(frame: OdometryFrame, settings: PointSettings) -> PointCloud:
 
     Args:
         frame: Pictures and disparity.
-        settings: Required texture, consistency, range and accuracy.
+        max_range_m: Farther points are not used.
 
     Returns:
         Points in camera axes with ``sigma_m``; perhaps none.
@@ -30,10 +43,10 @@ def select_points(frame: OdometryFrame, settings: PointSettings) -> PointCloud:
     depth = depth_from_disparity(frame.disparity.values, camera)
     sigma = depth_sigma(depth, frame.disparity.sigma_px, camera)
     with np.errstate(invalid="ignore"):
-        good = (depth >= settings.min_range_m) & (depth <= settings.max_range_m)
-        good &= sigma <= settings.max_sigma_m
-    good &= textured(frame.pair.left, settings.min_gradient)
-    good &= consistent(frame.disparity, settings.max_disparity_step_px)
+        good = (depth >= _MIN_RANGE_M) & (depth <= max_range_m)
+        good &= sigma <= _MAX_SIGMA_M
+    good &= textured(frame.pair.left, _MIN_GRADIENT)
+    good &= consistent(frame.disparity, _MAX_DISPARITY_STEP_PX)
     return _cloud(frame, depth, sigma, good)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import cv2
 import numpy as np
@@ -11,7 +12,18 @@ from recon.core.geometry.projection import project
 from recon.core.geometry.se3 import apply, invert, make_transform
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
-from recon.odometry.settings import PoseSettings
+
+REPROJECTION_PX: Final = 2.0
+"""RANSAC's inlier limit."""
+
+_ITERATIONS: Final = 200
+"""RANSAC's samples at most."""
+
+MIN_INLIERS: Final = 15
+"""Fewer agreeing tracks give no pose."""
+
+_MIN_INLIER_SHARE: Final = 0.3
+"""A smaller share of agreeing tracks gives no pose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +44,6 @@ def locate_camera(
     uv: Float64,
     camera: RectifiedCamera,
     T_world_guess: Float64,
-    settings: PoseSettings,
 ) -> LocatedCamera | None:
     """The pose of a camera that sees known points, from the largest set of them that agrees.
 
@@ -46,7 +57,6 @@ def locate_camera(
         uv: float64 (N, 2), where the camera sees them.
         camera: The rectified camera.
         T_world_guess: float64 (4, 4), the predicted pose.
-        settings: Tolerance, samples, and how many must agree.
 
     Returns:
         The pose; None where too few points agree on one.
@@ -54,41 +64,39 @@ def locate_camera(
     Ref:
         Fischler and Bolles, "Random sample consensus", CACM 1981.
     """
-    if len(xyz_world) < settings.min_inliers:
+    if len(xyz_world) < MIN_INLIERS:
         return None
-    consensus = _ransac(xyz_world, uv, camera, settings)
+    consensus = _ransac(xyz_world, uv, camera)
     if consensus is None:
         return None
     among = consensus.agree
     fits = [
-        _agreement(_fit(xyz_world[among], uv[among], camera, T), xyz_world, uv, camera, settings)
+        _agreement(_fit(xyz_world[among], uv[among], camera, T), xyz_world, uv, camera)
         for T in (T_world_guess, consensus.T_world_camera)
     ]
     best = max(fits, key=lambda fit: int(fit.agree.sum()))
-    return best if enough_agree(int(best.agree.sum()), len(xyz_world), settings) else None
+    return best if enough_agree(int(best.agree.sum()), len(xyz_world)) else None
 
 
-def enough_agree(agreeing: int, tracks: int, settings: PoseSettings) -> bool:
+def enough_agree(agreeing: int, tracks: int) -> bool:
     """Whether so many of the tracks agree that the pose counts as measured."""
-    return agreeing >= max(settings.min_inliers, settings.min_inlier_share * tracks)
+    return agreeing >= max(MIN_INLIERS, _MIN_INLIER_SHARE * tracks)
 
 
-def _ransac(
-    xyz_world: Float64, uv: Float64, camera: RectifiedCamera, settings: PoseSettings
-) -> LocatedCamera | None:
+def _ransac(xyz_world: Float64, uv: Float64, camera: RectifiedCamera) -> LocatedCamera | None:
     """The largest set that agrees, and a rough pose."""
     found, rotation, translation, inliers = cv2.solvePnPRansac(
         xyz_world,
         uv,
         camera.matrix,
         None,
-        iterationsCount=settings.iterations,
-        reprojectionError=settings.reprojection_px,
+        iterationsCount=_ITERATIONS,
+        reprojectionError=REPROJECTION_PX,
         confidence=0.999,
         flags=cv2.SOLVEPNP_AP3P,
     )
     # Four points give a closed-form pose anyhow; the fit that follows needs more.
-    if not found or inliers is None or len(inliers) < settings.min_inliers:
+    if not found or inliers is None or len(inliers) < MIN_INLIERS:
         return None
     agree = np.zeros(len(xyz_world), np.bool_)
     agree[inliers.reshape(-1)] = True
@@ -113,13 +121,12 @@ def _agreement(
     xyz_world: Float64,
     uv: Float64,
     camera: RectifiedCamera,
-    settings: PoseSettings,
 ) -> LocatedCamera:
     """Which points agree with a pose; none, where it is not finite."""
     u, v, _ = project(apply(invert(T_world_camera), xyz_world), camera)
     error_px = np.hypot(u - uv[:, 0], v - uv[:, 1])
     # A point behind the camera has a NaN error, which compares as False.
-    return LocatedCamera(T_world_camera, np.asarray(error_px <= settings.reprojection_px))
+    return LocatedCamera(T_world_camera, np.asarray(error_px <= REPROJECTION_PX))
 
 
 def _pose(rotation: Float64, translation: Float64) -> Float64:

@@ -18,6 +18,11 @@ _CAMERA_FROM_BODY: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0
 """Camera axes (x right, y down, z forward) of body axes (x forward, y left, z up)."""
 
 
+MAX_SIGMAS: Final = 4.7
+"""A visual motion farther from that of the path, in standard deviations of their difference,
+contradicts it: 0.1 % of right ones do, with six degrees of freedom."""
+
+
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
     """A path of the same rig on the same clock, of which only relative motions are used.

@@ -14,9 +14,9 @@ from recon.core.geometry.se3 import as_step, invert
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.odometry.covariance import covariance_of, step_covariance
-from recon.odometry.prior import MotionPrior
+from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame
-from recon.odometry.settings import OdometrySettings, PriorSettings
+from recon.odometry.settings import PriorSettings
 from recon.odometry.visual import VisualOdometry
 
 Axes = Literal["camera", "body"]
@@ -45,14 +45,14 @@ class FoundAxes:
 
 
 def find_axes(
-    prior: Trajectory, frames: Iterable[OdometryFrame], settings: OdometrySettings
+    prior: Trajectory, frames: Iterable[OdometryFrame], settings: PriorSettings
 ) -> FoundAxes | None:
     """Compare a prior in all supported axes with the visual motion of some frames.
 
     Args:
         prior: Path of the rig by other sensors.
         frames: Frames in order; as many are read as are needed.
-        settings: Visual odometry, and the accuracy of the prior.
+        settings: The accuracy of the prior.
 
     Returns:
         The axes; None if the cameras do not see enough motion to tell.
@@ -60,20 +60,18 @@ def find_axes(
     Raises:
         RegistrationError: The prior contradicts the visual motion in all axes.
     """
-    priors = {axes: MotionPrior(prior, _in_axes(settings.prior, axes)) for axes in get_args(Axes)}
-    off = [
-        _distances(priors, motion) for motion in _visual_motions(priors["camera"], frames, settings)
-    ]
+    priors = {axes: MotionPrior(prior, _in_axes(settings, axes)) for axes in get_args(Axes)}
+    off = [_distances(priors, motion) for motion in _visual_motions(priors["camera"], frames)]
     if not off:
         return None
     sigmas = {axes: float(np.median([one[axes] for one in off])) for axes in priors}
     best = min(priors, key=lambda axes: sigmas[axes])
-    if sigmas[best] > settings.prior.max_sigmas:
+    if sigmas[best] > MAX_SIGMAS:
         told = ", ".join(f"{axes} axes {sigmas[axes]:.1f}" for axes in priors)
         raise RegistrationError(
             "the prior fits what the cameras see in no axes",
             got=f"{told} standard deviations off in {len(off)} motions",
-            expected=f"at most {settings.prior.max_sigmas:g}",
+            expected=f"at most {MAX_SIGMAS:g}",
             hint="it must be the path of this rig, in metres and on its clock; name its axes with "
             "--set odometry.prior.axes= to use it nevertheless",
         )
@@ -116,11 +114,9 @@ def _in_sigmas(T: Float64, settings: PriorSettings) -> float:
     return max(float(np.linalg.norm(step[:3])) / settings.sigma_m, turned_deg / settings.sigma_deg)
 
 
-def _visual_motions(
-    prior: MotionPrior, frames: Iterable[OdometryFrame], settings: OdometrySettings
-) -> list[_VisualMotion]:
+def _visual_motions(prior: MotionPrior, frames: Iterable[OdometryFrame]) -> list[_VisualMotion]:
     """Visual motions that are long enough, one after the other, where the prior is known."""
-    odometry, motions = VisualOdometry(settings.visual), []
+    odometry, motions = VisualOdometry(), []
     start: tuple[int, float, Float64] | None = None
     covariance = np.zeros((6, 6))
     for index, frame in enumerate(islice(frames, _MOST_FRAMES)):

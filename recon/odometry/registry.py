@@ -16,9 +16,9 @@ from recon.odometry.settings import OdometrySettings
 from recon.odometry.visual import VisualOdometry
 
 ODOMETRIES: Final[dict[str, Callable[[OdometrySettings, MotionPrior | None], Odometry]]] = {
-    "visual": lambda settings, prior: VisualOdometry(settings.visual, prior),
-    "kiss": lambda settings, prior: KissOdometry(settings.kiss),
-    "fused": lambda settings, prior: FusedOdometry(settings.fused, settings.visual, prior),
+    "visual": lambda settings, prior: VisualOdometry(prior),
+    "kiss": lambda settings, prior: KissOdometry(settings.max_range_m),
+    "fused": FusedOdometry,
 }
 
 
@@ -45,4 +45,4 @@ def make_odometry(
         )
     settings = settings or OdometrySettings()
     motion_prior = None if prior is None else MotionPrior(prior, settings.prior)
-    return CheckedOdometry(ODOMETRIES[name](settings, motion_prior), settings.trust)
+    return CheckedOdometry(ODOMETRIES[name](settings, motion_prior))

@@ -2,18 +2,42 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import cv2
 import numpy as np
 
 from recon.core.values import Disparity
 from recon.core.values.arrays import Bool, Float32, UInt8
-from recon.odometry.settings import TrackSettings
 from recon.stereo.rectify.opencv_features import exposed_as
 
+_WINDOW_PX: Final = 17
+"""Edge of the tracked patch."""
 
-def follow(
-    source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32, settings: TrackSettings
-) -> tuple[Float32, Bool]:
+_LEVELS: Final = 3
+"""Pyramid levels above full resolution."""
+
+_RETURN_LEVELS: Final = 0
+"""Pyramid levels for tracking back. It starts where it should end, so it only has to stay there."""
+
+_MAX_EXPOSURE_CHANGE: Final = 0.05
+"""Relative change of brightness or contrast above which an image is adapted to the exposure of the
+last one before tracking."""
+
+_MAX_RETURN_PX: Final = 0.5
+"""Largest distance between a feature and where tracking forth and back ends."""
+
+_NEIGHBOUR_PX: Final = 2
+"""Half width of the neighbourhood whose median is the disparity."""
+
+_MAX_DISPARITY_STEP_PX: Final = 1.0
+"""Largest difference between a disparity and that median."""
+
+_MIN_EIGENVALUE: Final = 1e-4
+"""Least texture of a patch that is tracked, OpenCV's scale."""
+
+
+def follow(source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32) -> tuple[Float32, Bool]:
     """Track features to another picture, and back again as a check.
 
     Args:
@@ -21,7 +45,6 @@ def follow(
         target: Picture to which they are tracked.
         uv: float32 (N, 2), columns and rows in ``source``.
         guess_uv: float32 (N, 2), predicted columns and rows in ``target``.
-        settings: Window and tolerances.
 
     Returns:
         float32 (N, 2), columns and rows in ``target``, and bool (N,), True where tracking back
@@ -33,23 +56,23 @@ def follow(
     """
     if not len(uv):
         return uv.copy(), np.zeros(0, np.bool_)
-    target = _comparable(source, target, settings.max_exposure_change)
-    there, found = _lucas_kanade(source, target, uv, guess_uv, settings, settings.levels)
-    back, found_back = _lucas_kanade(target, source, there, uv, settings, settings.return_levels)
-    returned = np.abs(back - uv).max(axis=1) <= settings.max_return_px
+    target = _comparable(source, target)
+    there, found = _lucas_kanade(source, target, uv, guess_uv, _LEVELS)
+    back, found_back = _lucas_kanade(target, source, there, uv, _RETURN_LEVELS)
+    returned = np.abs(back - uv).max(axis=1) <= _MAX_RETURN_PX
     height, width = target.shape
     inside = (there >= 0).all(axis=1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
     return there, np.asarray(found & found_back & returned & inside)
 
 
-def _comparable(source: UInt8, target: UInt8, max_change: float) -> UInt8:
+def _comparable(source: UInt8, target: UInt8) -> UInt8:
     """The target, adapted to the exposure of the source if the two differ."""
     ours, theirs = (np.ravel(cv2.meanStdDev(image)) for image in (source, target))
-    same = np.abs(theirs - ours) <= max_change * ours
+    same = np.abs(theirs - ours) <= _MAX_EXPOSURE_CHANGE * ours
     return target if same.all() else exposed_as(source, target)
 
 
-def sample_disparity(disparity: Disparity, uv: Float32, settings: TrackSettings) -> Float32:
+def sample_disparity(disparity: Disparity, uv: Float32) -> Float32:
     """The matcher's disparity of features: the median around each, where that is consistent.
 
     Tracking features into the right picture instead gave two to four times the drift on real
@@ -58,21 +81,20 @@ def sample_disparity(disparity: Disparity, uv: Float32, settings: TrackSettings)
     Args:
         disparity: The matcher's result.
         uv: float32 (N, 2), features of the left picture.
-        settings: Neighbourhood and tolerance.
 
     Returns:
         float32 (N,), pixels; NaN where there is no match, or one unlike its neighbours.
     """
     height, width = disparity.values.shape
     column, row = np.rint(uv).astype(np.int64).T
-    offset = np.arange(-settings.neighbour_px, settings.neighbour_px + 1)
+    offset = np.arange(-_NEIGHBOUR_PX, _NEIGHBOUR_PX + 1)
     columns = np.clip(column[:, None, None] + offset, 0, width - 1)
     rows = np.clip(row[:, None, None] + offset[:, None], 0, height - 1)
     around = disparity.values[rows, columns].reshape(len(uv), offset.size**2)
     centre = around[:, around.shape[1] // 2]
     around = np.where(np.isfinite(around), around, centre[:, None])
     middle = np.median(around, axis=1)
-    agrees = np.abs(middle - centre) <= settings.max_disparity_step_px
+    agrees = np.abs(middle - centre) <= _MAX_DISPARITY_STEP_PX
     sampled: Float32 = np.where(agrees, middle, np.nan).astype(np.float32)
     return sampled
 
@@ -82,7 +104,6 @@ def _lucas_kanade(
     target: UInt8,
     uv: Float32,
     guess_uv: Float32,
-    settings: TrackSettings,
     levels: int,
 ) -> tuple[Float32, Bool]:
     """One way of `follow`."""
@@ -92,10 +113,10 @@ def _lucas_kanade(
         target,
         uv.reshape(-1, 1, 2),
         guess_uv.reshape(-1, 1, 2).copy(),
-        winSize=(settings.window_px, settings.window_px),
+        winSize=(_WINDOW_PX, _WINDOW_PX),
         maxLevel=levels,
         criteria=end,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=settings.min_eigenvalue,
+        minEigThreshold=_MIN_EIGENVALUE,
     )
     return there.reshape(-1, 2), status.reshape(-1).astype(np.bool_)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,13 +15,24 @@ from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.odometry.corners import find_corners
 from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.motion import Motion
-from recon.odometry.pose import enough_agree, locate_camera
-from recon.odometry.prior import MotionPrior
+from recon.odometry.pose import MIN_INLIERS, enough_agree, locate_camera
+from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in, tree_of
-from recon.odometry.settings import VisualSettings
 from recon.odometry.tracking import follow, sample_disparity
 from recon.odometry.window import TrackWindow, adjust, misfits, pose_information, reprojection
 from recon.stereo.rectify.opencv_features import match_features
+
+_FRAMES: Final = 6
+"""Frames adjusted together."""
+
+_INDEPENDENCE: Final = 0.25
+"""Share of the tracks whose errors count as independent."""
+
+_RELOCATE_FEATURES: Final = 2000
+"""Features matched over the whole image where tracking fails."""
+
+MIN_DISPARITY_PX: Final = 0.5
+"""Features with less disparity count as without depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +82,11 @@ class VisualOdometry:
     """Tracks the camera by features.
 
     Args:
-        settings: Corners, tracks, pose and window.
         prior: Motion by other sensors: it predicts where features are, bridges frames without any,
             and refuses features that contradict it.
     """
 
-    def __init__(self, settings: VisualSettings, prior: MotionPrior | None = None) -> None:
-        self._settings = settings
+    def __init__(self, prior: MotionPrior | None = None) -> None:
         self._prior = prior
         self._state: VisualState | None = None
 
@@ -113,7 +122,7 @@ class VisualOdometry:
             what = "features contradict the prior"
             return self._lost(state, frame, motion, prior_motion, what)
         T_world_camera = seen.window.T_world_camera[-1].copy()
-        window = self._replenish(seen.window.trimmed(self._settings.window.frames), frame)
+        window = self._replenish(seen.window.trimmed(_FRAMES), frame)
         motion = state.motion.moved(T_world_camera, time_s)
         self._state = VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
         return self._estimate(seen, frame.pair.camera)
@@ -157,9 +166,9 @@ class VisualOdometry:
             return False
         found = invert(state.window.T_world_camera[-1]) @ seen.window.T_world_camera[-1]
         off = as_step(invert(prior_motion) @ found)
-        information = self._information(seen.window, frame.pair.camera)
+        information = _information(seen.window, frame.pair.camera)
         both = covariance_of(information) + step_covariance(*self._prior.sigmas(prior_motion))
-        return float(np.sqrt(off @ np.linalg.solve(both, off))) > self._prior.settings.max_sigmas
+        return float(np.sqrt(off @ np.linalg.solve(both, off))) > MAX_SIGMAS
 
     def _by_tracking(
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
@@ -173,8 +182,7 @@ class VisualOdometry:
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
         """The frame, registered by matching over the whole picture; None = that fails."""
-        count = self._settings.relocate_features
-        uv, uv_now = match_features(state.left, frame.pair.left, count, any_scale=True)
+        uv, uv_now = match_features(state.left, frame.pair.left, _RELOCATE_FEATURES, any_scale=True)
         camera, T_world_then = frame.pair.camera, state.window.T_world_camera[-1]
         then = np.column_stack([uv, self._disparity(state.disparity, camera, uv)])
         now = np.column_stack([uv_now, self._disparity(frame.disparity, camera, uv_now)])
@@ -190,17 +198,15 @@ class VisualOdometry:
         self, window: TrackWindow, uvd: Float64, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
         """The window with the new frame added, if enough features agree on one motion."""
-        camera, settings = frame.pair.camera, self._settings
+        camera = frame.pair.camera
         tracks = np.flatnonzero(np.isfinite(uvd[:, 0]))
-        found = locate_camera(
-            window.xyz_world[tracks], uvd[tracks, :2], camera, predicted, settings.pose
-        )
+        found = locate_camera(window.xyz_world[tracks], uvd[tracks, :2], camera, predicted)
         if found is None:
             return None
         uvd[tracks[~found.agree]] = np.nan
-        window = adjust(window.with_frame(found.T_world_camera, uvd), camera, settings.window)
-        window = window.without_newest(misfits(window, camera, settings.window))
-        if not enough_agree(int(window.seen[-1].sum()), len(tracks), settings.pose):
+        window = adjust(window.with_frame(found.T_world_camera, uvd), camera)
+        window = window.without_newest(misfits(window, camera))
+        if not enough_agree(int(window.seen[-1].sum()), len(tracks)):
             return None
         return _Seen(window, len(tracks))
 
@@ -215,7 +221,7 @@ class VisualOdometry:
         """Continue the motion; a frame with enough features starts a new window."""
         begun = self._begin(frame, motion)
         points = len(begun.window.xyz_world)
-        sees = points >= self._settings.pose.min_inliers
+        sees = points >= MIN_INLIERS
         self._state = begun if sees else replace(state, motion=motion)
         why = f"{what if sees else 'nothing to follow in the picture'} ({points} features)"
         if prior_motion is None or self._prior is None:
@@ -236,33 +242,28 @@ class VisualOdometry:
         u, v, _ = project(apply(invert(predicted), window.xyz_world[alive]), frame.pair.camera)
         guess = np.stack([u, v], axis=1)
         guess = np.where(np.isfinite(guess), guess, uv).astype(np.float32)
-        there, found = follow(state.left, frame.pair.left, uv, guess, self._settings.tracks)
+        there, found = follow(state.left, frame.pair.left, uv, guess)
         uvd[alive[found], :2] = there[found]
         uvd[alive[found], 2] = self._disparity(frame.disparity, frame.pair.camera, there[found])
         return uvd
 
     def _disparity(self, disparity: Disparity, camera: RectifiedCamera, uv: Float32) -> Float64:
         """Disparity (N,) of features; NaN = unknown, or too small to tell a depth."""
-        d = sample_disparity(disparity, uv, self._settings.tracks).astype(np.float64)
-        return np.where(d + camera.doffs_px < self._settings.pose.min_disparity_px, np.nan, d)
+        d = sample_disparity(disparity, uv).astype(np.float64)
+        return np.where(d + camera.doffs_px < MIN_DISPARITY_PX, np.nan, d)
 
     def _replenish(self, window: TrackWindow, frame: OdometryFrame) -> TrackWindow:
         """The window with new points where the newest frame has too few."""
         taken = window.uvd[-1, window.seen[-1], :2].astype(np.float32)
-        uv = find_corners(frame.pair.left, taken, self._settings.corners)
+        uv = find_corners(frame.pair.left, taken)
         d = self._disparity(frame.disparity, frame.pair.camera, uv)
         uvd = np.column_stack([uv, d])[np.isfinite(d)]
         return window.with_points(uvd, _points(uvd, window.T_world_camera[-1], frame.pair.camera))
 
-    def _information(self, window: TrackWindow, camera: RectifiedCamera) -> Float64:
-        """Information (6, 6) of the newest pose, scaled because errors of tracks correlate."""
-        settings = self._settings.window
-        return settings.independence * pose_information(window, camera, settings)
-
     def _estimate(self, seen: _Seen, camera: RectifiedCamera) -> VisualEstimate:
         """The pose of a registered frame, its health and its information."""
         window = seen.window
-        information = self._information(window, camera)
+        information = _information(window, camera)
         newest = window.seen[-1]
         error = reprojection(window, camera)[newest, :2]
         sigma = np.sqrt(np.diag(covariance_of(information)))
@@ -276,6 +277,11 @@ class VisualOdometry:
         )
         T_world_camera = window.T_world_camera[-1].copy()
         return VisualEstimate(OdometryResult(T_world_camera, health), information)
+
+
+def _information(window: TrackWindow, camera: RectifiedCamera) -> Float64:
+    """Information (6, 6) of the newest pose, scaled because errors of tracks correlate."""
+    return _INDEPENDENCE * pose_information(window, camera)
 
 
 def _points(uvd: Float64, T_world_camera: Float64, camera: RectifiedCamera) -> Float64:

@@ -7,6 +7,7 @@ disparities average out before they become errors of the path.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -14,7 +15,25 @@ from recon.core.geometry.se3 import apply, as_transform, invert
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, frozen_array
 from recon.odometry.kernels import bundle
-from recon.odometry.settings import WindowSettings
+
+_ITERATIONS: Final = 6
+"""Levenberg-Marquardt steps at most."""
+
+_MIN_GAIN: Final = 1e-3
+"""Relative decrease of the cost below which a step is the last."""
+
+_SIGMA_UV_PX: Final = 0.3
+"""Standard deviation of a tracked column or row."""
+
+_SIGMA_D_PX: Final = 1.5
+"""Standard deviation of a disparity; larger than that of a single match, because its error stays
+with a feature from frame to frame and does not average out."""
+
+_CAUCHY_SIGMAS: Final = 3.0
+"""Residual at which the weight of an observation is one half."""
+
+_MAX_SIGMAS: Final = 6.0
+"""Residual above which an observation ends its track."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,15 +112,15 @@ def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
     return np.asarray(window.uvd[-1] - predicted)
 
 
-def misfits(window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings) -> Bool:
+def misfits(window: TrackWindow, camera: RectifiedCamera) -> Bool:
     """bool (N,), points whose newest observation is an outlier."""
     residual = np.nan_to_num(reprojection(window, camera))
-    sigmas = [settings.sigma_uv_px, settings.sigma_uv_px, settings.sigma_d_px]
+    sigmas = [_SIGMA_UV_PX, _SIGMA_UV_PX, _SIGMA_D_PX]
     square = np.square(residual / np.array(sigmas)).sum(axis=1)
-    return np.asarray(square > settings.max_sigmas**2)
+    return np.asarray(square > _MAX_SIGMAS**2)
 
 
-def adjust(window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings) -> TrackWindow:
+def adjust(window: TrackWindow, camera: RectifiedCamera) -> TrackWindow:
     """Adjust poses and points to all observations; the oldest pose stays fixed.
 
     Levenberg-Marquardt on whitened residuals with Cauchy weights; the points are eliminated
@@ -114,19 +133,17 @@ def adjust(window: TrackWindow, camera: RectifiedCamera, settings: WindowSetting
         return window
     usable = window.seen.sum(axis=0) >= 2
     part = TrackWindow(window.T_world_camera, window.uvd[:, usable], window.xyz_world[usable])
-    part = _levenberg_marquardt(part, camera, settings)
+    part = _levenberg_marquardt(part, camera)
     xyz_world = window.xyz_world.copy()
     xyz_world[usable] = part.xyz_world
     return TrackWindow(part.T_world_camera, window.uvd, xyz_world)
 
 
-def _levenberg_marquardt(
-    window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings
-) -> TrackWindow:
-    model = _model(camera, settings)
+def _levenberg_marquardt(window: TrackWindow, camera: RectifiedCamera) -> TrackWindow:
+    model = _model(camera)
     damping = 1e-4
     cost, normal = _cost(window, model), _linearise(window, model)
-    for _ in range(settings.iterations):
+    for _ in range(_ITERATIONS):
         proposal = _moved(window, *bundle.solve_step(normal, damping))
         proposed = _cost(proposal, model)
         if not proposed < cost:
@@ -134,15 +151,13 @@ def _levenberg_marquardt(
             continue
         gain = (cost - proposed) / cost
         window, cost, damping = proposal, proposed, 0.1 * damping
-        if gain < settings.min_gain:
+        if gain < _MIN_GAIN:
             break
         normal = _linearise(window, model)
     return window
 
 
-def pose_information(
-    window: TrackWindow, camera: RectifiedCamera, settings: WindowSettings
-) -> Float64:
+def pose_information(window: TrackWindow, camera: RectifiedCamera) -> Float64:
     """Information of the newest frame's observations on its pose, given the frames before.
 
     Returns:
@@ -151,7 +166,7 @@ def pose_information(
     """
     usable = window.seen[-1] & (window.seen.sum(axis=0) >= 2)
     part = TrackWindow(window.T_world_camera, window.uvd[:, usable], window.xyz_world[usable])
-    normal = _linearise(part, _model(camera, settings))
+    normal = _linearise(part, _model(camera))
     inverse = np.linalg.inv(normal.H_point + bundle.RIDGE * np.eye(3))
     cross = normal.H_cross[-1]
     folded = (cross @ inverse) @ cross.transpose(0, 2, 1)
@@ -175,14 +190,14 @@ def _moved(window: TrackWindow, step_pose: Float64, step_point: Float64) -> Trac
     return replace(window, T_world_camera=poses, xyz_world=window.xyz_world + step_point)
 
 
-def _model(camera: RectifiedCamera, settings: WindowSettings) -> bundle.BundleModel:
+def _model(camera: RectifiedCamera) -> bundle.BundleModel:
     return bundle.BundleModel(
         focal=camera.focal_px,
         cx=camera.cx_px,
         cy=camera.cy_px,
         fb=camera.focal_px * camera.baseline_m,
         doffs=camera.doffs_px,
-        sigma_uv=settings.sigma_uv_px,
-        sigma_d=settings.sigma_d_px,
-        cauchy=settings.cauchy_sigmas,
+        sigma_uv=_SIGMA_UV_PX,
+        sigma_d=_SIGMA_D_PX,
+        cauchy=_CAUCHY_SIGMAS,
     )

@@ -10,8 +10,8 @@ import pytest
 
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.odometry.agreement import Agreement, Sight, explain_motion, noise_sigma
+from recon.odometry.checked import MIN_SHARE
 from recon.odometry.protocol import OdometryFrame
-from recon.odometry.settings import AgreementSettings
 
 See = Callable[..., OdometryFrame]
 STEP = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.array([0.0, 0.0, 0.5]))
@@ -19,8 +19,7 @@ STEP = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.array([0.0, 0.0, 0
 
 def ask(before: OdometryFrame, now: OdometryFrame, T_before_now: np.ndarray) -> Agreement:
     sight = Sight(before.pair.left, before.disparity)
-    settings = AgreementSettings()
-    return explain_motion(sight, now.pair.left, T_before_now, now.pair.camera, settings)
+    return explain_motion(sight, now.pair.left, T_before_now, now.pair.camera)
 
 
 def scaled(T: np.ndarray, share: float) -> np.ndarray:
@@ -41,7 +40,7 @@ def test_the_true_motion_explains_nearly_every_patch(see: See) -> None:
 def test_a_wrong_motion_does_not(wrong: np.ndarray, see: See) -> None:
     found = ask(see(np.eye(4)), see(STEP), wrong)
     assert found.telling >= 8
-    assert found.share < AgreementSettings().min_share
+    assert found.share < MIN_SHARE
 
 
 def test_another_exposure_changes_nothing(see: See) -> None:

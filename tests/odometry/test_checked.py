@@ -10,7 +10,6 @@ import pytest
 from recon.core.geometry.se3 import make_transform
 from recon.odometry.checked import CheckedOdometry
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
-from recon.odometry.settings import TrustSettings
 
 See = Callable[..., OdometryFrame]
 
@@ -28,7 +27,7 @@ class Says:
 def last_health(
     frames: list[OdometryFrame], poses: np.ndarray, health: OdometryHealth
 ) -> OdometryHealth:
-    odometry = CheckedOdometry(Says(poses, health), TrustSettings())
+    odometry = CheckedOdometry(Says(poses, health))
     results = [odometry.register(frame) for frame in frames]
     np.testing.assert_array_equal(results[-1].T_world_camera, poses[-1])
     return results[-1].health

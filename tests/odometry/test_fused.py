@@ -8,23 +8,24 @@ import pytest
 
 from recon.core.geometry.se3 import invert
 from recon.io.tree_file import read_tree, write_tree
+from recon.odometry import gate
 from recon.odometry.fused import FusedOdometry
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.registry import make_odometry
-from recon.odometry.settings import FusedSettings, GateSettings, IcpSettings, VisualSettings
+from recon.odometry.settings import OdometrySettings
 
 See = Callable[..., OdometryFrame]
 
 
-def always() -> FusedSettings:
+def always() -> OdometrySettings:
     """ICP runs in every frame."""
-    return FusedSettings(icp=IcpSettings(every=1))
+    return OdometrySettings(icp_every=1)
 
 
 def follow(
-    frames: Iterable[OdometryFrame], settings: FusedSettings | None = None
+    frames: Iterable[OdometryFrame], settings: OdometrySettings | None = None
 ) -> list[OdometryResult]:
-    odometry = FusedOdometry(settings or FusedSettings(), VisualSettings())
+    odometry = FusedOdometry(settings or OdometrySettings())
     return [odometry.register(frame) for frame in frames]
 
 
@@ -68,11 +69,14 @@ def test_two_runs_are_equal_to_the_bit(
 
 
 def test_a_sure_prior_asks_icp_now_and_then(
-    street: tuple[OdometryFrame, ...], street_poses: np.ndarray
+    street: tuple[OdometryFrame, ...],
+    street_poses: np.ndarray,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # An ICP that is never better than this cannot help.
-    poor = GateSettings(icp_floor_m=1.0, icp_floor_deg=10.0)
-    found = follow(street, FusedSettings(icp=IcpSettings(every=5), gate=poor))
+    monkeypatch.setattr(gate, "_ICP_FLOOR_M", 1.0)
+    monkeypatch.setattr(gate, "_ICP_FLOOR_DEG", 10.0)
+    found = follow(street, OdometrySettings(icp_every=5))
     asked = [index for index, result in enumerate(found) if result.health.icp_points]
     assert asked == [0, 5, 10]
     assert error_m(found[-1], street_poses[-1]) < 0.055
@@ -128,7 +132,7 @@ def test_icp_takes_over_where_vision_is_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Without tracks, but with a disparity map, the map still tells where the camera is."""
-    odometry = FusedOdometry(FusedSettings(), VisualSettings())
+    odometry = FusedOdometry(OdometrySettings())
     results = [odometry.register(frame) for frame in street[:6]]
     monkeypatch.setattr("recon.odometry.visual.locate_camera", lambda *_: None)
     results += [odometry.register(frame) for frame in street[6:9]]

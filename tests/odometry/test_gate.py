@@ -7,10 +7,8 @@ from hypothesis import strategies as st
 
 from recon.odometry.covariance import step_covariance
 from recon.odometry.gate import Correction, icp_covariance, judge
-from recon.odometry.settings import GateSettings
 from recon.odometry.surfaces import Fit, describe_surfaces, fit_surfaces
 
-GATE = GateSettings()
 UNSURE = step_covariance(0.3, 1.0)
 SURE = step_covariance(0.002, 0.005)
 NOTHING = np.zeros(6)
@@ -37,7 +35,7 @@ def corrected(xyz: np.ndarray, step: np.ndarray) -> Correction:
 
 def test_a_corridor_takes_nothing_along_itself_and_all_across() -> None:
     step = np.array([0.1, 0.05, 0.4, 0.0, 0.0, 0.0])
-    verdict = judge(corrected(corridor(ends=False), step), NOTHING, UNSURE, GATE)
+    verdict = judge(corrected(corridor(ends=False), step), NOTHING, UNSURE)
     assert verdict.accepted
     # 2 % remain to the prior across; along, nothing fixes the camera.
     np.testing.assert_allclose(verdict.step[:2], step[:2], rtol=0.02)
@@ -46,13 +44,13 @@ def test_a_corridor_takes_nothing_along_itself_and_all_across() -> None:
 
 def test_walls_across_the_corridor_fix_the_way_along_it() -> None:
     step = np.array([0.1, 0.05, 0.4, 0.0, 0.0, 0.0])
-    verdict = judge(corrected(corridor(ends=True), step), NOTHING, UNSURE, GATE)
+    verdict = judge(corrected(corridor(ends=True), step), NOTHING, UNSURE)
     np.testing.assert_allclose(verdict.step[:3], step[:3], rtol=0.02)
 
 
 def test_a_sure_prior_stays() -> None:
     step = np.array([0.01, 0.0, 0.01, 0.0, 0.0, 0.0])
-    verdict = judge(corrected(corridor(ends=True), step), NOTHING, SURE, GATE)
+    verdict = judge(corrected(corridor(ends=True), step), NOTHING, SURE)
     assert not verdict.accepted
     assert "no better" in verdict.note
     np.testing.assert_array_equal(verdict.step, 0.0)
@@ -60,14 +58,14 @@ def test_a_sure_prior_stays() -> None:
 
 def test_a_correction_far_outside_both_uncertainties_is_refused() -> None:
     step = np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
-    verdict = judge(corrected(corridor(ends=True), step), NOTHING, SURE, GATE)
+    verdict = judge(corrected(corridor(ends=True), step), NOTHING, SURE)
     assert not verdict.accepted
     assert "sigma" in verdict.note
 
 
 def test_the_standing_offset_is_no_news() -> None:
     step = np.array([0.1, 0.05, 0.4, 0.0, 0.01, 0.0])
-    verdict = judge(corrected(corridor(ends=True), step), step, UNSURE, GATE)
+    verdict = judge(corrected(corridor(ends=True), step), step, UNSURE)
     np.testing.assert_allclose(verdict.step, 0.0, atol=1e-12)
 
 
@@ -87,7 +85,7 @@ def test_a_correction_that_does_not_fit_better_is_refused(
     correction = Correction(
         np.full(6, 0.01), Fit(overlap, before, information), Fit(overlap, after, information)
     )
-    verdict = judge(correction, NOTHING, UNSURE, GATE)
+    verdict = judge(correction, NOTHING, UNSURE)
     assert not verdict.accepted
     assert told in verdict.note
 
@@ -100,6 +98,6 @@ def test_no_more_is_taken_than_is_offered(seed: int, scale: float) -> None:
     prior = scale**2 * (A @ A.T + 0.1 * np.eye(6))
     fit = Fit(0.9, 0.1, 1e3 * B @ B.T)
     step = scale * rng.normal(size=6)
-    verdict = judge(Correction(step, Fit(0.9, 0.2, fit.information), fit), NOTHING, prior, GATE)
-    both = prior + icp_covariance(fit, GATE)
+    verdict = judge(Correction(step, Fit(0.9, 0.2, fit.information), fit), NOTHING, prior)
+    both = prior + icp_covariance(fit)
     assert verdict.step @ np.linalg.solve(both, verdict.step) <= step @ np.linalg.solve(both, step)

@@ -7,13 +7,12 @@ import numpy as np
 from recon.core.geometry.se3 import invert
 from recon.odometry.kiss import KissOdometry
 from recon.odometry.protocol import OdometryFrame
-from recon.odometry.settings import KissSettings
 
 See = Callable[..., OdometryFrame]
 
 
 def test_a_still_camera_stays(see: See) -> None:
-    odometry = KissOdometry(KissSettings())
+    odometry = KissOdometry(30.0)
     results = [odometry.register(see(np.eye(4))) for _ in range(3)]
     # ICP against its own points: centimetres, from voxels of 0.5 m.
     assert np.linalg.norm(results[-1].T_world_camera[:3, 3]) < 0.05
@@ -24,14 +23,14 @@ def test_dense_clouds_lose_the_motion_along_a_street(
     street: tuple[OdometryFrame, ...], street_poses: np.ndarray
 ) -> None:
     """The known weakness that the fused odometry exists for."""
-    odometry = KissOdometry(KissSettings())
+    odometry = KissOdometry(30.0)
     results = [odometry.register(frame) for frame in street]
     off = invert(street_poses[-1]) @ results[-1].T_world_camera
     assert np.linalg.norm(off[:3, 3]) > 0.5
 
 
 def test_an_empty_frame_extrapolates_and_says_so(blind: See, see: See) -> None:
-    odometry = KissOdometry(KissSettings())
+    odometry = KissOdometry(30.0)
     before = [odometry.register(see(np.eye(4))) for _ in range(2)]
     result = odometry.register(blind())
     step = invert(before[0].T_world_camera) @ before[1].T_world_camera
@@ -41,7 +40,7 @@ def test_an_empty_frame_extrapolates_and_says_so(blind: See, see: See) -> None:
 
 
 def test_an_empty_drive_stays_at_the_identity(blind: See) -> None:
-    odometry = KissOdometry(KissSettings())
+    odometry = KissOdometry(30.0)
     results = [odometry.register(blind()) for _ in range(3)]
     for result in results:
         np.testing.assert_array_equal(result.T_world_camera, np.eye(4))

@@ -29,9 +29,9 @@ def test_the_settings_offer_what_there_is() -> None:
     "values",
     [
         {"method": "lidar"},
-        {"visual": {"windw": {}}},
-        {"visual": {"window": {"frames": 1}}},
-        {"fused": {"gate": {"min_overlap": 1.5}}},
+        {"prior": {"axis": "body"}},
+        {"prior": {"sigma_m": 0}},
+        {"icp_every": 0},
     ],
 )
 def test_what_is_no_setting_is_refused(values: dict[str, object]) -> None:

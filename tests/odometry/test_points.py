@@ -4,17 +4,18 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from recon.core.values import RectifiedCamera
+from recon.odometry import points
 from recon.odometry.points import all_points, consistent, select_points, textured
 from recon.odometry.protocol import OdometryFrame
-from recon.odometry.settings import PointSettings
 
 See = Callable[..., OdometryFrame]
 
 
 def test_selected_points_lie_on_the_street(see: See) -> None:
-    xyz = select_points(see(np.eye(4)), PointSettings()).xyz
+    xyz = select_points(see(np.eye(4)), 30.0).xyz
     walls = np.stack(
         [xyz[:, 1] - 1.6, xyz[:, 0] + 4.0, xyz[:, 0] - 5.0, xyz[:, 1] + 4.0, xyz[:, 2] - 40.0]
     )
@@ -23,15 +24,17 @@ def test_selected_points_lie_on_the_street(see: See) -> None:
     assert np.abs(walls).min(axis=0).max() < 1e-4
 
 
-def test_range_and_accuracy_bound_the_selection(see: See) -> None:
+def test_range_and_accuracy_bound_the_selection(see: See, monkeypatch: pytest.MonkeyPatch) -> None:
     frame = see(np.eye(4))
-    settings = PointSettings(min_range_m=6.0, max_range_m=20.0, max_sigma_m=0.2)
-    cloud = select_points(frame, settings)
+    every = select_points(frame, 30.0)
+    monkeypatch.setattr(points, "_MIN_RANGE_M", 6.0)
+    monkeypatch.setattr(points, "_MAX_SIGMA_M", 0.2)
+    cloud = select_points(frame, 20.0)
     assert cloud.xyz[:, 2].min() >= 6.0
     assert cloud.xyz[:, 2].max() <= 20.0
     assert cloud.sigma_m is not None
     assert cloud.sigma_m.max() <= 0.2
-    assert 0 < len(cloud) < len(select_points(frame, PointSettings()))
+    assert 0 < len(cloud) < len(every)
 
 
 def test_only_change_along_the_row_is_texture() -> None:
@@ -56,7 +59,7 @@ def test_pixels_at_the_rim_of_the_unknown_are_not_consistent(see: See, blind: Se
 
 
 def test_a_frame_without_disparity_gives_no_points(blind: See) -> None:
-    assert len(select_points(blind(), PointSettings())) == 0
+    assert len(select_points(blind(), 30.0)) == 0
     assert len(all_points(blind(), 30.0)) == 0
 
 

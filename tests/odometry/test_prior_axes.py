@@ -12,7 +12,7 @@ from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import Trajectory
 from recon.odometry.prior_axes import find_axes, first_moving
 from recon.odometry.protocol import OdometryFrame
-from recon.odometry.settings import OdometrySettings
+from recon.odometry.settings import PriorSettings
 
 See = Callable[..., OdometryFrame]
 
@@ -35,7 +35,7 @@ def prior(T_camera_body: np.ndarray, step: np.ndarray = STEP, count: int = 8) ->
 
 @pytest.mark.parametrize("axes", AXES)
 def test_the_axes_of_a_path_are_found(frames: list[OdometryFrame], axes: str) -> None:
-    found = find_axes(prior(AXES[axes]), iter(frames), OdometrySettings())
+    found = find_axes(prior(AXES[axes]), iter(frames), PriorSettings())
     assert found is not None
     assert found.axes == axes
     # The path is exact, so its own standard deviation of 3 % is never used up.
@@ -49,7 +49,7 @@ def test_a_body_near_the_camera_and_a_scale_two_per_cent_off_are_recognised(
     lever = make_transform(exp_so3(np.array([0.02, 0.0, 0.03])), np.array([0.3, 0.5, -0.2]))
     step = STEP.copy()
     step[:3, 3] *= 1.02
-    found = find_axes(prior(CAMERA_FROM_BODY @ lever, step), iter(frames), OdometrySettings())
+    found = find_axes(prior(CAMERA_FROM_BODY @ lever, step), iter(frames), PriorSettings())
     assert found is not None
     assert found.axes == "body"
 
@@ -57,7 +57,7 @@ def test_a_body_near_the_camera_and_a_scale_two_per_cent_off_are_recognised(
 def test_a_path_of_other_axes_is_refused_in_one_line(frames: list[OdometryFrame]) -> None:
     backwards = make_transform(exp_so3(np.array([0.0, np.pi, 0.0])), np.zeros(3))
     with pytest.raises(RegistrationError, match="fits what the cameras see in no axes") as error:
-        find_axes(prior(backwards), iter(frames), OdometrySettings())
+        find_axes(prior(backwards), iter(frames), PriorSettings())
     assert "camera" in str(error.value)
     assert "body" in str(error.value)
     assert "\n" not in str(error.value)
@@ -65,7 +65,7 @@ def test_a_path_of_other_axes_is_refused_in_one_line(frames: list[OdometryFrame]
 
 def test_without_motion_the_axes_stay_open(see: See) -> None:
     still = [see(np.eye(4), n) for n in range(4)]
-    assert find_axes(prior(np.eye(4), np.eye(4)), iter(still), OdometrySettings()) is None
+    assert find_axes(prior(np.eye(4), np.eye(4)), iter(still), PriorSettings()) is None
 
 
 def test_the_first_moving_frame_is_found_from_the_path_alone() -> None:
@@ -73,4 +73,4 @@ def test_the_first_moving_frame_is_found_from_the_path_alone() -> None:
     poses = np.stack([make_transform(np.eye(3), np.array([x, 0.0, 0.0])) for x in moved])
     path = Trajectory(poses, 0.1 * np.arange(60))
     # Of the frames until 0.3 m are covered, those before the path moves are of no use.
-    assert first_moving(path, 0.1 * np.arange(5, 60), OdometrySettings().prior) == 15
+    assert first_moving(path, 0.1 * np.arange(5, 60), PriorSettings()) == 15

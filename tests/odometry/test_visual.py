@@ -9,14 +9,13 @@ import pytest
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import RectifiedPair
 from recon.odometry.protocol import OdometryFrame
-from recon.odometry.settings import VisualSettings
 from recon.odometry.visual import VisualOdometry
 
 See = Callable[..., OdometryFrame]
 
 
 def follow(frames: list[OdometryFrame] | tuple[OdometryFrame, ...]) -> np.ndarray:
-    odometry = VisualOdometry(VisualSettings())
+    odometry = VisualOdometry()
     return np.stack([odometry.register(frame).T_world_camera for frame in frames])
 
 
@@ -65,7 +64,7 @@ def test_two_runs_are_equal_to_the_bit(street: tuple[OdometryFrame, ...]) -> Non
 def test_a_black_frame_extrapolates_says_so_and_is_recovered_from(
     see: See, blind: See, street: tuple[OdometryFrame, ...], street_poses: np.ndarray
 ) -> None:
-    odometry = VisualOdometry(VisualSettings())
+    odometry = VisualOdometry()
     results = [odometry.register(f) for f in (*street[:6], blind(index=6), *street[7:])]
     assert [result.health.ok for result in results] == [True] * 6 + [False] + [True] * 5
     assert "lost" in results[6].health.notes[0]
@@ -78,7 +77,7 @@ def test_a_missing_disparity_map_does_not_lose_the_camera(
     blind: See, street: tuple[OdometryFrame, ...], street_poses: np.ndarray
 ) -> None:
     empty = OdometryFrame(street[6].pair, blind().disparity)
-    odometry = VisualOdometry(VisualSettings())
+    odometry = VisualOdometry()
     results = [odometry.register(f) for f in (*street[:6], empty, *street[7:])]
     assert all(result.health.ok for result in results)
     off = invert(street_poses[-1]) @ results[-1].T_world_camera
@@ -86,7 +85,7 @@ def test_a_missing_disparity_map_does_not_lose_the_camera(
 
 
 def test_a_blank_wall_gives_no_motion_and_no_exception(blind: See) -> None:
-    odometry = VisualOdometry(VisualSettings())
+    odometry = VisualOdometry()
     results = [odometry.register(blind(128, n)) for n in range(3)]
     assert results[0].health.ok
     assert not results[1].health.ok
@@ -121,7 +120,7 @@ def test_frames_that_are_missing_are_bridged_by_what_looks_alike(
     """A jump of 2.5 m that the times do not show: tracks are lost, the pose is not."""
     late = [replace(f, pair=replace(f.pair, timestamp_s=0.1 * n)) for n, f in enumerate(street)]
     jump = [*late[:5], *(late[n] for n in (9, 10, 11))]
-    odometry = VisualOdometry(VisualSettings())
+    odometry = VisualOdometry()
     results = [odometry.register(frame) for frame in jump]
     assert all(result.health.ok for result in results)
     off = invert(street_poses[-1]) @ results[-1].T_world_camera
@@ -134,7 +133,7 @@ def test_a_jump_of_the_exposure_loses_no_frame(
     gain: float, street: tuple[OdometryFrame, ...], street_poses: np.ndarray
 ) -> None:
     frames = [*street[:5], *(_exposed(frame, gain) for frame in street[5:])]
-    odometry = VisualOdometry(VisualSettings())
+    odometry = VisualOdometry()
     results = [odometry.register(frame) for frame in frames]
     assert all(result.health.ok for result in results)
     off = invert(street_poses[-1]) @ results[-1].T_world_camera
@@ -145,7 +144,7 @@ def test_sight_that_comes_back_finds_the_last_seen_frame(
     blind: See, street: tuple[OdometryFrame, ...], street_poses: np.ndarray
 ) -> None:
     frames = [*street[:5], *(blind(index=n) for n in (5, 6, 7)), *street[8:]]
-    odometry = VisualOdometry(VisualSettings())
+    odometry = VisualOdometry()
     results = [odometry.register(frame) for frame in frames]
     assert [result.health.ok for result in results] == [True] * 5 + [False] * 3 + [True] * 4
     # Measured across the gap: 2 m in one step, by patches that grew meanwhile.
@@ -154,7 +153,7 @@ def test_sight_that_comes_back_finds_the_last_seen_frame(
 
 
 def test_health_says_how_sure_the_motion_is(street: tuple[OdometryFrame, ...]) -> None:
-    odometry = VisualOdometry(VisualSettings())
+    odometry = VisualOdometry()
     results = [odometry.register(frame) for frame in street]
     for result in results[1:]:
         assert 0.0 < result.health.sigma_m < 0.05

@@ -6,7 +6,7 @@ import pytest
 from recon.core.geometry.projection import project
 from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
-from recon.odometry.settings import WindowSettings
+from recon.odometry import window as bundle_window
 from recon.odometry.window import (
     TrackWindow,
     adjust,
@@ -15,7 +15,12 @@ from recon.odometry.window import (
     reprojection,
 )
 
-SETTINGS = WindowSettings(iterations=30, min_gain=1e-9)
+
+@pytest.fixture(autouse=True)
+def _to_the_minimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Adjust until nothing changes any more, not only as far as a drive needs."""
+    monkeypatch.setattr(bundle_window, "_ITERATIONS", 30)
+    monkeypatch.setattr(bundle_window, "_MIN_GAIN", 1e-9)
 
 
 def truth(camera: RectifiedCamera, frames: int = 4, points: int = 150) -> TrackWindow:
@@ -44,7 +49,7 @@ def newest_error(window: TrackWindow, right: TrackWindow) -> tuple[float, float]
 
 def test_exact_observations_give_exact_poses_and_points(camera: RectifiedCamera) -> None:
     right = truth(camera)
-    found = adjust(disturbed(right), camera, SETTINGS)
+    found = adjust(disturbed(right), camera)
     error_m, error_rad = newest_error(found, right)
     # The cost is flat at its minimum: square roots of float64's accuracy are left.
     assert error_m < 1e-5
@@ -54,7 +59,7 @@ def test_exact_observations_give_exact_poses_and_points(camera: RectifiedCamera)
 
 def test_the_oldest_pose_stays(camera: RectifiedCamera) -> None:
     start = disturbed(truth(camera))
-    found = adjust(start, camera, SETTINGS)
+    found = adjust(start, camera)
     np.testing.assert_array_equal(found.T_world_camera[0], start.T_world_camera[0])
 
 
@@ -62,12 +67,10 @@ def test_some_wrong_tracks_hardly_matter(camera: RectifiedCamera) -> None:
     right = truth(camera)
     uvd = right.uvd.copy()
     uvd[-1, :20, 0] += 15.0
-    found = adjust(
-        disturbed(TrackWindow(right.T_world_camera, uvd, right.xyz_world)), camera, SETTINGS
-    )
+    found = adjust(disturbed(TrackWindow(right.T_world_camera, uvd, right.xyz_world)), camera)
     error_m, _ = newest_error(found, right)
     assert error_m < 0.02
-    wrong = misfits(found, camera, SETTINGS)
+    wrong = misfits(found, camera)
     assert wrong[:20].all()
     assert not wrong[20:].any()
 
@@ -76,9 +79,7 @@ def test_a_track_without_disparity_still_counts(camera: RectifiedCamera) -> None
     right = truth(camera)
     uvd = right.uvd.copy()
     uvd[1:, :, 2] = np.nan
-    found = adjust(
-        disturbed(TrackWindow(right.T_world_camera, uvd, right.xyz_world)), camera, SETTINGS
-    )
+    found = adjust(disturbed(TrackWindow(right.T_world_camera, uvd, right.xyz_world)), camera)
     assert newest_error(found, right)[0] < 1e-3
     assert np.isnan(reprojection(found, camera)[:, 2]).all()
 
@@ -87,13 +88,15 @@ def test_information_predicts_the_scatter(camera: RectifiedCamera) -> None:
     """Noise of the stated size in the newest frame alone: scatter against the covariance."""
     right = truth(camera, frames=2)
     rng = np.random.default_rng(13)
-    sigmas = np.array([SETTINGS.sigma_uv_px, SETTINGS.sigma_uv_px, SETTINGS.sigma_d_px])
+    sigmas = np.array(
+        [bundle_window._SIGMA_UV_PX, bundle_window._SIGMA_UV_PX, bundle_window._SIGMA_D_PX]
+    )
     offs = []
     for _ in range(60):
         uvd = right.uvd + sigmas * rng.normal(size=right.uvd.shape)
-        found = adjust(TrackWindow(right.T_world_camera, uvd, right.xyz_world), camera, SETTINGS)
+        found = adjust(TrackWindow(right.T_world_camera, uvd, right.xyz_world), camera)
         offs.append((invert(right.T_world_camera[-1]) @ found.T_world_camera[-1])[:3, 3])
-    covariance = np.linalg.inv(pose_information(right, camera, SETTINGS))
+    covariance = np.linalg.inv(pose_information(right, camera))
     ratio = np.std(offs, axis=0) / np.sqrt(np.diag(covariance)[:3])
     # 60 trials: ±10 %; Cauchy weights cost some efficiency and shrink the formal information.
     assert (ratio > 0.7).all()
@@ -116,4 +119,4 @@ def test_trimming_keeps_what_is_followed_and_what_was_seen_twice(camera: Rectifi
 def test_a_window_without_points_stays_as_it_is(frames: int, camera: RectifiedCamera) -> None:
     poses = truth(camera).T_world_camera[:frames]
     window = TrackWindow(poses, np.zeros((frames, 0, 3)), np.zeros((0, 3)))
-    np.testing.assert_array_equal(adjust(window, camera, SETTINGS).T_world_camera, poses)
+    np.testing.assert_array_equal(adjust(window, camera).T_world_camera, poses)
