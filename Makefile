@@ -6,7 +6,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 COMPILED := .venv/.compiled
 WORKERS ?= 2
-PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadscope --no-loadscope-reorder
 
 .PHONY: help setup demo test test-all fuzz check lint bench format clean
 
@@ -28,7 +28,7 @@ demo: $(COMPILED) ## map a synthetic street drive into outputs/demo/
 	$(BIN)/recon demo
 
 test: $(COMPILED) ## fast tests, with style, types and import contracts; real data where RECON_DATA is set
-	NUMBA_DISABLE_JIT=1 $(PYTEST) -q tests/kernels
+	NUMBA_DISABLE_JIT=1 $(PYTEST) -q tests/*/kernels
 	$(PYTEST) -m "not slow"
 
 test-all: $(COMPILED) ## every test

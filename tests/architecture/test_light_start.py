@@ -36,6 +36,14 @@ def test_import_of_the_package_loads_no_heavy_library() -> None:
     assert HEAVY & set(done.stdout.split()) == set()
 
 
+def test_the_process_that_meshes_loads_nothing_that_it_does_not_use() -> None:
+    """There is one for each tile of a surface."""
+    probe = "import recon.export.pymeshlab, sys; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
+
+    assert HEAVY & set(done.stdout.split()) == set()
+
+
 def test_help_takes_less_than_half_a_second_of_processor_time() -> None:
     """The best of some tries: on a busy machine even processor time is stretched."""
     program = str(Path(sys.executable).with_name("recon"))

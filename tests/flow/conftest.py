@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -9,8 +11,18 @@ import pytest
 from recon.commands.config import load_config
 from recon.commands.demo_source import demo_source
 from recon.commands.map import MapOptions, run_map
+from recon.sources import synthetic
 
 SMALL_STREET = {"frames": 12, "width_px": 256, "height_px": 96, "focal_px": 150.0}
+
+
+@pytest.fixture(scope="session", autouse=True)
+def streets_built_once() -> Iterator[None]:
+    """Let sources of equal settings share their street, which takes seconds to lay out."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("build_street", "StreetCamera"):
+            patch.setattr(synthetic, name, lru_cache(maxsize=4)(getattr(synthetic, name)))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -20,7 +20,8 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 def kitti_drive(tmp_path: Path) -> Path:
     """Six frames of the synthetic street as a KITTI folder."""
     folder = tmp_path / "drive"
-    write_kitti(SyntheticSource(StreetSettings(frames=6)), folder)
+    street = StreetSettings(frames=6, width_px=256, height_px=96, focal_px=150.0)
+    write_kitti(SyntheticSource(street), folder)
     return folder
 
 

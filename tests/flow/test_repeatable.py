@@ -11,7 +11,7 @@ from recon.commands.map import MapOptions, run_map
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetSettings
 
-STREET = StreetSettings(frames=6, width_px=320, height_px=120, focal_px=180.0)
+STREET = StreetSettings(frames=4, width_px=320, height_px=120, focal_px=180.0)
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from recon.core.errors import MeshingError
 from recon.core.settings import Settings
 from recon.core.values import PointCloud, TriangleMesh
 from recon.core.values.arrays import Bool, Float32, Int32
-from recon.export.mesh.pymeshlab import screened_poisson
 from recon.export.mesh.surgery import drop_small_components, keep_vertices, vertex_normals
+from recon.export.pymeshlab import screened_poisson
 from recon.io.models import open3d_meshes
 from recon.stereo.cloud import open3d_clouds
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from recon.core.errors import MeshingError
-from recon.export.mesh.pymeshlab import screened_poisson
+from recon.export.pymeshlab import screened_poisson
 
 
 def reconstruct(xyz: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, ...]:
