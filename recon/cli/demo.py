@@ -49,7 +49,7 @@ def demo(
             out=out,
             threads=threads,
             mesh=mesh,
-            observers=(choose_viewer(quiet=quiet, verbose=verbose),),
+            progress=choose_viewer(quiet=quiet, verbose=verbose),
             present=present_map,
         )
         run = run_map(demo_source(settings), settings, options)

@@ -86,7 +86,7 @@ def middlebury(
     if json and latex:
         raise typer.BadParameter("--json and --latex exclude each other")
     with session(quiet=quiet):
-        from recon.cli.show.scenes import choose_scene_viewer
+        from recon.cli.show import choose_viewer
         from recon.commands.config import load_config
         from recon.commands.evaluate_middlebury import MiddleburyOptions, run_middlebury
         from recon.report.middlebury_pictures import draw_result, present_middlebury
@@ -100,7 +100,7 @@ def middlebury(
             threads=threads,
             parallel=parallel,
             auto_range=range_ is Range.auto,
-            observer=choose_scene_viewer(quiet=quiet, verbose=verbose),
+            progress=choose_viewer(quiet=quiet, verbose=verbose),
             draw=draw_result,
             present=present_middlebury,
         )

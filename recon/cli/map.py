@@ -130,7 +130,7 @@ def map_(
             mesh=request.mesh,
             resume=resume is not None,
             arguments=request.arguments(),
-            observers=(choose_viewer(quiet=quiet, verbose=verbose),),
+            progress=choose_viewer(quiet=quiet, verbose=verbose),
             present=present_map,
             warnings=found,
         )

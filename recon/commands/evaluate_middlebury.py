@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from recon.commands.config import ReconConfig, dump_config
 from recon.core.errors import SettingsError, SourceError
@@ -24,6 +24,7 @@ from recon.io.files import StrPath
 from recon.io.images.pfm import write_pfm
 from recon.run.directory import RunDirectory
 from recon.run.machine import peak_memory_mb, use_threads
+from recon.run.progress import SILENT, Progress
 from recon.run.record import fingerprint, write_record
 from recon.run.summary import plain
 from recon.stereo.match import Matcher, check_matcher, name_of
@@ -37,20 +38,31 @@ SceneFigures = dict[str, Figures]
 """Figures of one scene, by matcher."""
 
 
-class SceneObserver(Protocol):
-    """Receives the progress of an evaluation, in the thread that runs it."""
+@dataclass(frozen=True)
+class SceneDone:
+    """A scene that is matched and scored: a `Step` of the progress of a run.
 
-    def on_start(self, name: str, total: int) -> None:
-        """An evaluation of ``total`` scenes begins."""
-        ...
+    Attributes:
+        name: Its name.
+        figures: Its figures by matcher; None = it has no ground truth.
+        seconds: Time since the previous scene was done.
+    """
 
-    def on_scene(self, name: str, figures: Mapping[str, Figures]) -> None:
-        """A scene is matched and scored; empty figures = it has no ground truth."""
-        ...
+    name: str
+    figures: SceneFigures | None
+    seconds: float
+    ok: bool = True
 
-    def on_finish(self) -> None:
-        """The evaluation has ended, successfully or not."""
-        ...
+    @property
+    def event(self) -> dict[str, Any]:
+        """The seconds of each matcher."""
+        seconds = {matcher: one["seconds"] for matcher, one in (self.figures or {}).items()}
+        return {"event": "scene", "name": self.name, "seconds": seconds}
+
+    @property
+    def state(self) -> str:
+        """The name of the scene."""
+        return self.name if self.figures is not None else f"{self.name}: no truth"
 
 
 @dataclass(frozen=True)
@@ -67,7 +79,7 @@ class MiddleburyOptions:
         parallel: Scenes processed at once, sharing the threads. Above 1, timings are those of a
             busy machine.
         auto_range: Whether the disparity range is estimated from each pair.
-        observer: Notified of each scene.
+        progress: Shown each scene.
         draw: Draws the figures of one result.
         present: Writes the tables.
     """
@@ -79,7 +91,7 @@ class MiddleburyOptions:
     threads: int | None = None
     parallel: int = 1
     auto_range: bool = False
-    observer: SceneObserver | None = None
+    progress: Progress = SILENT
     draw: Callable[[SceneResult, RunDirectory], None] | None = None
     present: Callable[[Mapping[str, Any], RunDirectory], None] | None = None
 
@@ -194,21 +206,20 @@ def _scenes(
     work: _Work, folder: StrPath, paths: Mapping[str, Path]
 ) -> Iterator[tuple[str, SceneFigures | None]]:
     """Figures of each scene, in order; None for a scene without ground truth."""
-    observer = work.options.observer
-    if observer is not None:
-        observer.on_start(str(folder), len(paths))
+    progress, last = work.options.progress, time.perf_counter()
+    progress.on_start(str(folder), len(paths), "scenes")
     pool = ThreadPoolExecutor(work.options.parallel)
     try:
         done = pool.map(work.figures, paths.keys(), paths.values())
         for name, figures in zip(paths, done, strict=True):
-            if observer is not None:
-                observer.on_scene(name, figures or {})
+            now = time.perf_counter()
+            progress.on_step(SceneDone(name, figures, now - last))
+            last = now
             yield name, figures
     finally:
         # After an error, scenes that have not started are cancelled.
         pool.shutdown(cancel_futures=True)
-        if observer is not None:
-            observer.on_finish()
+        progress.on_finish()
 
 
 def _common(

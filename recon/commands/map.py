@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -32,12 +32,12 @@ from recon.export.mesh.drive_mesh import mesh_to_show, store_map, write_drive_me
 from recon.io.atomic import write_text
 from recon.io.trajectory import write_kitti_poses, write_tum
 from recon.map import base_axes
-from recon.map.observer import Observer
 from recon.map.sequence import MappedSequence, map_sequence
 from recon.map.workspace import RAYS, Workspace
 from recon.odometry.health import health_warnings
 from recon.run.directory import RunDirectory
 from recon.run.machine import use_threads
+from recon.run.progress import SILENT, Progress
 from recon.run.record import fingerprint, write_record
 from recon.run.stopwatch import Stopwatch
 from recon.run.summary import cost, plain
@@ -99,7 +99,7 @@ class MapOptions:
         prior: Motion of the left camera from another sensor, in the time base of the source.
         prior_origin: Where it is from, for the summary.
         mesh: Whether to reconstruct a surface.
-        observers: Notified of progress.
+        progress: Shown how far the run is.
         present: Writes figures and the report into the result folder.
         resume: Resume the unfinished run in ``out``.
         arguments: Command-line arguments, stored so that resuming need not repeat them.
@@ -113,7 +113,7 @@ class MapOptions:
     prior: Trajectory | None = None
     prior_origin: str = ""
     mesh: bool = True
-    observers: tuple[Observer, ...] = ()
+    progress: Progress = SILENT
     present: Callable[[MapRun, RunDirectory], None] | None = None
     resume: bool = False
     arguments: Mapping[str, Any] = field(default_factory=dict)
@@ -139,7 +139,7 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
             config,
             known_poses=options.known_poses,
             prior=options.prior,
-            observers=options.observers,
+            progress=options.progress,
             workspace=Workspace(watch, directory.state(""), resume=options.resume, threads=threads),
         )
         run = _finish(source, config, mapped, options, directory, watch)
@@ -147,7 +147,7 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
             _write(run, directory)
         run.summary.update(cost(watch, time.perf_counter() - start))
         if options.present is not None:
-            _tell(options.observers, "report")
+            options.progress.on_stage("report")
             with watch.stage("report"):
                 options.present(run, directory)
             config.memory.check("report")
@@ -187,13 +187,13 @@ def _finish(
         warnings += mapped.prior.warnings()
     if mapped.loops is not None:
         warnings += mapped.loops.warnings()
-    _tell(options.observers, "map")
+    options.progress.on_stage("map")
     check_map(mapped, source.name)
     written = write_map(mapped, directory, watch)
     warnings += written.warnings
     mesh, faces = None, 0
     if options.mesh:
-        _tell(options.observers, "mesh")
+        options.progress.on_stage("mesh")
         with watch.stage("mesh"):
             mesh, faces = _mesh(mapped, config.mesh, directory, options.threads, warnings)
         config.memory.check("mesh")
@@ -327,8 +327,3 @@ def _base_in_map(run: MapRun) -> Trajectory:
     path, T_map_world = run.mapped.trajectory, run.mapped.T_map_world
     T_camera_base = invert(base_axes(T_map_world, run.camera_height_m))
     return replace(path, T_world_camera=T_map_world @ path.T_world_camera @ T_camera_base)
-
-
-def _tell(observers: Iterable[Observer], stage: str) -> None:
-    for observer in observers:
-        observer.on_stage(stage)

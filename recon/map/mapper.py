@@ -14,7 +14,7 @@ from recon.core.values.arrays import Float64
 from recon.map import SubmapBuilder, estimate_ground, fusion_range_m, map_axes, thin_rays
 from recon.map.axes import check_rigid
 from recon.map.frame_log import FrameLog
-from recon.map.observer import FrameResult
+from recon.map.frame_result import FrameResult
 from recon.map.ray_log import RayLog
 from recon.map.settings import DriveSettings
 from recon.map.submap_store import SubmapStore

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -15,8 +15,8 @@ from recon.core.values import OccupancyVoxels, PointCloud, RectifiedCamera, Ster
 from recon.core.values.arrays import Float64
 from recon.map.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive_map import DriveMap
+from recon.map.frame_result import FrameResult
 from recon.map.mapper import Mapper
-from recon.map.observer import FrameResult, Observer
 from recon.map.rays import thin_rays
 from recon.map.settings import DriveSettings
 from recon.map.submap_store import SubmapStore
@@ -34,6 +34,7 @@ from recon.odometry import (
 )
 from recon.run.lookahead import look_ahead
 from recon.run.machine import serial_algebra
+from recon.run.progress import SILENT, Progress
 from recon.sources import IncompleteSource, StampedSource, StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 
@@ -141,7 +142,7 @@ def map_sequence(
     *,
     known_poses: Trajectory | None = None,
     prior: Trajectory | None = None,
-    observers: Iterable[Observer] = (),
+    progress: Progress = SILENT,
     workspace: Workspace | None = None,
 ) -> MappedSequence:
     """Register and fuse all frames of a source, and close loops in the path.
@@ -156,7 +157,7 @@ def map_sequence(
             unchanged, without loop closure.
         prior: Motion of the left camera from wheel odometry, an IMU or GNSS, in the time base of
             the source; only relative motions are used.
-        observers: Notified of progress.
+        progress: Shown each frame.
         workspace: Disk storage, threads and stopwatch of the run; None = in memory, all cores,
             not timed.
 
@@ -164,7 +165,6 @@ def map_sequence(
         ReconError: A frame cannot be read, matched or registered.
     """
     work = workspace or Workspace()
-    audience = tuple(observers)
     reconstructor = FrameReconstructor(
         source.calibration, config, threads=work.threads, stopwatch=work.stopwatch
     )
@@ -182,20 +182,16 @@ def map_sequence(
     loops = LoopWatch(config.loops, work.loops, work.stopwatch) if looking else None
     mapper = Mapper(config, reconstructor.camera, odometry, work)
     drive = _Drive(mapper, loops, config, work)
-    for observer in audience:
-        observer.on_start(source.name, len(source))
+    progress.on_start(source.name, len(source))
     try:
         with serial_algebra():
             pairs = source.frames(len(drive.mapper))
             for frame in look_ahead(reconstruct, pairs):
-                result = drive.add(frame, total=len(source))
-                for observer in audience:
-                    observer.on_frame(result)
+                progress.on_step(drive.add(frame, total=len(source)))
             drive.settle()
     finally:
         drive.stop()
-        for observer in audience:
-            observer.on_finish()
+        progress.on_finish()
     return replace(drive.finish(source, reconstructor), prior=used)
 
 

@@ -1,1 +1,5 @@
-"""What every command shares: the result folder, its record, threads, memory and timing."""
+"""What every command shares: the run with its folder, threads, times, progress and memory."""
+
+from recon.run.run import Run
+
+__all__ = ["Run"]

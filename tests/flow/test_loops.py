@@ -15,8 +15,9 @@ from recon.commands.config import load_config
 from recon.commands.map import MapOptions, MapRun, run_map
 from recon.core.values import SequenceTruth, StereoPair
 from recon.io.trajectory import read_tum
-from recon.map.observer import FrameResult
+from recon.map.frame_result import FrameResult
 from recon.report import present_map
+from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
 from recon.street import StreetSettings
@@ -66,28 +67,22 @@ class _Filmed:
         return iter(self._pairs[start:])
 
 
-class _Breaks:
-    """An observer that interrupts a run before a frame is reported."""
+class _Breaks(Silent):
+    """A progress that interrupts a run before a frame is reported."""
 
     def __init__(self, frame: int) -> None:
         self.frame = frame
 
-    def on_start(self, name: str, total: int) -> None: ...
-
-    def on_frame(self, result: FrameResult) -> None:
+    def on_step(self, result: FrameResult) -> None:
         if result.index == self.frame:
             raise KeyboardInterrupt
-
-    def on_stage(self, name: str) -> None: ...
-
-    def on_finish(self) -> None: ...
 
 
 def _run(
     drive: _Filmed, out: Path, *settings: str, resume: bool = False, breaks: int = -1
 ) -> MapRun:
     options = MapOptions(
-        out=out, mesh=False, resume=resume, observers=(_Breaks(breaks),), present=present_map
+        out=out, mesh=False, resume=resume, progress=_Breaks(breaks), present=present_map
     )
     return run_map(drive, load_config(None, settings), options)
 

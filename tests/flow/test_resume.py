@@ -14,7 +14,8 @@ from recon.commands.config import ReconConfig, load_config
 from recon.commands.map import MapOptions, MapRun, run_map
 from recon.core.errors import FormatError, OutputError, SettingsError
 from recon.io.tree_file import write_tree
-from recon.map.observer import FrameResult
+from recon.map.frame_result import FrameResult
+from recon.run.progress import SILENT, Silent
 from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetSettings
@@ -36,21 +37,15 @@ FILES = [
 ]
 
 
-class _Breaks:
-    """An observer that aborts a run before a frame is reported."""
+class _Breaks(Silent):
+    """A progress that aborts a run before a frame is reported."""
 
     def __init__(self, frame: int, error: BaseException) -> None:
         self.frame, self.error = frame, error
 
-    def on_start(self, name: str, total: int) -> None: ...
-
-    def on_frame(self, result: FrameResult) -> None:
+    def on_step(self, result: FrameResult) -> None:
         if result.index == self.frame:
             raise self.error
-
-    def on_stage(self, name: str) -> None: ...
-
-    def on_finish(self) -> None: ...
 
 
 def _config(*more: str) -> ReconConfig:
@@ -60,8 +55,7 @@ def _config(*more: str) -> ReconConfig:
 def _run(
     drive: Path, out: Path, observer: _Breaks | None = None, *, resume: bool = False
 ) -> MapRun:
-    observers = () if observer is None else (observer,)
-    options = MapOptions(out=out, mesh=False, observers=observers, resume=resume)
+    options = MapOptions(out=out, mesh=False, progress=observer or SILENT, resume=resume)
     return run_map(open_source(drive), _config(), options)
 
 
@@ -146,7 +140,7 @@ def test_a_second_run_in_the_same_folder_is_refused_and_the_first_goes_on(
     refused = []
 
     class Meddles(_Breaks):
-        def on_frame(self, result: FrameResult) -> None:
+        def on_step(self, result: FrameResult) -> None:
             if result.index == 9:
                 for resume in (False, True):
                     with pytest.raises(OutputError, match="another run") as told:

@@ -9,7 +9,8 @@ import pytest
 from recon.commands.config import load_config
 from recon.commands.map import MapOptions, run_map
 from recon.commands.resume import MapRequest
-from recon.map.observer import FrameResult
+from recon.map.frame_result import FrameResult
+from recon.run.progress import Silent
 from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetSettings
@@ -19,18 +20,12 @@ DRIVE = {"frames": 6, "width_px": 256, "height_px": 96, "focal_px": 150.0}
 STATE = Path(".partial") / ".state"
 
 
-class _Stops:
-    """An observer that interrupts a run at its fourth frame."""
+class _Stops(Silent):
+    """A progress that interrupts a run at its fourth frame."""
 
-    def on_start(self, name: str, total: int) -> None: ...
-
-    def on_frame(self, result: FrameResult) -> None:
+    def on_step(self, result: FrameResult) -> None:
         if result.index == 3:
             raise KeyboardInterrupt
-
-    def on_stage(self, name: str) -> None: ...
-
-    def on_finish(self) -> None: ...
 
 
 def interrupt_run(folder: Path) -> None:
@@ -39,7 +34,7 @@ def interrupt_run(folder: Path) -> None:
     config = load_config(None, ["checkpoints.every_frames=1", "submaps.max_frames=2"])
     request = MapRequest(folder / "drive", mesh=False)
     options = MapOptions(
-        out=folder / "run", mesh=False, observers=(_Stops(),), arguments=request.arguments()
+        out=folder / "run", mesh=False, progress=_Stops(), arguments=request.arguments()
     )
     with pytest.raises(KeyboardInterrupt):
         run_map(open_source(folder / "drive"), config, options)

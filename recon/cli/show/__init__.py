@@ -1,6 +1,6 @@
-"""Observers that show the progress of a run."""
+"""What a command shows beside its results: its source, warnings, progress."""
 
 from recon.cli.show.announce import announce, warn
-from recon.cli.show.progress import JsonLines, Quiet, RichProgress, choose_viewer
+from recon.cli.show.progress import JsonLines, ProgressBar, choose_viewer
 
-__all__ = ["JsonLines", "Quiet", "RichProgress", "announce", "choose_viewer", "warn"]
+__all__ = ["JsonLines", "ProgressBar", "announce", "choose_viewer", "warn"]

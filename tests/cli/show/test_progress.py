@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from recon.cli.show.progress import JsonLines, Quiet, RichProgress, choose_viewer
-from recon.map.observer import FrameResult, Observer
+from recon.cli.show.progress import JsonLines, ProgressBar, choose_viewer
+from recon.commands.evaluate_middlebury import SceneDone
+from recon.map.frame_result import FrameResult
 from recon.odometry.protocol import OdometryHealth
+from recon.run.progress import SILENT, Progress, Silent
 
 
 class Terminal(io.StringIO):
@@ -25,21 +27,21 @@ def frame(index: int, *, ok: bool = True, overlap: float = 0.8) -> FrameResult:
     return FrameResult(index, 3, 0.25, 0.7, 900, np.eye(4), health)
 
 
-def run(observer: Observer) -> None:
-    observer.on_start("drive [1]", 3)
+def run(viewer: Progress) -> None:
+    viewer.on_start("drive [1]", 3)
     for index in range(3):
-        observer.on_frame(frame(index, ok=index != 1, overlap=float("nan")))
-    observer.on_finish()
-    observer.on_stage("mesh")
+        viewer.on_step(frame(index, ok=index != 1, overlap=float("nan")))
+    viewer.on_finish()
+    viewer.on_stage("mesh")
 
 
 def lines(stream: io.StringIO) -> list[dict[str, Any]]:
     return [json.loads(line) for line in stream.getvalue().splitlines()]
 
 
-def test_each_viewer_is_an_observer() -> None:
-    viewers = (Quiet(), JsonLines(io.StringIO()), RichProgress(Console(file=io.StringIO())))
-    assert all(isinstance(viewer, Observer) for viewer in viewers)
+def test_each_viewer_takes_the_progress_of_a_run() -> None:
+    viewers = (SILENT, JsonLines(io.StringIO()), ProgressBar(Console(file=io.StringIO())))
+    assert all(isinstance(viewer, Progress) for viewer in viewers)
 
 
 def test_every_event_is_one_json_line() -> None:
@@ -51,7 +53,7 @@ def test_every_event_is_one_json_line() -> None:
 
 def test_json_lines_tell_the_frame_and_have_null_for_nan() -> None:
     stream = io.StringIO()
-    JsonLines(stream).on_frame(frame(1, ok=False, overlap=float("nan")))
+    JsonLines(stream).on_step(frame(1, ok=False, overlap=float("nan")))
     (told,) = lines(stream)
     assert told["index"] == 1
     assert told["measured"] is False
@@ -62,18 +64,18 @@ def test_json_lines_tell_the_frame_and_have_null_for_nan() -> None:
 
 def test_bar_shows_frames_rate_and_lost_poses() -> None:
     stream = Terminal()
-    run(RichProgress(Console(file=stream, force_terminal=True, width=140)))
+    run(ProgressBar(Console(file=stream, force_terminal=True, width=140)))
     shown = stream.getvalue()
     assert "3/3" in shown
-    assert "4.0 fps" in shown  # 0.25 s each
+    assert "4.0 frames/s" in shown  # 0.25 s each
     assert "1 not trusted" in shown
     assert "drive [1]" in shown  # a name is no markup
     assert "mesh" in shown
 
 
 def test_bar_may_be_finished_twice_and_asked_before_its_start() -> None:
-    viewer = RichProgress(Console(file=io.StringIO()))
-    viewer.on_frame(frame(0))
+    viewer = ProgressBar(Console(file=io.StringIO()))
+    viewer.on_step(frame(0))
     viewer.on_finish()
     run(viewer)
     viewer.on_finish()
@@ -85,9 +87,9 @@ def test_quiet_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_terminal_gets_a_bar_and_a_file_json_lines_if_verbose() -> None:
-    assert isinstance(choose_viewer(stream=Terminal()), RichProgress)
+    assert isinstance(choose_viewer(stream=Terminal()), ProgressBar)
     assert isinstance(choose_viewer(stream=io.StringIO(), verbose=True), JsonLines)
-    assert isinstance(choose_viewer(stream=io.StringIO()), Quiet)
+    assert isinstance(choose_viewer(stream=io.StringIO()), Silent)
 
 
 def test_progress_goes_to_standard_error(capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,3 +97,28 @@ def test_progress_goes_to_standard_error(capsys: pytest.CaptureFixture[str]) -> 
     out, err = capsys.readouterr()
     assert out == ""
     assert err
+
+
+def run_scenes(viewer: Progress) -> None:
+    viewer.on_start("trainingQ [1]", 2, "scenes")
+    viewer.on_step(SceneDone("Piano", {"sad": {"seconds": 0.25}}, 0.5))
+    viewer.on_step(SceneDone("Pipes", None, 0.5))
+    viewer.on_finish()
+
+
+def test_lines_of_scenes_have_the_seconds_of_each_matcher() -> None:
+    stream = io.StringIO()
+    run_scenes(JsonLines(stream))
+    events = lines(stream)
+    assert [event["event"] for event in events] == ["start", "scene", "scene", "finish"]
+    assert events[0]["scenes"] == 2
+    assert events[1] == {"event": "scene", "name": "Piano", "seconds": {"sad": 0.25}}
+    assert events[2]["seconds"] == {}
+
+
+def test_the_bar_counts_scenes_and_names_one_without_truth() -> None:
+    stream = Terminal()
+    run_scenes(ProgressBar(Console(file=stream, force_terminal=True, width=120)))
+    assert "trainingQ [1]" in stream.getvalue()
+    assert "2/2" in stream.getvalue()
+    assert "Pipes: no truth" in stream.getvalue()

@@ -1,0 +1,71 @@
+"""The progress of a run: what every command reports while it works, and what shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
+
+
+class Step(Protocol):
+    """One item of a run that is done, such as a frame or a scene."""
+
+    @property
+    def seconds(self) -> float:
+        """Time since the previous item was done."""
+        ...
+
+    @property
+    def ok(self) -> bool:
+        """Whether its result is to be trusted."""
+        ...
+
+    @property
+    def event(self) -> Mapping[str, Any]:
+        """Its figures for programs, ready for JSON; ``event`` names the kind of item."""
+        ...
+
+    @property
+    def state(self) -> str:
+        """Its result in a few words, for people; plain text."""
+        ...
+
+
+@runtime_checkable
+class Progress(Protocol):
+    """Receives the progress of a run, in the thread that runs it."""
+
+    def on_start(self, name: str, total: int, unit: str = "frames") -> None:
+        """A series of ``total`` items begins."""
+        ...
+
+    def on_step(self, step: Step) -> None:
+        """An item is done."""
+        ...
+
+    def on_stage(self, name: str) -> None:
+        """A stage that is not per item, such as ``mesh``, begins."""
+        ...
+
+    def on_finish(self) -> None:
+        """The series has ended, successfully or not."""
+        ...
+
+
+class Silent:
+    """Shows no progress."""
+
+    def on_start(self, name: str, total: int, unit: str = "frames") -> None:
+        """Ignore it."""
+
+    def on_step(self, step: Step) -> None:
+        """Ignore it."""
+
+    def on_stage(self, name: str) -> None:
+        """Ignore it."""
+
+    def on_finish(self) -> None:
+        """Ignore it."""
+
+
+SILENT = Silent()
+"""For runs that nobody watches."""

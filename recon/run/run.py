@@ -1,0 +1,137 @@
+"""What every command shares: a result folder with configuration, summary and record; times."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any, Final
+
+from typing_extensions import Self
+
+from recon.core.settings import Settings
+from recon.io.yaml_file import write_yaml
+from recon.run.directory import RECORD, RunDirectory, default_folder
+from recon.run.machine import peak_memory_mb, use_threads, versions
+from recon.run.progress import SILENT, Progress
+from recon.run.record import fingerprint
+from recon.run.stopwatch import Stopwatch
+
+CONFIG: Final = "config.yaml"
+SUMMARY: Final = "summary.json"
+
+
+class Run(RunDirectory):
+    """One run of a command, as a context manager.
+
+    It writes ``config.yaml`` at the start; `finish` writes ``summary.json`` and ``run.json``; all
+    files appear in the folder when the body of the ``with`` statement has ended without an error::
+
+        with Run("pair", out, config) as run:
+            with run.stage("match"):
+                write_pfm(run.path("disparity/disparity.pfm"), match(pair))
+            with run.report(summary):
+                write_pair_page(result, run)
+            run.finish(summary, source="im0.png", inputs=files)
+
+    Args:
+        command: The name of the command, for the record and the default folder.
+        out: The result folder; None = a new one below ``outputs/<command>/``.
+        config: The configuration; None = the command has none.
+        threads: Threads to use; None = all cores. `threads` is their number.
+        progress: Shown how far the run is.
+        resume: Resume the unfinished run in the folder.
+
+    Raises:
+        OutputError: As for `RunDirectory`.
+    """
+
+    def __init__(
+        self,
+        command: str,
+        out: Path | None = None,
+        config: Settings | None = None,
+        *,
+        threads: int | None = None,
+        progress: Progress = SILENT,
+        resume: bool = False,
+    ) -> None:
+        standard = default_folder(command)
+        # A run in a default folder keeps its link when it is resumed.
+        stamped = out is not None and out.parent.resolve() == standard.parent.resolve()
+        super().__init__(
+            standard if out is None else out,
+            latest=out is None or (resume and stamped),
+            resume=resume,
+        )
+        self.command = command
+        self.threads = use_threads(threads)
+        self.progress = progress
+        self.watch = Stopwatch()
+        self._config = config
+        self._start = time.perf_counter()
+
+    def __enter__(self) -> Self:
+        super().__enter__()
+        if self._config is not None:
+            write_yaml(self.path(CONFIG), self._config.model_dump(mode="json"))
+        return self
+
+    def stage(self, name: str) -> AbstractContextManager[None]:
+        """Time the body of a ``with`` statement as part of the stage ``name``."""
+        return self.watch.stage(name)
+
+    @contextmanager
+    def report(self, summary: dict[str, Any]) -> Iterator[None]:
+        """Time the writing of the report, which finds the cost of the run so far in the summary."""
+        self.progress.on_stage("report")
+        summary |= self._cost()
+        with self.stage("report"):
+            yield
+
+    def finish(
+        self,
+        summary: dict[str, Any],
+        *,
+        source: str,
+        inputs: Iterable[Path],
+        record: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Write ``summary.json`` and ``run.json``; the last thing that a run does.
+
+        Args:
+            summary: The figures; the cost of the run and its folder are added.
+            source: What was processed.
+            inputs: The files that were read, of which the record has a hash.
+            record: What else the record has.
+        """
+        summary |= {**self._cost(), "out": str(self.folder)}
+        self.write_json(SUMMARY, summary)
+        with self.stage("hash"):
+            hashed = fingerprint(inputs)
+        self.write_json(
+            RECORD,
+            {
+                "command": self.command,
+                "finished_utc": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+                "versions": versions(),
+                "source": source,
+                "inputs": hashed,
+                "timings": self.watch.seconds,
+                "peak_memory_mb": summary["peak_memory_mb"],
+                "warnings": list(summary.get("warnings", ())),
+                **(record or {}),
+                # Last, since it lists all files.
+                "files": [*self.files(), RECORD],
+            },
+        )
+
+    def _cost(self) -> dict[str, Any]:
+        """Seconds in all and per stage (stages overlap), and peak memory."""
+        return {
+            "seconds": round(time.perf_counter() - self._start, 3),
+            "stages": {name: round(value, 3) for name, value in self.watch.seconds.items()},
+            "peak_memory_mb": round(peak_memory_mb(), 1),
+        }
