@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from recon.commands.evaluate_middlebury import MiddleburyOptions, run_middlebury
     from recon.commands.map import MapOptions, run_map
     from recon.commands.occupancy import OccupancyRequest, run_occupancy
-    from recon.commands.pair import PairInput, PairOptions, run_pair
+    from recon.commands.pair import run_disparity, run_pair
     from recon.core.errors import ReconError
     from recon.core.values import (
         CameraIntrinsics,
@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from recon.map.sequence import MappedSequence, map_sequence
     from recon.rig.audit.run import Audit, run_audit
     from recon.sources import SourceSettings, StereoSource, open_source
+    from recon.sources.pair_input import PairInput
     from recon.sources.synthetic import SyntheticSource
     from recon.stereo.match import Matcher
 
@@ -87,7 +88,8 @@ _HOMES = {
     "recon.commands.map": ("MapOptions", "run_map"),
     "recon.commands.evaluate_middlebury": ("MiddleburyOptions", "run_middlebury"),
     "recon.commands.occupancy": ("OccupancyRequest", "run_occupancy"),
-    "recon.commands.pair": ("PairInput", "PairOptions", "run_pair"),
+    "recon.commands.pair": ("run_disparity", "run_pair"),
+    "recon.sources.pair_input": ("PairInput",),
     "recon.map.sequence": ("MappedSequence", "map_sequence"),
     "recon.sources": ("SourceSettings", "StereoSource", "open_source"),
     "recon.sources.synthetic": ("SyntheticSource",),
@@ -126,7 +128,6 @@ __all__ = [
     "OccupancyRequest",
     "OccupancyVoxels",
     "PairInput",
-    "PairOptions",
     "PointCloud",
     "Reason",
     "ReconConfig",
@@ -159,6 +160,7 @@ __all__ = [
     "reconstruct",
     "reconstruct_mesh",
     "run_audit",
+    "run_disparity",
     "run_map",
     "run_middlebury",
     "run_occupancy",

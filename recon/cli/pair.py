@@ -9,7 +9,6 @@ import typer
 
 from recon.cli.options import Config, Formats, Json, Matcher, Out, Quiet, Set, Threads, Verbose
 from recon.cli.session import print_json, print_run, session
-from recon.core.errors import SettingsError
 
 Left = Annotated[Path, typer.Argument(help="Left image.")]
 Right = Annotated[Path, typer.Argument(help="Right image.")]
@@ -94,42 +93,27 @@ def pair(
     """
     with session(quiet=quiet):
         from recon.cli.show import choose_viewer
-        from recon.commands.config import (
-            PAIR_DEFAULTS,
-            check_ndisp,
-            load_config,
-            matching_overrides,
-        )
-        from recon.commands.pair import PairOptions, run_pair
-        from recon.commands.pair_input import (
-            KnownCamera,
-            read_pair_input,
-            read_uncalibrated_pair,
-        )
-        from recon.report import present_pair
+        from recon.commands.config import pair_config
+        from recon.commands.pair import run_pair
+        from recon.sources.pair_input import KnownCamera, read_pair_input, with_truth
 
-        overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
-        settings = load_config(config, overrides, PAIR_DEFAULTS)
-        check_ndisp(settings, ndisp)
-        unit, most = settings.source.metres_per_unit, settings.readable_megapixels
-        known = KnownCamera(focal, baseline, cx, cy)
-        if calib is None:
-            given = read_uncalibrated_pair(left, right, known, truth, max_megapixels=most)
-        elif known != KnownCamera():
-            raise SettingsError(
-                "--focal, --baseline, --cx and --cy replace a calibration file",
-                where="--calib",
-                got=calib,
-                hint="give either",
-            )
-        else:
-            given = read_pair_input(
-                left, right, calib, truth, metres_per_unit=unit_m or unit, max_megapixels=most
-            )
-        viewer = choose_viewer(quiet=quiet, verbose=verbose)
-        others = tuple(name for name in dict.fromkeys(formats or ()) if name != "ply")
-        options = PairOptions("pair", out, threads, present_pair, viewer.on_stage, others)
-        run = run_pair(given, settings, options)
+        settings = pair_config(config, set_ or (), matcher, ndisp)
+        given = read_pair_input(
+            left,
+            right,
+            calib,
+            known=KnownCamera(focal, baseline, cx, cy),
+            metres_per_unit=unit_m or settings.source.metres_per_unit,
+            max_megapixels=settings.readable_megapixels,
+        )
+        run = run_pair(
+            with_truth(given, truth),
+            settings,
+            out=out,
+            formats=formats or (),
+            threads=threads,
+            progress=choose_viewer(quiet=quiet, verbose=verbose),
+        )
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)
 
 
@@ -160,22 +144,18 @@ def disparity(
     """
     with session(quiet=quiet):
         from recon.cli.show import choose_viewer
-        from recon.commands.config import (
-            PAIR_DEFAULTS,
-            check_ndisp,
-            load_config,
-            matching_overrides,
-        )
-        from recon.commands.pair import PairOptions, run_pair
-        from recon.commands.pair_input import read_pair_input
-        from recon.report import present_disparity
+        from recon.commands.config import pair_config
+        from recon.commands.pair import run_disparity
+        from recon.sources.pair_input import read_pair_input
 
-        overrides = [*(set_ or ()), *matching_overrides(matcher, ndisp)]
-        settings = load_config(config, overrides, PAIR_DEFAULTS)
-        check_ndisp(settings, ndisp)
-        unit, most = settings.source.metres_per_unit, settings.readable_megapixels
-        given = read_pair_input(left, right, calib, metres_per_unit=unit, max_megapixels=most)
+        settings = pair_config(config, set_ or (), matcher, ndisp)
+        given = read_pair_input(
+            left,
+            right,
+            calib,
+            metres_per_unit=settings.source.metres_per_unit,
+            max_megapixels=settings.readable_megapixels,
+        )
         viewer = choose_viewer(quiet=quiet, verbose=verbose)
-        options = PairOptions("disparity", out, threads, present_disparity, viewer.on_stage)
-        run = run_pair(given, settings, options)
+        run = run_disparity(given, settings, out=out, threads=threads, progress=viewer)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

@@ -10,7 +10,7 @@ from typing import Any, Final
 import yaml
 
 from recon.core.errors import FormatError, SettingsError
-from recon.core.settings import merge
+from recon.core.settings import Settings, merge
 from recon.evaluation.paper.settings import PaperConfig
 from recon.export.mesh import MeshSettings
 from recon.io.files import SMALL_FILE_BYTES, read_text
@@ -92,17 +92,21 @@ def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> 
     return chosen + ([] if ndisp is None else [f"matching.{name}.ndisp={ndisp}" for name in ranged])
 
 
-def check_ndisp(config: ReconConfig, ndisp: int | None) -> None:
-    """Check that the matcher obeys a number of disparities given by itself; None = none given.
+def pair_config(
+    path: Path | None, overrides: Sequence[str], matcher: str | None, ndisp: int | None
+) -> ReconConfig:
+    """The configuration of one pair, with its matcher and disparity range; None = unchanged.
 
     Raises:
-        SettingsError: The matcher has no such setting.
+        SettingsError: As for `load_config`, or the matcher searches no range.
     """
-    matcher = config.matching.matcher
-    if ndisp is not None and not hasattr(settings_of(matcher, config.matching), "ndisp"):
+    config = load_config(path, [*overrides, *matching_overrides(matcher, ndisp)], PAIR_DEFAULTS)
+    used = config.matching.matcher
+    if ndisp is not None and not hasattr(settings_of(used, config.matching), "ndisp"):
         raise SettingsError(
-            "the matcher has no such setting", where="--ndisp", got=f"matcher {name_of(matcher)!r}"
+            "the matcher has no such setting", where="--ndisp", got=f"matcher {name_of(used)!r}"
         )
+    return config
 
 
 def source_overrides(
@@ -160,7 +164,7 @@ def capture_overrides(
     return [f"capture.{key}={value}" for key, value in given.items() if value is not None]
 
 
-def dump_config(config: ReconConfig) -> str:
+def dump_config(config: Settings) -> str:
     """The configuration as YAML; `load_config` restores the same configuration."""
     return str(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
 

@@ -7,13 +7,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.commands.pair_input import read_disparity
 from recon.core.errors import EvaluationError
 from recon.core.values import Disparity, DisparityTruth, Reason
 from recon.core.values.arrays import Float32
 from recon.evaluation import evaluate_disparity
 from recon.evaluation.middlebury.confidence import curve_figures
 from recon.evaluation.middlebury.score import dense_map, named_figures
+from recon.io.images.disparity_png import read_disparity
 from recon.io.images.image import read_grey_levels
 from recon.io.images.pfm import read_pfm
 from recon.run.summary import plain

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, dump_config
-from recon.commands.empty_map import check_map
 from recon.commands.finished_run import RAYS_FILE, UNTRUSTED
 from recon.commands.resume import begin_or_resume, identity_of, tell_how_to_resume
 from recon.core.errors import EvaluationError, MeshingError
@@ -32,6 +31,7 @@ from recon.export.mesh.drive_mesh import mesh_to_show, store_map, write_drive_me
 from recon.io.atomic import write_text
 from recon.io.trajectory import write_kitti_poses, write_tum
 from recon.map import base_axes
+from recon.map.empty import check_map
 from recon.map.sequence import MappedSequence, map_sequence
 from recon.map.workspace import RAYS, Workspace
 from recon.odometry.health import health_warnings

@@ -20,7 +20,13 @@ from recon.commands.finished_run import (
 )
 from recon.core.values import RectifiedCamera
 from recon.core.values.cloud import Frame
-from recon.export.mesh import MeshSettings, mesh_coverage, reconstruct_mesh, reconstruct_view
+from recon.export.mesh import (
+    MeshSettings,
+    check_coverage,
+    mesh_coverage,
+    reconstruct_mesh,
+    reconstruct_view,
+)
 from recon.export.mesh.drive_mesh import write_drive_mesh
 from recon.export.mesh.tile_store import TileStore
 from recon.io.atomic import atomic_path, write_text
@@ -28,7 +34,6 @@ from recon.io.models.mesh import check_mesh_formats, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.io.models.ply import read_ply, read_ply_pieces, write_ply
 from recon.io.occupancy.octomap_leaves import octomap_pieces
-from recon.rig.audit.pair_checks import check_coverage
 from recon.run.directory import RunDirectory
 from recon.run.machine import use_threads
 from recon.run.record import fingerprint, write_record

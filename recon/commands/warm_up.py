@@ -16,12 +16,13 @@ from recon.commands.demo_source import demo_source
 from recon.commands.finished_run import OCTOMAP
 from recon.commands.map import MapOptions, run_map
 from recon.commands.occupancy import OccupancyRequest, run_occupancy
-from recon.commands.pair import PairInput, PairOptions, run_pair
+from recon.commands.pair import run_pair
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.kernels.cache import when_compiling
 from recon.core.values import StereoPair
 from recon.io.occupancy.octomap_leaves import octomap_pieces
 from recon.map.sequence import MappedSequence, map_sequence
+from recon.sources.pair_input import PairInput
 from recon.stereo.match import MATCHERS
 
 _MATCHERS: Final = tuple(name for name in MATCHERS if name != "onnx")  # it needs a network
@@ -68,9 +69,7 @@ def compile_kernels() -> WarmUp:
         grey = StereoPair(*(image[:, :, 1].copy() for image in (colour.left, colour.right)))
         for number, (matcher, pair) in enumerate(product(_MATCHERS, (colour, grey))):
             config = load_config(None, [f"matching.matcher={matcher}"], PAIR_DEFAULTS)
-            run_pair(
-                PairInput(pair, source.calibration), config, PairOptions(out=folder / str(number))
-            )
+            run_pair(PairInput(pair, source.calibration), config, out=folder / str(number))
     return WarmUp(len(compiled), time.perf_counter() - begun)
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from recon.commands.config import dump_config
 from recon.commands.map import MapRun
-from recon.commands.pair import PairRun
 from recon.commands.paper import PaperRun
 from recon.io.atomic import write_text
 from recon.io.images.image import write_image
@@ -19,6 +18,7 @@ from recon.report.pair_report import PairReportInputs, pair_report
 from recon.report.paper_report import paper_report
 from recon.run.directory import RunDirectory
 from recon.run.machine import versions
+from recon.stereo.pair_run import PairRun
 
 
 def present_map(run: MapRun, directory: RunDirectory) -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from recon.commands.config import PAIR_DEFAULTS, load_config
-from recon.commands.pair import PairOptions, run_pair
-from recon.commands.pair_input import KnownCamera, read_uncalibrated_pair
+from recon.commands.pair import run_pair
 from recon.core.errors import CalibrationError
 from recon.core.values import RectifiedCamera
 from recon.io.images.image import write_image
+from recon.sources.pair_input import KnownCamera, PairInput, read_pair_input
 
 
 @pytest.fixture
@@ -27,8 +27,12 @@ def images(tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "left.png", tmp_path / "right.png"
 
 
+def read(images: tuple[Path, Path], known: KnownCamera) -> PairInput:
+    return read_pair_input(*images, None, known=known)
+
+
 def test_focal_length_and_baseline_give_metres(images: tuple[Path, Path]) -> None:
-    given = read_uncalibrated_pair(*images, KnownCamera(focal_px=300, baseline_m=0.2))
+    given = read(images, KnownCamera(focal_px=300, baseline_m=0.2))
     camera = given.calibration
     assert isinstance(camera, RectifiedCamera)
     assert (camera.focal_px, camera.baseline_m) == (300, 0.2)
@@ -38,7 +42,7 @@ def test_focal_length_and_baseline_give_metres(images: tuple[Path, Path]) -> Non
 
 def test_a_given_principal_point_is_that_of_both_views(images: tuple[Path, Path]) -> None:
     known = KnownCamera(focal_px=300, baseline_m=0.2, cx_px=100, cy_px=50)
-    camera = read_uncalibrated_pair(*images, known).calibration
+    camera = read(images, known).calibration
     assert isinstance(camera, RectifiedCamera)
     assert (camera.cx_px, camera.cy_px, camera.cx_right_px) == (100, 50, 100)
 
@@ -46,9 +50,9 @@ def test_a_given_principal_point_is_that_of_both_views(images: tuple[Path, Path]
 def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(
     images: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    given = read_uncalibrated_pair(*images, KnownCamera(focal_px=300))
+    given = read(images, KnownCamera(focal_px=300))
     settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
-    run = run_pair(given, settings, PairOptions("pair", tmp_path / "out"))
+    run = run_pair(given, settings, out=tmp_path / "out")
     assert run.summary["up_to_scale"] is True
     assert run.summary["depth_median_m"] == pytest.approx(300 / 12, rel=0.01)  # in baselines
     assert [text for text in run.warnings if "in baselines, not in metres" in text]
@@ -56,4 +60,4 @@ def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(
 
 def test_an_unknown_focal_length_is_refused(images: tuple[Path, Path]) -> None:
     with pytest.raises(CalibrationError, match=r"left\.png: focal length is unknown.*--focal PX"):
-        read_uncalibrated_pair(*images, KnownCamera(baseline_m=0.2))
+        read(images, KnownCamera(baseline_m=0.2))

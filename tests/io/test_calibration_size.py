@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.commands.pair_input import read_pair_input
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
@@ -21,6 +20,7 @@ from recon.io.cameras.opencv_yaml import write_opencv_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.image import write_image
 from recon.sources import SourceSettings, open_source
+from recon.sources.pair_input import read_pair_input
 from tests.sources import drives
 
 RAW, RECTIFIED = (160, 60), (142, 44)

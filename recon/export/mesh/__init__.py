@@ -4,12 +4,12 @@ from recon.export.mesh.cut import Plane, cut_mesh
 from recon.export.mesh.free_space import looked_through
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
 from recon.export.mesh.seams import close_seam, open_edges
-from recon.export.mesh.view import COVERED_WITHIN, mesh_coverage, reconstruct_view
+from recon.export.mesh.view import check_coverage, mesh_coverage, reconstruct_view
 
 __all__ = [
-    "COVERED_WITHIN",
     "MeshSettings",
     "Plane",
+    "check_coverage",
     "close_seam",
     "cut_mesh",
     "looked_through",

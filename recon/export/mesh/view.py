@@ -31,6 +31,8 @@ from recon.export.mesh.surgery import vertex_normals
 
 COVERED_WITHIN: Final = 0.005
 """A point is covered if the mesh is no farther from it than this share of its depth."""
+LEAST_COVERAGE: Final = 0.8
+"""Share of the points of a pair that its mesh should cover."""
 _DISPARITY_STEP: Final = 2.0
 """Pixels that a pixel of disparity counts for: what is trimmed as farther than two pixel spacings
 from the points (2.8 pixels) is then a step of 1.4 pixels of disparity or more."""
@@ -85,6 +87,19 @@ def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
     xyz = cloud.xyz[:: math.ceil(len(cloud) / _COVERAGE_SAMPLES)]
     distance_m = RayScene(mesh.vertices[mesh.faces]).distance(xyz)
     return float(np.mean(distance_m <= COVERED_WITHIN * xyz[:, 2]))
+
+
+def check_coverage(coverage: float) -> tuple[str, ...]:
+    """A warning if the mesh of a pair leaves out much of its cloud.
+
+    Args:
+        coverage: Share of the points that are on the mesh, see `mesh_coverage`.
+    """
+    if coverage >= LEAST_COVERAGE:
+        return ()
+    tolerance = f"points within {100 * COVERED_WITHIN:g} % of their depth"
+    advice = "lower mesh.cell_spacings or mesh.min_component_faces, or use the cloud"
+    return (f"the mesh covers {100 * coverage:.2g} % of the cloud ({tolerance}); {advice}",)
 
 
 @dataclass(frozen=True)

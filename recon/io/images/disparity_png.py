@@ -1,8 +1,9 @@
-"""Disparity as a 16-bit PNG: ``256·d``, 0 = unknown (KITTI)."""
+"""Disparity as a 16-bit PNG: ``256·d``, 0 = unknown (KITTI); disparity files of either kind."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 
@@ -10,6 +11,16 @@ from recon.core.errors import FormatError, OutputError
 from recon.core.values.arrays import Float32, frozen_array
 from recon.io.files import StrPath, reader
 from recon.io.images.image import read_grey_levels, write_image
+from recon.io.images.pfm import read_pfm
+
+
+def read_disparity(path: StrPath) -> Float32:
+    """A disparity map, PFM or 16-bit PNG by its suffix: float32 (H, W), NaN = unknown.
+
+    Raises:
+        FormatError: The file is missing or damaged.
+    """
+    return read_pfm(path) if Path(path).suffix.lower() == ".pfm" else read_disparity_png(path)
 
 
 @reader

@@ -18,10 +18,10 @@ from recon.core.values import (
     StereoCalibration,
     StereoPair,
 )
-from recon.export.mesh import COVERED_WITHIN
 from recon.rig.audit import Finding
 from recon.rig.audit.run import run_audit
 from recon.rig.audit.settings import AuditedSettings
+from recon.sources.pair_input import PairInput
 
 #: Findings that images alone support, and those that need a calibration. The inspection of the
 #: frame reports swapped cameras and misaligned rows; few features do not matter if the disparity
@@ -34,19 +34,9 @@ FEW_VALID_SHARE: Final = 0.25
 even of bare walls, exceed 40 %; swapped images, or those of different moments, stay under 15 %."""
 
 
-LEAST_COVERAGE: Final = 0.8
-"""Share of the points of a pair that its mesh should cover."""
-
-
 @dataclass(frozen=True, eq=False)
-class OnePair:
-    """A pair as a source of one frame.
-
-    Attributes:
-        pair: The images.
-        calibration: Calibration of the two cameras.
-        files: Files that the pair was read from.
-    """
+class _OnePair:
+    """A pair as a source of one frame."""
 
     pair: StereoPair
     calibration: RectifiedCamera | StereoCalibration
@@ -71,7 +61,7 @@ class OnePair:
 
 
 def find_pair_faults(
-    given: OnePair, config: AuditedSettings, *, metric: bool
+    given: PairInput, config: AuditedSettings, *, metric: bool
 ) -> tuple[Finding, ...]:
     """Findings of a quick audit; none if it is switched off.
 
@@ -84,7 +74,7 @@ def find_pair_faults(
         return ()
     telling = _BY_PICTURES | _BY_CALIBRATION if metric else _BY_PICTURES
     try:
-        audit = run_audit(given, config, quick=True)
+        audit = run_audit(_OnePair(given.pair, given.calibration), config, quick=True)
     except CalibrationError:
         return ()  # the run itself reports this later
     return tuple(finding for finding in audit.findings if finding.code in telling)
@@ -121,19 +111,6 @@ def check_found(
         got=_reasons(disparity),
         hint=next((fault.text for fault in faults if fault.fatal), advice),
     )
-
-
-def check_coverage(coverage: float) -> tuple[str, ...]:
-    """A warning if the mesh of a pair leaves out much of its cloud.
-
-    Args:
-        coverage: Share of the points that are on the mesh, see `mesh_coverage`.
-    """
-    if coverage >= LEAST_COVERAGE:
-        return ()
-    tolerance = f"points within {100 * COVERED_WITHIN:g} % of their depth"
-    advice = "lower mesh.cell_spacings or mesh.min_component_faces, or use the cloud"
-    return (f"the mesh covers {100 * coverage:.2g} % of the cloud ({tolerance}); {advice}",)
 
 
 def _reasons(disparity: Disparity) -> str:

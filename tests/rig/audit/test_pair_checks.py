@@ -11,10 +11,13 @@ import pytest
 
 from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.commands.mesh import MeshOptions, run_mesh
-from recon.commands.pair import PairInput, PairOptions, PairRun, run_pair
+from recon.commands.pair import run_disparity, run_pair
 from recon.core.errors import FormatError, MappingError, MatchingError, SettingsError
 from recon.core.values import RectifiedCamera, StereoPair
-from recon.rig.audit.pair_checks import check_coverage
+from recon.export.mesh import check_coverage
+from recon.run.progress import Silent
+from recon.sources.pair_input import PairInput
+from recon.stereo.pair_run import PairRun
 
 CAMERA = RectifiedCamera(300.0, 160.0, 120.0, 160.0, 0.1, 320, 240)
 
@@ -32,14 +35,20 @@ def run(
     pair: StereoPair, out: Path, camera: RectifiedCamera = CAMERA, command: str = "disparity"
 ) -> PairRun:
     settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
-    return run_pair(PairInput(pair, camera), settings, PairOptions(command, out))
+    run_command = run_pair if command == "pair" else run_disparity
+    return run_command(PairInput(pair, camera), settings, out=out)
 
 
 def test_stages_that_take_long_are_told_when_they_begin(pair: StereoPair, tmp_path: Path) -> None:
     told: list[str] = []
-    options = PairOptions("pair", tmp_path / "out", on_stage=told.append)
-    run_pair(PairInput(pair, CAMERA), load_config(None, ["mesh.max_depth=5"]), options)
-    assert told == ["match", "mesh"]  # there is no report to write
+
+    class Notes(Silent):
+        def on_stage(self, name: str) -> None:
+            told.append(name)
+
+    settings = load_config(None, ["mesh.max_depth=5"])
+    run_pair(PairInput(pair, CAMERA), settings, out=tmp_path / "out", progress=Notes())
+    assert told == ["match", "mesh", "report"]
 
 
 def test_a_good_pair_is_not_warned_of(pair: StereoPair, tmp_path: Path) -> None:
@@ -59,10 +68,9 @@ def test_a_pair_without_a_point_is_refused_with_its_depths(
     pair: StereoPair, tmp_path: Path
 ) -> None:
     settings = load_config(None, ["cloud.max_range_m=1"], PAIR_DEFAULTS)
-    options = PairOptions("pair", tmp_path / "out")
     # 300 px and 0.1 m at 12 px: 2.5 m.
     with pytest.raises(MappingError, match=r"the cloud is empty .* at 2\.\d+ to 2\.5 m.* to 1 m"):
-        run_pair(PairInput(pair, CAMERA), settings, options)
+        run_pair(PairInput(pair, CAMERA), settings, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -116,8 +124,8 @@ def test_the_run_of_a_pair_is_meshed_again_as_the_pair_was(
     pair: StereoPair, tmp_path: Path
 ) -> None:
     settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
-    options = PairOptions("pair", tmp_path / "run", formats=("glb",))
-    first = run_pair(PairInput(pair, CAMERA), settings, options)
+    given = PairInput(pair, CAMERA)
+    first = run_pair(given, settings, out=tmp_path / "run", formats=("glb",))
     assert (tmp_path / "run" / "mesh" / "mesh.glb").is_file()
     again = run_mesh(
         tmp_path / "run", settings, MeshOptions(tmp_path / "again", formats=("glb", "obj"))
@@ -138,7 +146,6 @@ def test_a_pair_run_that_does_not_name_its_camera_is_refused(tmp_path: Path) -> 
 
 
 def test_an_unknown_format_is_refused_before_the_work(pair: StereoPair, tmp_path: Path) -> None:
-    options = PairOptions("pair", tmp_path / "run", formats=("fbx",))
     with pytest.raises(SettingsError, match=r"--format: unknown mesh format .*fbx"):
-        run_pair(PairInput(pair, CAMERA), load_config(), options)
+        run_pair(PairInput(pair, CAMERA), out=tmp_path / "run", formats=("fbx",))
     assert not (tmp_path / "run").exists()

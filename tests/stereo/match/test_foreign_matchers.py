@@ -65,7 +65,7 @@ def test_a_run_is_made_with_an_object_and_records_its_name(tmp_path: Path) -> No
     config = recon.load_config().with_matcher(Flat())
     given = recon.PairInput(recon.StereoPair(image(), image()), CAMERA)
     out = tmp_path / "run"
-    run = recon.run_pair(given, config, recon.PairOptions("disparity", out=out))
+    run = recon.run_disparity(given, config, out=out)
     assert np.nanmedian(run.disparity.values) == 5
     assert "matcher: Flat" in (out / "config.yaml").read_text()
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.pair_input import read_pair_input
 from recon.core.errors import CalibrationError, FormatError
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
@@ -20,6 +19,7 @@ from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.image import write_image
 from recon.map.sequence import map_sequence
 from recon.sources import open_source
+from recon.sources.pair_input import read_pair_input
 from recon.stereo.frame import FrameReconstructor
 from recon.stereo.rectify import RectificationSettings, Rectifier, plan_turns
 from recon.stereo.rectify.rectifier import _check_focal

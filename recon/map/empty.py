@@ -18,19 +18,17 @@ from recon.stereo.cloud import CloudSettings
 from recon.stereo.frame import ReconstructedFrame
 
 
-def check_cloud(
-    points: int, disparity: Disparity, camera: RectifiedCamera, settings: CloudSettings, where: str
-) -> None:
+def check_cloud(frame: ReconstructedFrame, settings: CloudSettings, where: str) -> None:
     """Refuse a pair whose matches give no point.
 
     Raises:
         MappingError: There is no point.
     """
-    if not points:
+    if not len(frame.cloud):
         raise MappingError(
             "the cloud is empty",
             where=where,
-            got=_depths(disparity, camera),
+            got=_depths(frame.disparity, frame.pair.camera),
             expected=f"points {_limits(settings)}",
             hint="check the unit of the baseline, or set cloud.max_range_m and "
             "cloud.max_relative_sigma",

@@ -1,0 +1,158 @@
+"""Reading one pair with its calibration and ground truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import CalibrationError, FormatError, SettingsError
+from recon.core.values import DisparityTruth, RectifiedCamera, StereoCalibration, StereoPair
+from recon.io.images.disparity_png import read_disparity
+from recon.io.images.exif import read_focal_length
+from recon.io.images.image import MAX_MEGAPIXELS
+from recon.io.middlebury.scene import stand_in_camera
+from recon.sources.files import FilesSource
+
+UP_TO_SCALE: Final = "no baseline was given: all lengths are in baselines, not in metres"
+
+
+@dataclass(frozen=True, eq=False)
+class PairInput:
+    """One pair with its calibration and ground truth.
+
+    Attributes:
+        pair: The images.
+        calibration: Calibration of the two cameras.
+        files: Files that the pair was read from.
+        truth: True disparity of the rectified left view, or None.
+        notes: What the camera was taken from, where there is no calibration file; for warnings.
+        up_to_scale: True if the baseline is unknown and counts as 1 m.
+    """
+
+    pair: StereoPair
+    calibration: RectifiedCamera | StereoCalibration
+    files: tuple[Path, ...] = ()
+    truth: DisparityTruth | None = None
+    notes: tuple[str, ...] = ()
+    up_to_scale: bool = False
+
+
+@dataclass(frozen=True)
+class KnownCamera:
+    """What is known of the camera of a rectified pair that has no calibration file.
+
+    Attributes:
+        focal_px: Focal length; None = that in the EXIF data of the left image.
+        baseline_m: Distance between the cameras; None = unknown, the cloud is up to scale.
+        cx_px: Column of the principal point of both views; None = the middle.
+        cy_px: Its row; None = the middle.
+    """
+
+    focal_px: float | None = None
+    baseline_m: float | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
+
+
+def read_pair_input(
+    left: Path,
+    right: Path,
+    calibration: Path | None,
+    *,
+    known: KnownCamera | None = None,
+    metres_per_unit: float = 1.0,
+    max_megapixels: float = MAX_MEGAPIXELS,
+) -> PairInput:
+    """Read two images with their calibration.
+
+    Args:
+        left: Left image.
+        right: Right image.
+        calibration: Any file that `read_calibration` understands; None = the pair is rectified.
+        known: What is known of the camera, if depth is wanted without a calibration file; the
+            result has notes on what the rest was taken from.
+        metres_per_unit: Unit of the translation in an OpenCV file; other formats define theirs.
+        max_megapixels: Refuse larger images, in 10⁶ pixels.
+
+    Raises:
+        FormatError: A file is missing, damaged or of the wrong size.
+        SourceError: The images differ in size.
+        SettingsError: The camera is given twice.
+        CalibrationError: The focal length is neither given nor in the image, or not positive.
+    """
+    if calibration is not None and known not in (None, KnownCamera()):
+        raise SettingsError(
+            "--focal, --baseline, --cx and --cy replace a calibration file",
+            where="--calib",
+            got=calibration,
+            hint="give either",
+        )
+    source = FilesSource(
+        left,
+        right,
+        calibration,
+        metres_per_unit=metres_per_unit,
+        max_megapixels=max_megapixels,
+    )
+    (pair,) = source
+    given = PairInput(pair, source.calibration, source.files)
+    return given if calibration is not None or known is None else _with_camera(given, known)
+
+
+def _with_camera(given: PairInput, known: KnownCamera) -> PairInput:
+    """The pair with a camera from what is known of it, and from the EXIF data of its image."""
+    height_px, width_px = given.pair.left.shape[:2]
+    focal_px, basis = known.focal_px, ""
+    if focal_px is None:
+        left = given.files[0]
+        found = read_focal_length(left, width_px, height_px)
+        if found is None:
+            raise CalibrationError(
+                "focal length is unknown: there is no calibration and no EXIF data",
+                where=left,
+                hint="--calib FILE, or --focal PX",
+            )
+        focal_px = found.focal_px
+        basis = f"focal length of {focal_px:.0f} px from EXIF ({found.basis})"
+    middle = stand_in_camera(width_px, height_px)
+    cx_px = middle.cx_px if known.cx_px is None else known.cx_px
+    camera = RectifiedCamera(
+        focal_px=focal_px,
+        cx_px=cx_px,
+        cy_px=middle.cy_px if known.cy_px is None else known.cy_px,
+        cx_right_px=cx_px,
+        baseline_m=1.0 if known.baseline_m is None else known.baseline_m,
+        width_px=width_px,
+        height_px=height_px,
+    )
+    up_to_scale = known.baseline_m is None
+    unscaled = f"{UP_TO_SCALE}; --baseline M gives metres" if up_to_scale else ""
+    notes = tuple(note for note in (basis, unscaled) if note)
+    return replace(given, calibration=camera, notes=notes, up_to_scale=up_to_scale)
+
+
+def with_truth(given: PairInput, path: Path | None) -> PairInput:
+    """The pair with ground truth from a file, of which every known pixel counts.
+
+    Args:
+        given: The pair.
+        path: True disparity of the rectified left image, PFM or 16-bit PNG; None = none.
+
+    Raises:
+        FormatError: The file is missing, damaged or of another size.
+    """
+    if path is None:
+        return given
+    values, shape = read_disparity(path), given.pair.left.shape[:2]
+    if values.shape != shape:
+        raise FormatError(
+            "size of the ground truth differs from the images",
+            where=path,
+            got=f"{values.shape[1]}x{values.shape[0]}",
+            expected=f"{shape[1]}x{shape[0]}",
+        )
+    truth = DisparityTruth(values, np.isfinite(values))
+    return replace(given, truth=truth, files=(*given.files, path))
