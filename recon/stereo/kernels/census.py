@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 
 from recon.core.kernels.compiled import kernel
 from recon.stereo.kernels.borders import continue_row
-from recon.stereo.kernels.lanes import LANES, load_row, splat, store_row, where_less
+from recon.stereo.kernels.simd import (
+    LANES,
+    load_row,
+    splat,
+    store_row,
+    where_less,
+)
 
 PLANES: Final = 3
 """Planes of bits come in threes, which one loop compares: a census of 5 by 5 needs three."""
@@ -127,7 +133,7 @@ def _write_census(
 
 
 def planes_reference(grey: NDArray[np.uint8], descriptor: Descriptor) -> NDArray[np.uint8]:
-    """The plain-numpy twin of `write_planes`: uint8 (``descriptor.planes``, H, W)."""
+    """Reference implementation of `write_planes`: uint8 (``descriptor.planes``, H, W)."""
     height, width = grey.shape
     around = np.pad(grey.astype(np.int64), 1, mode="edge")
     slopes = around[:, 2:] - around[:, :-2]

@@ -6,7 +6,7 @@ are updated from row to row, one pixel in and one out; sums over the width are p
 sums of two and of four columns.
 
 Sums are stored place by place, with the columns of a block side by side. Place ``n`` is candidate
-``n - abs(lean)``, so that a leaning half finds candidates before the first and after the last.
+``n - abs(slant)``, so that a slanted half finds candidates before the first and after the last.
 Only the places of offered candidates are summed. Where one is offered again, its sums start early
 enough for the first window that needs them.
 """
@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 
 from recon.core.kernels.compiled import kernel
 from recon.stereo.kernels.borders import continue_row
-from recon.stereo.kernels.lanes import LANES, distance, fit, least, load, splat, store
+from recon.stereo.kernels.simd import (
+    LANES,
+    absolute_difference,
+    load,
+    minimum,
+    splat,
+    store,
+    widen,
+)
 from recon.stereo.kernels.tiles import GROUP, Offer
 
 _CACHE_BYTES: Final = 1024 * 1024
@@ -42,7 +50,7 @@ class Search(NamedTuple):
         radius: Half width of the window, pixels: it is ``2·radius + 1`` wide.
         rows_radius: Half height of the window, pixels.
         cost_cap: Largest cost of one pixel; times the pixels of both halves it is < 65535.
-        lean: By how many candidates the lower half of the leaning window is moved up and its upper
+        slant: By how many candidates the lower half of the slanted window is moved up and its upper
             half down; 0 = there is no such window.
     """
 
@@ -51,7 +59,7 @@ class Search(NamedTuple):
     radius: int
     rows_radius: int
     cost_cap: int
-    lean: int
+    slant: int
 
 
 class Views(NamedTuple):
@@ -59,8 +67,8 @@ class Views(NamedTuple):
 
     Attributes:
         left: uint8 (H, C); column ``c`` is column ``c - radius`` of the picture.
-        right: uint8 (H, C + n - 1), n = ndisp + 2·abs(lean); column ``c`` sees candidate
-            ``k`` at column ``c + n - 1 - abs(lean) - k``.
+        right: uint8 (H, C + n - 1), n = ndisp + 2·abs(slant); column ``c`` sees candidate
+            ``k`` at column ``c + n - 1 - abs(slant) - k``.
         width: Columns of the picture.
     """
 
@@ -135,7 +143,7 @@ def lay_out(
         views: Written: the rows.
     """
     places = views.right.shape[1] - views.left.shape[1] + 1
-    right_at = search.radius + search.minimum - abs(search.lean) + places - 1
+    right_at = search.radius + search.minimum - abs(search.slant) + places - 1
     for n in range(len(left)):
         continue_row(left[n], search.radius, views.left[first + n])
         continue_row(right[n], right_at, views.right[first + n])
@@ -170,7 +178,7 @@ def widest_block(search: Search, width: int) -> int:
 
 
 def _places(search: Search) -> int:
-    return search.ndisp + 2 * abs(search.lean)
+    return search.ndisp + 2 * abs(search.slant)
 
 
 def _stride(search: Search, block: int) -> int:
@@ -201,7 +209,7 @@ def next_half(
 
 
 @kernel
-def enlist(
+def offer_candidates(
     views: Views, search: Search, now: Offer, soon: Offer, y: int, x0: int, scratch: Scratch
 ) -> None:
     """From row ``y`` on offer some candidates, and sum these and those offered soon.
@@ -216,7 +224,7 @@ def enlist(
         scratch: Changed.
     """
     _list_runs(now, now, search.ndisp, 0, scratch.offers)
-    _list_runs(now, soon, search.ndisp, 2 * abs(search.lean), scratch.runs)
+    _list_runs(now, soon, search.ndisp, 2 * abs(search.slant), scratch.runs)
     _begin(views, search, y - 1, x0, scratch)
 
 
@@ -259,9 +267,9 @@ def _add_row(views: Views, n: int, cost_cap: int, y: int, x0: int, scratch: Scra
     sums, left, right = scratch.columns, views.left[y], views.right[y]
     cap, shift = splat(np.uint8(cost_cap)), x0 + scratch.alive.size - 1 - n
     for c in range(0, scratch.stride, LANES):
-        plus = least(distance(load(left, x0 + c), load(right, shift + c)), cap)
+        plus = minimum(absolute_difference(load(left, x0 + c), load(right, shift + c)), cap)
         at = n * scratch.stride + c
-        store(sums, at, load(sums, at) + fit(plus, sums))
+        store(sums, at, load(sums, at) + widen(plus, sums))
 
 
 @kernel
@@ -282,9 +290,9 @@ def _slide_row(
         left, left_gone = load(views.left[come], c), load(views.left[gone], c)
         at, other = n0 * stride + c - x0, c + scratch.alive.size - 1 - n0
         for _ in range(n1 - n0):
-            plus = least(distance(left, load(right, other)), cap)
-            minus = least(distance(left_gone, load(right_gone, other)), cap)
-            store(sums, at, load(sums, at) - fit(minus, sums) + fit(plus, sums))
+            plus = minimum(absolute_difference(left, load(right, other)), cap)
+            minus = minimum(absolute_difference(left_gone, load(right_gone, other)), cap)
+            store(sums, at, load(sums, at) - widen(minus, sums) + widen(plus, sums))
             at, other = at + stride, other - 1
 
 
@@ -298,15 +306,15 @@ def _sum_columns(
     """
     values, pairs, fours = scratch.columns, scratch.pairs, scratch.fours
     for i in range(0, end - first, LANES):
-        pair = fit(load(values, first + i), pairs) + fit(load(values, first + i + 1), pairs)
+        pair = widen(load(values, first + i), pairs) + widen(load(values, first + i + 1), pairs)
         store(pairs, i, pair)
     for i in range(0, end - first, LANES):
-        store(fours, i, fit(load(pairs, i), fours) + fit(load(pairs, i + 2), fours))
+        store(fours, i, widen(load(pairs, i), fours) + widen(load(pairs, i + 2), fours))
     whole, odd = window // 4, window % 4 == 3
     for i in range(0, end - first, LANES):
-        total = fit(load(values, first + i + window - 1), sums)
+        total = widen(load(values, first + i + window - 1), sums)
         if odd:
-            total = total + fit(load(pairs, i + window - 3), sums)
+            total = total + widen(load(pairs, i + window - 3), sums)
         for n in range(whole):
             total = total + load(fours, i + 4 * n)
         store(sums, first + i, total)

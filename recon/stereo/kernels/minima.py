@@ -39,7 +39,7 @@ def empty_minima(height: int, width: int) -> Minima:
 
 
 @kernel
-def claim_right(ndisp: int, minimum: int, y: int, minima: Minima) -> None:
+def write_right_winners(ndisp: int, minimum: int, y: int, minima: Minima) -> None:
     """Match each pixel of row ``y`` of the right view to the left pixel that chose it best.
 
     The left pixel of the least cost gets it, of equal ones the leftmost. The check is weaker than
@@ -53,12 +53,12 @@ def claim_right(ndisp: int, minimum: int, y: int, minima: Minima) -> None:
             ``right_winner``.
     """
     best = np.full(minima.winner.shape[1], NO_COST, np.uint16)
-    winners, costs, claims = minima.winner[y], minima.costs[0, y], minima.right_winner[y]
-    claims[:] = ndisp
+    winners, costs, chosen = minima.winner[y], minima.costs[0, y], minima.right_winner[y]
+    chosen[:] = ndisp
     for x in range(best.size):
         k = np.int64(winners[x])
         if k < ndisp:
             # Unsigned: an index that cannot be negative needs no check.
             right = np.uint64(x - minimum - k)
             if costs[x] < best[right]:
-                best[right], claims[right] = costs[x], k
+                best[right], chosen[right] = costs[x], k

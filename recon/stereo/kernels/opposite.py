@@ -1,6 +1,6 @@
 """Averages over pairs of opposite neighbours, which keep slopes and steps.
 
-The twin in plain numpy is `recon.stereo.kernels.opposite_reference.average_opposite_reference`.
+The reference implementation is in `recon.stereo.kernels.opposite_reference`.
 """
 
 from __future__ import annotations

@@ -16,23 +16,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.kernels.compiled import kernel
-from recon.stereo.kernels.lanes import (
+from recon.stereo.kernels.path_costs import aligned, padded
+from recon.stereo.kernels.path_rows import Paths, next_cost, p2_between
+from recon.stereo.kernels.simd import (
     LANES,
-    Lanes,
-    least,
+    Vector,
+    broadcast_minimum,
     load,
     load_row,
+    maximum,
     mean,
-    most,
+    minimum,
     put_after,
     put_before,
     splat,
-    spread_lowest,
     store_row,
+    transpose,
 )
-from recon.stereo.kernels.path_costs import aligned, padded
-from recon.stereo.kernels.path_rows import Paths, large_penalty, next_cost
-from recon.stereo.kernels.squares import transpose
 
 RIGHTWARD, LEFTWARD = range(2)
 """The two paths."""
@@ -47,10 +47,10 @@ class RowScratch(NamedTuple):
         means: uint8 (Q, C), means over both paths.
         last: uint8 (LANES, C), costs of the candidates that do not fill a vector.
         now: uint8 (2, LANES + Q + LANES), costs of each path at its present pixel; the margins are
-            too dear to change from.
-        floors: uint8 (Q,), lower bound of the path costs: 0, but for candidates that only pad a
-            vector, which are as dear as the margins.
-        steps: uint8 (C + 1,), the large penalty between a column and the one before.
+            too costly to change from.
+        least: uint8 (Q,), lower bound of the path costs: 0, but for candidates that only pad a
+            vector, which are as costly as the margins.
+        steps: uint8 (C + 1,), P2 between a column and the one before.
     """
 
     columns: NDArray[np.uint8]
@@ -58,17 +58,17 @@ class RowScratch(NamedTuple):
     means: NDArray[np.uint8]
     last: NDArray[np.uint8]
     now: NDArray[np.uint8]
-    floors: NDArray[np.uint8]
+    least: NDArray[np.uint8]
     steps: NDArray[np.uint8]
 
 
 def empty_row_scratch(columns: int, paths: Paths) -> RowScratch:
     """Memory for `follow_row`; columns is a multiple of `LANES`."""
     candidates = padded(paths.ndisp)
-    closed = np.uint8(255 - paths.small)
-    now, floors = aligned((2, LANES + candidates + LANES)), aligned((candidates,))
+    closed = np.uint8(255 - paths.p1)
+    now, least = aligned((2, LANES + candidates + LANES)), aligned((candidates,))
     now[:] = closed
-    floors[paths.ndisp :] = closed
+    least[paths.ndisp :] = closed
     shape = (columns, candidates)
     # The means are written once the costs have been read.
     transposed = aligned(shape)
@@ -78,7 +78,7 @@ def empty_row_scratch(columns: int, paths: Paths) -> RowScratch:
         transposed.reshape(shape[::-1]),
         aligned((LANES, columns)),
         now,
-        floors,
+        least,
         aligned((columns + 1,)),
     )
 
@@ -98,9 +98,9 @@ def follow_row(
     _set_steps(grey, paths, scratch.steps)
     _transpose_costs(costs, scratch)
     scratch.now[:, LANES:-LANES] = np.uint8(0)
-    _follow(grey.size, np.uint8(paths.small), scratch)
+    _follow(grey.size, np.uint8(paths.p1), scratch)
     for x in range(0, costs.shape[1], LANES):
-        for k in range(0, scratch.floors.size, LANES):
+        for k in range(0, scratch.least.size, LANES):
             transpose(scratch.paths, x, k, scratch.means, k, x)
 
 
@@ -123,66 +123,66 @@ def _transpose_costs(costs: NDArray[np.uint8], scratch: RowScratch) -> None:
 
 @kernel
 def _set_steps(grey: NDArray[np.uint8], paths: Paths, steps: NDArray[np.uint8]) -> None:
-    """Write the large penalty between neighbours; where a path starts there is none."""
-    edge, large = np.uint8(paths.edge), np.uint8(paths.large)
-    large_at_edge = np.uint8(paths.large_at_edge)
+    """Write P2 between neighbours; where a path starts there is none."""
+    edge, p2 = np.uint8(paths.edge), np.uint8(paths.p2)
+    p2_at_edge = np.uint8(paths.p2_at_edge)
     for x in range(1, grey.size):
-        steps[x] = large_penalty(grey[x], grey[x - 1], edge, large, large_at_edge)
+        steps[x] = p2_between(grey[x], grey[x - 1], edge, p2, p2_at_edge)
     steps[0] = steps[grey.size] = np.uint8(0)
 
 
 @kernel
-def _follow(width: int, small: np.uint8, scratch: RowScratch) -> None:
+def _follow(width: int, p1: np.uint8, scratch: RowScratch) -> None:
     """Follow both paths from end to end."""
     right = left = splat(np.uint8(0))
-    penalty, half = splat(small), width // 2
+    step_p1, half = splat(p1), width // 2
     for x in range(half):
-        right = _step(x, scratch.steps[x], RIGHTWARD, right, penalty, scratch, False)
+        right = _step(x, scratch.steps[x], RIGHTWARD, right, step_p1, scratch, False)
         back = width - 1 - x
-        left = _step(back, scratch.steps[back + 1], LEFTWARD, left, penalty, scratch, False)
+        left = _step(back, scratch.steps[back + 1], LEFTWARD, left, step_p1, scratch, False)
     if width % 2:
-        right = _step(half, scratch.steps[half], RIGHTWARD, right, penalty, scratch, False)
-        left = _step(half, scratch.steps[half + 1], LEFTWARD, left, penalty, scratch, True)
+        right = _step(half, scratch.steps[half], RIGHTWARD, right, step_p1, scratch, False)
+        left = _step(half, scratch.steps[half + 1], LEFTWARD, left, step_p1, scratch, True)
     for x in range(width - half, width):
-        right = _step(x, scratch.steps[x], RIGHTWARD, right, penalty, scratch, True)
+        right = _step(x, scratch.steps[x], RIGHTWARD, right, step_p1, scratch, True)
         back = width - 1 - x
-        left = _step(back, scratch.steps[back + 1], LEFTWARD, left, penalty, scratch, True)
+        left = _step(back, scratch.steps[back + 1], LEFTWARD, left, step_p1, scratch, True)
 
 
 @kernel(inline="always")
 def _step(
     x: int,
-    large: np.uint8,
+    p2: np.uint8,
     path: int,
-    low: Lanes,
-    penalty: Lanes,
+    low: Vector,
+    p1: Vector,
     scratch: RowScratch,
     met: bool,
-) -> Lanes:
+) -> Vector:
     """Advance a path to column ``x``; return its lowest cost there, in each lane.
 
-    ``large`` is the large penalty on the way, ``low`` the lowest cost before, ``met`` whether the
+    ``p2`` is the penalty on the way, ``low`` the lowest cost before, ``met`` whether the
     other path has been in this column.
     """
-    limit, fresh = low + splat(large), splat(np.uint8(255))
+    limit, fresh = low + splat(p2), splat(np.uint8(255))
     before, same = load_row(scratch.now, path, 0), load_row(scratch.now, path, LANES)
-    last = scratch.floors.size - LANES
+    last = scratch.least.size - LANES
     for k in range(0, last, LANES):
         after = load_row(scratch.now, path, k + 2 * LANES)
         below, above = put_before(same, before), put_after(same, after)
-        cost = next_cost(same, below, above, penalty, limit, low, load_row(scratch.columns, x, k))
+        cost = next_cost(same, below, above, p1, limit, low, load_row(scratch.columns, x, k))
         _keep(cost, path, x, k, scratch, met)
-        fresh, before, same = least(fresh, cost), same, after
+        fresh, before, same = minimum(fresh, cost), same, after
     below = put_before(same, before)
     above = put_after(same, load_row(scratch.now, path, last + 2 * LANES))
-    cost = next_cost(same, below, above, penalty, limit, low, load_row(scratch.columns, x, last))
-    cost = most(cost, load(scratch.floors, last))
+    cost = next_cost(same, below, above, p1, limit, low, load_row(scratch.columns, x, last))
+    cost = maximum(cost, load(scratch.least, last))
     _keep(cost, path, x, last, scratch, met)
-    return spread_lowest(least(fresh, cost))
+    return broadcast_minimum(minimum(fresh, cost))
 
 
 @kernel(inline="always")
-def _keep(cost: Lanes, path: int, x: int, k: int, scratch: RowScratch, met: bool) -> None:
+def _keep(cost: Vector, path: int, x: int, k: int, scratch: RowScratch, met: bool) -> None:
     """Store path costs, or their means with those of the other path where it has been."""
     store_row(scratch.now, path, k + LANES, cost)
     if met:

@@ -4,7 +4,7 @@ A row of costs is an array (candidates, W). The pixels of a candidate lie side b
 view as in the right, so vector registers are filled along the row and only its end needs padding.
 Sums over the window's width are kept for as many rows as the window is high.
 
-The twin in plain numpy is `recon.stereo.kernels.semi_global_reference.path_costs_reference`.
+The reference implementation is in `recon.stereo.kernels.semi_global_reference`.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from numpy.typing import NDArray
 
 from recon.core.kernels.compiled import kernel
 from recon.stereo.kernels.census import PLANES, Descriptor, write_planes
-from recon.stereo.kernels.lanes import (
+from recon.stereo.kernels.simd import (
     LANES,
-    Lanes,
+    Vector,
+    absolute_difference,
     differing_bits,
-    distance,
-    fit,
-    least,
     load_row,
+    minimum,
     narrow,
     splat,
     store_row,
+    widen,
 )
 
 ALIGNMENT: Final = 64
@@ -263,7 +263,7 @@ def _compare(
         bits_2, bits_3 = load_row(left, 2, here), load_row(left, 3, here)
         for k in range(first, end):
             other = load_row(right, 0, there - k)
-            apart = least(distance(gradient, other), cap)
+            apart = minimum(absolute_difference(gradient, other), cap)
             one = differing_bits(bits, load_row(right, 1, there - k))
             two = differing_bits(bits_2, load_row(right, 2, there - k))
             three = differing_bits(bits_3, load_row(right, 3, there - k))
@@ -293,7 +293,7 @@ def _add_bits(
 
 
 @kernel
-def _sum_across(pixels: NDArray[np.uint8], n: int, x: int, radius: int) -> Lanes:
+def _sum_across(pixels: NDArray[np.uint8], n: int, x: int, radius: int) -> Vector:
     """Sum the costs over the window's width; the sums fit into uint8."""
     total = load_row(pixels, n, x)
     for d in range(x + 1, x + 2 * radius + 1):
@@ -304,11 +304,11 @@ def _sum_across(pixels: NDArray[np.uint8], n: int, x: int, radius: int) -> Lanes
 @kernel
 def _sum_across_wide(
     pixels: NDArray[np.uint8], n: int, x: int, window: Window, sums: NDArray[np.uint16]
-) -> Lanes:
+) -> Vector:
     """The same in uint16, shifted to fit into uint8."""
-    total = fit(load_row(pixels, n, x), sums)
+    total = widen(load_row(pixels, n, x), sums)
     for d in range(x + 1, x + 2 * window.radius + 1):
-        total = total + fit(load_row(pixels, n, d), sums)
+        total = total + widen(load_row(pixels, n, d), sums)
     return narrow(total >> splat(np.uint16(window.row_shift)))
 
 
@@ -332,6 +332,6 @@ def _slide_window(
                 across = _sum_across_wide(pixels, n, x, window, sums)
             out = load_row(oldest, n, x)
             store_row(oldest, n, x, across)
-            total = load_row(sums, n, x) - fit(out, sums) + fit(across, sums)
+            total = load_row(sums, n, x) - widen(out, sums) + widen(across, sums)
             store_row(sums, n, x, total)
             store_row(costs, first + n, x, narrow(total * factor >> shift))

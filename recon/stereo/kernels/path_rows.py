@@ -20,8 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.kernels.compiled import kernel
-from recon.stereo.kernels.lanes import LANES, Lanes, least, load_row, mean, splat, store_row
 from recon.stereo.kernels.plane_minima import MARGIN
+from recon.stereo.kernels.simd import (
+    LANES,
+    Vector,
+    load_row,
+    mean,
+    minimum,
+    splat,
+    store_row,
+)
 
 DOWN, UP, WARM_UP = range(3)
 """What `advance` does with the means over the paths: write them (the sweep down), average them with
@@ -40,9 +48,9 @@ class Paths(NamedTuple):
     Attributes:
         ndisp: Number of candidates.
         minimum: Disparity of candidate 0, pixels.
-        small: Penalty for a change by one candidate (P1).
-        large: Penalty for any larger change (P2); `Window.top` + small + large is at most 254.
-        large_at_edge: P2 where the grey level changes by more than ``edge``.
+        p1: Penalty for a change by one candidate.
+        p2: Penalty for any larger change; `Window.top` + P1 + P2 is at most 254.
+        p2_at_edge: P2 where the grey level changes by more than ``edge``.
         edge: Grey levels.
         overlap: Rows above and below a block in which its paths start.
         side_overlap: Columns beside a band in which its paths start.
@@ -50,9 +58,9 @@ class Paths(NamedTuple):
 
     ndisp: int
     minimum: int
-    small: int
-    large: int
-    large_at_edge: int
+    p1: int
+    p2: int
+    p2_at_edge: int
     edge: int
     overlap: int
     side_overlap: int
@@ -63,12 +71,12 @@ class PathRow(NamedTuple):
 
     Attributes:
         costs: uint8 (3, P + 2, MARGIN + C + MARGIN), of the paths `STRAIGHT`, `FROM_LEFT` and
-            `FROM_RIGHT`. The first and the last candidate are dummies, too dear to change from.
+            `FROM_RIGHT`. The first and the last candidate are dummies, too costly to change from.
         lowest: uint8 (2, 3, MARGIN + C + MARGIN), lowest cost over all candidates of each path, in
             the row before and in this one.
         below: uint8 (3, C), previous cost of the candidate below the group being done, which that
             group has already overwritten.
-        limits: uint8 (3, C), lowest previous cost plus the large penalty: no way costs more.
+        limits: uint8 (3, C), lowest previous cost plus P2: no way costs more.
     """
 
     costs: NDArray[np.uint8]
@@ -80,7 +88,7 @@ class PathRow(NamedTuple):
 def begin(paths: Paths, row: PathRow) -> None:
     """Start all paths: every cost is 0, except those of the dummies."""
     row.costs[:] = 0
-    row.costs[:, 0] = row.costs[:, -1] = np.uint8(255 - paths.small)
+    row.costs[:, 0] = row.costs[:, -1] = np.uint8(255 - paths.p1)
     row.lowest[:] = row.limits[:] = 0
 
 
@@ -116,11 +124,11 @@ def advance(
         others = before[first + side : end + side]
         _set_limits(grey[first:end], others, beside, paths, row.limits[n, first:end])
     now[:, MARGIN : MARGIN + columns] = np.uint8(255)
-    row.below[:] = np.uint8(255 - paths.small)
+    row.below[:] = np.uint8(255 - paths.p1)
     for first in range(0, costs.shape[0], TOGETHER):
         end = min(first + TOGETHER, costs.shape[0])
-        _advance_from_right(costs, first, end, paths.small, row)
-        _advance_others(costs, first, end, paths.small, row, means, along, stage)
+        _advance_from_right(costs, first, end, paths.p1, row)
+        _advance_others(costs, first, end, paths.p1, row, means, along, stage)
         # Beyond the last column the paths from the right start.
         row.costs[FROM_RIGHT, first + 1 : end + 1, beyond] = np.uint8(0)
     now[FROM_RIGHT, beyond] = np.uint8(0)
@@ -135,49 +143,55 @@ def _set_limits(
     paths: Paths,
     limits: NDArray[np.uint8],
 ) -> None:
-    """Write a path's lowest cost in the row before, plus the large penalty."""
-    edge, large = np.uint8(paths.edge), np.uint8(paths.large)
-    large_at_edge = np.uint8(paths.large_at_edge)
+    """Write a path's lowest cost in the row before, plus P2."""
+    edge, p2 = np.uint8(paths.edge), np.uint8(paths.p2)
+    p2_at_edge = np.uint8(paths.p2_at_edge)
     for x in range(limits.size):
-        penalty = large_penalty(grey[x], others[x], edge, large, large_at_edge)
-        limits[x] = np.uint8(lowest[x] + penalty)
+        jump = p2_between(grey[x], others[x], edge, p2, p2_at_edge)
+        limits[x] = np.uint8(lowest[x] + jump)
 
 
 @kernel
-def large_penalty(
-    grey: np.uint8, before: np.uint8, edge: np.uint8, large: np.uint8, large_at_edge: np.uint8
+def p2_between(
+    grey: np.uint8, before: np.uint8, edge: np.uint8, p2: np.uint8, p2_at_edge: np.uint8
 ) -> np.uint8:
-    """The large penalty between two pixels of a path, from their grey levels."""
+    """Return P2 between two pixels of a path, from their grey levels."""
     step = np.uint8(max(grey, before) - min(grey, before))
-    return large_at_edge if step > edge else large
+    return p2_at_edge if step > edge else p2
 
 
 @kernel
 def next_cost(
-    same: Lanes, below: Lanes, above: Lanes, penalty: Lanes, limit: Lanes, low: Lanes, cost: Lanes
-) -> Lanes:
+    same: Vector,
+    below: Vector,
+    above: Vector,
+    p1: Vector,
+    limit: Vector,
+    low: Vector,
+    cost: Vector,
+) -> Vector:
     """The path cost of a candidate at the next pixel: Hirschmüller 2008, equation 13.
 
     Args:
         same: Path costs of the candidate at the pixel before.
         below: Those of the candidate before it.
         above: Those of the candidate after it.
-        penalty: The small penalty.
-        limit: Lowest path cost of all candidates there, plus the large penalty.
+        p1: The penalty for a change by one candidate.
+        limit: Lowest path cost of all candidates there, plus P2.
         low: That lowest cost, which is subtracted to keep costs bounded.
         cost: Costs of the candidate at the next pixel.
     """
-    beside = least(below, above) + penalty
-    return least(least(same, limit), beside) - low + cost
+    beside = minimum(below, above) + p1
+    return minimum(minimum(same, limit), beside) - low + cost
 
 
 @kernel
 def _advance_from_right(
-    costs: NDArray[np.uint8], first: int, end: int, small: int, row: PathRow
+    costs: NDArray[np.uint8], first: int, end: int, paths_p1: int, row: PathRow
 ) -> None:
     """Advance some candidates of the path from the right, from left to right."""
     path, lowest, now = row.costs[FROM_RIGHT], row.lowest[0], row.lowest[1]
-    penalty = splat(np.uint8(small))
+    p1 = splat(np.uint8(paths_p1))
     for x in range(0, costs.shape[1], LANES):
         here, there = x + MARGIN, x + MARGIN + 1
         low, limit = load_row(lowest, FROM_RIGHT, there), load_row(row.limits, FROM_RIGHT, x)
@@ -185,9 +199,9 @@ def _advance_from_right(
         same = load_row(path, first + 1, there)
         for k in range(first, end):
             above = load_row(path, k + 2, there)
-            cost = next_cost(same, below, above, penalty, limit, low, load_row(costs, k, x))
+            cost = next_cost(same, below, above, p1, limit, low, load_row(costs, k, x))
             store_row(path, k + 1, here, cost)
-            fresh, below, same = least(fresh, cost), same, above
+            fresh, below, same = minimum(fresh, cost), same, above
         store_row(row.below, FROM_RIGHT, x, below)
         store_row(now, FROM_RIGHT, here, fresh)
 
@@ -197,7 +211,7 @@ def _advance_others(
     costs: NDArray[np.uint8],
     first: int,
     end: int,
-    small: int,
+    paths_p1: int,
     row: PathRow,
     means: NDArray[np.uint8],
     along: NDArray[np.uint8],
@@ -205,7 +219,7 @@ def _advance_others(
 ) -> None:
     """Advance the other two paths, from right to left, and write the means."""
     left, straight, right = row.costs[FROM_LEFT], row.costs[STRAIGHT], row.costs[FROM_RIGHT]
-    lowest, now, penalty = row.lowest[0], row.lowest[1], splat(np.uint8(small))
+    lowest, now, p1 = row.lowest[0], row.lowest[1], splat(np.uint8(paths_p1))
     for x in range(costs.shape[1] - LANES, -1, -LANES):
         here, there = x + MARGIN, x + MARGIN - 1
         low, limit = load_row(lowest, FROM_LEFT, there), load_row(row.limits, FROM_LEFT, x)
@@ -217,8 +231,8 @@ def _advance_others(
         for k in range(first, end):
             above, above_0 = load_row(left, k + 2, there), load_row(straight, k + 2, here)
             pixel = load_row(costs, k, x)
-            cost = next_cost(same, below, above, penalty, limit, low, pixel)
-            cost_0 = next_cost(same_0, below_0, above_0, penalty, limit_0, low_0, pixel)
+            cost = next_cost(same, below, above, p1, limit, low, pixel)
+            cost_0 = next_cost(same_0, below_0, above_0, p1, limit_0, low_0, pixel)
             store_row(left, k + 1, here, cost)
             store_row(straight, k + 1, here, cost_0)
             if stage != WARM_UP:
@@ -227,8 +241,8 @@ def _advance_others(
                     middle = mean(load_row(means, k, here), middle)
                     middle = mean(load_row(along, k, x), middle)
                 store_row(means, k, here, middle)
-            fresh, below, same = least(fresh, cost), same, above
-            fresh_0, below_0, same_0 = least(fresh_0, cost_0), same_0, above_0
+            fresh, below, same = minimum(fresh, cost), same, above
+            fresh_0, below_0, same_0 = minimum(fresh_0, cost_0), same_0, above_0
         store_row(row.below, FROM_LEFT, x, below)
         store_row(now, FROM_LEFT, here, fresh)
         store_row(row.below, STRAIGHT, x, below_0)

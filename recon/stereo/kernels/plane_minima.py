@@ -12,9 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.kernels.compiled import kernel
-from recon.stereo.kernels.lanes import LANES, least, load_row, splat, store_row, where_less
 from recon.stereo.kernels.minima import NO_COST, Minima
 from recon.stereo.kernels.path_costs import aligned, padded
+from recon.stereo.kernels.simd import (
+    LANES,
+    load_row,
+    minimum,
+    splat,
+    store_row,
+    where_less,
+)
 
 NONE: Final = 255
 """Stands for the cost of a candidate that does not exist; real costs stay below it."""
@@ -154,13 +161,13 @@ def _search_left(costs: NDArray[np.uint8], first: int, end: int, known: NDArray[
         for k in range(first, end):
             cost = load_row(costs, k, x + MARGIN)
             # Where the last candidate is the best so far, this one is beside it: no second best.
-            second = where_less(last, prior, second, least(second, cost))
+            second = where_less(last, prior, second, minimum(second, cost))
             second = where_less(cost, lowest, prior, second)
             after = where_less(last, prior, cost, after)
             before = where_less(cost, lowest, last, before)
             which = where_less(cost, lowest, index, which)
             last, prior = cost, lowest
-            lowest, index = least(lowest, cost), index + one
+            lowest, index = minimum(lowest, cost), index + one
         store_row(known, LOWEST, x, lowest)
         store_row(known, WHICH, x, which)
         store_row(known, BEFORE, x, before)
@@ -191,7 +198,7 @@ def _search_right(
         for k in range(start, stop):
             cost = load_row(costs, k, MARGIN + ahead + k)
             which = where_less(cost, lowest, index, which)
-            lowest, index = least(lowest, cost), index + one
+            lowest, index = minimum(lowest, cost), index + one
         store_row(known, LOWEST, x, lowest)
         store_row(known, WHICH, x, which)
 

@@ -12,7 +12,7 @@ Index = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
 def make_points_reference(maps: Maps, rules: PointRules) -> Points:
-    """The twin of `recon.stereo.kernels.points.make_points`, all pixels at once."""
+    """Reference implementation of `recon.stereo.kernels.points.make_points`, all pixels at once."""
     rows, columns = np.nonzero(_candidates(maps, rules))
     with np.errstate(divide="ignore"):
         z = (rules.fb / (maps.values[rows, columns].astype(np.float64) + rules.doffs)).astype("f4")

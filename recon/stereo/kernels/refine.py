@@ -1,7 +1,7 @@
 """From the minima of a search to disparities: checks, sub-pixel fit, confidence and sigma.
 
 Works on the result of any search over whole disparities (`recon.stereo.kernels.minima.Minima`).
-The twin in plain numpy is `recon.stereo.kernels.refine_reference.refine_minima_reference`.
+The reference implementation is in `recon.stereo.kernels.refine_reference`.
 """
 
 from __future__ import annotations

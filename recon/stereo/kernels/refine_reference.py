@@ -56,7 +56,7 @@ def _reasons(minima: Minima, texture: NDArray[np.float32], rules: Rules) -> NDAr
     other = np.take_along_axis(minima.right_winner.astype(np.int64), place, axis=1)
     differs = (rules.left_right >= 0) & (np.abs(other - k) > rules.left_right)
     inside = (right > 0) & (right < width - 1)
-    claimed = _claimed(minima.right_winner, rules)
+    chosen = _chosen_beside(minima.right_winner, rules)
     ends = np.maximum(before, after) == NO_COST
     close = 100 * second <= best * (100 + rules.uniqueness)
     cases = [
@@ -64,7 +64,7 @@ def _reasons(minima: Minima, texture: NDArray[np.float32], rules: Rules) -> NDAr
         (texture < rules.texture, LOW_TEXTURE),
         (ends & ((k == 0) | (k == rules.ndisp - 1) | inside), OUT_OF_RANGE),
         (ends, BORDER),
-        (differs & claimed, LEFT_RIGHT),
+        (differs & chosen, LEFT_RIGHT),
         (differs, OCCLUDED),
         ((rules.uniqueness > 0) & close, AMBIGUOUS),
     ]
@@ -72,14 +72,14 @@ def _reasons(minima: Minima, texture: NDArray[np.float32], rules: Rules) -> NDAr
     return np.asarray(np.select(conditions, codes, VALID), dtype=np.uint8)
 
 
-def _claimed(right_winner: NDArray[np.uint16], rules: Rules) -> NDArray[np.bool_]:
+def _chosen_beside(right_winner: NDArray[np.uint16], rules: Rules) -> NDArray[np.bool_]:
     height, width = right_winner.shape
     x = np.arange(width) + rules.minimum + right_winner.astype(np.int64)
-    claimed = np.zeros((height, width), np.bool_)
+    chosen = np.zeros((height, width), np.bool_)
     for aside in (-1, 0, 1):
         seen = (right_winner != rules.ndisp) & (x + aside >= 0) & (x + aside < width)
-        claimed[np.nonzero(seen)[0], (x + aside)[seen]] = True
-    return claimed
+        chosen[np.nonzero(seen)[0], (x + aside)[seen]] = True
+    return chosen
 
 
 def _offsets(

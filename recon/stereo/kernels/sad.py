@@ -1,14 +1,14 @@
 """Sums of absolute differences over a window, and the best candidate of each pixel.
 
 Why it is fast: a tile of the image is offered only some candidates (`tiles`). The inner loops
-work on `LANES` neighbouring columns at once (`lanes`), with the best so far in registers. A window
+work on `LANES` neighbouring columns at once (`simd`), with the best so far in registers. A window
 consists of two halves (`half_windows`), each of which is summed once for two rows, in blocks of
 columns that stay in a core's own cache.
 
-Two halves that are shifted against each other make a leaning window, which costs one more addition
+Two halves that are shifted against each other make a slanted window, which costs one more addition
 than the upright one, not another search.
 
-The twin in plain numpy is `recon.stereo.kernels.sad_reference.sad_minima_reference`.
+The reference implementation is in `recon.stereo.kernels.sad_reference`.
 
 Ref: K. Mühlmann et al., "Calculating dense disparity maps from color stereo images, an efficient
 implementation", IJCV 47, 2002; N. Einecke, J. Eggert, "A multi-block-matching approach for
@@ -23,22 +23,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.kernels.compiled import kernel
-from recon.stereo.kernels.half_windows import Halves, Scratch, Search, Views, enlist, next_half
-from recon.stereo.kernels.lanes import (
+from recon.stereo.kernels.half_windows import (
+    Halves,
+    Scratch,
+    Search,
+    Views,
+    next_half,
+    offer_candidates,
+)
+from recon.stereo.kernels.minima import NO_COST, Minima, write_right_winners
+from recon.stereo.kernels.simd import (
     LANES,
-    Lanes,
-    least,
+    Vector,
     load,
+    minimum,
     ramp,
     splat,
     store,
     where_equal,
     where_less,
 )
-from recon.stereo.kernels.minima import NO_COST, Minima, claim_right
 from recon.stereo.kernels.tiles import Tiles
 
-Found: TypeAlias = tuple[Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes, Lanes]
+Found: TypeAlias = tuple[Vector, Vector, Vector, Vector, Vector, Vector, Vector, Vector]
 """The best so far in `LANES` columns; see `_weigh`."""
 
 
@@ -56,9 +63,9 @@ def sad_minima(
 
     Candidate ``k`` of a pixel is the disparity ``minimum + k``. Its cost is the sum of
     ``min(|left - right|, cost_cap)`` over both halves of the window (the middle row is in both,
-    so it counts twice), the pictures continued by their border pixels; with a lean it is the
-    smaller of that and of the same sum where the upper half takes candidate ``k - lean`` and the
-    lower ``k + lean``, as on the ground under a camera. Candidates whose right pixel lies outside
+    so it counts twice), the pictures continued by their border pixels; with a slant it is the
+    smaller of that and of the same sum where the upper half takes candidate ``k - slant`` and the
+    lower ``k + slant``, as on the ground under a camera. Candidates whose right pixel lies outside
     the picture do not exist, nor those that a tile is not offered. Of equal costs the smaller
     disparity wins. The costs before and after the best are those of the window that won, the
     upright one if both did. A pixel of the right view is matched to the left pixel that chose it
@@ -82,12 +89,12 @@ def sad_minima(
             if y == first - reach or y % height == 0 or (y + reach) % height == 0:
                 now = tiles.offered[max(y, first) // height, column]
                 soon = tiles.offered[min(y + reach, end - 1) // height, column]
-                enlist(views, search, now, soon, y, x0, scratch)
+                offer_candidates(views, search, now, soon, y, x0, scratch)
             halves = next_half(views, search, first, y, x0, scratch)
             if y >= first:
                 _choose(halves, search, scratch, y, x0, x1, minima)
     for y in range(first, end):
-        claim_right(search.ndisp, search.minimum, y, minima)
+        write_right_winners(search.ndisp, search.minimum, y, minima)
 
 
 @kernel
@@ -119,7 +126,7 @@ def _choose(
 @kernel
 def _search(
     halves: Halves, search: Search, offers: NDArray[np.int64], x: int, column: int, width: int
-) -> tuple[Lanes, Lanes, Lanes, Lanes, Lanes]:
+) -> tuple[Vector, Vector, Vector, Vector, Vector]:
     """Search a vector of columns from ``x`` on: winners, and the four costs of `Minima`."""
     # Candidate k exists in the columns from x + k + ahead to x + k + ahead + width - 1.
     ahead = search.minimum - x
@@ -130,9 +137,9 @@ def _search(
         if k0 >= k1:
             continue
         if k1 - 1 + ahead > 0 or k0 + ahead + width < LANES:
-            found = _offer_some(halves, search.lean, k0, k1, ahead, width, column, found)
+            found = _offer_some(halves, search.slant, k0, k1, ahead, width, column, found)
         else:
-            found = _offer_all(halves, search.lean, k0, k1, column, found)
+            found = _offer_all(halves, search.slant, k0, k1, column, found)
     winner, best, second, upright = found[0], found[1], found[2], found[3]
     before = where_less(best, upright, found[5], found[4])
     after = where_less(best, upright, found[7], found[6])
@@ -141,21 +148,21 @@ def _search(
 
 @kernel
 def _offer_all(
-    halves: Halves, search_lean: int, k0: int, k1: int, column: int, found: Found
+    halves: Halves, search_slant: int, k0: int, k1: int, column: int, found: Found
 ) -> Found:
     """Offer the candidates of a run where all of them exist."""
     upper, lower, stride = halves.upper, halves.lower, halves.stride
-    lean = search_lean * stride
+    slant = search_slant * stride
     none, one = splat(np.uint16(NO_COST)), splat(np.uint16(1))
-    upright_last = leaning_last = none
+    upright_last = slanted_last = none
     prior, number = found[1], splat(np.uint16(k0))
-    at = (k0 + abs(search_lean)) * stride + column
+    at = (k0 + abs(search_slant)) * stride + column
     for _ in range(k1 - k0):
         upright = load(upper, at) + load(lower, at)
-        leaning = load(upper, at - lean) + load(lower, at + lean)
+        slanted = load(upper, at - slant) + load(lower, at + slant)
         best = found[1]
-        found = _weigh(upright, leaning, upright_last, leaning_last, number, prior, found)
-        prior, upright_last, leaning_last = best, upright, leaning
+        found = _weigh(upright, slanted, upright_last, slanted_last, number, prior, found)
+        prior, upright_last, slanted_last = best, upright, slanted
         number, at = number + one, at + stride
     return found
 
@@ -163,7 +170,7 @@ def _offer_all(
 @kernel
 def _offer_some(
     halves: Halves,
-    search_lean: int,
+    search_slant: int,
     k0: int,
     k1: int,
     ahead: int,
@@ -173,60 +180,61 @@ def _offer_some(
 ) -> Found:
     """Offer the candidates of a run, each to those columns where it exists."""
     upper, lower, stride = halves.upper, halves.lower, halves.stride
-    lean = search_lean * stride
+    slant = search_slant * stride
     none, columns = splat(np.uint16(NO_COST)), ramp(np.uint16(0))
-    upright_last = leaning_last = none
+    upright_last = slanted_last = none
     prior = found[1]
     for k in range(k0, k1):
-        at = (k + abs(search_lean)) * stride + column
+        at = (k + abs(search_slant)) * stride + column
         start, end = max(k + ahead, 0), min(k + ahead + width, LANES)
         place, many = columns - splat(np.uint16(start)), splat(np.uint16(end - start))
         upright = load(upper, at) + load(lower, at)
-        leaning = load(upper, at - lean) + load(lower, at + lean)
+        slanted = load(upper, at - slant) + load(lower, at + slant)
         upright = where_less(place, many, upright, none)
-        leaning = where_less(place, many, leaning, none)
+        slanted = where_less(place, many, slanted, none)
         best, number = found[1], splat(np.uint16(k))
-        found = _weigh(upright, leaning, upright_last, leaning_last, number, prior, found)
-        prior, upright_last, leaning_last = best, upright, leaning
+        found = _weigh(upright, slanted, upright_last, slanted_last, number, prior, found)
+        prior, upright_last, slanted_last = best, upright, slanted
     return found
 
 
 @kernel
 def _weigh(
-    upright: Lanes,
-    leaning: Lanes,
-    upright_last: Lanes,
-    leaning_last: Lanes,
-    number: Lanes,
-    prior: Lanes,
+    upright: Vector,
+    slanted: Vector,
+    upright_last: Vector,
+    slanted_last: Vector,
+    number: Vector,
+    prior: Vector,
     found: Found,
 ) -> Found:
     """Update the best so far by one candidate.
 
     Args:
         upright: Its costs.
-        leaning: Those of the leaning window.
+        slanted: Those of the slanted window.
         upright_last: Costs of the candidate before; `NO_COST` = was not offered.
-        leaning_last: Those of the leaning window.
+        slanted_last: Those of the slanted window.
         number: Its number.
         prior: The lowest cost of all candidates before the previous one.
         found: The best so far: its number, its cost, the lowest cost two or more candidates away,
             its cost by the upright window; the costs of the candidate before it and of the one
-            after it, each by the upright and by the leaning window.
+            after it, each by the upright and by the slanted window.
     """
-    winner, best, second, upright_best, up_before, lean_before, up_after, lean_after = found
+    winner, best, second, upright_best = found[:4]
+    upright_before, slant_before, upright_after, slant_after = found[4:]
     none, last = splat(np.uint16(NO_COST)), number - splat(np.uint16(1))
-    cost = least(upright, leaning)
-    up_after = where_equal(winner, last, upright, up_after)
-    lean_after = where_equal(winner, last, leaning, lean_after)
-    second = where_equal(winner, last, second, least(second, cost))
+    cost = minimum(upright, slanted)
+    upright_after = where_equal(winner, last, upright, upright_after)
+    slant_after = where_equal(winner, last, slanted, slant_after)
+    second = where_equal(winner, last, second, minimum(second, cost))
     return (
         where_less(cost, best, number, winner),
-        least(best, cost),
+        minimum(best, cost),
         where_less(cost, best, prior, second),
         where_less(cost, best, upright, upright_best),
-        where_less(cost, best, upright_last, up_before),
-        where_less(cost, best, leaning_last, lean_before),
-        where_less(cost, best, none, up_after),
-        where_less(cost, best, none, lean_after),
+        where_less(cost, best, upright_last, upright_before),
+        where_less(cost, best, slanted_last, slant_before),
+        where_less(cost, best, none, upright_after),
+        where_less(cost, best, none, slant_after),
     )

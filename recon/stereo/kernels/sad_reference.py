@@ -15,18 +15,18 @@ def sad_minima_reference(
     left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search, tiles: Tiles
 ) -> Minima:
     """All rows of `recon.stereo.kernels.sad.sad_minima`, from pictures (H, W)."""
-    upright = window_costs_reference(left, right, search._replace(lean=0))
-    leaning = window_costs_reference(left, right, search)
-    lowest = np.minimum(upright, leaning)
+    upright = window_costs_reference(left, right, search._replace(slant=0))
+    slanted = window_costs_reference(left, right, search)
+    lowest = np.minimum(upright, slanted)
     offered = offered_reference(tiles, left.shape, search.ndisp)
     minima = minima_reference(np.where(offered, lowest, NO_COST), search.minimum)
     k = np.minimum(minima.winner, search.ndisp - 1).astype(np.int64)[:, :, None]
-    own = np.where(np.take_along_axis(leaning < upright, k, axis=2), leaning, upright)
+    own = np.where(np.take_along_axis(slanted < upright, k, axis=2), slanted, upright)
     for n, step in ((1, -1), (2, 1)):
         there = np.clip(k + step, 0, search.ndisp - 1)
         cost = np.take_along_axis(own, there, axis=2)[:, :, 0]
         minima.costs[n] = np.where(minima.costs[n] == NO_COST, NO_COST, cost)
-    return minima._replace(right_winner=claim_right_reference(minima, search))
+    return minima._replace(right_winner=right_winners_reference(minima, search))
 
 
 def window_costs_reference(
@@ -38,30 +38,30 @@ def window_costs_reference(
     candidates = search.minimum + np.arange(search.ndisp)
     y, x = np.arange(height), np.arange(width)
     reach = search.rows_radius
-    upper = [(dy, -search.lean) for dy in range(-reach, 1)]
-    lower = [(dy, search.lean) for dy in range(reach + 1)]
-    for dy, lean in upper + lower:
+    upper = [(dy, -search.slant) for dy in range(-reach, 1)]
+    lower = [(dy, search.slant) for dy in range(reach + 1)]
+    for dy, slant in upper + lower:
         rows = np.clip(y + dy, 0, height - 1)[:, None]
         for dx in range(-search.radius, search.radius + 1):
             columns = np.clip(x + dx, 0, width - 1)
-            others = np.clip(x[:, None] + dx - candidates - lean, 0, width - 1)
+            others = np.clip(x[:, None] + dx - candidates - slant, 0, width - 1)
             a = np.expand_dims(left[rows, columns].astype(np.int64), 2)
             b = right[np.expand_dims(rows, 2), others[None]].astype(np.int64)
             costs += np.minimum(np.abs(a - b), search.cost_cap)
     return costs
 
 
-def claim_right_reference(minima: Minima, search: Search) -> NDArray[np.uint16]:
+def right_winners_reference(minima: Minima, search: Search) -> NDArray[np.uint16]:
     """uint16 (H, W), the candidate of the left pixel that chose each right pixel at least cost."""
-    claims = np.full_like(minima.winner, search.ndisp)
-    x_last_first = -np.arange(claims.shape[1])
+    chosen = np.full_like(minima.winner, search.ndisp)
+    x_last_first = -np.arange(chosen.shape[1])
     for y, costs in enumerate(minima.costs[0].astype(np.int64)):
-        # The last claim stands: that of the least cost, and of equal ones the leftmost.
+        # The last one written stands: that of the least cost, and of equal ones the leftmost.
         for x in np.lexsort((x_last_first, -costs)):
             k = int(minima.winner[y, x])
             if k < search.ndisp:
-                claims[y, x - search.minimum - k] = k
-    return claims
+                chosen[y, x - search.minimum - k] = k
+    return chosen
 
 
 def minima_reference(costs: NDArray[np.int64], minimum: int) -> Minima:

@@ -2,7 +2,7 @@
 
 A sweep down and a sweep up follow three paths each; the sweep up also follows the two horizontal
 ones. Path costs are kept in uint8: their lowest is subtracted at every step, so that none exceeds
-the cost of a pixel plus the large penalty.
+the cost of a pixel plus P2.
 
 Memory, not arithmetic, would be the bottleneck, so what passes from one sweep to the other must
 stay in the cache. A strip of rows is divided into bands of columns, and a band into blocks of rows.
@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.kernels.compiled import kernel
-from recon.stereo.kernels.lanes import LANES
 from recon.stereo.kernels.minima import Minima
 from recon.stereo.kernels.path_along import RowScratch, empty_row_scratch, follow_row
 from recon.stereo.kernels.path_costs import (
@@ -38,6 +37,9 @@ from recon.stereo.kernels.path_costs import (
 )
 from recon.stereo.kernels.path_rows import DOWN, UP, WARM_UP, PathRow, Paths, advance, begin
 from recon.stereo.kernels.plane_minima import MARGIN, NONE, Band, Best, choose_row, empty_best
+from recon.stereo.kernels.simd import (
+    LANES,
+)
 
 ROWS: Final = 32
 """Rows of a block: many, compared with the overlap below it that is swept in vain."""

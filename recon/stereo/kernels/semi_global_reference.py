@@ -68,7 +68,7 @@ def path_costs_reference(views: Views, window: Window, ndisp: int) -> Int64:
 def path_reference(grey: NDArray[np.uint8], costs: Int64, paths: Paths, dy: int, dx: int) -> Int64:
     """int64 (H, W, P), costs of the paths that step by ``(dy, dx)`` to each pixel."""
     height, width, candidates = costs.shape
-    closed = np.full(candidates + 2, 255 - paths.small)
+    closed = np.full(candidates + 2, 255 - paths.p1)
     result: Int64 = costs.copy()
     for y in range(height) if dy >= 0 else range(height - 1, -1, -1):
         for x in range(width) if dx >= 0 else range(width - 1, -1, -1):
@@ -77,8 +77,8 @@ def path_reference(grey: NDArray[np.uint8], costs: Int64, paths: Paths, dy: int,
             before = result[y - dy, x - dx]
             closed[1:-1] = before
             edge = abs(int(grey[y, x]) - int(grey[y - dy, x - dx])) > paths.edge
-            large = paths.large_at_edge if edge else paths.large
-            beside = np.minimum(closed[:-2], closed[2:]) + paths.small
-            least = np.minimum(np.minimum(before, beside), before.min() + large)
+            p2 = paths.p2_at_edge if edge else paths.p2
+            beside = np.minimum(closed[:-2], closed[2:]) + paths.p1
+            least = np.minimum(np.minimum(before, beside), before.min() + p2)
             result[y, x] = costs[y, x] + least - before.min()
     return result

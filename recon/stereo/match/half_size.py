@@ -53,7 +53,7 @@ def half_search(search: Search) -> Search:
     """What to search at half size."""
     minimum = search.minimum // 2
     ndisp = -(-(search.minimum + search.ndisp) // 2) - minimum
-    return Search(ndisp, minimum, RADIUS_PX, RADIUS_PX, search.cost_cap, lean=0)
+    return Search(ndisp, minimum, RADIUS_PX, RADIUS_PX, search.cost_cap, slant=0)
 
 
 def half_rules(search: Search) -> Rules:

@@ -37,7 +37,7 @@ _BM_TEXTURE_THRESHOLD: Final = 10
 """Least sum of prefiltered values in the window; OpenCV's default, as the cap."""
 
 _SGBM_PREFILTER_CAP: Final = 63
-_SMALL_PENALTY, _LARGE_PENALTY = 8, 32
+_P1, _P2 = 8, 32
 """P1 and P2 per pixel of the block, as OpenCV's documentation suggests."""
 
 _UNIQUENESS_PERCENT: Final = 5
@@ -131,8 +131,8 @@ class OpencvSgbmMatcher:
             minDisparity=s.min_disparity_px,
             numDisparities=ndisp,
             blockSize=s.block_px,
-            P1=_SMALL_PENALTY * pixels,
-            P2=_LARGE_PENALTY * pixels,
+            P1=_P1 * pixels,
+            P2=_P2 * pixels,
             disp12MaxDiff=LEFT_RIGHT_PX,
             preFilterCap=_SGBM_PREFILTER_CAP,
             uniquenessRatio=_UNIQUENESS_PERCENT,

@@ -135,8 +135,8 @@ class SadMatcher:
         ndisp = s.ndisp_within(camera)
         radius = s.window_px // 2
         # The middles of the two halves lie half a radius above and below the pixel.
-        lean = math.floor(s.window_slant * radius / 2 + 0.5)
-        search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, lean)
+        slant = math.floor(s.window_slant * radius / 2 + 0.5)
+        search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, slant)
         return search, rules_of(s, ndisp, s.window_px**2, min_texture=s.min_texture)
 
 

@@ -62,8 +62,8 @@ _DESCRIPTOR: Final = Descriptor(_GRADIENT_CAP, _CENSUS_RADIUS, _CENSUS_RADIUS)
 _EDGE_GREY_LEVELS: Final = 12
 """Where the image changes by more along a path, large steps are cheaper: surfaces end there."""
 
-_EDGE_PENALTY_SHARE: Final = 0.25
-"""Share of the large penalty that is left there."""
+_EDGE_P2_SHARE: Final = 0.25
+"""Share of P2 that is left there."""
 
 _OVERLAP_ROWS: Final = 4
 """Rows that each strip of an image shares with its neighbours, for vertical paths to start in."""
@@ -182,14 +182,14 @@ def _window(settings: SgmSettings) -> Window:
 
 def _paths(settings: SgmSettings, ndisp: int, levels: float) -> Paths:
     s = settings
-    large = round(s.large_penalty * levels)
-    small = max(1, round(s.small_penalty * levels))
+    p2 = round(s.large_penalty * levels)
+    p1 = max(1, round(s.small_penalty * levels))
     return Paths(
         ndisp=ndisp,
         minimum=s.min_disparity_px,
-        small=small,
-        large=large,
-        large_at_edge=max(small, round(large * _EDGE_PENALTY_SHARE)),
+        p1=p1,
+        p2=p2,
+        p2_at_edge=max(p1, round(p2 * _EDGE_P2_SHARE)),
         edge=_EDGE_GREY_LEVELS,
         overlap=_OVERLAP_ROWS,
         side_overlap=_SIDE_OVERLAP,

@@ -25,7 +25,7 @@ def planes_of(
 
 
 @given(greys, st.builds(Descriptor, st.integers(1, 127), st.integers(0, 4), st.integers(0, 4)))
-def test_planes_equal_their_twin(grey: Image, descriptor: Descriptor) -> None:
+def test_planes_equal_the_reference(grey: Image, descriptor: Descriptor) -> None:
     np.testing.assert_array_equal(planes_of(grey, descriptor), planes_reference(grey, descriptor))
 
 

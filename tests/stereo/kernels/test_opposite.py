@@ -1,4 +1,4 @@
-"""The compiled average of opposite neighbours equals its twin, and leaves surfaces alone."""
+"""The compiled average of opposite neighbours equals its reference, and leaves surfaces alone."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def average(
 
 
 @given(maps, st.integers(0, 4), st.sampled_from([0.25, 1.0, 5.0]))
-def test_averages_equal_those_of_the_twin(
+def test_averages_equal_those_of_the_reference(
     values: NDArray[np.float32], radius: int, step: float
 ) -> None:
     expected = average_opposite_reference(values, radius, step)

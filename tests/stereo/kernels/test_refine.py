@@ -154,16 +154,16 @@ def test_vertex_of_a_parabola_is_found_exactly() -> None:
     assert value == 3.25
 
 
-@pytest.mark.parametrize(("claimant", "reason"), [(None, Reason.OCCLUDED), (4, Reason.LEFT_RIGHT)])
+@pytest.mark.parametrize(("chooser", "reason"), [(None, Reason.OCCLUDED), (4, Reason.LEFT_RIGHT)])
 def test_pixel_is_occluded_where_no_pixel_of_the_right_view_has_its_match(
-    claimant: int | None, reason: Reason
+    chooser: int | None, reason: Reason
 ) -> None:
     minima = one_pixel((20, 60, 40, 100))
     # Left pixel 5 looks at right pixel 2, which has its match elsewhere (2 + 6 = 8).
     minima.right_winner[:] = 8
     minima.right_winner[0, 2] = 6
-    if claimant is not None:
-        minima.right_winner[0, claimant] = 5 - claimant
+    if chooser is not None:
+        minima.right_winner[0, chooser] = 5 - chooser
     assert refine_one(minima)[3] == reason
 
 

@@ -1,4 +1,4 @@
-"""The compiled search equals its twin, for any image, window and range."""
+"""The compiled search equals its reference, for any image, window and range."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from recon.stereo.kernels.half_windows import (
     lay_out,
     widest_block,
 )
-from recon.stereo.kernels.lanes import LANES
 from recon.stereo.kernels.minima import NO_COST, Minima, empty_minima
 from recon.stereo.kernels.sad import sad_minima
 from recon.stereo.kernels.sad_reference import sad_minima_reference
+from recon.stereo.kernels.simd import LANES
 from recon.stereo.kernels.tiles import Tiles, make_tiles
 
 Image = NDArray[np.uint8]
@@ -68,12 +68,12 @@ searches = st.builds(
     radius=st.integers(0, 4),
     rows_radius=st.integers(0, 4),
     cost_cap=st.sampled_from([1, 20, 255]),
-    lean=st.integers(-2, 2),
+    slant=st.integers(-2, 2),
 )
 
 
 @given(pairs(), searches)
-def test_search_equals_its_twin(pair: tuple[Image, Image], search: Search) -> None:
+def test_search_equals_the_reference(pair: tuple[Image, Image], search: Search) -> None:
     tiles = everything(pair[0].shape, search)
     assert_equal(search_all(*pair, search), sad_minima_reference(*pair, search, tiles))
 
@@ -103,14 +103,14 @@ def test_strips_do_not_change_the_result(
     assert_equal(search_all(*pair, search, None, strips), search_all(*pair, search))
 
 
-@pytest.mark.parametrize("lean", [0, 1, -2])
+@pytest.mark.parametrize("slant", [0, 1, -2])
 @pytest.mark.parametrize(("ndisp", "minimum"), [(64, 0), (65, -40), (33, 20), (100, 60)])
-def test_wide_pictures_are_searched_in_vectors(ndisp: int, minimum: int, lean: int) -> None:
-    rng = np.random.default_rng(ndisp + lean)
+def test_wide_pictures_are_searched_in_vectors(ndisp: int, minimum: int, slant: int) -> None:
+    rng = np.random.default_rng(ndisp + slant)
     # Few grey levels, so that vectors and runs have equal costs to decide between.
     left, right = rng.integers(0, 4, (2, 5, 3 * LANES + 35), dtype=np.uint8)
-    search = Search(ndisp, minimum, 2, 1, cost_cap=2, lean=lean)
-    assert ndisp + 2 * abs(lean) > LANES
+    search = Search(ndisp, minimum, 2, 1, cost_cap=2, slant=slant)
+    assert ndisp + 2 * abs(slant) > LANES
     tiles = everything(left.shape, search)
     expected = sad_minima_reference(left, right, search, tiles)
     assert_equal(search_all(left, right, search), expected)
@@ -128,7 +128,7 @@ def test_blocks_do_not_change_the_result(
 @pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
 def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
     grey = np.zeros(shape, np.uint8)
-    search = Search(ndisp=4, minimum=0, radius=3, rows_radius=3, cost_cap=31, lean=0)
+    search = Search(ndisp=4, minimum=0, radius=3, rows_radius=3, cost_cap=31, slant=0)
     minima = search_all(grey, grey, search)
     assert_equal(minima, sad_minima_reference(grey, grey, search, everything(shape, search)))
     assert (minima.winner == 0).all()
@@ -138,7 +138,7 @@ def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]
 @pytest.mark.parametrize(("radius", "rows_radius"), [(7, 7), (1, 0), (4, 0)])
 def test_largest_costs_do_not_overflow(radius: int, rows_radius: int) -> None:
     left, right = np.full((40, 40), 255, np.uint8), np.zeros((40, 40), np.uint8)
-    search = Search(3, 0, radius, rows_radius, cost_cap=255, lean=0)
+    search = Search(3, 0, radius, rows_radius, cost_cap=255, slant=0)
     costs = search_all(left, right, search).costs[0]
     assert (costs == (2 * radius + 1) * 2 * (rows_radius + 1) * 255).all()
     assert costs.max() < NO_COST
@@ -146,7 +146,7 @@ def test_largest_costs_do_not_overflow(radius: int, rows_radius: int) -> None:
 
 def test_pixels_without_a_candidate_have_no_winner() -> None:
     grey = np.zeros((2, 8), np.uint8)
-    search = Search(ndisp=3, minimum=5, radius=1, rows_radius=1, cost_cap=31, lean=0)
+    search = Search(ndisp=3, minimum=5, radius=1, rows_radius=1, cost_cap=31, slant=0)
     minima = search_all(grey, grey, search)
     # Disparity 5 needs a right pixel at x - 5.
     assert (minima.winner[:, :5] == 3).all()

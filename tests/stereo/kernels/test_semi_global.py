@@ -1,4 +1,4 @@
-"""The compiled semi-global search equals its twin, for any image, window and range."""
+"""The compiled semi-global search equals its reference, for any image, window and range."""
 
 from __future__ import annotations
 
@@ -75,16 +75,16 @@ def windows(draw: st.DrawFn) -> tuple[Window, Paths]:
     radius, rows_radius, cap = draw(
         st.tuples(st.integers(0, 3), st.integers(0, 3), st.sampled_from([0, 16, 120]))
     )
-    small, more = draw(st.tuples(st.integers(1, 40), st.integers(0, 80)))
-    # The largest that a path cost leaves: cost + small + large <= 254.
-    top = 254 - 2 * small - more
+    p1, more = draw(st.tuples(st.integers(1, 40), st.integers(0, 80)))
+    # The largest that a path cost leaves: cost + P1 + P2 <= 254.
+    top = 254 - 2 * p1 - more
     window = scaled_window(radius, rows_radius, cap, cap + 14, top / (cap + 14))
     paths = Paths(
         ndisp=draw(st.sampled_from([1, 2, 3, 4, 5, 17, 70, 260])),
         minimum=draw(st.integers(-6, 6)),
-        small=small,
-        large=small + more,
-        large_at_edge=small,
+        p1=p1,
+        p2=p1 + more,
+        p2_at_edge=p1,
         edge=draw(st.sampled_from([0, 12, 255])),
         overlap=100,
         side_overlap=100,
@@ -94,7 +94,9 @@ def windows(draw: st.DrawFn) -> tuple[Window, Paths]:
 
 @settings(max_examples=60)
 @given(pairs(), windows())
-def test_search_equals_its_twin(pair: tuple[Image, Image], rules: tuple[Window, Paths]) -> None:
+def test_search_equals_the_reference(
+    pair: tuple[Image, Image], rules: tuple[Window, Paths]
+) -> None:
     window, paths = rules
     views = make_views(*pair, window, paths)
     expected = semi_global_minima_reference(views, window, paths)
@@ -138,7 +140,9 @@ def test_few_rows_of_overlap_change_little() -> None:
 
 @pytest.mark.parametrize("shape", [(3 * ROWS + 5, 70), (2 * ROWS, 64)])
 @pytest.mark.parametrize("overlap", [4 * ROWS, 2 * ROWS + 1])
-def test_a_picture_of_several_blocks_equals_the_twin(shape: tuple[int, int], overlap: int) -> None:
+def test_an_image_of_several_blocks_equals_the_reference(
+    shape: tuple[int, int], overlap: int
+) -> None:
     """Paths from above go on from block to block; those from below reach through all below."""
     rng = np.random.default_rng(1)
     left, right = rng.integers(0, 256, (2, *shape), dtype=np.uint8)
@@ -151,7 +155,7 @@ def test_a_picture_of_several_blocks_equals_the_twin(shape: tuple[int, int], ove
 
 @pytest.mark.parametrize("minimum", [-70, 0, 3])
 @pytest.mark.parametrize("side_overlap", [0, 9])
-def test_bands_equal_the_twin_that_begins_paths_at_their_sides(
+def test_bands_equal_the_reference_that_begins_paths_at_their_sides(
     minimum: int, side_overlap: int
 ) -> None:
     """The right view is put together from all bands."""

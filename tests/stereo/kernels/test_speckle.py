@@ -1,4 +1,4 @@
-"""The compiled speckle search equals its twin, and knows what a region is."""
+"""The compiled speckle search equals its reference, and knows what a region is."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ maps = hnp.arrays(
 
 
 @given(maps, st.sampled_from([0.5, 1.0, 2.0]), st.integers(0, 20))
-def test_speckles_equal_those_of_the_twin(values: np.ndarray, step: float, size: int) -> None:
+def test_speckles_equal_those_of_the_reference(values: np.ndarray, step: float, size: int) -> None:
     found = find_speckles(values, step, size)
     np.testing.assert_array_equal(found, find_speckles_reference(values, step, size))
 

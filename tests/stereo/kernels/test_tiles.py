@@ -1,4 +1,4 @@
-"""What matches at half size support is offered, by the compiled kernel and by its twin."""
+"""What matches at half size support is offered, by the compiled kernel and by its reference."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ disparities = st.one_of(st.just(np.nan), st.integers(-4, 30))
     st.integers(-9, 9),
     supports,
 )
-def test_support_equals_its_twin(halved: Float32, minimum: int, support: Support) -> None:
+def test_support_equals_the_reference(halved: Float32, minimum: int, support: Support) -> None:
     tiles = offered(halved, support, minimum)
     expected = offer_supported_reference(halved, minimum, NDISP, support, tiles)
     np.testing.assert_array_equal(tiles.offered, expected)

@@ -93,7 +93,7 @@ def test_slanted_window_sees_the_ground_more_completely_and_better() -> None:
     ]
     density = [np.isfinite(error).mean() for error in errors]
     assert density[1] >= density[0]
-    # Half, if the window leant by every row; its halves lean by whole disparities.
+    # Half, if the window were slanted by every row; its halves shift by whole disparities.
     assert np.nanmedian(errors[1]) < 0.6 * np.nanmedian(errors[0])
 
 

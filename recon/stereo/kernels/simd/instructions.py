@@ -1,11 +1,8 @@
-"""SIMD vectors, for loops that the compiler does not vectorise itself.
+"""How vectors compile: each function of `vectors` as the LLVM instructions that stand for it.
 
-A vector holds `LANES` neighbouring values of an array. The functions here are plain numpy, which
-defines them and runs where numba is switched off. Compiled, each becomes the LLVM instructions that
-are registered for it further down, and a vector stays in a register.
-
-Arithmetic wraps around, as numpy's does. Vectors exist in compiled code alone: no function that
-Python calls takes or returns one.
+A vector is a numba type whose values are LLVM vectors, so that it stays in a register. Vectors
+exist in compiled code alone: no function that Python calls takes or returns one. What this relies
+on in numba and llvmlite, and what breaks it, is in ``docs/simd.md``.
 
 Ref: LLVM Language Reference Manual, "Vector Operations"; numba manual, "Low-level extension API".
 """
@@ -14,114 +11,34 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from typing import Any, Final, TypeAlias
+from typing import Any
 
-import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
-from numpy.typing import NDArray
 
-LANES: Final = 32
-"""Values of a vector. In 16 bits they fill a register of 512 bits; where registers are smaller, the
-compiler uses several."""
-
-Lanes: TypeAlias = NDArray[Any]
-"""uint8 or uint16 (LANES,)."""
-
-
-def load(array: NDArray[Any], at: int) -> Lanes:
-    """Values ``at`` to ``at + LANES - 1`` of a uint8 or uint16 array (n,); bounds are unchecked."""
-    lanes: Lanes = array[at : at + LANES].copy()
-    return lanes
-
-
-def store(array: NDArray[Any], at: int, lanes: Lanes) -> None:
-    """Write a vector from ``at`` on; bounds are unchecked."""
-    array[at : at + LANES] = lanes
-
-
-def load_row(rows: NDArray[Any], n: int, at: int) -> Lanes:
-    """`load` from row ``n`` of a C-ordered array of rows."""
-    lanes: Lanes = rows[n, at : at + LANES].copy()
-    return lanes
-
-
-def store_row(rows: NDArray[Any], n: int, at: int, lanes: Lanes) -> None:
-    """`store` to row ``n`` of a C-ordered array of rows."""
-    rows[n, at : at + LANES] = lanes
-
-
-def splat(value: np.uint8 | np.uint16) -> Lanes:
-    """The same value in each lane."""
-    return np.full(LANES, value)
-
-
-def ramp(first: np.uint16) -> Lanes:
-    """``first``, ``first + 1`` and so on."""
-    return np.arange(LANES, dtype=np.uint16) + first
-
-
-def least(a: Lanes, b: Lanes) -> Lanes:
-    """The smaller value of each lane."""
-    return np.minimum(a, b)
-
-
-def most(a: Lanes, b: Lanes) -> Lanes:
-    """The larger value of each lane."""
-    return np.maximum(a, b)
-
-
-def distance(a: Lanes, b: Lanes) -> Lanes:
-    """``|a - b|`` of each lane."""
-    return np.maximum(a, b) - np.minimum(a, b)
-
-
-def mean(a: Lanes, b: Lanes) -> Lanes:
-    """Mean of two bytes, rounded up."""
-    return ((a.astype(np.uint16) + b + 1) >> 1).astype(np.uint8)
-
-
-def differing_bits(a: Lanes, b: Lanes) -> Lanes:
-    """How many bits of two bytes differ."""
-    bits = np.unpackbits(np.bitwise_xor(a, b)).reshape(-1, 8)
-    return np.asarray(bits.sum(axis=1, dtype=np.uint8))
-
-
-def where_equal(a: Lanes, b: Lanes, then: Lanes, otherwise: Lanes) -> Lanes:
-    """``then`` in the lanes where ``a == b``."""
-    return np.where(a == b, then, otherwise)
-
-
-def where_less(a: Lanes, b: Lanes, then: Lanes, otherwise: Lanes) -> Lanes:
-    """``then`` in the lanes where ``a < b``."""
-    return np.where(a < b, then, otherwise)
-
-
-def fit(lanes: Lanes, array: NDArray[Any]) -> Lanes:
-    """Bytes, converted to the dtype of an array."""
-    return lanes.astype(array.dtype)
-
-
-def narrow(lanes: Lanes) -> Lanes:
-    """The lower bytes of uint16."""
-    return lanes.astype(np.uint8)
-
-
-def put_before(lanes: Lanes, before: Lanes) -> Lanes:
-    """Each lane's neighbour below; that of the first lane is the last of ``before``."""
-    return np.concatenate((before[-1:], lanes[:-1]))
-
-
-def put_after(lanes: Lanes, after: Lanes) -> Lanes:
-    """Each lane's neighbour above; that of the last lane is the first of ``after``."""
-    return np.concatenate((lanes[1:], after[:1]))
-
-
-def spread_lowest(lanes: Lanes) -> Lanes:
-    """The smallest value, in each lane."""
-    return np.full_like(lanes, lanes.min())
+from recon.stereo.kernels.simd.vectors import (
+    LANES,
+    absolute_difference,
+    broadcast_minimum,
+    differing_bits,
+    load,
+    load_row,
+    maximum,
+    mean,
+    minimum,
+    narrow,
+    put_after,
+    put_before,
+    ramp,
+    splat,
+    store,
+    store_row,
+    where_equal,
+    where_less,
+    widen,
+)
 
 
 class _Vector(types.Type):  # type: ignore[misc]
@@ -180,7 +97,7 @@ def _intrinsic(name: str) -> Callable[..., Any]:
     return write
 
 
-def _write_distance(builder: Any, a: Any, b: Any) -> Any:
+def _write_difference(builder: Any, a: Any, b: Any) -> Any:
     # Saturating differences in either order: one of the two is zero.
     minus = _intrinsic("usub.sat")
     return builder.or_(minus(builder, a, b), minus(builder, b, a))
@@ -205,9 +122,9 @@ _binary(operator.mul, lambda builder, a, b: builder.mul(a, b))
 _binary(operator.rshift, lambda builder, a, b: builder.lshr(a, b))
 _binary(mean, _write_mean)
 _binary(differing_bits, _write_differing)
-_binary(least, _intrinsic("umin"))
-_binary(most, _intrinsic("umax"))
-_binary(distance, _write_distance)
+_binary(minimum, _intrinsic("umin"))
+_binary(maximum, _intrinsic("umax"))
+_binary(absolute_difference, _write_difference)
 
 
 def _write_splat(builder: Any, value: Any, lanes: int) -> Any:
@@ -300,8 +217,8 @@ def _where_less(context: Any, builder: Any, signature: Any, arguments: Any) -> A
     return builder.select(builder.icmp_unsigned("<", a, b), then, otherwise)
 
 
-@compiled_as(fit, lambda lanes, array: _Vector(array.dtype))
-def _fit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+@compiled_as(widen, lambda lanes, array: _Vector(array.dtype))
+def _widen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.zext(arguments[0], llvm_type(signature.return_type.element.bitwidth))
 
 
@@ -310,8 +227,8 @@ def _narrow(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.trunc(arguments[0], llvm_type(8))
 
 
-@compiled_as(spread_lowest, lambda lanes: lanes)
-def _spread_lowest(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+@compiled_as(broadcast_minimum, lambda lanes: lanes)
+def _broadcast_minimum(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     # A butterfly of exchanges between ever nearer lanes, which stays in registers.
     found, turn = arguments[0], LANES // 2
     while turn:

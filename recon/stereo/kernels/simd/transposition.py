@@ -1,7 +1,4 @@
-"""Transposition of square blocks of bytes in registers; plain numpy defines it (see `lanes`).
-
-Ref: as `recon.stereo.kernels.lanes`.
-"""
+"""Transposition of square blocks of bytes in registers: how `vectors.transpose` compiles."""
 
 from __future__ import annotations
 
@@ -9,32 +6,15 @@ from typing import Any, NamedTuple
 
 from numba import types
 from numba.core import typing
-from numpy.typing import NDArray
 
-from recon.stereo.kernels.lanes import (
-    LANES,
+from recon.stereo.kernels.simd.instructions import (
     address_in_row,
     compiled_as,
     llvm_type,
     shuffle,
     type_in_row,
 )
-
-
-def transpose(rows: NDArray[Any], n: int, at: int, out: NDArray[Any], m: int, to: int) -> None:
-    """Write a block of `LANES` by `LANES` bytes, transposed, to another array.
-
-    Bounds are unchecked.
-
-    Args:
-        rows: uint8 (N, C).
-        n: First row of the block.
-        at: Its first column.
-        out: uint8 (M, D), written.
-        m: First row of the transposed block.
-        to: Its first column.
-    """
-    out[m : m + LANES, to : to + LANES] = rows[n : n + LANES, at : at + LANES].T
+from recon.stereo.kernels.simd.vectors import LANES, transpose
 
 
 def _transpose_type(rows: Any, n: Any, at: Any, out: Any, m: Any, to: Any) -> Any:

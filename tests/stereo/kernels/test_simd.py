@@ -13,66 +13,65 @@ from hypothesis.extra import numpy as hnp
 from numba import njit
 from numba.core.errors import TypingError
 
-from recon.stereo.kernels import lanes
-from recon.stereo.kernels.lanes import LANES
-from recon.stereo.kernels.squares import transpose
+from recon.stereo.kernels import simd
+from recon.stereo.kernels.simd import LANES, transpose
 
 KINDS = (np.uint8, np.uint16)
 
 
 @njit
 def add(a: Any, b: Any, out: Any) -> None:
-    lanes.store(out, 1, lanes.load(a, 2) + lanes.load(b, 0))
+    simd.store(out, 1, simd.load(a, 2) + simd.load(b, 0))
 
 
 @njit
 def subtract(a: Any, b: Any, out: Any) -> None:
-    lanes.store(out, 1, lanes.load(a, 2) - lanes.load(b, 0))
+    simd.store(out, 1, simd.load(a, 2) - simd.load(b, 0))
 
 
 @njit
 def compare(a: Any, b: Any, out: Any) -> None:
-    x, y = lanes.load(a, 2), lanes.load(b, 0)
-    lanes.store(out, 0, lanes.least(x, y))
-    lanes.store(out, LANES, lanes.where_equal(x, y, x, lanes.splat(a[0])))
-    lanes.store(out, 2 * LANES, lanes.distance(x, y))
-    lanes.store(out, 3 * LANES, lanes.where_less(x, y, y, x))
+    x, y = simd.load(a, 2), simd.load(b, 0)
+    simd.store(out, 0, simd.minimum(x, y))
+    simd.store(out, LANES, simd.where_equal(x, y, x, simd.splat(a[0])))
+    simd.store(out, 2 * LANES, simd.absolute_difference(x, y))
+    simd.store(out, 3 * LANES, simd.where_less(x, y, y, x))
 
 
 @njit
 def resize(a: Any, b: Any, out: Any) -> None:
-    x = lanes.load(a, 2)
-    lanes.store(out, 0, lanes.fit(x, out))
-    lanes.store(out, LANES, lanes.fit(lanes.splat(a[0]), out))
+    x = simd.load(a, 2)
+    simd.store(out, 0, simd.widen(x, out))
+    simd.store(out, LANES, simd.widen(simd.splat(a[0]), out))
 
 
 @njit
 def number(a: Any, b: Any, out: Any) -> None:
-    lanes.store(out, LANES, lanes.ramp(a[0]))
+    simd.store(out, LANES, simd.ramp(a[0]))
 
 
 @njit
 def compare_bytes(a: Any, b: Any, out: Any) -> None:
-    x, y = lanes.load(a, 2), lanes.load(b, 0)
-    lanes.store(out, 0, lanes.mean(x, y))
-    lanes.store(out, LANES, lanes.differing_bits(x, y))
+    x, y = simd.load(a, 2), simd.load(b, 0)
+    simd.store(out, 0, simd.mean(x, y))
+    simd.store(out, LANES, simd.differing_bits(x, y))
 
 
 @njit
 def scale(a: Any, b: Any, out: Any) -> None:
-    product = lanes.load(a, 2) * lanes.load(b, 0)
-    lanes.store(out, 0, product)
-    lanes.store(out, LANES, product >> lanes.splat(np.uint16(3)))
+    product = simd.load(a, 2) * simd.load(b, 0)
+    simd.store(out, 0, product)
+    simd.store(out, LANES, product >> simd.splat(np.uint16(3)))
 
 
 @njit
 def shorten(a: Any, b: Any, out: Any) -> None:
-    lanes.store(out, 2, lanes.narrow(lanes.load(a, 2)))
+    simd.store(out, 2, simd.narrow(simd.load(a, 2)))
 
 
 @njit
 def move_rows(a: Any, b: Any, out: Any) -> None:
-    lanes.store_row(out, 2, 1, lanes.load_row(a, 1, 3))
+    simd.store_row(out, 2, 1, simd.load_row(a, 1, 3))
 
 
 @njit
@@ -82,10 +81,10 @@ def move_block(a: Any, b: Any, out: Any) -> None:
 
 @njit
 def look_beside(a: Any, b: Any, out: Any) -> None:
-    x, y = lanes.load(a, 2), lanes.load(b, 0)
-    lanes.store(out, 0, lanes.put_before(x, y))
-    lanes.store(out, LANES, lanes.put_after(x, y))
-    lanes.store(out, 2 * LANES, lanes.spread_lowest(x))
+    x, y = simd.load(a, 2), simd.load(b, 0)
+    simd.store(out, 0, simd.put_before(x, y))
+    simd.store(out, LANES, simd.put_after(x, y))
+    simd.store(out, 2 * LANES, simd.broadcast_minimum(x))
 
 
 def assert_same(function: Callable[..., None], a: Any, b: Any, kind: Any) -> None:
@@ -128,8 +127,8 @@ def test_values_are_scaled_and_narrowed_as_numpy_does(a: Any, b: Any) -> None:
 
 def test_means_are_rounded_up_and_bits_counted() -> None:
     a, b = np.array([[0, 1, 255], [1, 1, 254]], np.uint8)
-    assert lanes.mean(a, b).tolist() == [1, 1, 255]
-    assert lanes.differing_bits(a, b).tolist() == [1, 0, 1]
+    assert simd.mean(a, b).tolist() == [1, 1, 255]
+    assert simd.differing_bits(a, b).tolist() == [1, 0, 1]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -150,8 +149,8 @@ def test_blocks_are_transposed_and_nothing_else_is_written() -> None:
 
 def test_neighbours_of_the_ends_come_from_the_other_vector() -> None:
     a, b = np.arange(LANES, dtype=np.uint8), np.arange(100, 100 + LANES, dtype=np.uint8)
-    assert lanes.put_before(a, b).tolist() == [99 + LANES, *range(LANES - 1)]
-    assert lanes.put_after(a, b).tolist() == [*range(1, LANES), 100]
+    assert simd.put_before(a, b).tolist() == [99 + LANES, *range(LANES - 1)]
+    assert simd.put_after(a, b).tolist() == [*range(1, LANES), 100]
 
 
 def test_rows_that_are_not_contiguous_are_refused_by_the_compiler() -> None:

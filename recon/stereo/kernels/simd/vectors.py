@@ -1,0 +1,125 @@
+"""What vectors do, in plain numpy: the definition of each function, and the fallback without numba.
+
+Arithmetic (``+ - * >>``) wraps around, as numpy's does. Bounds are never checked.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+LANES: Final = 32
+"""Values of a vector. In 16 bits they fill a register of 512 bits; where registers are smaller, the
+compiler uses several."""
+
+Vector: TypeAlias = NDArray[Any]
+"""uint8 or uint16 (LANES,)."""
+
+
+def load(array: NDArray[Any], at: int) -> Vector:
+    """Values ``at`` to ``at + LANES - 1`` of a uint8 or uint16 array (n,)."""
+    vector: Vector = array[at : at + LANES].copy()
+    return vector
+
+
+def store(array: NDArray[Any], at: int, vector: Vector) -> None:
+    """Write a vector from ``at`` on."""
+    array[at : at + LANES] = vector
+
+
+def load_row(rows: NDArray[Any], n: int, at: int) -> Vector:
+    """`load` from row ``n`` of a C-ordered array of rows."""
+    vector: Vector = rows[n, at : at + LANES].copy()
+    return vector
+
+
+def store_row(rows: NDArray[Any], n: int, at: int, vector: Vector) -> None:
+    """`store` to row ``n`` of a C-ordered array of rows."""
+    rows[n, at : at + LANES] = vector
+
+
+def splat(value: np.uint8 | np.uint16) -> Vector:
+    """The same value in each lane."""
+    return np.full(LANES, value)
+
+
+def ramp(first: np.uint16) -> Vector:
+    """``first``, ``first + 1`` and so on."""
+    return np.arange(LANES, dtype=np.uint16) + first
+
+
+def minimum(a: Vector, b: Vector) -> Vector:
+    """The smaller value of each lane."""
+    return np.minimum(a, b)
+
+
+def maximum(a: Vector, b: Vector) -> Vector:
+    """The larger value of each lane."""
+    return np.maximum(a, b)
+
+
+def absolute_difference(a: Vector, b: Vector) -> Vector:
+    """``|a - b|`` of each lane."""
+    return np.maximum(a, b) - np.minimum(a, b)
+
+
+def mean(a: Vector, b: Vector) -> Vector:
+    """Mean of two bytes, rounded up."""
+    return ((a.astype(np.uint16) + b + 1) >> 1).astype(np.uint8)
+
+
+def differing_bits(a: Vector, b: Vector) -> Vector:
+    """How many bits of two bytes differ."""
+    bits = np.unpackbits(np.bitwise_xor(a, b)).reshape(-1, 8)
+    return np.asarray(bits.sum(axis=1, dtype=np.uint8))
+
+
+def where_equal(a: Vector, b: Vector, then: Vector, otherwise: Vector) -> Vector:
+    """``then`` in the lanes where ``a == b``."""
+    return np.where(a == b, then, otherwise)
+
+
+def where_less(a: Vector, b: Vector, then: Vector, otherwise: Vector) -> Vector:
+    """``then`` in the lanes where ``a < b``."""
+    return np.where(a < b, then, otherwise)
+
+
+def widen(vector: Vector, array: NDArray[Any]) -> Vector:
+    """Convert bytes to the dtype of an array."""
+    return vector.astype(array.dtype)
+
+
+def narrow(vector: Vector) -> Vector:
+    """The lower bytes of uint16."""
+    return vector.astype(np.uint8)
+
+
+def put_before(vector: Vector, before: Vector) -> Vector:
+    """Each lane's neighbour below; that of the first lane is the last of ``before``."""
+    return np.concatenate((before[-1:], vector[:-1]))
+
+
+def put_after(vector: Vector, after: Vector) -> Vector:
+    """Each lane's neighbour above; that of the last lane is the first of ``after``."""
+    return np.concatenate((vector[1:], after[:1]))
+
+
+def broadcast_minimum(vector: Vector) -> Vector:
+    """The smallest value, in each lane."""
+    return np.full_like(vector, vector.min())
+
+
+def transpose(rows: NDArray[Any], n: int, at: int, out: NDArray[Any], m: int, to: int) -> None:
+    """Write a block of `LANES` by `LANES` bytes, transposed, to another array.
+
+    Args:
+        rows: uint8 (N, C).
+        n: First row of the block.
+        at: Its first column.
+        out: uint8 (M, D), written.
+        m: First row of the transposed block.
+        to: Its first column.
+    """
+    out[m : m + LANES, to : to + LANES] = rows[n : n + LANES, at : at + LANES].T
