@@ -36,7 +36,7 @@ from recon.run.machine import serial_algebra, use_threads
 from recon.run.record import fingerprint, write_record
 from recon.run.stopwatch import Stopwatch
 from recon.run.summary import cost
-from recon.sources.picture_pairs import PicturePairs, pair_pictures
+from recon.sources.image_pairs import ImagePairs, pair_images
 from recon.stereo.rectify import RectifyingTurns, plan_turns
 
 CalibrationForm = Literal["recon", "opencv", "ros", "kalibr"]
@@ -116,7 +116,7 @@ def run_calibration(
     threads, watch = use_threads(options.threads), Stopwatch()
     _check_file(options.file)
     videos = _videos(left, right)
-    pictures = PicturePairs((), by_order=False) if videos else pair_pictures(left, right or "")
+    pictures = ImagePairs((), by_order=False) if videos else pair_images(left, right or "")
     with RunDirectory.for_command("calibrate", options.folder) as directory:
         if videos:
             with watch.stage("pick"):

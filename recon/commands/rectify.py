@@ -22,14 +22,14 @@ from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.image import write_image
 from recon.io.yaml_file import write_yaml
-from recon.rig.uncalibrated import UncalibratedRectification, rectify_pictures
+from recon.rig.uncalibrated import UncalibratedRectification, rectify_images
 from recon.run.directory import RunDirectory
 from recon.run.machine import serial_algebra, use_threads
 from recon.run.record import fingerprint, write_record
 from recon.run.stopwatch import Stopwatch
 from recon.run.summary import cost, plain
 from recon.sources.files import read_pair
-from recon.sources.picture_pairs import PicturePairs, pair_pictures
+from recon.sources.image_pairs import ImagePairs, pair_images
 from recon.stereo.rectify import (
     Rectifier,
     epipolar_curves,
@@ -107,22 +107,22 @@ def run_rectify(left: str, right: str, config: ReconConfig, options: RectifyOpti
     """
     start = time.perf_counter()
     use_threads(options.threads)
-    watch, pictures = Stopwatch(), pair_pictures(left, right)
+    watch, images = Stopwatch(), pair_images(left, right)
     with RunDirectory.for_command("rectify", options.out) as directory, serial_algebra():
         with watch.stage("plan"):
-            first = read_pair(*pictures.pairs[0])
-            cameras = kitti_cameras_of(pictures.pairs[0][0])
+            first = read_pair(*images.pairs[0])
+            cameras = kitti_cameras_of(images.pairs[0][0])
             plan = _by_file(options, config, first, cameras) if options.calibration else None
-            plan = plan or _by_features(pictures, first)
+            plan = plan or _by_features(images, first)
         with watch.stage("rectify"):
-            for pair, (left_path, right_path) in _pairs(pictures):
+            for pair, (left_path, right_path) in _pairs(images):
                 warped = plan.warp(pair)
                 write_image(directory.path(f"left/{_rectified_name(left_path)}"), warped[0])
                 write_image(directory.path(f"right/{_rectified_name(right_path)}"), warped[1])
         run = _measure(plan, first)
-        run.summary["pairs"] = len(pictures.pairs)
-        run.summary["frames_left_out"] = len(pictures.lonely)
-        run.summary["warnings"] = _warnings(run.summary, pictures)
+        run.summary["pairs"] = len(images.pairs)
+        run.summary["frames_left_out"] = len(images.lonely)
+        run.summary["warnings"] = _warnings(run.summary, images)
         plan.write(directory)
         write_text(directory.path("config.yaml"), dump_config(config))
         if options.present is not None:
@@ -136,7 +136,7 @@ def run_rectify(left: str, right: str, config: ReconConfig, options: RectifyOpti
             "rectify",
             {
                 "source": f"{left} {right}",
-                "inputs": fingerprint(path for pair in pictures.pairs for path in pair),
+                "inputs": fingerprint(path for pair in images.pairs for path in pair),
                 "timings": watch.seconds,
                 "warnings": run.summary["warnings"],
             },
@@ -194,21 +194,21 @@ def _by_file(
     )
 
 
-def _by_features(pictures: PicturePairs, first: StereoPair) -> _Plan:
+def _by_features(images: ImagePairs, first: StereoPair) -> _Plan:
     """Rectification by homographies from feature matches; depth has no scale."""
     height, width = first.left.shape[:2]
     size = (width, height)
-    step = max(1, len(pictures.pairs) // _UNCALIBRATED_PAIRS)
-    some = replace(pictures, pairs=pictures.pairs[::step][:_UNCALIBRATED_PAIRS])
+    step = max(1, len(images.pairs) // _UNCALIBRATED_PAIRS)
+    some = replace(images, pairs=images.pairs[::step][:_UNCALIBRATED_PAIRS])
     greys = [(to_grey(pair.left), to_grey(pair.right)) for pair, _ in _pairs(some)]
     try:
-        result = rectify_pictures(greys)
+        result = rectify_images(greys)
     except CalibrationError as error:
-        if len(pictures.pairs) > 1:
+        if len(images.pairs) > 1:
             raise
         raise CalibrationError(
             error.what,
-            where=pictures.pairs[0][0],
+            where=images.pairs[0][0],
             got=error.got,
             expected=error.expected,
             hint=f"{error.hint}; or it has too few good matches, and several pairs are needed: "
@@ -259,10 +259,10 @@ def _uncalibrated_figures(result: UncalibratedRectification) -> dict[str, Any]:
     }
 
 
-def _pairs(pictures: PicturePairs) -> Iterator[tuple[StereoPair, tuple[Path, Path]]]:
+def _pairs(images: ImagePairs) -> Iterator[tuple[StereoPair, tuple[Path, Path]]]:
     """Yield the pairs with their files, one in memory at a time; all must have the same size."""
     shape: tuple[int, ...] | None = None
-    for files in pictures.pairs:
+    for files in images.pairs:
         pair = read_pair(*files)
         shape = shape or pair.left.shape[:2]
         if pair.left.shape[:2] != shape:
@@ -296,7 +296,7 @@ def _measure(plan: _Plan, first: StereoPair) -> RectifyRun:
     )
 
 
-def _warnings(summary: dict[str, Any], pictures: PicturePairs) -> list[str]:
+def _warnings(summary: dict[str, Any], images: ImagePairs) -> list[str]:
     lines = []
     if summary["up_to_scale"]:
         lines.append("without a calibration: rows correspond, but depth is up to scale, no metres")
@@ -304,9 +304,9 @@ def _warnings(summary: dict[str, Any], pictures: PicturePairs) -> list[str]:
         lines.append(f"rows are {summary['row_error_px']:.2f} px apart: a matcher needs 0.5")
     if "row_error_px" not in summary:
         lines.append("no features to measure rows by")
-    if pictures.lonely:
-        names = ", ".join(path.name for path in pictures.lonely[:6])
-        lines.append(f"images without a partner, left out: {len(pictures.lonely)} ({names})")
-    if pictures.by_order:
-        lines.append("names do not tell which pictures belong together: paired by their order")
+    if images.lonely:
+        names = ", ".join(path.name for path in images.lonely[:6])
+        lines.append(f"images without a partner, left out: {len(images.lonely)} ({names})")
+    if images.by_order:
+        lines.append("names do not tell which images belong together: paired by their order")
     return lines

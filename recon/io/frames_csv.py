@@ -13,7 +13,7 @@ from recon.core.errors import FormatError
 from recon.io.files import StrPath, read_text, reader
 
 FRAMES: Final = "frames.csv"
-HEADER: Final = "# left picture, right picture, left time [s], right time [s]\n"
+HEADER: Final = "# left image, right image, left time [s], right time [s]\n"
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from recon.io.tree_file import read_tree, write_tree
 from recon.map.submap_store import SubmapEntry
 from recon.places import LoopSettings
 from recon.places.detector import CONTRADICTED, KeyframeMemory, LoopDetector, StoredKeyframe
-from recon.places.drift import doubtful_path
+from recon.places.drift import path_lengths
 from recon.places.graph import Closure, close_loops
 from recon.places.keyframe import Keyframe
 from recon.places.verify import Loop
@@ -203,7 +203,7 @@ class LoopWatch:
     def _advance(self, T_world_camera: Float64, *, measured: bool) -> float:
         """Path length up to the next frame, as the detector measures it."""
         before = self._last if self._path_m else T_world_camera
-        step = doubtful_path(
+        step = path_lengths(
             np.stack([before, T_world_camera]), np.array([True, measured]), self._settings.drift
         )
         self._path_m.append((self._path_m[-1] if self._path_m else 0.0) + float(step[1]))

@@ -1,7 +1,7 @@
-"""Whether a motion explains the pictures: a check on all patches, not on the tracked features.
+"""Whether a motion explains the images: a check on all patches, not on the tracked features.
 
 Features may agree on a motion that is not the camera's: that of a lorry ahead, or none at all
-where they slide along the edge of a road. Then the rest of the picture contradicts: its patches,
+where they slide along the edge of a road. Then the rest of the image contradicts: its patches,
 moved accordingly, do not match what is seen there.
 """
 
@@ -45,14 +45,14 @@ _MIN_CORRELATION: Final = 0.6
 
 @dataclass(frozen=True)
 class Agreement:
-    """How many patches of a picture a motion explains.
+    """How many patches of an image a motion explains.
 
     Attributes:
-        telling: Patches with texture in all directions, which can tell motions apart.
+        informative: Patches with texture in all directions, which can distinguish motions.
         share: Share of them that match where the motion takes them; NaN = there are none.
     """
 
-    telling: int
+    informative: int
     share: float
 
 
@@ -71,11 +71,11 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
-    """Pixels of a picture that another picture should show too.
+    """Pixels of an image that another image should show too.
 
     Attributes:
         patch: int64 (N,), number of the patch of each.
-        before: float64 (N,), grey values in the last picture.
+        before: float64 (N,), grey values in the last image.
         now: float64 (N,), grey values where the motion takes them in this one.
         slope: float64 (N, 2), gradient of ``before`` per pixel to the right and down.
     """
@@ -92,33 +92,33 @@ def explain_motion(
     T_before_now: Float64,
     camera: RectifiedCamera,
 ) -> Agreement:
-    """Count the patches of the last picture that match where a motion takes them in this one.
+    """Count the patches of the last image that match where a motion takes them in this one.
 
     Every sampled pixel with a disparity is moved. A patch matches where its grey values correlate
     with those seen there, corrected for noise; brightness and contrast may change. Patches without
     texture, or with edges in one direction alone, match after many motions and are not counted; in
-    a picture that is dark by now no patch is.
+    an image that is dark by now no patch is.
 
     Args:
         before: The last frame.
-        left: uint8 (H, W), this picture.
+        left: uint8 (H, W), this image.
         T_before_now: float64 (4, 4), the motion in question.
         camera: The rectified camera.
     """
     samples = _sample(before, left, T_before_now, camera)
     count = np.bincount(samples.patch)
     noise = (noise_sigma(before.left), noise_sigma(left))
-    telling = (count >= _MIN_PIXELS) & _textured(samples, count, noise[0])
-    # A picture that shows little more than noise where the patches should be is blind.
+    informative = (count >= _MIN_PIXELS) & _textured(samples, count, noise[0])
+    # An image that shows little more than noise where the patches should be is blind.
     blind = _power(samples, samples.now, count) < 2.0 * noise[1] ** 2
-    if not telling.any() or blind[telling].mean() > 0.5:
+    if not informative.any() or blind[informative].mean() > 0.5:
         return Agreement(0, float("nan"))
-    agreeing = _correlation(samples, count, noise)[telling] >= _MIN_CORRELATION
-    return Agreement(int(telling.sum()), float(agreeing.mean()))
+    agreeing = _correlation(samples, count, noise)[informative] >= _MIN_CORRELATION
+    return Agreement(int(informative.sum()), float(agreeing.mean()))
 
 
 def noise_sigma(grey: UInt8) -> float:
-    """Standard deviation of the noise of a picture, grey values.
+    """Standard deviation of the noise of an image, grey values.
 
     From the median of mixed fourth differences, in which gradients and straight edges cancel.
 
@@ -142,7 +142,7 @@ def _sample(
     T_before_now: Float64,
     camera: RectifiedCamera,
 ) -> _Samples:
-    """Every n-th pixel with a disparity that stays in the picture."""
+    """Every n-th pixel with a disparity that stays in the image."""
     step, (height, width) = _STRIDE_PX, left.shape
     # Slopes need a neighbour on either side.
     row, column = np.nonzero(before.disparity.valid[1:-1:step, 1:-1:step])
@@ -184,7 +184,7 @@ def _textured(samples: _Samples, count: Int64, sigma: float) -> NDArray[np.bool_
 
 
 def _correlation(samples: _Samples, count: Int64, noise: tuple[float, float]) -> Float64:
-    """Correlation (P,) of each patch between the two pictures, corrected for noise."""
+    """Correlation (P,) of each patch between the two images, corrected for noise."""
     one, other = samples.before, samples.now
     mean, mean_other = (_mean(samples, values, count) for values in (one, other))
     both = _mean(samples, one * other, count) - mean * mean_other

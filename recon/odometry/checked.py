@@ -47,7 +47,7 @@ class CheckedState:
 
 
 class CheckedOdometry:
-    """Checks how certain every motion is, and whether the picture agrees with it.
+    """Checks how certain every motion is, and whether the image agrees with it.
 
     Poses stay as they are; ``health.ok`` and its notes say which are not to be trusted.
 
@@ -101,15 +101,15 @@ class CheckedOdometry:
         if health.sigma_m > _MAX_SIGMA_M + _MAX_SIGMA_SHARE * length_m:
             return [f"the motion is known to {health.sigma_m:.2f} m only"]
         found = explain_motion(before, frame.pair.left, T_before_now, frame.pair.camera)
-        if found.telling >= _MIN_TELLING:
-            return _contradiction(found.share, found.telling)
+        if found.informative >= _MIN_TELLING:
+            return _contradiction(found.share, found.informative)
         # A visual motion has passed the test of its uncertainty; any other has no other evidence.
         if np.isfinite(health.sigma_m):
             return []
-        return [f"only {found.telling} patches of the picture can tell one motion from another"]
+        return [f"only {found.informative} patches of the image can distinguish motions"]
 
 
-def _contradiction(share: float, telling: int) -> list[str]:
+def _contradiction(share: float, informative: int) -> list[str]:
     if share >= MIN_SHARE:
         return []
-    return [f"only {100 * share:.0f} % of {telling} patches of the picture moved like that"]
+    return [f"only {100 * share:.0f} % of {informative} patches of the image moved like that"]

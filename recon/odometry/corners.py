@@ -1,4 +1,4 @@
-"""Corners to track, spread over the picture."""
+"""Corners to track, spread over the image."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _BORDER_PX: Final = 8
 
 
 def find_corners(grey: UInt8, taken_uv: Float32) -> Float32:
-    """The best corners of each cell of a picture, away from those already tracked.
+    """The best corners of each cell of an image, away from those already tracked.
 
     Cells keep one strongly textured region from taking all features: only features spread over the
-    picture determine the motion well.
+    image determine the motion well.
 
     Args:
         grey: uint8 (H, W).

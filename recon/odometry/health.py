@@ -13,8 +13,8 @@ _MANY: Final = 0.1
 
 def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:
     """One line per distinct warning, and per stretch of frames without a trusted pose."""
-    told = dict.fromkeys(line for record in health for line in record.warnings)
-    lines = [f"{_named(health, line)}: {line}" for line in told]
+    texts = dict.fromkeys(line for record in health for line in record.warnings)
+    lines = [f"{_named(health, line)}: {line}" for line in texts]
     bad = [index for index, record in enumerate(health) if not record.ok]
     for first, last in _stretches(bad):
         why = "; ".join(dict.fromkeys(health[first].notes)) or "no reason recorded"

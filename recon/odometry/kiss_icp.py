@@ -130,7 +130,7 @@ class KissIcp:
         pose = _pose(T_world_camera)
         with _our_errors():
             _, frame = self._icp.voxelize(self._icp.clip(points))
-            self._icp.settle(frame, pose)
+            self._icp.correct(frame, pose)
 
     def map_points(self) -> Float64:
         """float64 (M, 3), the points of the local map, world axes, in ascending order."""
@@ -238,7 +238,7 @@ class _RangedKissIcp(KissICP):  # type: ignore[misc]
         )
         return pose
 
-    def settle(self, frame: Float64, pose: Float64) -> None:
+    def correct(self, frame: Float64, pose: Float64) -> None:
         """Accept a pose and add its frame to the map."""
         self.last_delta = orthonormalise(np.linalg.inv(self.last_pose) @ pose)
         self.last_pose = pose

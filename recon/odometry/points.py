@@ -33,7 +33,7 @@ def select_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
     ground towards the camera; ICP on all points underestimates forward motion.
 
     Args:
-        frame: Pictures and disparity.
+        frame: Images and disparity.
         max_range_m: Farther points are not used.
 
     Returns:
@@ -59,7 +59,7 @@ def all_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
 
 
 def textured(grey: UInt8, min_gradient: float) -> Bool:
-    """bool (H, W), where the picture changes along the row: only that fixes a disparity."""
+    """bool (H, W), where the image changes along the row: only that fixes a disparity."""
     gradient = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3)
     return np.asarray(np.abs(gradient) > min_gradient)
 

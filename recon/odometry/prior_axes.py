@@ -22,7 +22,7 @@ from recon.odometry.visual import VisualOdometry
 Axes = Literal["camera", "body"]
 
 _CLEAR: Final = 10.0
-"""Standard deviations of a prior that a motion must exceed to tell one set of axes from another."""
+"""Standard deviations of a prior that a motion must exceed to distinguish two sets of axes."""
 _ENOUGH: Final = 5
 """Motions compared; their median is not spoiled by two that are wrong."""
 _MOST_FRAMES: Final = 100
@@ -55,7 +55,7 @@ def find_axes(
         settings: The accuracy of the prior.
 
     Returns:
-        The axes; None if the cameras do not see enough motion to tell.
+        The axes; None if the cameras do not see enough motion to decide.
 
     Raises:
         RegistrationError: The prior contradicts the visual motion in all axes.
@@ -67,10 +67,10 @@ def find_axes(
     sigmas = {axes: float(np.median([one[axes] for one in off])) for axes in priors}
     best = min(priors, key=lambda axes: sigmas[axes])
     if sigmas[best] > MAX_SIGMAS:
-        told = ", ".join(f"{axes} axes {sigmas[axes]:.1f}" for axes in priors)
+        misfits = ", ".join(f"{axes} axes {sigmas[axes]:.1f}" for axes in priors)
         raise RegistrationError(
             "the prior fits what the cameras see in no axes",
-            got=f"{told} standard deviations off in {len(off)} motions",
+            got=f"{misfits} standard deviations off in {len(off)} motions",
             expected=f"at most {MAX_SIGMAS:g}",
             hint="it must be the path of this rig, in metres and on its clock; name its axes with "
             "--set odometry.prior.axes= to use it nevertheless",

@@ -17,7 +17,7 @@ class OdometryFrame:
     """What an odometry is given of one frame.
 
     Attributes:
-        pair: The rectified pictures.
+        pair: The rectified images.
         disparity: Their disparity.
     """
 
@@ -30,7 +30,7 @@ class OdometryHealth:
     """How far the pose of one frame can be trusted. NaN = does not apply or not measured.
 
     Attributes:
-        ok: False where the pose is not to be trusted: it is extrapolated, or the picture
+        ok: False where the pose is not to be trusted: it is extrapolated, or the image
             contradicts it.
         tracks: Features followed from the last frame.
         inliers: Features that agree with the visual motion.

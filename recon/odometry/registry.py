@@ -34,7 +34,7 @@ def make_odometry(
 
     Raises:
         SettingsError: There is no such odometry, or it takes no prior.
-        RegistrationError: The prior tells no motion.
+        RegistrationError: The prior has no motion.
     """
     if name not in ODOMETRIES:
         choices = ", ".join(sorted(ODOMETRIES))

@@ -1,4 +1,4 @@
-"""Tracking of features from picture to picture, and their disparity."""
+"""Tracking of features from image to image, and their disparity."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ _MIN_EIGENVALUE: Final = 1e-4
 
 
 def follow(source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32) -> tuple[Float32, Bool]:
-    """Track features to another picture, and back again as a check.
+    """Track features to another image, and back again as a check.
 
     Args:
-        source: Picture in which the features are known.
-        target: Picture to which they are tracked.
+        source: Image in which the features are known.
+        target: Image to which they are tracked.
         uv: float32 (N, 2), columns and rows in ``source``.
         guess_uv: float32 (N, 2), predicted columns and rows in ``target``.
 
@@ -75,12 +75,12 @@ def _comparable(source: UInt8, target: UInt8) -> UInt8:
 def sample_disparity(disparity: Disparity, uv: Float32) -> Float32:
     """The matcher's disparity of features: the median around each, where that is consistent.
 
-    Tracking features into the right picture instead gave two to four times the drift on real
+    Tracking features into the right image instead gave two to four times the drift on real
     drives, probably because patches at the edge of an object contain the background, too.
 
     Args:
         disparity: The matcher's result.
-        uv: float32 (N, 2), features of the left picture.
+        uv: float32 (N, 2), features of the left image.
 
     Returns:
         float32 (N,), pixels; NaN where there is no match, or one unlike its neighbours.

@@ -41,7 +41,7 @@ class VisualState:
 
     Attributes:
         window: The last frames that were registered, and the points in them.
-        left: uint8 (H, W), the left picture of the newest of them.
+        left: uint8 (H, W), the left image of the newest of them.
         disparity: Its disparity.
         motion: Pose and motion by now, which may be some frames later.
         seen_s: Time of the newest frame that was registered.
@@ -97,7 +97,7 @@ class VisualOdometry:
     def track(self, frame: OdometryFrame) -> VisualEstimate:
         """Register the next frame, with the uncertainty of its pose.
 
-        Where features cannot be tracked, they are matched over the whole picture: after a gap, or
+        Where features cannot be tracked, they are matched over the whole image: after a gap, or
         once the view is clear again. Where that fails too, a frame with features of its own starts
         a new window at the predicted pose; a frame without any is skipped, and the next one is
         matched with the last that was registered.
@@ -181,7 +181,7 @@ class VisualOdometry:
     def _by_matching(
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
-        """The frame, registered by matching over the whole picture; None = that fails."""
+        """The frame, registered by matching over the whole image; None = that fails."""
         uv, uv_now = match_features(state.left, frame.pair.left, _RELOCATE_FEATURES, any_scale=True)
         camera, T_world_then = frame.pair.camera, state.window.T_world_camera[-1]
         then = np.column_stack([uv, self._disparity(state.disparity, camera, uv)])
@@ -192,7 +192,7 @@ class VisualOdometry:
         seen = self._register(window, now, frame, predicted)
         if seen is None:
             return None
-        return replace(seen, note="features were looked for in the whole picture")
+        return replace(seen, note="features were looked for in the whole image")
 
     def _register(
         self, window: TrackWindow, uvd: Float64, frame: OdometryFrame, predicted: Float64
@@ -223,7 +223,7 @@ class VisualOdometry:
         points = len(begun.window.xyz_world)
         sees = points >= MIN_INLIERS
         self._state = begun if sees else replace(state, motion=motion)
-        why = f"{what if sees else 'nothing to follow in the picture'} ({points} features)"
+        why = f"{what if sees else 'nothing to follow in the image'} ({points} features)"
         if prior_motion is None or self._prior is None:
             health = OdometryHealth(False, notes=(f"lost: {why}; the last motion goes on",))
             return VisualEstimate(OdometryResult(motion.T_world_camera, health), None)
@@ -248,7 +248,7 @@ class VisualOdometry:
         return uvd
 
     def _disparity(self, disparity: Disparity, camera: RectifiedCamera, uv: Float32) -> Float64:
-        """Disparity (N,) of features; NaN = unknown, or too small to tell a depth."""
+        """Disparity (N,) of features; NaN = unknown, or too small to give a depth."""
         d = sample_disparity(disparity, uv).astype(np.float64)
         return np.where(d + camera.doffs_px < MIN_DISPARITY_PX, np.nan, d)
 

@@ -30,7 +30,7 @@ class StoredKeyframe:
     Attributes:
         keyframe: Features and coarse disparities.
         T_world_camera: float64 (4, 4), by odometry.
-        path_m: Path up to it, by `doubtful_path`.
+        path_m: Path up to it, by `path_lengths`.
         loops: Verified loops that end in it.
         refused: Why other candidates were refused.
     """
@@ -112,10 +112,10 @@ class LoopDetector:
 
         Args:
             frame: Its number.
-            pair: Its pictures.
+            pair: Its images.
             disparity: Of its left view.
             T_world_camera: float64 (4, 4), by odometry.
-            path_m: Path up to it, by `doubtful_path`.
+            path_m: Path up to it, by `path_lengths`.
             measured: False where the pose is extrapolated; such a frame is no keyframe.
         """
         if not measured or not self._is_due(T_world_camera):

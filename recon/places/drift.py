@@ -26,7 +26,7 @@ class Drift:
     angle_rad: float
 
 
-def doubtful_path(T_world_camera: Float64, measured: Bool, settings: DriftSettings) -> Float64:
+def path_lengths(T_world_camera: Float64, measured: Bool, settings: DriftSettings) -> Float64:
     """Length of the path up to each frame, in which extrapolated metres count several times.
 
     Args:
@@ -61,20 +61,20 @@ def spread_over(path_m: Float64, settings: DriftSettings) -> tuple[Float64, Floa
 
 
 def is_possible(
-    T_difference: NDArray[np.float64], drift: Drift, floor: Drift, settings: DriftSettings
+    T_difference: NDArray[np.float64], drift: Drift, other: Drift, settings: DriftSettings
 ) -> bool:
     """Whether a motion differs from odometry's by no more than drift explains.
 
     Args:
         T_difference: float64 (4, 4), inverse of odometry's motion times the other one.
         drift: Of odometry over that motion.
-        floor: Standard deviations of the other motion.
+        other: Standard deviations of the other motion.
         settings: How many standard deviations are possible.
     """
     off_m = float(np.linalg.norm(T_difference[:3, 3]))
     off_rad = float(angle_rad(T_difference))
-    sigma_m = math.hypot(drift.position_m, floor.position_m)
-    sigma_rad = math.hypot(drift.angle_rad, floor.angle_rad)
+    sigma_m = math.hypot(drift.position_m, other.position_m)
+    sigma_rad = math.hypot(drift.angle_rad, other.angle_rad)
     return off_m <= settings.sigmas * sigma_m and off_rad <= settings.sigmas * sigma_rad
 
 

@@ -57,7 +57,7 @@ def close_loops(
 
     Args:
         trajectory: By odometry.
-        path_m: float64 (N,), path up to each frame, by `doubtful_path`.
+        path_m: float64 (N,), path up to each frame, by `path_lengths`.
         loops: Loops between frames of it.
         settings: Nodes and tolerances.
 
@@ -142,12 +142,12 @@ def _loop_edge(
     way_m += abs(float(path_m[nodes[last]] - path_m[loop.last]))
     drift, graph = drift_over(way_m, settings.drift), settings.graph
     apart_m = float(np.linalg.norm(loop.T_first_last[:3, 3]))
-    floor = Drift(
+    other = Drift(
         math.hypot(drift.position_m, graph.loop_sigma_m, graph.loop_share * apart_m),
         math.hypot(drift.angle_rad, math.radians(graph.loop_sigma_deg)),
     )
     covariance = np.linalg.inv(_turned(loop.information, to_last)) + np.linalg.inv(
-        _information(floor)
+        _information(other)
     )
     T = orthonormalise(to_first @ loop.T_first_last @ to_last)
     return PoseEdge(first, last, T, np.linalg.inv(covariance), doubtful=True)

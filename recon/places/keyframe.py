@@ -34,7 +34,7 @@ class Keyframe:
         frame: Number of the frame in the drive.
         uvd: float32 (N, 3), column, row and disparity of each feature; disparity NaN = unknown.
         descriptors: uint8 (N, 32), ORB.
-        coarse: float32 (h, w), every n-th disparity of the picture; NaN = unknown.
+        coarse: float32 (h, w), every n-th disparity of the image; NaN = unknown.
     """
 
     frame: int
@@ -65,7 +65,7 @@ def make_keyframe(
 
     Args:
         frame: Its number.
-        pair: Its pictures.
+        pair: Its images.
         disparity: What the matcher found in them.
         settings: Number of features, and how they are spread.
 
@@ -91,7 +91,7 @@ def make_keyframe(
 
 
 def words_of(descriptors: UInt8, settings: CandidateSettings) -> NDArray[np.uint32]:
-    """The distinct words of a picture, sorted.
+    """The distinct words of an image, sorted.
 
     A word is the value of some fixed bits of a descriptor: similar descriptors are likely to share
     one, different ones are not, and no vocabulary has to be trained.

@@ -13,7 +13,7 @@ from recon.core.values.arrays import Bool, Float64
 from recon.places.drift import spread_over
 from recon.places.settings import LoopSettings
 
-_LONGEST_RUN: Final = 256  # pictures: half a million words, which merge in 50 ms and 10 MB
+_LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms and 10 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,7 @@ class Place:
     Attributes:
         frame: Its frame.
         T_world_camera: float64 (4, 4), by odometry.
-        path_m: Path up to it, by `doubtful_path`.
+        path_m: Path up to it, by `path_lengths`.
         words: uint32 (W,), sorted, each once.
     """
 
@@ -88,13 +88,13 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """The sorted words of consecutive pictures, with the picture of each.
+    """The sorted words of consecutive images, with the image of each.
 
     Attributes:
-        first: Number of the first picture.
-        count: Number of pictures.
+        first: Number of the first image.
+        count: Number of images.
         words: uint32 (W,), sorted.
-        owners: uint16 (W,), picture of each word, counted from the first.
+        owners: uint16 (W,), image of each word, counted from the first.
     """
 
     first: int
@@ -111,7 +111,7 @@ class _Run:
         return _Run(self.first, self.count + other.count, words[order], owners[order])
 
     def shared(self, words: NDArray[np.uint32]) -> NDArray[np.intp]:
-        """int64 (count,), number of words that each picture shares with another one."""
+        """int64 (count,), number of words that each image shares with another one."""
         begin, end = (np.searchsorted(self.words, words, side) for side in ("left", "right"))
         # words[k] is in the run at begin[k] … end[k] - 1.
         found = end - begin
@@ -121,7 +121,7 @@ class _Run:
 
 
 class WordIndex:
-    """An inverted index: which pictures have which words.
+    """An inverted index: which images have which words.
 
     Runs of sorted words are merged when they have the same size, as in a binary counter, up to a
     size that still merges in little time and memory.
@@ -135,7 +135,7 @@ class WordIndex:
         self._runs: list[_Run] = []
 
     def add(self, words: NDArray[np.uint32]) -> None:
-        """Add the distinct, sorted words of the next picture."""
+        """Add the distinct, sorted words of the next image."""
         run = _Run(len(self._sizes), 1, np.asarray(words), np.zeros(len(words), np.uint16))
         self._sizes.append(len(words))
         while self._runs and self._runs[-1].count == run.count < _LONGEST_RUN:
@@ -143,7 +143,7 @@ class WordIndex:
         self._runs.append(run)
 
     def likeness(self, words: NDArray[np.uint32]) -> Float64:
-        """float64 (N,), shared words of each picture and another one, normalised to [0, 1]."""
+        """float64 (N,), shared words of each image and another one, normalised to [0, 1]."""
         shared = np.zeros(len(self._sizes))
         for run in self._runs:
             shared[run.first : run.first + run.count] = run.shared(words)

@@ -104,7 +104,7 @@ class VerifySettings(Settings):
         0.3, gt=0.0, le=1.0, description="Least share of the matches that agree."
     )
     spread_cells: int = Field(
-        5, ge=1, le=16, description="Of 4 by 4 cells of each picture, how many must hold inliers."
+        5, ge=1, le=16, description="Of 4 by 4 cells of each image, how many must hold inliers."
     )
     both_ways_m: float = Field(
         0.5, gt=0.0, description="Largest distance between the poses found in either direction."

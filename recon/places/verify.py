@@ -63,7 +63,7 @@ def verify(
     """Whether two keyframes show the same place.
 
     Matches must be mutually best. The motions found in either direction must be inverse to each
-    other. The inliers must be many, a fair share of the matches, spread over both pictures, and
+    other. The inliers must be many, a fair share of the matches, spread over both images, and
     determine the motion in all directions. The coarse disparities must agree with it, too.
     """
     seen = match(first, last, camera, settings)
@@ -143,10 +143,10 @@ def _confirmed(
     off = _interpolated(target.coarse, (u - half) / step, (v - half) / step) - d
     tolerance = settings.dense_tolerance_px + settings.dense_tolerance_share * np.abs(d)
     with np.errstate(invalid="ignore"):
-        telling = off <= tolerance  # False for NaN, unknown in one of the frames
-    if int(telling.sum()) < settings.min_dense_points:
+        comparable = off <= tolerance  # False for NaN, unknown in one of the frames
+    if int(comparable.sum()) < settings.min_dense_points:
         return 0.0
-    return float(np.mean(off[telling] >= -tolerance[telling]))
+    return float(np.mean(off[comparable] >= -tolerance[comparable]))
 
 
 def _interpolated(values: Float32, column: Float64, row: Float64) -> Float64:
@@ -217,7 +217,7 @@ def _weakness(
 
 
 def _spread(uvd: Float64, camera: RectifiedCamera) -> int:
-    """Of 4 by 4 cells of the picture, how many hold a feature."""
+    """Of 4 by 4 cells of the image, how many hold a feature."""
     column = np.clip(uvd[:, 0] * _CELLS / camera.width_px, 0, _CELLS - 1).astype(int)
     row = np.clip(uvd[:, 1] * _CELLS / camera.height_px, 0, _CELLS - 1).astype(int)
     return len(np.unique(row * _CELLS + column))

@@ -119,8 +119,8 @@ def warm_up(cameras: tuple[Camera, ...], settings: CaptureSettings) -> bool:
 
 
 def _rate_hz(cameras: tuple[Camera, ...], settings: CaptureSettings) -> float:
-    told = [camera.rate_hz for camera in cameras if np.isfinite(camera.rate_hz)]
-    return settings.rate_hz or min(told, default=_USUAL_RATE_HZ)
+    known_hz = [camera.rate_hz for camera in cameras if np.isfinite(camera.rate_hz)]
+    return settings.rate_hz or min(known_hz, default=_USUAL_RATE_HZ)
 
 
 def _grab(cameras: tuple[Camera, ...], period_s: float) -> list[float] | None:

@@ -10,7 +10,7 @@ from recon.sources.pairing import find_partners, partner_names
 from recon.sources.rosbags import CAMERA_INFO, COMPRESSED, IMAGE, POSES, Bag
 from recon.sources.settings import SourceSettings
 
-_PICTURES = (IMAGE, COMPRESSED)
+_IMAGES = (IMAGE, COMPRESSED)
 _LISTED = 20
 
 
@@ -30,7 +30,7 @@ def choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], 
     images = [
         topic.name
         for topic in bag.topics.values()
-        if topic.kind in _PICTURES and topic.messages and "depth" not in topic.name.lower()
+        if topic.kind in _IMAGES and topic.messages and "depth" not in topic.name.lower()
     ]
     pairs = [
         (left, right)
@@ -41,7 +41,7 @@ def choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], 
         raise SourceError(
             "recording has no image topics of a left and a right camera",
             where=bag.paths[0],
-            got=list_topics(bag, _PICTURES) or "no image topic",
+            got=list_topics(bag, _IMAGES) or "no image topic",
             hint="name them with --left and --right",
         )
     best, *others = sorted(pairs, key=lambda pair: _rank(bag, pair[0]))
@@ -63,7 +63,7 @@ def list_others(bag: Bag, used: Sequence[str]) -> str:
 
     Other pairs of image topics are not among them; see `choose_topics`.
     """
-    images = [topic.name for topic in bag.topics.values() if topic.kind in _PICTURES]
+    images = [topic.name for topic in bag.topics.values() if topic.kind in _IMAGES]
     told = {*used, *(name for pair in find_partners(images) for name in pair)}
     others = sorted(
         t.name for t in bag.topics.values() if t.kind != CAMERA_INFO and t.name not in told
@@ -97,12 +97,12 @@ def _named(bag: Bag, settings: SourceSettings) -> tuple[str, str]:
     if left is None:
         left = next((one for one, other in find_partners(bag.topics) if other == right), None)
     for name in (left, right):
-        if name is None or name not in bag.topics or bag.topics[name].kind not in _PICTURES:
+        if name is None or name not in bag.topics or bag.topics[name].kind not in _IMAGES:
             raise SourceError(
                 "recording has no such image topic",
                 where=bag.paths[0],
                 got=name or "one name alone",
-                expected=list_topics(bag, _PICTURES) or "an image topic",
+                expected=list_topics(bag, _IMAGES) or "an image topic",
             )
     return str(left), str(right)
 

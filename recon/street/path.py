@@ -129,11 +129,11 @@ def _camera_pose(along_m: float, settings: StreetSettings, road: CentreLine) -> 
     drift = 0.2 * settings.sway * math.sin(along_m / 11.0 + phase)
     slope = 0.2 * settings.sway / 11.0 * math.cos(along_m / 11.0 + phase)
     nod = math.radians(0.25) * settings.sway * math.sin(along_m / 3.1 + phase)
-    lean = math.radians(0.15) * settings.sway * math.sin(along_m / 4.3 + 2.0 * phase)
+    tilt = math.radians(0.15) * settings.sway * math.sin(along_m / 4.3 + 2.0 * phase)
     heave = 0.015 * settings.sway * math.sin(along_m / 2.7 + 3.0 * phase)
     T = road.place(along_m, LANE_M + drift, settings.camera_height_m + heave)
     T[:3, :3] = T[:3, :3] @ se3.exp_so3(np.array([0.0, 0.0, math.atan(slope)])) @ R_STREET_LEVEL
     yaw, pitch, roll = np.radians([settings.yaw_deg, settings.pitch_deg, settings.roll_deg])
-    for turn in ((0.0, yaw, 0.0), (-pitch - nod, 0.0, 0.0), (0.0, 0.0, roll + lean)):
+    for turn in ((0.0, yaw, 0.0), (-pitch - nod, 0.0, 0.0), (0.0, 0.0, roll + tilt)):
         T[:3, :3] = T[:3, :3] @ se3.exp_so3(np.array(turn))
     return T

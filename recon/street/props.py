@@ -62,7 +62,7 @@ def _body(length: float, width: float, paint: Paint, van: bool) -> TriangleSoup:
 
 
 def _cabin(length: float, width: float, height: float, paint: Paint, van: bool) -> TriangleSoup:
-    """Windows that lean inwards, and a roof."""
+    """Windows that slant inwards, and a roof."""
     a, side, front = length / 2, 0.14, 0.75
     back = 0.12 if van else 0.4
     low = np.array([-a + (0.06 if van else 0.35), -width / 2 + 0.03, 0.9])

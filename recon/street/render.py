@@ -13,7 +13,7 @@ from recon.core.errors import SettingsError
 from recon.core.geometry.triangulation import disparity_from_depth
 from recon.core.values import DisparityTruth, StereoPair
 from recon.core.values.arrays import Float32, Float64, UInt8, freeze
-from recon.street.picture import record, take_picture
+from recon.street.image import record, take_image
 from recon.street.stage import Stage, make_stage
 from recon.street.street import StreetWorld
 from recon.street.view import View, stereo_views
@@ -92,8 +92,8 @@ class StreetCamera:
         smooth, threads = self.world.settings.smooth_edges, self.world.settings.threads
         # The two views are independent, so the number of threads does not affect the result.
         with ThreadPoolExecutor(max_workers=1 if threads == 1 else 2) as pool:
-            pictures = list(pool.map(lambda view: take_picture(stage, view, smooth), views))
-        left, right = (self._record(picture, index, side) for side, picture in enumerate(pictures))
+            images = list(pool.map(lambda view: take_image(stage, view, smooth), views))
+        left, right = (self._record(image, index, side) for side, image in enumerate(images))
         return StereoPair(
             left=left,
             right=right,
@@ -147,11 +147,11 @@ class StreetCamera:
         nonocc[known] = seen
         return DisparityTruth(disparity_from_depth(depth_m, camera), nonocc.reshape(depth_m.shape))
 
-    def _record(self, picture: Float64, index: int, side: int) -> UInt8:
+    def _record(self, image: Float64, index: int, side: int) -> UInt8:
         """Apply the sensor model of one camera to an image."""
         settings = self.world.settings
         return record(
-            picture,
+            image,
             gain=settings.right_gain if side else 1.0,
             offset_dn=settings.right_offset_dn if side else 0.0,
             noise_dn=settings.noise_dn,

@@ -17,7 +17,7 @@ from recon.io.images.image import read_image, write_image
 from recon.report import present_calibration
 from recon.rig.calibrate.board_views import find_views
 from recon.rig.calibrate.summary import tell_depths
-from recon.sources.picture_pairs import pair_pictures
+from recon.sources.image_pairs import pair_images
 from recon.stereo.rectify import Rectifier
 from tests.scenery.boards import board_rig, place_boards, render_views
 from tests.sources.drives import write_video
@@ -139,7 +139,7 @@ def test_a_charuco_board_of_the_older_pattern_is_found_out(tmp_path: Path) -> No
     for number, pair in enumerate(render_views(rig, older, views)):
         for side, picture in zip(("left", "right"), pair, strict=True):
             write_image(tmp_path / f"{side}{number}.png", picture)
-    pictures = pair_pictures(f"{tmp_path}/left*.png", f"{tmp_path}/right*.png")
+    pictures = pair_images(f"{tmp_path}/left*.png", f"{tmp_path}/right*.png")
     seen = find_views(pictures, parse_board("charuco:8x6:30mm:22mm:5x5_100"), 1)
     assert seen.board == older
     assert len(seen.views) == 2

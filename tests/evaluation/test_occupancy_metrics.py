@@ -84,7 +84,7 @@ def test_what_is_invented_behind_a_wall_is_wrong() -> None:
     assert found.voxels.recall == 1.0
 
 
-def test_voxels_that_no_picture_held_do_not_count() -> None:
+def test_voxels_that_no_image_held_do_not_count() -> None:
     beside, behind, far = (
         WALL + np.array([0, 80, 0]),
         WALL - np.array([100, 0, 0]),

@@ -74,7 +74,7 @@ def test_two_writes_are_the_same_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rgb", [None, MESH.rgb])
-def test_only_colours_from_pictures_are_unlit(tmp_path: Path, rgb: np.ndarray | None) -> None:
+def test_only_colours_from_images_are_unlit(tmp_path: Path, rgb: np.ndarray | None) -> None:
     write_glb(tmp_path / "a.glb", TriangleMesh(MESH.vertices, MESH.faces, rgb=rgb))
     document, _ = read_chunks(tmp_path / "a.glb")
     assert ("extensionsUsed" in document) == (rgb is not None)

@@ -18,7 +18,7 @@ SHAPES = st.one_of(
 )
 
 
-def picture(*shape: int, dtype: str = "u1") -> np.ndarray:
+def random_image(*shape: int, dtype: str = "u1") -> np.ndarray:
     top = np.iinfo(dtype).max
     return np.random.default_rng(7).integers(0, top, shape, dtype=dtype, endpoint=True)
 
@@ -41,7 +41,7 @@ def test_lossless_formats_give_back_every_level(
 def test_netpbm_gives_back_every_level(
     tmp_path: Path, suffix: str, shape: tuple[int, ...], dtype: str
 ) -> None:
-    image = picture(*shape, dtype=dtype)
+    image = random_image(*shape, dtype=dtype)
     write_image(tmp_path / f"a{suffix}", image)
     np.testing.assert_array_equal(read_levels(tmp_path / f"a{suffix}"), image)
 
@@ -61,7 +61,7 @@ def test_sixteen_bits_are_scaled_over_their_whole_range(tmp_path: Path) -> None:
 
 
 def test_alpha_is_dropped(tmp_path: Path) -> None:
-    bgra = picture(4, 5, 4)
+    bgra = random_image(4, 5, 4)
     cv2.imwrite(str(tmp_path / "a.png"), bgra)
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), bgra[:, :, 2::-1])
 
@@ -76,21 +76,21 @@ def test_jpeg_is_read_close_to_what_was_written(tmp_path: Path) -> None:
 def test_grey_stored_as_three_equal_channels_is_grey_and_colours_are_refused(
     tmp_path: Path,
 ) -> None:
-    grey = picture(4, 5)
+    grey = random_image(4, 5)
     write_image(tmp_path / "grey.png", np.repeat(grey[:, :, None], 3, axis=2))
     np.testing.assert_array_equal(read_grey_levels(tmp_path / "grey.png"), grey)
-    write_image(tmp_path / "rgb.png", picture(4, 5, 3))
+    write_image(tmp_path / "rgb.png", random_image(4, 5, 3))
     with pytest.raises(FormatError, match=r"rgb\.png: image is in colour"):
         read_grey_levels(tmp_path / "rgb.png")
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".pgm", ".tif"])
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.5, 0.9, 0.99])
-def test_a_truncated_picture_is_refused_wherever_it_was_cut(
+def test_a_truncated_image_is_refused_wherever_it_was_cut(
     tmp_path: Path, suffix: str, share: float
 ) -> None:
     path = tmp_path / f"000007{suffix}"
-    write_image(path, picture(60, 80))
+    write_image(path, random_image(60, 80))
     content = path.read_bytes()
     path.write_bytes(content[: max(1, int(len(content) * share))])
     with pytest.raises(FormatError, match=rf"000007\{suffix}: ") as caught:
@@ -100,7 +100,7 @@ def test_a_truncated_picture_is_refused_wherever_it_was_cut(
 
 @pytest.mark.parametrize("shape", [(16, 18), (16, 18, 3)])
 def test_a_bmp_is_read_whole_or_not_at_all(tmp_path: Path, shape: tuple[int, ...]) -> None:
-    pixels = picture(*shape)
+    pixels = random_image(*shape)
     content = cv2.imencode(".bmp", pixels if pixels.ndim == 2 else pixels[:, :, ::-1])[1].tobytes()
     path = tmp_path / "a.bmp"
     path.write_bytes(content)
@@ -117,7 +117,7 @@ def test_no_cut_passes_unseen(
     cut: int, suffix: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.getbasetemp() / f"cut{suffix}"
-    write_image(path, picture(16, 16, 3))
+    write_image(path, random_image(16, 16, 3))
     content = path.read_bytes()
     path.write_bytes(content[: -min(cut, len(content) - 1)])
     with pytest.raises(FormatError):
@@ -126,7 +126,7 @@ def test_no_cut_passes_unseen(
 
 def test_a_flipped_bit_in_a_png_is_seen(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
-    write_image(path, picture(20, 20))
+    write_image(path, random_image(20, 20))
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(bytes(content))
@@ -136,7 +136,7 @@ def test_a_flipped_bit_in_a_png_is_seen(tmp_path: Path) -> None:
 
 def test_a_jpeg_with_an_embedded_preview_is_still_seen_to_be_truncated(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
-    write_image(path, picture(40, 40))
+    write_image(path, random_image(40, 40))
     content = path.read_bytes()
     preview = b"\xff\xd8preview\xff\xd9"
     segment = b"\xff\xe1" + (len(preview) + 2).to_bytes(2, "big") + preview
@@ -172,7 +172,7 @@ def test_pgm_is_read_binary_and_ascii_with_comments(tmp_path: Path, content: byt
         (b"II*\x00garbage", "image cannot be decoded"),
     ],
 )
-def test_what_is_no_picture_is_one_clear_line(
+def test_what_is_no_image_is_one_clear_line(
     tmp_path: Path, content: bytes | None, message: str
 ) -> None:
     path = tmp_path / "left.png"
@@ -185,7 +185,7 @@ def test_what_is_no_picture_is_one_clear_line(
 def test_a_damaged_tiff_is_told_by_the_error_alone(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    write_image(tmp_path / "a.tif", picture(60, 80))
+    write_image(tmp_path / "a.tif", random_image(60, 80))
     content = (tmp_path / "a.tif").read_bytes()
     (tmp_path / "a.tif").write_bytes(content[: len(content) // 2])
     with pytest.raises(FormatError, match=r"a\.tif: image cannot be decoded"):
@@ -202,14 +202,14 @@ def test_floating_point_pixels_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "image", "error"),
     [
-        ("a.xyz", picture(3, 3), OutputError),
-        ("a", picture(3, 3), OutputError),
-        ("a.pgm", picture(3, 3, 3), OutputError),
-        ("a.ppm", picture(3, 3), OutputError),
-        ("a.jpg", picture(3, 3, dtype="u2"), OutputError),
-        ("a.png", picture(3, 3).astype(np.float32), ShapeError),
-        ("a.png", picture(3, 3, 4), ShapeError),
-        ("a.png", picture(0, 3), ShapeError),
+        ("a.xyz", random_image(3, 3), OutputError),
+        ("a", random_image(3, 3), OutputError),
+        ("a.pgm", random_image(3, 3, 3), OutputError),
+        ("a.ppm", random_image(3, 3), OutputError),
+        ("a.jpg", random_image(3, 3, dtype="u2"), OutputError),
+        ("a.png", random_image(3, 3).astype(np.float32), ShapeError),
+        ("a.png", random_image(3, 3, 4), ShapeError),
+        ("a.png", random_image(0, 3), ShapeError),
     ],
 )
 def test_what_a_format_cannot_hold_is_refused_and_nothing_is_written(

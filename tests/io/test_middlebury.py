@@ -29,14 +29,14 @@ vmax=60
 NAN = float("nan")
 
 
-def picture(height: int, width: int) -> np.ndarray:
+def image(height: int, width: int) -> np.ndarray:
     return np.random.default_rng(3).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
 def make_2014(folder: Path, **change: str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("im0.png", "im1.png"):
-        write_image(folder / name, picture(12, 24))
+        write_image(folder / name, image(12, 24))
     text = CALIB
     for key, value in change.items():
         kept = [line for line in text.splitlines() if not line.startswith(f"{key}=")]
@@ -124,7 +124,7 @@ def test_truth_of_2006_may_lie_above_folders_of_light_and_exposure(tmp_path: Pat
     inner = tmp_path / "Aloe" / "Illum1" / "Exp2"
     inner.mkdir(parents=True)
     for view in ("view1.png", "view5.png"):
-        write_image(inner / view, picture(370, 30))
+        write_image(inner / view, image(370, 30))
     write_image(tmp_path / "Aloe" / "disp1.png", np.full((370, 30), 9, np.uint8))
     (tmp_path / "Aloe" / "dmin.txt").write_text("150\n")
     scene = read_middlebury_scene(inner)
@@ -138,7 +138,7 @@ def test_truth_of_2006_may_lie_above_folders_of_light_and_exposure(tmp_path: Pat
 
 def test_tsukuba_as_published_is_read(tmp_path: Path) -> None:
     for column in (1, 2, 3, 4, 5):
-        write_image(tmp_path / f"scene1.row3.col{column}.ppm", picture(288, 384))
+        write_image(tmp_path / f"scene1.row3.col{column}.ppm", image(288, 384))
     write_image(tmp_path / "truedisp.row3.col3.pgm", np.full((288, 384), 160, np.uint8))
     truth = read_middlebury_scene(tmp_path).truth
     assert truth is not None
@@ -202,7 +202,7 @@ def test_older_scenes_are_told_apart_and_their_truth_scaled(
     generation: str,
 ) -> None:
     for name in (left, right):
-        write_image(tmp_path / name, picture(*size))
+        write_image(tmp_path / name, image(*size))
     write_image(tmp_path / truth, np.tile(np.arange(size[1]) % 200, (size[0], 1)).astype(np.uint8))
     scene = read_middlebury_scene(tmp_path)
     assert scene.generation == generation
@@ -213,7 +213,7 @@ def test_older_scenes_are_told_apart_and_their_truth_scaled(
 
 def test_a_scene_of_2005_gets_its_nominal_camera_from_dmin(tmp_path: Path) -> None:
     for name in ("view1.png", "view5.png"):
-        write_image(tmp_path / name, picture(370, 463))
+        write_image(tmp_path / name, image(370, 463))
     (tmp_path / "dmin.txt").write_text("200")
     scene = read_middlebury_scene(tmp_path)
     assert scene.camera == nominal_camera_2005(463, 370, 200, 3)
@@ -232,19 +232,19 @@ def test_nominal_camera_gives_one_depth_at_every_size() -> None:
 
 
 @pytest.mark.parametrize("missing", ["im0.png", "im1.png"])
-def test_a_missing_picture_is_named(tmp_path: Path, missing: str) -> None:
+def test_a_missing_image_is_named(tmp_path: Path, missing: str) -> None:
     folder = make_2014(tmp_path)
     (folder / missing).unlink()
     with pytest.raises(FormatError, match=rf"image is missing \(expected {missing}\)"):
         read_middlebury_scene(folder)
 
 
-def test_pictures_and_truth_of_different_sizes_are_named(tmp_path: Path) -> None:
+def test_images_and_truth_of_different_sizes_are_named(tmp_path: Path) -> None:
     folder = make_2014(tmp_path)
     write_pfm(folder / "disp0.pfm", np.ones((12, 23), dtype=np.float32))
     with pytest.raises(FormatError, match=r"disp0\.pfm: size.*got 23x12, expected 24x12"):
         read_middlebury_scene(folder)
-    write_image(folder / "im1.png", picture(12, 23))
+    write_image(folder / "im1.png", image(12, 23))
     with pytest.raises(FormatError, match=r"differ in size \(got im0 24x12, im1 23x12\)"):
         read_middlebury_scene(folder)
 

@@ -18,17 +18,17 @@ GRID = OccupancyGrid(CELLS, 0.2, (-3.4, 1.25))
 
 
 def test_a_map_is_read_back_as_it_was(tmp_path: Path) -> None:
-    picture, description = write_nav2(tmp_path / "map" / "grid", GRID)
-    assert (picture.name, description.name) == ("grid.pgm", "grid.yaml")
+    image, description = write_nav2(tmp_path / "map" / "grid", GRID)
+    assert (image.name, description.name) == ("grid.pgm", "grid.yaml")
     back = read_nav2(description)
     np.testing.assert_array_equal(back.cells, GRID.cells)
     assert back.resolution_m == GRID.resolution_m
     assert back.origin_m == GRID.origin_m
 
 
-def test_the_first_row_of_the_picture_has_the_largest_y(tmp_path: Path) -> None:
-    picture, _ = write_nav2(tmp_path / "grid", GRID)
-    header, pixels = picture.read_bytes()[:11], picture.read_bytes()[11:]
+def test_the_first_row_of_the_image_has_the_largest_y(tmp_path: Path) -> None:
+    image, _ = write_nav2(tmp_path / "grid", GRID)
+    header, pixels = image.read_bytes()[:11], image.read_bytes()[11:]
     assert header == b"P5\n4 3\n255\n"
     assert list(pixels) == [205, 254, 254, 254, 254, 254, 254, 254, 254, 254, 254, 0]
 
@@ -97,8 +97,8 @@ def test_a_damaged_yaml_file_is_a_format_error(tmp_path: Path, content: str) -> 
 
 
 @pytest.mark.parametrize("keep", [0, 5, 15])
-def test_a_truncated_picture_is_a_format_error(tmp_path: Path, keep: int) -> None:
-    picture, description = write_nav2(tmp_path / "grid", GRID)
-    picture.write_bytes(picture.read_bytes()[:keep])
+def test_a_truncated_image_is_a_format_error(tmp_path: Path, keep: int) -> None:
+    image, description = write_nav2(tmp_path / "grid", GRID)
+    image.write_bytes(image.read_bytes()[:keep])
     with pytest.raises(FormatError):
         read_nav2(description)

@@ -32,14 +32,14 @@ def turned(T: np.ndarray, angle_rad: float) -> np.ndarray:
 
 def test_the_true_motion_explains_nearly_every_patch(see: See) -> None:
     found = ask(see(np.eye(4)), see(STEP), STEP)
-    assert found.telling >= 20
+    assert found.informative >= 20
     assert found.share > 0.9
 
 
 @pytest.mark.parametrize("wrong", [np.eye(4), scaled(STEP, 2.0), invert(STEP), turned(STEP, 0.05)])
 def test_a_wrong_motion_does_not(wrong: np.ndarray, see: See) -> None:
     found = ask(see(np.eye(4)), see(STEP), wrong)
-    assert found.telling >= 8
+    assert found.informative >= 8
     assert found.share < MIN_SHARE
 
 
@@ -50,14 +50,14 @@ def test_another_exposure_changes_nothing(see: See) -> None:
     assert ask(before, dimmed, STEP).share == pytest.approx(ask(before, now, STEP).share, abs=0.05)
 
 
-def test_a_picture_without_texture_tells_nothing(blind: See) -> None:
+def test_an_image_without_texture_tells_nothing(blind: See) -> None:
     found = ask(blind(100), blind(100), np.eye(4))
-    assert found.telling == 0
+    assert found.informative == 0
     assert np.isnan(found.share)
 
 
-def test_a_picture_that_is_dark_now_tells_nothing(see: See, blind: See) -> None:
-    assert ask(see(np.eye(4)), blind(2), STEP).telling == 0
+def test_an_image_that_is_dark_now_tells_nothing(see: See, blind: See) -> None:
+    assert ask(see(np.eye(4)), blind(2), STEP).informative == 0
 
 
 def test_edges_of_one_direction_tell_nothing(see: See) -> None:
@@ -65,11 +65,11 @@ def test_edges_of_one_direction_tell_nothing(see: See) -> None:
     frame = see(np.eye(4))
     stripes = np.tile(np.where(np.arange(160) % 20 < 10, 60, 180)[:, None], (1, 400))
     striped = replace(frame, pair=replace(frame.pair, left=stripes.astype(np.uint8)))
-    assert ask(striped, striped, np.eye(4)).telling == 0
+    assert ask(striped, striped, np.eye(4)).informative == 0
 
 
 @pytest.mark.parametrize("sigma", [1.0, 3.0, 8.0])
-def test_the_noise_of_a_picture_is_found(sigma: float) -> None:
+def test_the_noise_of_an_image_is_found(sigma: float) -> None:
     ramp = np.tile(np.linspace(60, 190, 300), (200, 1))
     noisy = ramp + np.random.default_rng(3).normal(0.0, sigma, ramp.shape)
     grey = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
@@ -77,5 +77,5 @@ def test_the_noise_of_a_picture_is_found(sigma: float) -> None:
     assert noise_sigma(grey) == pytest.approx(sigma, rel=0.1, abs=0.3)
 
 
-def test_a_tiny_picture_has_the_least_noise() -> None:
+def test_a_tiny_image_has_the_least_noise() -> None:
     assert noise_sigma(np.zeros((2, 2), np.uint8)) == 0.5

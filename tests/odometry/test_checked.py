@@ -42,17 +42,17 @@ def half_a_metre(see: See) -> list[OdometryFrame]:
     return [see(T, index) for index, T in enumerate(forward(0.0, 0.5))]
 
 
-def test_a_motion_that_the_picture_bears_out_is_trusted(half_a_metre: list[OdometryFrame]) -> None:
+def test_a_motion_that_the_image_bears_out_is_trusted(half_a_metre: list[OdometryFrame]) -> None:
     sure = OdometryHealth(sigma_m=0.01)
     assert last_health(half_a_metre, forward(0.0, 0.5), sure) == sure
 
 
-def test_a_confident_motion_that_the_picture_is_against_is_not(
+def test_a_confident_motion_that_the_image_is_against_is_not(
     half_a_metre: list[OdometryFrame],
 ) -> None:
     health = last_health(half_a_metre, forward(0.0, 0.0), OdometryHealth(sigma_m=0.01))
     assert not health.ok
-    assert "of the picture moved like that" in health.notes[-1]
+    assert "of the image moved like that" in health.notes[-1]
 
 
 def test_a_motion_that_is_hardly_known_is_not(half_a_metre: list[OdometryFrame]) -> None:
@@ -61,7 +61,7 @@ def test_a_motion_that_is_hardly_known_is_not(half_a_metre: list[OdometryFrame])
     assert health.notes == ("the motion is known to 0.30 m only",)
 
 
-def test_a_motion_without_a_deviation_needs_a_picture_that_tells(blind: See) -> None:
+def test_a_motion_without_a_deviation_needs_an_image_that_tells(blind: See) -> None:
     frames = [blind(100, index) for index in range(2)]
     health = last_health(frames, forward(0.0, 0.5), OdometryHealth())
     assert not health.ok

@@ -11,7 +11,7 @@ import pytest
 from recon.core.geometry import se3
 from recon.core.values import Disparity, Reason, RectifiedPair, Trajectory
 from recon.places.detector import KeyframeMemory, LoopDetector
-from recon.places.drift import doubtful_path
+from recon.places.drift import path_lengths
 from recon.places.keyframe import Keyframe, make_keyframe
 from recon.places.settings import LoopSettings
 from recon.street.render import StreetCamera
@@ -85,7 +85,7 @@ class Filmed:
         """A detector that has seen some frames, their poses being those of ``path``."""
         settings = settings or LoopSettings()
         measured = ~np.isin(np.arange(len(path)), list(lost))
-        path_m = doubtful_path(path.T_world_camera, measured, settings.drift)
+        path_m = path_lengths(path.T_world_camera, measured, settings.drift)
         detector = LoopDetector(settings, KeyframeMemory())
         for k in frames:
             pair, disparity = self.frame(k)

@@ -10,7 +10,7 @@ import pytest
 from recon.core.errors import RegistrationError
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
-from recon.places.drift import Drift, doubtful_path, drift_over, is_possible
+from recon.places.drift import Drift, drift_over, is_possible, path_lengths
 from recon.places.graph import close_loops
 from recon.places.settings import DriftSettings, LoopSettings
 from recon.places.verify import Loop
@@ -55,7 +55,7 @@ def _loop(truth: Trajectory, first: int, last: int) -> Loop:
 
 def _close(odometry: Trajectory, loops: list[Loop], settings: LoopSettings = SETTINGS):
     measured = np.ones(len(odometry), np.bool_)
-    path_m = doubtful_path(odometry.T_world_camera, measured, settings.drift)
+    path_m = path_lengths(odometry.T_world_camera, measured, settings.drift)
     return close_loops(odometry, path_m, loops, settings)
 
 
@@ -159,7 +159,7 @@ def test_a_metre_without_measurement_counts_as_many():
     poses[:, 2, 3] = [0.0, 1.0, 2.0, 3.0]
     settings = DriftSettings(lost_factor=20.0, lost_m=2.0)
 
-    path_m = doubtful_path(poses, np.array([True, True, False, True]), settings)
+    path_m = path_lengths(poses, np.array([True, True, False, True]), settings)
     assert path_m.tolist() == [0.0, 1.0, 23.0, 24.0]
 
 

@@ -43,7 +43,7 @@ def test_features_are_spread_and_have_the_disparity_of_their_place(block):
     assert known.mean() > 0.3
 
 
-def test_a_picture_without_texture_gives_a_keyframe_without_features():
+def test_an_image_without_texture_gives_a_keyframe_without_features():
     grey = np.full((120, 320), 90, np.uint8)
     unknown = Disparity(
         np.full(grey.shape, np.nan, np.float32),

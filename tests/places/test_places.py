@@ -14,14 +14,14 @@ from recon.places.drift import drift_over
 from recon.places.places import Place, Places, WordIndex
 from recon.places.settings import LoopSettings
 
-pictures = st.lists(st.sets(st.integers(0, 30)), max_size=20)
+images = st.lists(st.sets(st.integers(0, 30)), max_size=20)
 
 
 def _sorted(words) -> np.ndarray:
     return np.array(sorted(words), np.uint32)
 
 
-@given(pictures, st.sets(st.integers(0, 30)))
+@given(images, st.sets(st.integers(0, 30)))
 def test_likeness_is_the_share_of_words_in_common(known, asked):
     index = WordIndex()
     for words in known:
@@ -34,15 +34,15 @@ def test_likeness_is_the_share_of_words_in_common(known, asked):
     np.testing.assert_allclose(index.likeness(_sorted(asked)), expected, rtol=1e-12)
 
 
-def test_likeness_is_that_of_the_right_picture_among_many():
+def test_likeness_is_that_of_the_right_image_among_many():
     rng = np.random.default_rng(0)
-    pictures = [np.unique(rng.integers(0, 1 << 20, 20, np.uint32)) for _ in range(900)]
+    images = [np.unique(rng.integers(0, 1 << 20, 20, np.uint32)) for _ in range(900)]
     index = WordIndex()
-    for words in pictures:
+    for words in images:
         index.add(words)
 
     for number in (0, 255, 256, 511, 512, 700, 899):
-        alike = index.likeness(pictures[number])
+        alike = index.likeness(images[number])
         assert alike[number] == 1.0
         assert np.delete(alike, number).max() < 0.2
 

@@ -55,7 +55,7 @@ def test_the_second_lap_runs_where_the_first_did(block):
     assert block.world.trajectory.distances_m[100] == pytest.approx(expected_m, rel=0.005)
 
 
-def test_the_same_place_gives_the_same_picture_a_lap_later(block):
+def test_the_same_place_gives_the_same_image_a_lap_later(block):
     assert np.array_equal(block.pair(3).left, block.pair(103).left)
     assert not np.array_equal(block.pair(3).left, block.pair(53).left)
 

@@ -27,7 +27,7 @@ def _points(depth_m: np.ndarray, camera) -> np.ndarray:
     return unproject(u.ravel(), v.ravel(), depth_m.ravel().astype(np.float64), camera)
 
 
-def test_pictures_are_colour_and_well_exposed(frame):
+def test_images_are_colour_and_well_exposed(frame):
     for image in (frame.pair.left, frame.pair.right):
         assert image.shape == (120, 320, 3)
         assert 70 < image.mean() < 180
@@ -127,7 +127,7 @@ def test_points_of_one_frame_are_found_by_the_next(street):
     assert same.mean() > 0.85
 
 
-def test_pictures_are_bit_identical_whatever_the_number_of_threads(street, small_settings):
+def test_images_are_bit_identical_whatever_the_number_of_threads(street, small_settings):
     again = StreetCamera(build_street(small_settings.model_copy(update={"threads": 1})))
     one, other = street.render(2), again.render(2)
     assert np.array_equal(one.pair.left, other.pair.left)
@@ -145,7 +145,7 @@ def test_a_longer_drive_goes_down_the_same_street(street, small_settings):
     np.testing.assert_allclose(here[near], there[near], rtol=1e-6)
 
 
-def test_noise_and_gain_change_pictures_but_not_truth(street, small_settings):
+def test_noise_and_gain_change_images_but_not_truth(street, small_settings):
     update = {"noise_dn": 3.0, "right_gain": 0.8, "right_offset_dn": 5.0}
     noisy = StreetCamera(
         dataclasses.replace(street.world, settings=small_settings.model_copy(update=update))

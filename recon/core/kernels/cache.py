@@ -21,19 +21,19 @@ _LISTENERS: Final[list[Callable[[str], None]]] = []
 
 
 @contextmanager
-def when_compiling(tell: Callable[[str], None]) -> Iterator[None]:
-    """Call ``tell`` with the name of each kernel that is about to be compiled, in any thread."""
-    _LISTENERS.append(tell)
+def when_compiling(notify: Callable[[str], None]) -> Iterator[None]:
+    """Call ``notify`` with the name of each kernel that is about to be compiled, in any thread."""
+    _LISTENERS.append(notify)
     try:
         yield
     finally:
-        _LISTENERS.remove(tell)
+        _LISTENERS.remove(notify)
 
 
 def announce(kernel: str) -> None:
-    """Tell those who listen that a kernel is not in the cache and is about to be compiled."""
-    for tell in tuple(_LISTENERS):
-        tell(kernel)
+    """Notify all listeners that a kernel is not in the cache and is about to be compiled."""
+    for notify in tuple(_LISTENERS):
+        notify(kernel)
 
 
 def cache_parent() -> Path:
@@ -57,13 +57,13 @@ def cache_folder(parent: Path, package: Path = _PACKAGE) -> Path:
 
     Args:
         parent: Holds the cache.
-        package: The kernels are in the folders ``kernels`` below it.
+        package: The kernels are in the folders ``kernels`` below it, and in folders of these.
 
     Returns:
         The folder, which numba makes when it first writes to it.
     """
     digest = hashlib.sha256()
-    for path in sorted(package.rglob("kernels/*.py")):
+    for path in sorted(path for path in package.rglob("*.py") if "kernels" in path.parts):
         digest.update(path.read_bytes())
     folder = parent / f"{_PREFIX}{digest.hexdigest()[:16]}"
     if not folder.is_dir():

@@ -14,7 +14,7 @@ import numpy as np
 from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import Float32
 from recon.evaluation.middlebury.confidence import confidence_figures
-from recon.evaluation.middlebury.rules import by_the_rules
+from recon.evaluation.middlebury.rules import values_compared
 from recon.evaluation.middlebury.scenes import ScoredScene
 from recon.evaluation.middlebury.score import Figures, dense_map, score_result
 from recon.io.files import naming
@@ -50,7 +50,7 @@ class SceneResult:
     def error_px(self) -> Float32:
         """float32 (H, W), dense absolute error in full-size pixels; NaN = truth unknown."""
         truth, rules = self.scene.truth.values, self.scene.rules
-        error = by_the_rules(dense_map(self.values), truth.shape, rules) - truth
+        error = values_compared(dense_map(self.values), truth.shape, rules) - truth
         return np.asarray(np.abs(error) * np.float32(rules.full_size_factor), dtype=np.float32)
 
 
@@ -112,7 +112,7 @@ class Bench:
 
 
 def _rates(disparity: Disparity) -> bool:
-    """Whether the matcher tells how sure it is of each match, and not the same of all."""
+    """Return whether the matcher gives each match a confidence of its own."""
     sure = disparity.confidence[disparity.valid]
     return bool(sure.size) and bool(sure.min() < sure.max())
 

@@ -13,7 +13,7 @@ from recon.evaluation.middlebury.scenes import ScoredScene, check_folder
 from recon.evaluation.middlebury.score import score_result
 from recon.io.files import naming, read_table
 from recon.io.images.pfm import read_pfm
-from recon.io.middlebury.layout import find_picture, scene_root
+from recon.io.middlebury.layout import find_image, scene_root
 
 _DISPARITY: Final = "disp0"
 _TIME: Final = "time"
@@ -86,7 +86,7 @@ def find_results(
 
 
 def _names(folders: Sequence[Path], taken: Sequence[str]) -> list[str]:
-    """The shortest ends of the paths that tell them apart."""
+    """Return the shortest ends of the paths that distinguish them."""
     paths = [folder.resolve() for folder in folders]
     if len(set(paths)) < len(paths):
         raise SettingsError("a folder of results is given twice", got=", ".join(map(str, folders)))
@@ -109,7 +109,7 @@ def _file_of(folder: Path, scene: str, path: Path) -> Path | None:
 
 def _submitted(folder: Path) -> Path | None:
     """The dense result in the folder of one scene; not its ground truth."""
-    truth = {"disp0GT.pfm"} if find_picture(folder, "im0") is None else {"disp0GT.pfm", "disp0.pfm"}
+    truth = {"disp0GT.pfm"} if find_image(folder, "im0") is None else {"disp0GT.pfm", "disp0.pfm"}
     files = {file.stem: file for file in folder.glob(f"{_DISPARITY}*.pfm")}
     found = [
         file

@@ -89,8 +89,8 @@ def estimate_at_truth_size(estimate: Disparity, shape: tuple[int, ...]) -> tuple
     return sized, step
 
 
-def by_the_rules(values: Float32, shape: tuple[int, ...], rules: MiddleburyRules) -> Float32:
-    """A result as it is compared: float32 (H, W), at the size of the truth, clipped, rounded.
+def values_compared(values: Float32, shape: tuple[int, ...], rules: MiddleburyRules) -> Float32:
+    """Return a result as it is compared: at the size of the truth, clipped, rounded.
 
     Args:
         values: float32 (h, w), pixels; NaN = none.
@@ -127,7 +127,7 @@ def evaluate_middlebury(
         EvaluationError: The sizes do not fit, or no pixel has a known truth.
     """
     known, rules = truth_of(truth), rules or MiddleburyRules()
-    compared = by_the_rules(values_of(estimate), known.values.shape, rules)
+    compared = values_compared(values_of(estimate), known.values.shape, rules)
     return evaluate_disparity(compared, known, occluded=occluded, scale=rules.full_size_factor)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.values import DisparityMetrics
 from recon.core.values.arrays import Float32
 from recon.evaluation import evaluate_depth, evaluate_middlebury
-from recon.evaluation.middlebury.rules import by_the_rules, weighted_mean
+from recon.evaluation.middlebury.rules import values_compared, weighted_mean
 from recon.evaluation.middlebury.scenes import ScoredScene
 from recon.stereo.match import fill_holes
 
@@ -86,6 +86,6 @@ def _depth(scene: ScoredScene, values: Float32, *, occluded: bool) -> Figures:
     """Errors in metres, where the scene has a calibration."""
     if scene.truth_camera is None:
         return {}
-    compared = by_the_rules(values, scene.truth.values.shape, scene.rules)
+    compared = values_compared(values, scene.truth.values.shape, scene.rules)
     metrics = evaluate_depth(compared, scene.truth, scene.truth_camera, occluded=occluded)
     return {"depth": asdict(metrics)}

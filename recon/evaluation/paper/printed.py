@@ -43,7 +43,7 @@ class PrintedSettings(Settings):
 class PrintedMatcher:
     """Takes the disparity with the smallest sum over a square patch; a `Matcher`.
 
-    A pixel has no value only where no patch lies within both pictures. Every other pixel keeps
+    A pixel has no value only where no patch lies within both images. Every other pixel keeps
     its minimum, however doubtful: confidence 1 says that nothing was asked, not that it is right.
 
     Args:
@@ -76,7 +76,7 @@ class PrintedMatcher:
         return _undoubted(values)
 
     def _smallest_sums(self, pair: RectifiedPair) -> Float32:
-        """float32, the disparity of each pixel whose patch lies within the left picture."""
+        """float32, the disparity of each pixel whose patch lies within the left image."""
         left, right = pair.left.astype(np.int32), pair.right.astype(np.int32)
         outside = self._settings.patch_px - 1
         size = (left.shape[0] - outside, left.shape[1] - outside)

@@ -1,4 +1,4 @@
-"""The twin of `recon.io.kernels.octree`: the same walk by recursion, for reading and testing."""
+"""Reference implementation of `recon.io.kernels.octree`: the same walk by recursion."""
 
 from __future__ import annotations
 

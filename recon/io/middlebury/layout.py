@@ -29,7 +29,7 @@ from typing import Final, Literal
 
 Generation = Literal["2001", "2003", "2005", "2014"]
 
-_PICTURES: Final = (".png", ".ppm", ".pgm", ".jpg")
+_IMAGES: Final = (".png", ".ppm", ".pgm", ".jpg")
 _2003_FACTORS: Final = {1800: 1, 900: 2, 450: 4}
 _2005_FULL_HEIGHT_PX: Final = 1110
 _EVAL3_FACTORS: Final = {"F": 1, "H": 2, "Q": 4}
@@ -79,17 +79,17 @@ def find_layout(folder: Path) -> Layout | None:
     marks = ("calib.txt", "disp0GT.pfm", "disp0.pfm")
     if any((folder / mark).is_file() for mark in marks):
         eval3 = (folder / "disp0GT.pfm").is_file()
-        return (_EVAL3 if eval3 else _2014) if _has_picture(folder, _2014) else None
+        return (_EVAL3 if eval3 else _2014) if _has_image(folder, _2014) else None
     known = (_2005, _2001_2003, _TSUKUBA, _TSUKUBA_2001)
-    layout = next((one for one in known if _has_picture(folder, one)), None)
-    if layout is None and _has_picture(folder, _MAP) and find_picture(folder, "disp0"):
+    layout = next((one for one in known if _has_image(folder, one)), None)
+    if layout is None and _has_image(folder, _MAP) and find_image(folder, "disp0"):
         return _MAP
     return layout
 
 
-def find_picture(folder: Path, stem: str) -> Path | None:
+def find_image(folder: Path, stem: str) -> Path | None:
     """The image file with that stem and any image suffix, or None."""
-    paths = (folder / f"{stem}{suffix}" for suffix in _PICTURES)
+    paths = (folder / f"{stem}{suffix}" for suffix in _IMAGES)
     return next((path for path in paths if path.is_file()), None)
 
 
@@ -145,5 +145,5 @@ def full_size_factor(layout: Layout, width_px: int, height_px: int, folder: Path
     return 1.0
 
 
-def _has_picture(folder: Path, layout: Layout) -> bool:
-    return any(find_picture(folder, stem) for stem in (layout.left, layout.right))
+def _has_image(folder: Path, layout: Layout) -> bool:
+    return any(find_image(folder, stem) for stem in (layout.left, layout.right))

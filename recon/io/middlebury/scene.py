@@ -18,8 +18,8 @@ from recon.io.middlebury.calib import (
 from recon.io.middlebury.layout import (
     Generation,
     Layout,
+    find_image,
     find_layout,
-    find_picture,
     full_size_factor,
     generation_of,
     levels_per_pixel,
@@ -110,7 +110,7 @@ def stand_in_camera(width_px: int, height_px: int, ndisp: int | None = None) -> 
 
 
 def _read_pair(path: Path, layout: Layout) -> StereoPair:
-    left, right = (_read_picture(path, stem) for stem in (layout.left, layout.right))
+    left, right = (_read_image(path, stem) for stem in (layout.left, layout.right))
     if left.shape != right.shape:
         raise FormatError(
             "left and right images differ in size",
@@ -120,8 +120,8 @@ def _read_pair(path: Path, layout: Layout) -> StereoPair:
     return StereoPair(left, right, name=path.name)
 
 
-def _read_picture(path: Path, stem: str) -> UInt8:
-    file = find_picture(path, stem)
+def _read_image(path: Path, stem: str) -> UInt8:
+    file = find_image(path, stem)
     if file is None:
         raise FormatError("image is missing", where=path, expected=f"{stem}.png")
     return read_image(file)

@@ -13,7 +13,7 @@ from recon.core.values.arrays import Bool, Float32
 from recon.io.images.disparity_png import read_disparity_png
 from recon.io.images.image import read_grey_levels
 from recon.io.images.pfm import read_pfm
-from recon.io.middlebury.layout import Layout, find_picture
+from recon.io.middlebury.layout import Layout, find_image
 
 _MASKS: Final = ("mask0nocc.png", "mask_nocc_derived.png", "v2eval/nonocc.png", "nonocc.png")
 _SEEN_BY_BOTH: Final = 255
@@ -74,7 +74,7 @@ def cross_check(left: Float32, right: Float32, tolerance_px: float) -> Bool:
 def _read_disparity(
     folder: Path, stem: str, scale: float | None, shape: tuple[int, int]
 ) -> Float32 | None:
-    path = folder / f"{stem}.pfm" if scale is None else find_picture(folder, stem)
+    path = folder / f"{stem}.pfm" if scale is None else find_image(folder, stem)
     if path is None or not path.is_file():
         return None
     values = read_pfm(path) if scale is None else read_disparity_png(path, scale=scale)

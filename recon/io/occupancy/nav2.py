@@ -46,14 +46,14 @@ def write_nav2(path: str | PathLike[str], grid: OccupancyGrid) -> tuple[Path, Pa
         OutputError: A file cannot be written.
     """
     stem = Path(path)
-    picture, description = (stem.with_name(f"{stem.name}.{end}") for end in ("pgm", "yaml"))
+    image, description = (stem.with_name(f"{stem.name}.{end}") for end in ("pgm", "yaml"))
     rows, columns = grid.cells.shape
-    with atomic_path(picture) as temporary, temporary.open("wb") as file:
+    with atomic_path(image) as temporary, temporary.open("wb") as file:
         file.write(f"P5\n{columns} {rows}\n255\n".encode())
         for last in range(rows, 0, -_STRIP_ROWS):
             file.write(_grey(grid.cells[max(0, last - _STRIP_ROWS) : last][::-1]).tobytes())
-    write_text(description, yaml.safe_dump(_describe(grid, picture.name), sort_keys=False))
-    return picture, description
+    write_text(description, yaml.safe_dump(_describe(grid, image.name), sort_keys=False))
+    return image, description
 
 
 @reader
@@ -69,8 +69,8 @@ def read_nav2(path: str | PathLike[str]) -> OccupancyGrid:
     """
     path = Path(path)
     fields = _fields(path)
-    picture = path.parent / str(fields["image"])
-    grey = _read_pgm(picture).astype(np.float64)
+    image = path.parent / str(fields["image"])
+    grey = _read_pgm(image).astype(np.float64)
     occupancy = grey / 255 if fields["negate"] else (255 - grey) / 255
     cells = np.full(grey.shape, UNKNOWN, np.int8)
     cells[occupancy > float(fields["occupied_thresh"])] = OCCUPIED

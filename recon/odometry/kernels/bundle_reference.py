@@ -13,7 +13,7 @@ Float64 = NDArray[np.float64]
 def linearise_reference(
     T_camera_world: Float64, uvd: Float64, xyz_world: Float64, model: BundleModel
 ) -> NormalEquations:
-    """The twin of `recon.odometry.kernels.bundle.linearise`, all observations at once."""
+    """Reference implementation of `recon.odometry.kernels.bundle.linearise`."""
     white, xyz = _white(T_camera_world, uvd, xyz_world, model)
     weight = 1.0 / (1.0 + np.square(white).sum(axis=2) / model.cauchy**2)
     J_camera = _projection_jacobian(xyz, model) * np.isfinite(uvd)[:, :, :, None]
@@ -60,7 +60,7 @@ def whole_system(normal: NormalEquations, damping: float) -> tuple[Float64, Floa
 def cost_reference(
     T_camera_world: Float64, uvd: Float64, xyz_world: Float64, model: BundleModel
 ) -> float:
-    """The twin of `recon.odometry.kernels.bundle.cost`."""
+    """Reference implementation of `recon.odometry.kernels.bundle.cost`."""
     white, _ = _white(T_camera_world, uvd, xyz_world, model)
     return float(np.log1p(np.square(white).sum(axis=2) / model.cauchy**2).sum())
 

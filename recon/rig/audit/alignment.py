@@ -1,7 +1,7 @@
 """Row errors of a rectified pair, and the small rotation that corrects them.
 
 Two of the right camera's three rotations move rows: pitch moves all rows alike, roll in proportion
-to the column. Yaw moves columns, which cannot be told from disparity.
+to the column. Yaw moves columns, which cannot be distinguished from disparity.
 """
 
 from __future__ import annotations

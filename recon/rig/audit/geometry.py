@@ -84,8 +84,8 @@ def _align(
     if len(features) < settings.min_features:
         return None
     alignment = align_rows(features.left_uv, features.right_uv, camera)
-    told = alignment is not None and alignment.agreeing >= settings.min_features
-    return alignment if told else None
+    enough = alignment is not None and alignment.agreeing >= settings.min_features
+    return alignment if enough else None
 
 
 def _disparities(

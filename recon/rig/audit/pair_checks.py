@@ -72,12 +72,12 @@ def find_pair_faults(
     """
     if not config.audit.quick:
         return ()
-    telling = _BY_PICTURES | _BY_CALIBRATION if metric else _BY_PICTURES
+    codes = _BY_PICTURES | _BY_CALIBRATION if metric else _BY_PICTURES
     try:
         audit = run_audit(_OnePair(given.pair, given.calibration), config, quick=True)
     except CalibrationError:
         return ()  # the run itself reports this later
-    return tuple(finding for finding in audit.findings if finding.code in telling)
+    return tuple(finding for finding in audit.findings if finding.code in codes)
 
 
 def check_found(

@@ -195,20 +195,20 @@ def _sample(grey: UInt8, places: Float64) -> Float64:
     return np.where(inside, grey[y, x].astype(np.float64), np.nan)
 
 
-def _marker_votes(pictures: Sequence[UInt8]) -> tuple[str, Counter[str]]:
+def _marker_votes(images: Sequence[UInt8]) -> tuple[str, Counter[str]]:
     """The dictionary with the most markers found, and the number found of each."""
     votes = Counter(
         {
-            name: sum(len(find_markers(picture, name)) for picture in pictures)
+            name: sum(len(find_markers(image, name)) for image in images)
             for name in dictionary_names()
         }
     )
     return votes.most_common(1)[0][0], votes
 
 
-def _check_no_markers(pictures: Sequence[UInt8], board: CalibrationBoard) -> None:
-    best, votes = _marker_votes(pictures)
-    if votes[best] >= _SURE * len(pictures):
+def _check_no_markers(images: Sequence[UInt8], board: CalibrationBoard) -> None:
+    best, votes = _marker_votes(images)
+    if votes[best] >= _SURE * len(images):
         raise CalibrationError(
             "the images show a board with markers (ChArUco)",
             got=f"markers of {best.lower()}",

@@ -13,7 +13,7 @@ from recon.core.errors import SourceError
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.io.images.image import write_image
 from recon.io.images.video import VIDEOS, VideoFile
-from recon.sources.picture_pairs import PicturePairs
+from recon.sources.image_pairs import ImagePairs
 from recon.sources.settings import SourceSettings
 from recon.sources.video import frames_of, open_videos, split_views, view_size
 from recon.stereo.rectify import to_grey
@@ -38,7 +38,7 @@ def is_video(where: str) -> bool:
 
 def pick_views(
     files: Sequence[Path], settings: SourceSettings, path: Callable[[str], Path]
-) -> PicturePairs:
+) -> ImagePairs:
     """Write the still frames of one or two videos that differ most as image files.
 
     Args:
@@ -70,7 +70,7 @@ def pick_views(
         pairs.append((path(f"views/left{number:06d}.png"), path(f"views/right{number:06d}.png")))
         write_image(pairs[-1][0], left)
         write_image(pairs[-1][1], right)
-    return PicturePairs(tuple(pairs), by_order=False)
+    return ImagePairs(tuple(pairs), by_order=False)
 
 
 def _frames(

@@ -20,7 +20,7 @@ from recon.rig.calibrate import (
     grown_size,
     orient_like,
 )
-from recon.sources.picture_pairs import PicturePairs
+from recon.sources.image_pairs import ImagePairs
 from recon.stereo.rectify import to_grey
 
 
@@ -54,7 +54,7 @@ class _Look:
     grown: tuple[int, int] | None
 
 
-def find_views(pictures: PicturePairs, board: CalibrationBoard, threads: int) -> BoardViews:
+def find_views(images: ImagePairs, board: CalibrationBoard, threads: int) -> BoardViews:
     """Find a board in all images of a rig.
 
     Raises:
@@ -62,7 +62,7 @@ def find_views(pictures: PicturePairs, board: CalibrationBoard, threads: int) ->
         SourceError: Images differ in size.
         CalibrationError: No pair shows the board, or it is of another size, which is named.
     """
-    files = [path for pair in pictures.pairs for path in pair]
+    files = [path for pair in images.pairs for path in pair]
     board, looks = _look_at_all(files, board, threads)
     size = _one_size(files, looks)
     if board.kind == "chess":
@@ -79,13 +79,13 @@ def find_views(pictures: PicturePairs, board: CalibrationBoard, threads: int) ->
         )
     empty = tuple(path for path, look in zip(files, looks, strict=True) if look.seen is None)
     views, pairs = {}, {}
-    for number, pair in enumerate(pictures.pairs):
+    for number, pair in enumerate(images.pairs):
         left, right = (look.seen for look in looks[2 * number : 2 * number + 2])
         if left is not None and right is not None:
             name = pair[0].name
             views[name] = View(name, (left, _same_order(left, right, board)))
             pairs[name] = pair
-    return BoardViews(tuple(views.values()), pairs, empty, size, len(pictures.pairs), board)
+    return BoardViews(tuple(views.values()), pairs, empty, size, len(images.pairs), board)
 
 
 def _look_at_all(

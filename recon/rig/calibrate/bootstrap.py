@@ -18,7 +18,7 @@ from recon.core.values.arrays import Float64
 from recon.rig.calibrate.bundle import RigState, moved, solve_scaled
 from recon.rig.calibrate.settings import CalibrationSettings
 from recon.rig.calibrate.stereo import StereoFit, stereo_of
-from recon.stereo.rectify.lens import project_into_picture, unproject
+from recon.stereo.rectify.lens import project_into_image, unproject
 
 # The depth error is evaluated on a 3 by 3 grid in the left image, in fractions of its size.
 _PLACES: Final = (0.2, 0.5, 0.8)
@@ -174,7 +174,7 @@ def _depth_error(
     width, height = rig.left.width_px, rig.left.height_px
     places = np.array([[x * width, y * height] for y in _PLACES for x in _PLACES])
     xyz = unproject(rig.left, places) * depth_m
-    right_px = project_into_picture(rig.right, apply(rig.T_right_left, xyz))
+    right_px = project_into_image(rig.right, apply(rig.T_right_left, xyz))
     shared = np.asarray(np.isfinite(right_px).all(axis=1))
     focal_px = float(rig.left.matrix[0, 0])
     matching_m = depth_m**2 * settings.match_sigma_px / (focal_px * rig.baseline_m)

@@ -68,8 +68,8 @@ def tell_depths(summary: dict[str, Any]) -> dict[str, str]:
     """The depth errors of a summary as text, one line per distance."""
     working = summary["working_error"]
     share = working["calibration_share"]
-    told = "unknown" if share is None else f"{100 * share:.1f} %"
-    lines = {f"depth error at the working distance of {working['distance_m']:.3g} m": told}
+    text = "unknown" if share is None else f"{100 * share:.1f} %"
+    lines = {f"depth error at the working distance of {working['distance_m']:.3g} m": text}
     for depth, cm in summary["depth_error_cm"].items():
         known = "no common view"
         if cm["calibration"] is not None:

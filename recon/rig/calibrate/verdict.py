@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from recon.core.values.board import CalibrationBoard
-from recon.sources.picture_pairs import PicturePairs
+from recon.sources.image_pairs import ImagePairs
 
 Verdict = Literal["good", "usable", "repeat"]
 Severity = Literal["fatal", "warning", "note"]
@@ -28,7 +28,7 @@ _COVERED: Final = 0.8
 _TILTED: Final = 0.5
 _FAR_TO_NEAR: Final = 2.0
 TILT_DEG: Final = 20.0
-"""A board turned away from the camera by this much tells the focal length."""
+"""A board turned away from the camera by this much determines the focal length."""
 _SHARP_PX: Final = 0.5
 _UNSURE_FOCAL: Final = 0.01  # half of the interval, relative to the focal length
 
@@ -58,13 +58,13 @@ def verdict_of_calibration(findings: Sequence[CalibrationFinding]) -> Verdict:
 
 
 def judge_calibration(
-    board: CalibrationBoard, pictures: PicturePairs, summary: dict[str, Any]
+    board: CalibrationBoard, images: ImagePairs, summary: dict[str, Any]
 ) -> list[CalibrationFinding]:
     """All findings of a calibration, the gravest first."""
     found = [
         *_find_depth_faults(board, summary),
         *_find_fit_faults(board, summary),
-        *_find_left_out(board, pictures, summary),
+        *_find_left_out(board, images, summary),
     ]
     if verdict_of_calibration(found) != "good":
         found += list(_advise(summary)) or [
@@ -130,18 +130,18 @@ def _find_fit_faults(
 
 
 def _find_left_out(
-    board: CalibrationBoard, pictures: PicturePairs, summary: dict[str, Any]
+    board: CalibrationBoard, images: ImagePairs, summary: dict[str, Any]
 ) -> Iterator[CalibrationFinding]:
     """What was left out or is not known; none of it makes the depth of this rig worse."""
     if not board.metric:
         text = "size of a square not given: every length is in squares; add it, as in :25mm"
         yield CalibrationFinding("square", "note", text)
-    if pictures.by_order:
-        text = "names do not tell which images belong together: paired by their order"
+    if images.by_order:
+        text = "names do not say which images belong together: paired by their order"
         yield CalibrationFinding("order", "note", text)
-    if pictures.lonely:
-        names = _listed([path.name for path in pictures.lonely])
-        text = f"images without a partner, left out: {len(pictures.lonely)} ({names})"
+    if images.lonely:
+        names = _listed([path.name for path in images.lonely])
+        text = f"images without a partner, left out: {len(images.lonely)} ({names})"
         yield CalibrationFinding("unpaired", "note", text)
     if summary["pictures_without_board"]:
         text = f"board not found in {_listed(summary['pictures_without_board'])}"

@@ -2,12 +2,12 @@
 
 from recon.rig.uncalibrated.rectify import (
     UncalibratedRectification,
-    rectify_pictures,
+    rectify_images,
     rectify_uncalibrated,
 )
 
 __all__ = [
     "UncalibratedRectification",
-    "rectify_pictures",
+    "rectify_images",
     "rectify_uncalibrated",
 ]

@@ -63,7 +63,7 @@ class UncalibratedRectification:
     disparity_px: tuple[float, float]
 
 
-def rectify_pictures(
+def rectify_images(
     pairs: Sequence[tuple[UInt8, UInt8]], count: int = MOST_FEATURES
 ) -> UncalibratedRectification:
     """Find homographies that align the rows of images of uncalibrated cameras.

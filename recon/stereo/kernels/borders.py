@@ -1,4 +1,4 @@
-"""Rows of pixels continued beyond the borders of a picture."""
+"""Rows of pixels continued beyond the borders of an image."""
 
 from __future__ import annotations
 

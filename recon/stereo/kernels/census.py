@@ -65,7 +65,7 @@ def write_planes(
     Args:
         grey: uint8 (H, W); continued by its border pixels.
         descriptor: How pixels are described.
-        place: Column of the planes that holds column 0 of the picture; may lie outside them.
+        place: Column of the planes that holds column 0 of the image; may lie outside them.
         first: First row to do.
         end: The row after the last.
         planes: Written: uint8 (H, ``descriptor.planes``, R), the rows.

@@ -24,7 +24,7 @@ from recon.stereo.kernels.simd import (
     LANES,
     absolute_difference,
     load,
-    minimum,
+    smaller,
     splat,
     store,
     widen,
@@ -63,13 +63,13 @@ class Search(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Both pictures, continued by their border pixels.
+    """Both images, continued by their border pixels.
 
     Attributes:
-        left: uint8 (H, C); column ``c`` is column ``c - radius`` of the picture.
+        left: uint8 (H, C); column ``c`` is column ``c - radius`` of the image.
         right: uint8 (H, C + n - 1), n = ndisp + 2·abs(slant); column ``c`` sees candidate
             ``k`` at column ``c + n - 1 - abs(slant) - k``.
-        width: Columns of the picture.
+        width: Columns of the image.
     """
 
     left: NDArray[np.uint8]
@@ -133,13 +133,13 @@ def lay_out(
     first: int,
     views: Views,
 ) -> None:
-    """Copy some rows of both pictures to where the search reads them.
+    """Copy some rows of both images to where the search reads them.
 
     Args:
         left: uint8 (N, W), the rows.
         right: uint8 (N, W).
         search: What will be searched.
-        first: Number of the first of them in the picture.
+        first: Number of the first of them in the image.
         views: Written: the rows.
     """
     places = views.right.shape[1] - views.left.shape[1] + 1
@@ -215,7 +215,7 @@ def offer_candidates(
     """From row ``y`` on offer some candidates, and sum these and those offered soon.
 
     Args:
-        views: The pictures.
+        views: The images.
         search: What is searched.
         now: bool (G,), the groups of candidates that are offered in row ``y``.
         soon: bool (G,), those offered when the half below row ``y`` will be an upper one.
@@ -267,7 +267,7 @@ def _add_row(views: Views, n: int, cost_cap: int, y: int, x0: int, scratch: Scra
     sums, left, right = scratch.columns, views.left[y], views.right[y]
     cap, shift = splat(np.uint8(cost_cap)), x0 + scratch.alive.size - 1 - n
     for c in range(0, scratch.stride, LANES):
-        plus = minimum(absolute_difference(load(left, x0 + c), load(right, shift + c)), cap)
+        plus = smaller(absolute_difference(load(left, x0 + c), load(right, shift + c)), cap)
         at = n * scratch.stride + c
         store(sums, at, load(sums, at) + widen(plus, sums))
 
@@ -290,8 +290,8 @@ def _slide_row(
         left, left_gone = load(views.left[come], c), load(views.left[gone], c)
         at, other = n0 * stride + c - x0, c + scratch.alive.size - 1 - n0
         for _ in range(n1 - n0):
-            plus = minimum(absolute_difference(left, load(right, other)), cap)
-            minus = minimum(absolute_difference(left_gone, load(right_gone, other)), cap)
+            plus = smaller(absolute_difference(left, load(right, other)), cap)
+            minus = smaller(absolute_difference(left_gone, load(right_gone, other)), cap)
             store(sums, at, load(sums, at) - widen(minus, sums) + widen(plus, sums))
             at, other = at + stride, other - 1
 

@@ -23,7 +23,7 @@ def average_opposite(
     """Average each pixel of some rows with the pairs of opposite neighbours that are near it.
 
     A pair is a neighbour and its mirror image about the pixel; it counts where both are within
-    the picture, have a value, and differ from the pixel's by ``largest_step`` or less. On a plane
+    the image, have a value, and differ from the pixel's by ``largest_step`` or less. On a plane
     the mean of a pair is the pixel's own value, so slopes are preserved even beside holes and
     steps, where a mean over all neighbours would be biased. Only the fields of a chessboard that
     have the pixel's colour are used: the noise of neighbours is correlated, so the others would

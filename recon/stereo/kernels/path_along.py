@@ -21,14 +21,14 @@ from recon.stereo.kernels.path_rows import Paths, next_cost, p2_between
 from recon.stereo.kernels.simd import (
     LANES,
     Vector,
-    broadcast_minimum,
+    broadcast_smallest,
+    larger,
     load,
     load_row,
-    maximum,
     mean,
-    minimum,
     put_after,
     put_before,
+    smaller,
     splat,
     store_row,
     transpose,
@@ -91,7 +91,7 @@ def follow_row(
 
     Args:
         costs: uint8 (P, C), cost of each candidate at each pixel.
-        grey: uint8 (W), the row of the left picture, of at most C columns.
+        grey: uint8 (W), the row of the left image, of at most C columns.
         paths: Candidates and penalties.
         scratch: Memory to work in; its ``means`` are the result.
     """
@@ -172,13 +172,13 @@ def _step(
         below, above = put_before(same, before), put_after(same, after)
         cost = next_cost(same, below, above, p1, limit, low, load_row(scratch.columns, x, k))
         _keep(cost, path, x, k, scratch, met)
-        fresh, before, same = minimum(fresh, cost), same, after
+        fresh, before, same = smaller(fresh, cost), same, after
     below = put_before(same, before)
     above = put_after(same, load_row(scratch.now, path, last + 2 * LANES))
     cost = next_cost(same, below, above, p1, limit, low, load_row(scratch.columns, x, last))
-    cost = maximum(cost, load(scratch.least, last))
+    cost = larger(cost, load(scratch.least, last))
     _keep(cost, path, x, last, scratch, met)
-    return broadcast_minimum(minimum(fresh, cost))
+    return broadcast_smallest(smaller(fresh, cost))
 
 
 @kernel(inline="always")

@@ -22,8 +22,8 @@ from recon.stereo.kernels.simd import (
     absolute_difference,
     differing_bits,
     load_row,
-    minimum,
     narrow,
+    smaller,
     splat,
     store_row,
     widen,
@@ -37,13 +37,13 @@ BLOCK: Final = 16
 
 
 class Views(NamedTuple):
-    """Both pictures, as the costs compare them.
+    """Both images, as the costs compare them.
 
     Attributes:
-        grey: uint8 (H, W), the left picture.
+        grey: uint8 (H, W), the left image.
         left: uint8 (H, 1 + B, R), its planes: the gradient, and B planes of census bits. Columns
             are shifted by `column_offsets`.
-        right: uint8 (H, 1 + B, R + P - 1), those of the right picture.
+        right: uint8 (H, 1 + B, R + P - 1), those of the right image.
     """
 
     grey: NDArray[np.uint8]
@@ -150,10 +150,10 @@ def write_views(
     rows: range,
     views: Views,
 ) -> None:
-    """Write the planes of some rows of both pictures.
+    """Write the planes of some rows of both images.
 
     Args:
-        right: uint8 (H, W), the right picture; the left one is in ``views``.
+        right: uint8 (H, W), the right image; the left one is in ``views``.
         descriptor: How pixels are described.
         offsets: From `column_offsets`.
         rows: The rows.
@@ -164,7 +164,7 @@ def write_views(
 
 
 def column_offsets(window: Window, ndisp: int, minimum: int) -> tuple[int, int]:
-    """Column of the planes that holds column 0 of the picture, of the left and the right one.
+    """Column of the planes that holds column 0 of the image, of the left and the right one.
 
     Column ``x`` of the left planes is compared, as candidate ``k``, with column ``x - k + P - 1``
     of the right ones.
@@ -194,7 +194,7 @@ def write_costs(
     """Write the costs of some columns of rows ``top`` to ``bottom - 1``.
 
     Args:
-        views: The pictures.
+        views: The images.
         window: What a cost sums up.
         columns: First column and the one after the last.
         top: First row.
@@ -226,7 +226,7 @@ def _write_block(
     rows: CostRows,
     costs: NDArray[np.uint8],
 ) -> None:
-    """Move the window down to row ``y`` (clamped to the picture), and write its costs (P, C).
+    """Move the window down to row ``y`` (clamped to the image), and write its costs (P, C).
 
     After ``2·rows_radius + 1`` calls for successive rows, they are those of the middle row.
     """
@@ -263,7 +263,7 @@ def _compare(
         bits_2, bits_3 = load_row(left, 2, here), load_row(left, 3, here)
         for k in range(first, end):
             other = load_row(right, 0, there - k)
-            apart = minimum(absolute_difference(gradient, other), cap)
+            apart = smaller(absolute_difference(gradient, other), cap)
             one = differing_bits(bits, load_row(right, 1, there - k))
             two = differing_bits(bits_2, load_row(right, 2, there - k))
             three = differing_bits(bits_3, load_row(right, 3, there - k))

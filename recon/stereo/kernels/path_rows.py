@@ -26,7 +26,7 @@ from recon.stereo.kernels.simd import (
     Vector,
     load_row,
     mean,
-    minimum,
+    smaller,
     splat,
     store_row,
 )
@@ -107,7 +107,7 @@ def advance(
 
     Args:
         costs: uint8 (P, C), cost of each candidate at each pixel.
-        grey: uint8 (W), the row of the left picture.
+        grey: uint8 (W), the row of the left image.
         before: uint8 (W), the row that the paths come from.
         paths: Candidates and penalties.
         row: Path costs of the row before; those of this row are written.
@@ -181,8 +181,8 @@ def next_cost(
         low: That lowest cost, which is subtracted to keep costs bounded.
         cost: Costs of the candidate at the next pixel.
     """
-    beside = minimum(below, above) + p1
-    return minimum(minimum(same, limit), beside) - low + cost
+    beside = smaller(below, above) + p1
+    return smaller(smaller(same, limit), beside) - low + cost
 
 
 @kernel
@@ -201,7 +201,7 @@ def _advance_from_right(
             above = load_row(path, k + 2, there)
             cost = next_cost(same, below, above, p1, limit, low, load_row(costs, k, x))
             store_row(path, k + 1, here, cost)
-            fresh, below, same = minimum(fresh, cost), same, above
+            fresh, below, same = smaller(fresh, cost), same, above
         store_row(row.below, FROM_RIGHT, x, below)
         store_row(now, FROM_RIGHT, here, fresh)
 
@@ -241,8 +241,8 @@ def _advance_others(
                     middle = mean(load_row(means, k, here), middle)
                     middle = mean(load_row(along, k, x), middle)
                 store_row(means, k, here, middle)
-            fresh, below, same = minimum(fresh, cost), same, above
-            fresh_0, below_0, same_0 = minimum(fresh_0, cost_0), same_0, above_0
+            fresh, below, same = smaller(fresh, cost), same, above
+            fresh_0, below_0, same_0 = smaller(fresh_0, cost_0), same_0, above_0
         store_row(row.below, FROM_LEFT, x, below)
         store_row(now, FROM_LEFT, here, fresh)
         store_row(row.below, STRAIGHT, x, below_0)

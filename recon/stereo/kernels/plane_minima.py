@@ -17,7 +17,7 @@ from recon.stereo.kernels.path_costs import aligned, padded
 from recon.stereo.kernels.simd import (
     LANES,
     load_row,
-    minimum,
+    smaller,
     splat,
     store_row,
     where_less,
@@ -35,12 +35,12 @@ BLOCK: Final = 256
 PARTS: Final = 8
 """Units of `Minima.costs` per unit of these costs."""
 
-LOWEST, WHICH, BEFORE, AFTER, SECOND, LAST, PRIOR, SETTLED = range(8)
+LOWEST, WHICH, BEFORE, AFTER, SECOND, LAST, PRIOR, EARLIER = range(8)
 """Rows of what is known of a column.
 
 LOWEST is the lowest cost so far and WHICH the number of its candidate in the block; BEFORE and
 AFTER are the costs of the candidates beside it, SECOND the lowest cost two or more candidates away.
-LAST is the cost of the last candidate, and PRIOR the lowest cost before that one. SETTLED is the
+LAST is the cost of the last candidate, and PRIOR the lowest cost before that one. EARLIER is the
 lowest cost of the earlier blocks.
 """
 
@@ -62,13 +62,13 @@ class Band(NamedTuple):
 
 
 class Best(NamedTuple):
-    """The best so far, for bands of C columns of a picture of W columns.
+    """The best so far, for bands of C columns of an image of W columns.
 
     Attributes:
-        left: uint8 (8, C), what is known of the columns of the left view, `LOWEST` to `SETTLED`.
+        left: uint8 (8, C), what is known of the columns of the left view, `LOWEST` to `EARLIER`.
         left_which: uint16 (C), candidate of the lowest cost.
         right: uint8 (8, at least W), as ``left`` for the right view; only `LOWEST`, `WHICH` and
-            `SETTLED` are used.
+            `EARLIER` are used.
         right_lowest: uint8 (N, at least W), lowest cost in N rows of the right view over the bands
             done so far.
     """
@@ -103,7 +103,7 @@ def choose_row(
 ) -> None:
     """Choose the best candidate of each pixel of a row of a band, in both views.
 
-    Candidates whose right pixel lies outside the picture do not exist; of equal costs the
+    Candidates whose right pixel lies outside the image do not exist; of equal costs the
     smaller candidate wins. The bands of a row are done from left to right.
 
     Args:
@@ -124,13 +124,13 @@ def choose_row(
     columns, which = band.end - band.start, minima.right_winner[y]
     best.left[:] = np.uint8(NONE)
     best.left_which[:] = np.uint16(ndisp)
-    best.right[LOWEST] = best.right[SETTLED] = best.right_lowest[place]
+    best.right[LOWEST] = best.right[EARLIER] = best.right_lowest[place]
     for first in range(0, ndisp, BLOCK):
         end = min(first + BLOCK, ndisp)
         _search_left(costs, first, end, best.left)
-        _settle(best.left, first, best.left_which[:columns])
+        _merge_block(best.left, first, best.left_which[:columns])
         _search_right(costs, minimum, first, end, band, best.right)
-        _settle(best.right, first, which)
+        _merge_block(best.right, first, which)
     best.right_lowest[place] = best.right[LOWEST]
     _write_row(best, ndisp, y, band, minima)
 
@@ -161,13 +161,13 @@ def _search_left(costs: NDArray[np.uint8], first: int, end: int, known: NDArray[
         for k in range(first, end):
             cost = load_row(costs, k, x + MARGIN)
             # Where the last candidate is the best so far, this one is beside it: no second best.
-            second = where_less(last, prior, second, minimum(second, cost))
+            second = where_less(last, prior, second, smaller(second, cost))
             second = where_less(cost, lowest, prior, second)
             after = where_less(last, prior, cost, after)
             before = where_less(cost, lowest, last, before)
             which = where_less(cost, lowest, index, which)
             last, prior = cost, lowest
-            lowest, index = minimum(lowest, cost), index + one
+            lowest, index = smaller(lowest, cost), index + one
         store_row(known, LOWEST, x, lowest)
         store_row(known, WHICH, x, which)
         store_row(known, BEFORE, x, before)
@@ -198,19 +198,19 @@ def _search_right(
         for k in range(start, stop):
             cost = load_row(costs, k, MARGIN + ahead + k)
             which = where_less(cost, lowest, index, which)
-            lowest, index = minimum(lowest, cost), index + one
+            lowest, index = smaller(lowest, cost), index + one
         store_row(known, LOWEST, x, lowest)
         store_row(known, WHICH, x, which)
 
 
 @kernel
-def _settle(known: NDArray[np.uint8], first: int, which: NDArray[np.uint16]) -> None:
+def _merge_block(known: NDArray[np.uint8], first: int, which: NDArray[np.uint16]) -> None:
     """Take over the winners of a block that beat those of the blocks before."""
-    lowest, settled, place = known[LOWEST], known[SETTLED], known[WHICH]
+    lowest, earlier, place = known[LOWEST], known[EARLIER], known[WHICH]
     for x in range(which.size):
         here = np.uint16(np.uint16(place[x]) + np.uint16(first))
-        which[x] = here if lowest[x] < settled[x] else which[x]
-        settled[x] = lowest[x]
+        which[x] = here if lowest[x] < earlier[x] else which[x]
+        earlier[x] = lowest[x]
 
 
 @kernel

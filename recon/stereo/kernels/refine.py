@@ -96,7 +96,7 @@ def refine_minima(
     """Check the minima of some rows, and refine those that pass.
 
     The first of these that applies is the reason of a pixel: no candidate, or one that ends at
-    the border of the right picture (BORDER); too little texture (LOW_TEXTURE); the minimum at
+    the border of the right image (BORDER); too little texture (LOW_TEXTURE); the minimum at
     an end of what was searched (OUT_OF_RANGE); the right view disagrees, and none of its pixels is
     matched here (OCCLUDED) or one is (LEFT_RIGHT); a second best that is too good (AMBIGUOUS).
 
@@ -119,7 +119,7 @@ def refine_minima(
     Args:
         minima: What the search found.
         texture: float32 (end - first, W), of those rows, in the unit of ``rules.texture``; NaN = no
-            picture there (BORDER).
+            image there (BORDER).
         rules: Thresholds.
         first: First row to do.
         end: The row after the last.

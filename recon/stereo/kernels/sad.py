@@ -36,8 +36,8 @@ from recon.stereo.kernels.simd import (
     LANES,
     Vector,
     load,
-    minimum,
     ramp,
+    smaller,
     splat,
     store,
     where_equal,
@@ -63,16 +63,16 @@ def sad_minima(
 
     Candidate ``k`` of a pixel is the disparity ``minimum + k``. Its cost is the sum of
     ``min(|left - right|, cost_cap)`` over both halves of the window (the middle row is in both,
-    so it counts twice), the pictures continued by their border pixels; with a slant it is the
+    so it counts twice), the images continued by their border pixels; with a slant it is the
     smaller of that and of the same sum where the upper half takes candidate ``k - slant`` and the
     lower ``k + slant``, as on the ground under a camera. Candidates whose right pixel lies outside
-    the picture do not exist, nor those that a tile is not offered. Of equal costs the smaller
+    the image do not exist, nor those that a tile is not offered. Of equal costs the smaller
     disparity wins. The costs before and after the best are those of the window that won, the
     upright one if both did. A pixel of the right view is matched to the left pixel that chose it
     at the least cost.
 
     Args:
-        views: The pictures, from `lay_out`.
+        views: The images, from `lay_out`.
         search: What is searched.
         tiles: Which candidates are offered where.
         first: First row to do.
@@ -224,13 +224,13 @@ def _weigh(
     winner, best, second, upright_best = found[:4]
     upright_before, slant_before, upright_after, slant_after = found[4:]
     none, last = splat(np.uint16(NO_COST)), number - splat(np.uint16(1))
-    cost = minimum(upright, slanted)
+    cost = smaller(upright, slanted)
     upright_after = where_equal(winner, last, upright, upright_after)
     slant_after = where_equal(winner, last, slanted, slant_after)
-    second = where_equal(winner, last, second, minimum(second, cost))
+    second = where_equal(winner, last, second, smaller(second, cost))
     return (
         where_less(cost, best, number, winner),
-        minimum(best, cost),
+        smaller(best, cost),
         where_less(cost, best, prior, second),
         where_less(cost, best, upright, upright_best),
         where_less(cost, best, upright_last, upright_before),

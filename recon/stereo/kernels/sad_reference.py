@@ -14,7 +14,7 @@ from recon.stereo.kernels.tiles_reference import offered_reference
 def sad_minima_reference(
     left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search, tiles: Tiles
 ) -> Minima:
-    """All rows of `recon.stereo.kernels.sad.sad_minima`, from pictures (H, W)."""
+    """All rows of `recon.stereo.kernels.sad.sad_minima`, from images (H, W)."""
     upright = window_costs_reference(left, right, search._replace(slant=0))
     slanted = window_costs_reference(left, right, search)
     lowest = np.minimum(upright, slanted)
@@ -32,7 +32,7 @@ def sad_minima_reference(
 def window_costs_reference(
     left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search
 ) -> NDArray[np.int64]:
-    """int64 (H, W, ndisp), the cost of each candidate, as if both pictures went on for ever."""
+    """int64 (H, W, ndisp), the cost of each candidate, as if both images went on for ever."""
     height, width = left.shape
     costs = np.zeros((height, width, search.ndisp), np.int64)
     candidates = search.minimum + np.arange(search.ndisp)

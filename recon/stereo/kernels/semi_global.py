@@ -80,13 +80,13 @@ class BandScratch(NamedTuple):
 
 
 def empty_scratch(width: int, paths: Paths) -> Scratch:
-    """Memory for strips of pictures of a width."""
+    """Memory for strips of images of a width."""
     columns = band_columns(width, paths)
     return Scratch(aligned((scratch_bytes(columns, paths),)), columns)
 
 
 def band_columns(width: int, paths: Paths) -> int:
-    """Columns of the bands of a picture."""
+    """Columns of the bands of an image."""
     most = SCRATCH_BYTES // (paths.ndisp * (2 * ROWS + paths.overlap)) // LANES * LANES
     # A band should keep more columns than it shares with its neighbours.
     least = padded(4 * paths.side_overlap + 1)
@@ -126,12 +126,12 @@ def semi_global_minima(
     """Find the best candidate of each pixel of a strip, in the left and the right view.
 
     Candidate ``k`` of a pixel is the disparity ``minimum + k``. Its cost is the mean of the costs
-    of the paths that end there. A path starts at the border of the picture or, if that is nearer,
+    of the paths that end there. A path starts at the border of the image or, if that is nearer,
     ``overlap`` rows above the strip (from above), ``overlap`` rows below each block (from below) or
     ``side_overlap`` columns beside each band (from the sides).
 
     Args:
-        views: The pictures.
+        views: The images.
         window: What the cost of a pixel sums up.
         paths: Candidates and penalties.
         strip: The rows.
@@ -150,7 +150,7 @@ def semi_global_minima(
 
 
 def bands_of(width: int, columns: int, window: Window, paths: Paths) -> list[Band]:
-    """Divide a picture into bands that overlap, each of at most so many columns."""
+    """Divide an image into bands that overlap, each of at most so many columns."""
     if columns < width:
         # Together with the sides of its windows, a band fills whole vectors.
         columns -= 2 * window.radius

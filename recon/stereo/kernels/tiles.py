@@ -1,6 +1,6 @@
-"""Which candidates are searched in which tile of a picture.
+"""Which candidates are searched in which tile of an image.
 
-A search at half size costs an eighth and tells which disparities occur in each part of a picture.
+A search at half size costs an eighth and shows which disparities occur in each part of an image.
 Only those are worth searching at full size.
 """
 
@@ -58,7 +58,7 @@ def make_tiles(shape: tuple[int, int], size: tuple[int, int], ndisp: int) -> Til
     """Tiles that are offered every candidate.
 
     Args:
-        shape: Rows and columns of the picture.
+        shape: Rows and columns of the image.
         size: Rows and columns of a tile.
         ndisp: Number of candidates.
     """
@@ -79,7 +79,7 @@ def offer_supported(
     """Offer the tiles of some rows those groups of candidates that matches at half size support.
 
     Args:
-        halved: float32 (h, w), disparities of the pictures at half size; NaN = no match.
+        halved: float32 (h, w), disparities of the images at half size; NaN = no match.
         minimum: Disparity of candidate 0 at full size.
         ndisp: Number of candidates at full size.
         support: How much support is needed.

@@ -36,13 +36,13 @@ def texture(pair: RectifiedPair, window: tuple[int, int], least: float, rows: ra
     """Mean size of the horizontal gradient in the window around each pixel of the left view.
 
     Args:
-        pair: The pictures.
+        pair: The images.
         window: Width and height of the window, pixels.
         least: The threshold; at 0 the texture is not computed, but returned as 0.
         rows: N consecutive rows.
 
     Returns:
-        float32 (N, W) of those rows, grey levels per pixel; NaN = no picture.
+        float32 (N, W) of those rows, grey levels per pixel; NaN = no image.
     """
     width, reach = pair.left.shape[1], window[1] // 2
     mean = np.zeros((len(rows), width), np.float32)
@@ -64,7 +64,7 @@ def texture(pair: RectifiedPair, window: tuple[int, int], least: float, rows: ra
 
 
 def _around(rows: range, reach: int, height: int) -> range:
-    """Rows, and those around them that the picture has."""
+    """Rows, and those around them that the image has."""
     return range(max(rows.start - reach, 0), min(rows.stop + reach, height))
 
 

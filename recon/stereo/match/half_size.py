@@ -1,4 +1,4 @@
-"""Search at half size, which tells where to search at full size.
+"""Search at half size, which decides where to search at full size.
 
 It takes an eighth of the time. Its reliable matches give the disparities of each tile; a match at
 another disparity would more often than not be wrong, so a search among fewer candidates is not only
@@ -42,7 +42,7 @@ def halve(image: UInt8) -> UInt8:
 
 
 def zero_texture(width: int, valid: Bool | None, rows: range) -> Float32:
-    """float32 (N, w), texture for checks that ask for none: 0, NaN where there is no picture."""
+    """float32 (N, w), texture for checks that ask for none: 0, NaN where there is no image."""
     texture = np.zeros((len(rows), width), np.float32)
     if valid is not None:
         texture[~valid[2 * rows.start : 2 * rows.stop : 2, ::2]] = np.nan

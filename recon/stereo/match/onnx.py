@@ -84,7 +84,7 @@ class OnnxMatcher:
             SettingsError: No network is given.
             MissingDependencyError: onnxruntime is not installed.
             FormatError: The network cannot be loaded.
-            MatchingError: It does not fit the pictures, or gives no disparity map.
+            MatchingError: It does not fit the images, or gives no disparity map.
         """
         s, network = self._settings, self._loaded()
         declared = network.input_shapes

@@ -2,7 +2,7 @@
 
 What changes at this border: OpenCV gives 16ths of a pixel, and ``(minimum - 1) · 16`` where it
 found nothing; it skips the columns that the whole range does not fit, unless `OpencvSettings.pad`
-widens the pictures.
+widens the images.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class OpencvSgbmMatcher:
 
 @dataclass(frozen=True)
 class _Margins:
-    """Pixels added to each side of both pictures."""
+    """Pixels added to each side of both images."""
 
     rows: int
     left: int
@@ -159,12 +159,12 @@ class _Margins:
         return cls(margin, margin + max(0, high), margin + max(0, -low))
 
     def widen(self, image: UInt8) -> UInt8:
-        """The picture with its edges repeated."""
+        """The image with its edges repeated."""
         sides = (self.rows, self.rows, self.left, self.right)
         return np.asarray(cv2.copyMakeBorder(image, *sides, cv2.BORDER_REPLICATE))
 
     def crop(self, image: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
-        """What `widen` made of a picture of that shape, without the edges."""
+        """What `widen` made of an image of that shape, without the edges."""
         height, width = shape
         rows, columns = slice(self.rows, self.rows + height), slice(self.left, self.left + width)
         return image[rows, columns]
@@ -173,7 +173,7 @@ class _Margins:
 def _match(pair: RectifiedPair, engine: Any, s: OpencvSettings, margins: _Margins) -> Disparity:
     """Let OpenCV match, and say of each pixel without a value why, as far as that is known.
 
-    OpenCV does not tell which of its own checks (texture, uniqueness, left against right) a pixel
+    OpenCV does not report which of its own checks (texture, uniqueness, left against right) a pixel
     failed: such pixels are AMBIGUOUS.
     """
     try:

@@ -15,7 +15,7 @@ from recon.stereo.match.sad import SadMatcher, SadSettings
 from recon.stereo.match.search import usual_ndisp
 
 _COARSE_WIDTH_PX: Final = 200
-"""Approximate width of the small pair; pictures are reduced by whole factors."""
+"""Approximate width of the small pair; images are reduced by whole factors."""
 
 _STEP: Final = 16
 _SHARE: Final = 99.5
@@ -56,7 +56,7 @@ class AutoRangeMatcher:
 def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
     """Number of disparities that a pair needs, from matching it at a small size.
 
-    The small pair is searched up to half its width. Its trusted disparities tell how near the scene
+    The small pair is searched up to half its width. Its trusted disparities show how near the scene
     is; a tenth and one pixel of the small pair are added, because small objects may be nearer.
 
     Args:
@@ -65,7 +65,7 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
 
     Returns:
         A multiple of 16: at least `usual_ndisp`, which it is where too little can be trusted, and
-        at most the picture's width (rounded up).
+        at most the image's width (rounded up).
     """
     height, width = pair.left.shape
     factor = max(1, width // _COARSE_WIDTH_PX)

@@ -82,7 +82,7 @@ class SadSettings(MeasuredSettings):
 class SadMatcher:
     """Compares windows of gradients and checks what it finds; a `Matcher`.
 
-    Every pixel is searched, those at the left border as far as the right picture reaches.
+    Every pixel is searched, those at the left border as far as the right image reaches.
 
     Args:
         settings: What to search and what to believe.
@@ -100,7 +100,7 @@ class SadMatcher:
         """Match one rectified pair.
 
         Raises:
-            MatchingError: No disparity of the range lies within the picture.
+            MatchingError: No disparity of the range lies within the image.
         """
         search, rules = self._plan(pair.camera)
         s = self._settings

@@ -1,6 +1,6 @@
 """Memory that a matcher keeps from one pair to the next.
 
-The system clears new memory page by page when it is first touched: for pictures that takes longer
+The system clears new memory page by page when it is first touched: for images that takes longer
 than some searches.
 """
 

@@ -73,11 +73,11 @@ class SearchSettings(Settings):
     )
 
     def ndisp_for(self, camera: RectifiedCamera) -> int:
-        """Number of disparities to search in the pictures of a camera."""
+        """Number of disparities to search in the images of a camera."""
         return self.ndisp or camera.ndisp or usual_ndisp(camera.width_px)
 
     def ndisp_within(self, camera: RectifiedCamera) -> int:
-        """Number of disparities to search, some of which lie within the picture.
+        """Number of disparities to search, some of which lie within the image.
 
         Raises:
             MatchingError: None does.

@@ -104,9 +104,9 @@ class SgmSettings(MeasuredSettings):
 
 
 class SgmMatcher:
-    """Aggregates costs along paths through the picture, and checks the result; a `Matcher`.
+    """Aggregates costs along paths through the image, and checks the result; a `Matcher`.
 
-    Every pixel is searched, those at the left border as far as the right picture reaches.
+    Every pixel is searched, those at the left border as far as the right image reaches.
 
     Args:
         settings: What to search and what to believe.
@@ -126,7 +126,7 @@ class SgmMatcher:
         """Match one rectified pair.
 
         Raises:
-            MatchingError: No disparity of the range lies within the picture.
+            MatchingError: No disparity of the range lies within the image.
         """
         s = self._settings
         ndisp = s.ndisp_within(pair.camera)
@@ -159,7 +159,7 @@ class SgmMatcher:
             return finish(refined, s, pool, at_once)
 
     def _strips(self, camera: RectifiedCamera, paths: Paths) -> tuple[list[range], int]:
-        """The strips of a picture, and how many may be worked on at once."""
+        """The strips of an image, and how many may be worked on at once."""
         height = camera.height_px
         # An even number of strips keeps two cores busy to the end.
         rows = -(-height // (2 * -(-height // (2 * _STRIP_ROWS))))

@@ -1,4 +1,4 @@
-"""Local search of a pair of pictures in strips of rows, one per thread."""
+"""Local search of a pair of images in strips of rows, one per thread."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from recon.stereo.match.scratch import ResultPool, ScratchPool
 
 
 class StripSearch:
-    """Searches pairs of pictures, one strip of rows per thread, and keeps its memory between pairs.
+    """Searches pairs of images, one strip of rows per thread, and keeps its memory between pairs.
 
     Args:
-        prefilter: Gives what windows compare in some rows of a picture, uint8 (N, W).
+        prefilter: Gives what windows compare in some rows of an image, uint8 (N, W).
         threads: Strips worked on at once. The result does not depend on it.
     """
 
@@ -36,7 +36,7 @@ class StripSearch:
     def find(
         self,
         pool: Executor,
-        pictures: tuple[UInt8, UInt8],
+        images: tuple[UInt8, UInt8],
         search: Search,
         tiles: Tiles,
         rules: Rules,
@@ -46,18 +46,18 @@ class StripSearch:
 
         Args:
             pool: Where to work.
-            pictures: Left and right, uint8 (H, W).
+            images: Left and right, uint8 (H, W).
             search: What is searched.
             tiles: Which candidates are offered where.
             rules: What the checks ask for.
-            texture: Gives the texture of some rows of the left picture, float32 (N, W).
+            texture: Gives the texture of some rows of the left image, float32 (N, W).
         """
-        height, width = pictures[0].shape
+        height, width = images[0].shape
         results = self._results.lend(REFINED_BYTES * height * width)
         refined = refined_in(results, height, width)
 
         def prepare(strip: range) -> None:
-            left, right = (self._prefilter(picture, strip) for picture in pictures)
+            left, right = (self._prefilter(image, strip) for image in images)
             lay_out(left, right, search, strip.start, views)
 
         def search_strip(strip: range) -> None:

@@ -12,7 +12,7 @@ from recon.core.values.disparity import ASSUMED_CONFIDENCE, ASSUMED_SIGMA_PX
 def unrated_disparity(values: Float32, reason: UInt8, pair: RectifiedPair) -> Disparity:
     """A disparity map whose matches all have the confidence and uncertainty that are assumed.
 
-    A match where there is no picture, or that lies outside the right picture, becomes BORDER.
+    A match where there is no image, or that lies outside the right image, becomes BORDER.
 
     Args:
         values: float32 (H, W), pixels; read where ``reason`` is VALID.
@@ -24,11 +24,11 @@ def unrated_disparity(values: Float32, reason: UInt8, pair: RectifiedPair) -> Di
         there = np.arange(width, dtype=np.float32) - values
         beside = (reason == np.uint8(Reason.VALID)) & ((there < -0.5) | (there > width - 0.5))
     border = beside if pair.valid is None else beside | ~pair.valid
-    told = np.where(border, np.uint8(Reason.BORDER), reason)
-    valid, nan = told == np.uint8(Reason.VALID), np.float32(np.nan)
+    checked = np.where(border, np.uint8(Reason.BORDER), reason)
+    valid, nan = checked == np.uint8(Reason.VALID), np.float32(np.nan)
     return Disparity(
         values=np.where(valid, values, nan).astype(np.float32),
         confidence=np.where(valid, np.float32(ASSUMED_CONFIDENCE), np.float32(0)),
         sigma_px=np.where(valid, np.float32(ASSUMED_SIGMA_PX), nan),
-        reason=told,
+        reason=checked,
     )

@@ -114,8 +114,8 @@ def inspect_features(
     known = len(rows) >= min_features
     middle = float(np.median(rows)) if known else float("nan")
     spread = 1.4826 * float(np.median(np.abs(rows - middle))) if known else float("nan")
-    tells = near.sum() >= min_features
-    negative = float(np.mean(disparity[near] < 0)) if tells else float("nan")
+    enough = near.sum() >= min_features
+    negative = float(np.mean(disparity[near] < 0)) if enough else float("nan")
     return PairInspection(len(rows), middle, spread, int(near.sum()), negative)
 
 

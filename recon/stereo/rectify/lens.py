@@ -53,7 +53,7 @@ def project_with_jacobian(
     return pixels, by_point.reshape(-1, 2, 3), by_lens.reshape(len(pixels), 2, -1)
 
 
-def project_into_picture(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
+def project_into_image(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
     """float64 (N, 2), pixels of points (N, 3) inside the image; NaN for all others.
 
     Far outside the field of view, the distortion polynomial may fold points back into the image;
@@ -140,5 +140,5 @@ def _without_folds(
     x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
     rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]).astype(np.float64)
     xyz = (np.linalg.inv(rotation) @ np.linalg.inv(matrix[:, :3]) @ rays).T
-    pixels = np.nan_to_num(project_into_picture(camera, xyz), nan=-1.0).astype(np.float32)
+    pixels = np.nan_to_num(project_into_image(camera, xyz), nan=-1.0).astype(np.float32)
     return pixels[:, 0].reshape(x.shape), pixels[:, 1].reshape(x.shape)

@@ -35,6 +35,16 @@ def test_a_change_in_any_source_gives_another_folder(tmp_path: Path, sources: Pa
     assert cache_folder(tmp_path, sources.parents[1]) != before
 
 
+def test_a_change_in_a_folder_of_kernels_gives_another_folder(
+    tmp_path: Path, sources: Path
+) -> None:
+    (sources / "simd").mkdir()
+    (sources / "simd" / "vectors.py").write_text("LANES = 32\n")
+    before = cache_folder(tmp_path, sources.parents[1])
+    (sources / "simd" / "vectors.py").write_text("LANES = 16\n")
+    assert cache_folder(tmp_path, sources.parents[1]) != before
+
+
 def test_folders_of_earlier_sources_are_removed(tmp_path: Path, sources: Path) -> None:
     current = cache_folder(tmp_path, sources.parents[1])
     current.mkdir()

@@ -6,9 +6,9 @@ import pytest
 
 from recon.core.values.board import parse_board
 from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
-from recon.sources.picture_pairs import PicturePairs
+from recon.sources.image_pairs import ImagePairs
 
-PAIRS = PicturePairs((), by_order=False)
+PAIRS = ImagePairs((), by_order=False)
 
 
 def figures(**other: Any) -> dict[str, Any]:

@@ -19,11 +19,11 @@ CHARUCO = "charuco:8x6:30mm:22mm:5x5_100"
 def rendered(text: str, lens: str = "radtan") -> list[tuple[BoardView, UInt8, UInt8]]:
     rig, board = board_rig(lens), parse_board(text)  # type: ignore[arg-type]
     views = place_boards(rig, board, 2, seed=5)
-    pictures = render_views(rig, board, views)
-    return [(view, *pair) for view, pair in zip(views, pictures, strict=True)]
+    images = render_views(rig, board, views)
+    return [(view, *pair) for view, pair in zip(views, images, strict=True)]
 
 
-def pictures(text: str) -> list[UInt8]:
+def images(text: str) -> list[UInt8]:
     return list(chain.from_iterable((left, right) for _, left, right in rendered(text)))
 
 
@@ -43,7 +43,7 @@ def test_corners_are_found_to_a_tenth_of_a_pixel(text: str, lens: str) -> None:
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.12
 
 
-def test_corners_of_a_large_picture_are_found_in_a_small_copy_and_refined_in_it() -> None:
+def test_corners_of_a_large_image_are_found_in_a_small_copy_and_refined_in_it() -> None:
     board = parse_board("chess:9x6:25mm")
     view, left, _ = rendered("chess:9x6:25mm")[0]
     large = np.kron(left, np.ones((4, 4), np.uint8))
@@ -67,7 +67,7 @@ def test_a_charuco_board_that_is_half_covered_is_used_in_part() -> None:
 
 
 @pytest.mark.parametrize("turn", [0, 1, 2, 3])
-def test_corners_of_the_right_picture_run_as_in_the_left_one(turn: int) -> None:
+def test_corners_of_the_right_image_run_as_in_the_left_one(turn: int) -> None:
     board = parse_board("chess:7x7:25mm")
     view = rendered("chess:7x7:25mm")[0][0]
     grid = np.rot90(view.right_px.reshape(7, 7, 2), turn).reshape(-1, 2)
@@ -88,11 +88,11 @@ def test_corners_of_the_right_picture_run_as_in_the_left_one(turn: int) -> None:
     ],
 )
 def test_a_wrong_size_is_found_out_and_the_true_one_said(claimed: str, true: str) -> None:
-    board, shown = parse_board(f"chess:{claimed}:25mm"), pictures(f"chess:{true}:25mm")
-    seen = [find_board(picture, board) for picture in shown]
+    board, shown = parse_board(f"chess:{claimed}:25mm"), images(f"chess:{true}:25mm")
+    seen = [find_board(image, board) for image in shown]
     sizes = [
-        None if sighting is None else grown_size(picture, sighting.pixels, board.inner)
-        for picture, sighting in zip(shown, seen, strict=True)
+        None if sighting is None else grown_size(image, sighting.pixels, board.inner)
+        for image, sighting in zip(shown, seen, strict=True)
     ]
     if sorted(claimed.split("x")) == sorted(true.split("x")):
         assert None not in sizes
@@ -104,7 +104,7 @@ def test_a_wrong_size_is_found_out_and_the_true_one_said(claimed: str, true: str
 
 
 def test_squares_that_were_counted_for_corners_are_told() -> None:
-    board, shown = parse_board("chess:10x7:25mm"), pictures("chess:9x6:25mm")
+    board, shown = parse_board("chess:10x7:25mm"), images("chess:9x6:25mm")
     with pytest.raises(CalibrationError, match="count inner corners, not squares"):
         check_chessboard([None] * len(shown), shown.__getitem__, board)
 
@@ -119,17 +119,17 @@ def test_a_part_of_a_grid_grows_to_the_whole_and_the_whole_no_further() -> None:
 def test_markers_of_another_dictionary_are_told() -> None:
     board = parse_board("charuco:8x6:30mm:22mm:4x4_50")
     with pytest.raises(CalibrationError, match=r"another dictionary \(got \S+, expected 4x4_50"):
-        check_charuco(4, pictures(CHARUCO).__getitem__, board)
+        check_charuco(4, images(CHARUCO).__getitem__, board)
 
 
 def test_a_charuco_board_of_another_size_is_told() -> None:
     board = parse_board("charuco:5x4:30mm:22mm:5x5_100")
     with pytest.raises(CalibrationError, match=r"marker ids up to 2\d, expected 0 to 9 for 5x4"):
-        check_charuco(4, pictures(CHARUCO).__getitem__, board)
+        check_charuco(4, images(CHARUCO).__getitem__, board)
 
 
 def test_a_larger_board_is_told_although_parts_of_it_passed_for_the_claimed_one() -> None:
-    shown = pictures("chess:9x6:25mm")
+    shown = images("chess:9x6:25mm")
     sizes = [(7, 5), None, None, (7, 5), None, None, None]
     with pytest.raises(CalibrationError, match=r"does not have 7x5.*got 9x6 in \d of 5"):
         check_chessboard(sizes, lambda n: shown[n % 4], parse_board("chess:7x5:25mm"))
@@ -146,8 +146,8 @@ def test_views_of_a_part_of_the_claimed_board_are_no_other_board() -> None:
 
 def test_a_chessboard_for_a_charuco_board_is_told_and_the_other_way_round() -> None:
     with pytest.raises(CalibrationError, match=r"without markers \(got 9x6 .*chess:9x6"):
-        check_charuco(4, pictures("chess:9x6:25mm").__getitem__, parse_board(CHARUCO))
-    shown = pictures(CHARUCO)
+        check_charuco(4, images("chess:9x6:25mm").__getitem__, parse_board(CHARUCO))
+    shown = images(CHARUCO)
     with pytest.raises(CalibrationError, match=r"board with markers \(ChArUco\) .*5x5_"):
         check_chessboard([None] * 4, shown.__getitem__, parse_board("chess:11x9:25mm"))
 

@@ -124,7 +124,7 @@ def test_a_board_seen_in_part_by_either_camera_counts_with_what_is_seen(make_vie
     assert fit.calibration.baseline_m == pytest.approx(rig.baseline_m, rel=0.005)
 
 
-def test_pictures_of_different_moments_are_refused_as_such(make_views) -> None:
+def test_images_of_different_moments_are_refused_as_such(make_views) -> None:
     _, views = make_views(count=12)
     shuffled = [
         replace(view, seen=(view.seen[0], views[(n + 5) % 12].seen[1]))

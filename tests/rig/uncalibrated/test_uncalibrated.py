@@ -11,7 +11,7 @@ from recon.core.errors import CalibrationError
 from recon.core.geometry.projection import map_pixels
 from recon.core.geometry.se3 import exp_so3
 from recon.io.middlebury.scene import read_middlebury_scene
-from recon.rig.uncalibrated import rectify_pictures, rectify_uncalibrated
+from recon.rig.uncalibrated import rectify_images, rectify_uncalibrated
 from recon.stereo.rectify import PairFeatures, epipolar_lines, match_again, match_exactly, to_grey
 
 SIZE = (640, 480)
@@ -76,7 +76,7 @@ def test_wrong_matches_do_no_harm() -> None:
     assert np.abs(rows).mean() < 0.15
 
 
-def test_pictures_stay_upright_in_size_and_disparities_positive() -> None:
+def test_images_stay_upright_in_size_and_disparities_positive() -> None:
     found = rectify_uncalibrated(scene(), SIZE)
     for H in (found.H_left, found.H_right):
         upper_left, upper_right, lower_right, lower_left = corners_of(H)
@@ -140,22 +140,22 @@ def test_matches_without_any_geometry_are_refused() -> None:
 
 def test_exact_features_know_places_to_a_third_of_a_pixel_under_a_homography() -> None:
     rng = np.random.default_rng(5)
-    picture = cv2.GaussianBlur(rng.integers(0, 256, (240, 320), dtype=np.uint8), (0, 0), 2.0)
-    picture = cv2.normalize(picture, None, 0, 255, cv2.NORM_MINMAX)
+    image = cv2.GaussianBlur(rng.integers(0, 256, (240, 320), dtype=np.uint8), (0, 0), 2.0)
+    image = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX)
     H = np.array([[1.05, 0.08, -9], [-0.05, 0.97, 6], [1e-4, -5e-5, 1]])
-    warped = cv2.warpPerspective(picture, H, (320, 240), flags=cv2.INTER_CUBIC)
-    found = match_exactly(picture, warped)
+    warped = cv2.warpPerspective(image, H, (320, 240), flags=cv2.INTER_CUBIC)
+    found = match_exactly(image, warped)
     apart = np.linalg.norm(map_pixels(H, found.left_uv) - found.right_uv, axis=1)
     assert len(found) > 100
     assert np.median(apart) < 0.33
 
 
-def test_blank_pictures_have_no_features() -> None:
+def test_blank_images_have_no_features() -> None:
     blank = np.full((100, 100), 90, np.uint8)
     assert len(match_exactly(blank, blank)) == 0
 
 
-def picture_of(seed: int, size: tuple[int, int]) -> np.ndarray:
+def image_of(seed: int, size: tuple[int, int]) -> np.ndarray:
     """A texture with detail of many sizes."""
     rng, total = np.random.default_rng(seed), np.zeros(size[::-1])
     for sigma in (1.0, 2.0, 4.0):
@@ -172,7 +172,7 @@ def planes_pair(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarr
         rows = slice(n * height // 3, (n + 1) * height // 3)
         disparity[rows] = np.linspace(*values, width)[None]
     u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    right = picture_of(0, (width + 80, height))[:, 40:-40]
+    right = image_of(0, (width + 80, height))[:, 40:-40]
     at = (u - disparity).astype(np.float32)
     return cv2.remap(right, at, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT), right, disparity
 
@@ -206,16 +206,16 @@ def test_a_pair_under_known_homographies_comes_back_onto_rows(warp: str) -> None
         "strong": (shaken(size, 0.1, rng), shaken(size, 0.1, rng)),
     }[warp]
     seen = tuple(cv2.warpPerspective(p, H, size) for p, H in ((left, A), (right, B)))
-    found = rectify_pictures([seen], count=1500)
+    found = rectify_images([seen], count=1500)
     rows = true_rows(found, A, B, disparity)
     assert np.abs(rows).mean() < 0.3
 
 
-def test_matches_of_pictures_made_alike_are_places_in_those_recorded() -> None:
+def test_matches_of_images_made_alike_are_places_in_those_recorded() -> None:
     size, rng = (320, 240), np.random.default_rng(7)
-    picture = picture_of(1, size)
+    image = image_of(1, size)
     A, B = shaken(size, 0.08, rng), shaken(size, 0.08, rng)
-    seen = [cv2.warpPerspective(picture, H, size) for H in (A, B)]
+    seen = [cv2.warpPerspective(image, H, size) for H in (A, B)]
     found = match_again(*seen, np.linalg.inv(A), np.linalg.inv(B), 800)
     back = [map_pixels(np.linalg.inv(H), uv) for H, uv in ((A, found.left_uv), (B, found.right_uv))]
     assert len(found) > 100
@@ -234,7 +234,7 @@ def test_warped_middlebury_pairs_come_back_onto_rows_by_their_truth(
     A, B = shaken(size, reach, rng), shaken(size, reach, rng)
     seen = tuple(cv2.warpPerspective(p, H, size) for p, H in ((left, A), (right, B)))
     assert found.truth is not None
-    rows = true_rows(rectify_pictures([seen]), A, B, found.truth.values)
+    rows = true_rows(rectify_images([seen]), A, B, found.truth.values)
     sys.stdout.write(f"{name} by {reach}: mean row error {np.abs(rows).mean():.3f} px\n")
     # Motorcycle and Pipes are 0.3 px off as they are published.
     assert np.abs(rows).mean() <= 0.7

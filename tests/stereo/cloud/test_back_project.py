@@ -132,7 +132,7 @@ def test_points_carry_the_colours_of_their_pixels() -> None:
     np.testing.assert_array_equal(cloud.rgb, [coloured.left_rgb[7, 11]])
 
 
-def test_pixels_without_a_source_in_the_raw_picture_make_no_point() -> None:
+def test_pixels_without_a_source_in_the_raw_image_make_no_point() -> None:
     valid = np.ones((40, 64), dtype=bool)
     valid[:, 5:] = False
     pair = replace(make_pair(), valid=valid)

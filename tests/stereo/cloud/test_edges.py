@@ -104,7 +104,7 @@ def test_it_can_be_turned_off(removed: bool) -> None:
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (3, 200), (200, 4)])
-def test_pictures_as_small_as_the_window_pass(shape: tuple[int, int]) -> None:
+def test_images_as_small_as_the_window_pass(shape: tuple[int, int]) -> None:
     assert remove_flying_edges(as_disparity(np.full(shape, 5.0))).valid.all()
 
 

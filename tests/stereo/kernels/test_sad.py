@@ -105,7 +105,7 @@ def test_strips_do_not_change_the_result(
 
 @pytest.mark.parametrize("slant", [0, 1, -2])
 @pytest.mark.parametrize(("ndisp", "minimum"), [(64, 0), (65, -40), (33, 20), (100, 60)])
-def test_wide_pictures_are_searched_in_vectors(ndisp: int, minimum: int, slant: int) -> None:
+def test_wide_images_are_searched_in_vectors(ndisp: int, minimum: int, slant: int) -> None:
     rng = np.random.default_rng(ndisp + slant)
     # Few grey levels, so that vectors and runs have equal costs to decide between.
     left, right = rng.integers(0, 4, (2, 5, 3 * LANES + 35), dtype=np.uint8)
@@ -126,7 +126,7 @@ def test_blocks_do_not_change_the_result(
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
-def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
+def test_images_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
     grey = np.zeros(shape, np.uint8)
     search = Search(ndisp=4, minimum=0, radius=3, rows_radius=3, cost_cap=31, slant=0)
     minima = search_all(grey, grey, search)

@@ -114,7 +114,7 @@ def test_strips_that_overlap_wholly_do_not_change_the_result(
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 20), (20, 1)])
-def test_pictures_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
+def test_images_of_one_row_column_or_pixel_are_searched(shape: tuple[int, int]) -> None:
     grey = np.zeros(shape, np.uint8)
     paths, window = (
         Paths(4, 0, 10, 50, 20, 12, overlap=4, side_overlap=4),

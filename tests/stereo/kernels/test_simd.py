@@ -32,7 +32,7 @@ def subtract(a: Any, b: Any, out: Any) -> None:
 @njit
 def compare(a: Any, b: Any, out: Any) -> None:
     x, y = simd.load(a, 2), simd.load(b, 0)
-    simd.store(out, 0, simd.minimum(x, y))
+    simd.store(out, 0, simd.smaller(x, y))
     simd.store(out, LANES, simd.where_equal(x, y, x, simd.splat(a[0])))
     simd.store(out, 2 * LANES, simd.absolute_difference(x, y))
     simd.store(out, 3 * LANES, simd.where_less(x, y, y, x))
@@ -84,7 +84,7 @@ def look_beside(a: Any, b: Any, out: Any) -> None:
     x, y = simd.load(a, 2), simd.load(b, 0)
     simd.store(out, 0, simd.put_before(x, y))
     simd.store(out, LANES, simd.put_after(x, y))
-    simd.store(out, 2 * LANES, simd.broadcast_minimum(x))
+    simd.store(out, 2 * LANES, simd.broadcast_smallest(x))
 
 
 def assert_same(function: Callable[..., None], a: Any, b: Any, kind: Any) -> None:

@@ -69,7 +69,7 @@ def test_mean_and_scale_are_what_the_settings_say(difference: Path) -> None:
     assert np.nanmedian(disparity.values) == pytest.approx(10, abs=1e-3)
 
 
-def test_a_network_of_another_size_gives_disparities_in_pixels_of_the_picture(
+def test_a_network_of_another_size_gives_disparities_in_pixels_of_the_image(
     difference: Path,
 ) -> None:
     fixed = {"std": (1 / 255,), "width_px": 30, "height_px": 20}

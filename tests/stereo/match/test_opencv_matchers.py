@@ -36,7 +36,7 @@ def match(name: str, pair: RectifiedPair, *, pad: bool = True, **settings: objec
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("shift_px", [0, 7, 20])
-def test_a_shift_is_found_in_pixels_wherever_the_right_picture_reaches(
+def test_a_shift_is_found_in_pixels_wherever_the_right_image_reaches(
     name: str, shift_px: int
 ) -> None:
     disparity = match(name, shifted_pair(shift_px))
@@ -70,7 +70,7 @@ def test_what_opencv_could_not_match_is_nan_with_a_reason(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_nothing_is_matched_with_what_lies_beside_the_right_picture(name: str) -> None:
+def test_nothing_is_matched_with_what_lies_beside_the_right_image(name: str) -> None:
     values = match(name, shifted_pair(20)).values
     there = np.arange(values.shape[1]) - values
     assert np.nanmin(there) >= -0.5
@@ -78,7 +78,7 @@ def test_nothing_is_matched_with_what_lies_beside_the_right_picture(name: str) -
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_pixels_without_a_picture_are_border(name: str) -> None:
+def test_pixels_without_an_image_are_border(name: str) -> None:
     pair = shifted_pair(7)
     valid = np.ones(pair.left.shape, dtype=bool)
     valid[:10] = False
@@ -88,7 +88,7 @@ def test_pixels_without_a_picture_are_border(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (3, 3)])
-def test_tiny_pictures_are_no_error(name: str, shape: tuple[int, int]) -> None:
+def test_tiny_images_are_no_error(name: str, shape: tuple[int, int]) -> None:
     image = np.full(shape, 90, np.uint8)
     pair = RectifiedPair(image, image, stand_in_camera(shape[1], shape[0]))
     assert match(name, pair).values.shape == shape

@@ -48,7 +48,7 @@ def test_signed_differences_do_not_find_the_wall() -> None:
     assert np.mean(found.values[:, 9:-3] == 6) < 0.3
 
 
-def test_the_least_signed_sum_is_the_brightest_patch_of_the_right_picture() -> None:
+def test_the_least_signed_sum_is_the_brightest_patch_of_the_right_image() -> None:
     left = np.full((9, 30), 100, dtype=np.uint8)
     right = np.full((9, 30), 50, dtype=np.uint8)
     right[:, 10] = 200
@@ -56,7 +56,7 @@ def test_the_least_signed_sum_is_the_brightest_patch_of_the_right_picture() -> N
     assert match(left, left, patch_px=1, ndisp=16)[4, 15] == 0
 
 
-def test_only_pixels_whose_patch_leaves_the_picture_have_no_value() -> None:
+def test_only_pixels_whose_patch_leaves_the_image_have_no_value() -> None:
     left = np.random.default_rng(0).integers(0, 256, (20, 30), dtype=np.uint8)
     pair = RectifiedPair(left, left, camera_for(30, 20))
     found = PrintedMatcher(PrintedSettings(patch_px=5)).match(pair)
@@ -67,13 +67,13 @@ def test_only_pixels_whose_patch_leaves_the_picture_have_no_value() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 255])
-def test_a_picture_without_texture_gives_disparity_zero(level: int) -> None:
+def test_an_image_without_texture_gives_disparity_zero(level: int) -> None:
     flat = np.full((12, 15), level, dtype=np.uint8)
     values = match(flat, flat, patch_px=3, signed=False)
     assert np.all(values[1:-1, 1:-1] == 0)
 
 
-def test_a_patch_larger_than_the_picture_is_refused() -> None:
+def test_a_patch_larger_than_the_image_is_refused() -> None:
     flat = np.zeros((4, 40), dtype=np.uint8)
     with pytest.raises(MatchingError, match="at most 4 px"):
         match(flat, flat, patch_px=5)

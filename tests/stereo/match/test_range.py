@@ -48,7 +48,7 @@ def test_negative_minimum_widens_the_range() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 900), (900, 1), (3, 5), (90, 480)])
-def test_pictures_without_matches_get_the_usual_range(shape: tuple[int, int]) -> None:
+def test_images_without_matches_get_the_usual_range(shape: tuple[int, int]) -> None:
     grey = np.full(shape, 77, np.uint8)
     pair = RectifiedPair(grey, grey, stand_in_camera(shape[1], shape[0]))
     assert estimate_ndisp(pair) == usual_ndisp(shape[1])

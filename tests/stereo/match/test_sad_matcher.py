@@ -11,7 +11,7 @@ from recon.core.values.arrays import Float32, Float64
 from recon.stereo.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA
 from recon.stereo.match import SadMatcher, SadSettings, sad, search
 from recon.stereo.match.search import usual_ndisp
-from tests.stereo.match.pictures import (
+from tests.stereo.match.images import (
     HEIGHT,
     WIDTH,
     inner,
@@ -123,7 +123,7 @@ def test_half_occluded_wall_is_occluded_and_not_given_a_value() -> None:
     assert np.nanmedian(found.values[25:55, 10:45]) == pytest.approx(4, abs=0.1)
 
 
-def test_left_border_columns_are_searched_as_far_as_the_right_picture_reaches() -> None:
+def test_left_border_columns_are_searched_as_far_as_the_right_image_reaches() -> None:
     scene = noise(width=WIDTH + 3)
     found = SadMatcher(SadSettings(ndisp=64)).match(make_pair(scene[:, :WIDTH], scene[:, 3:]))
     # Far left of column 63, where a matcher that wants all 64 disparities gives nothing.
@@ -131,7 +131,7 @@ def test_left_border_columns_are_searched_as_far_as_the_right_picture_reaches() 
     assert np.nanmax(np.abs(found.values[:, 6:63] - 3)) < 0.5
 
 
-def test_flat_picture_has_low_texture_everywhere() -> None:
+def test_flat_image_has_low_texture_everywhere() -> None:
     grey = np.full((20, 40), 90, np.uint8)
     found = SadMatcher(PLAIN).match(make_pair(grey, grey))
     assert (found.reason == Reason.LOW_TEXTURE).all()
@@ -160,7 +160,7 @@ def test_minimum_at_an_end_of_the_range_is_out_of_range() -> None:
     assert (inner(found.reason) == Reason.OUT_OF_RANGE).mean() > 0.99
 
 
-def test_pixels_without_a_picture_are_border() -> None:
+def test_pixels_without_an_image_are_border() -> None:
     scene = noise()
     valid = np.ones(scene.shape, bool)
     valid[:, 50:60] = False
@@ -177,7 +177,7 @@ def test_number_of_threads_does_not_change_the_result(threads: int) -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 30), (30, 1), (3, 5)])
-def test_tiny_pictures_give_a_map_of_their_size(shape: tuple[int, int]) -> None:
+def test_tiny_images_give_a_map_of_their_size(shape: tuple[int, int]) -> None:
     grey = np.zeros(shape, np.uint8)
     found = SadMatcher(SadSettings(ndisp=40)).match(make_pair(grey, grey))
     assert found.values.shape == shape
@@ -185,7 +185,7 @@ def test_tiny_pictures_give_a_map_of_their_size(shape: tuple[int, int]) -> None:
 
 
 @pytest.mark.usefixtures("no_fit")
-def test_range_wider_than_the_picture_is_searched_where_it_can_be() -> None:
+def test_range_wider_than_the_image_is_searched_where_it_can_be() -> None:
     scene = noise(width=WIDTH + 9)
     settings = SadSettings(min_disparity_px=-300, ndisp=600)
     found = SadMatcher(settings).match(make_pair(scene[:, :WIDTH], scene[:, 9:]))
@@ -200,7 +200,7 @@ def normalised_errors(found: Disparity, truth: float) -> Float32:
 
 
 @pytest.mark.parametrize("grey_noise", [2.0, 6.0])
-def test_sigma_covers_the_errors_of_noisy_pictures(grey_noise: float) -> None:
+def test_sigma_covers_the_errors_of_noisy_images(grey_noise: float) -> None:
     clean = warped_pair(np.full((HEIGHT, WIDTH), 7.3))
     rng = np.random.default_rng(5)
     left, right = (
@@ -214,7 +214,7 @@ def test_sigma_covers_the_errors_of_noisy_pictures(grey_noise: float) -> None:
     assert (errors < 0.2).mean() < 0.8
 
 
-def test_range_outside_the_picture_is_an_error() -> None:
+def test_range_outside_the_image_is_an_error() -> None:
     grey = noise()
     matcher = SadMatcher(SadSettings(min_disparity_px=200))
     with pytest.raises(MatchingError, match="200 to 215 px"):

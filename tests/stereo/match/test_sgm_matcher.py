@@ -14,7 +14,7 @@ from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Float64
 from recon.stereo.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA
 from recon.stereo.match import SgmMatcher, SgmSettings, search
-from tests.stereo.match.pictures import HEIGHT, WIDTH, inner, make_pair, noise, warped_pair
+from tests.stereo.match.images import HEIGHT, WIDTH, inner, make_pair, noise, warped_pair
 
 PLAIN = SgmSettings(ndisp=32)
 
@@ -135,21 +135,21 @@ def test_number_of_threads_does_not_change_the_result() -> None:
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (2, 3), (40, 60)])
 @pytest.mark.parametrize("level", [0, 7, 255])
-def test_pictures_without_content_have_no_disparity(shape: tuple[int, int], level: int) -> None:
+def test_images_without_content_have_no_disparity(shape: tuple[int, int], level: int) -> None:
     grey = np.full(shape, level, np.uint8)
     found = SgmMatcher(SgmSettings(ndisp=16)).match(make_pair(grey, grey))
     assert np.isnan(found.values).all()
     assert (found.confidence == 0).all()
 
 
-def test_range_far_wider_than_the_picture_is_searched() -> None:
+def test_range_far_wider_than_the_image_is_searched() -> None:
     scene = noise(20, 39)
     settings = SgmSettings(ndisp=300, min_disparity_px=-100)
     found = SgmMatcher(settings).match(make_pair(scene[:, :30], scene[:, 9:]))
     assert (np.abs(found.values[:, 14:26] - 9) < 0.5).mean() > 0.9
 
 
-def test_pixels_without_a_picture_are_border() -> None:
+def test_pixels_without_an_image_are_border() -> None:
     scene = noise(width=WIDTH + 9)
     valid = np.ones((HEIGHT, WIDTH), bool)
     valid[:, 80:] = False
@@ -157,7 +157,7 @@ def test_pixels_without_a_picture_are_border() -> None:
     assert (found.reason[:, 80:] == Reason.BORDER).all()
 
 
-def test_range_outside_the_picture_is_an_error() -> None:
+def test_range_outside_the_image_is_an_error() -> None:
     grey = noise()
     with pytest.raises(MatchingError, match="no disparity of the range"):
         SgmMatcher(SgmSettings(min_disparity_px=WIDTH)).match(make_pair(grey, grey))

@@ -14,7 +14,7 @@ from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.io.images.image import write_image
 from recon.stereo.rectify import RectifyingTurns
-from recon.street.picture import take_picture
+from recon.street.image import take_image
 from recon.street.shapes import boxes, cylinder, quads
 from recon.street.soup import Material, Paint, TriangleSoup, merge, move
 from recon.street.stage import Stage, make_stage
@@ -123,7 +123,7 @@ def photograph(rig: StereoCalibration, T_room_left: np.ndarray, seed: int = 1) -
     images = []
     T_room_right = T_room_left @ invert(rig.T_right_left)
     for side, (camera, T) in enumerate(((rig.left, T_room_left), (rig.right, T_room_right))):
-        light = take_picture(room(seed), view_of(camera, T), smooth_edges=True).mean(axis=2)
+        light = take_image(room(seed), view_of(camera, T), smooth_edges=True).mean(axis=2)
         noise = np.random.default_rng([seed, side]).standard_normal(light.shape)
         images.append(np.clip(light + noise / 510, 0, 1) * _image_circle(camera))
     return images

@@ -128,7 +128,7 @@ def striped(calibration: StereoCalibration) -> StereoPair:
 RIG = rig()
 
 
-def test_stripes_of_epipolar_planes_become_level_and_equal_in_both_pictures() -> None:
+def test_stripes_of_epipolar_planes_become_level_and_equal_in_both_images() -> None:
     raw = striped(RIG)
     rectified = Rectifier(rig()).rectify(raw)
     spread = [image.astype(float).std(axis=1).max() for image in (rectified.left, rectified.right)]
@@ -140,7 +140,7 @@ def test_stripes_of_epipolar_planes_become_level_and_equal_in_both_pictures() ->
     assert np.ptp(means[0]) > 100
 
 
-def test_a_rig_that_is_aligned_already_keeps_its_pictures() -> None:
+def test_a_rig_that_is_aligned_already_keeps_its_images() -> None:
     rectifier = Rectifier(aligned_rig())
     rectified = rectifier.rectify(pair())
     assert rectifier.camera.baseline_m == pytest.approx(0.1)
@@ -198,7 +198,7 @@ def test_rectified_input_passes_through_bit_by_bit() -> None:
 
 
 @pytest.mark.parametrize("calibration", [rig(), RectifiedCamera(250, 1, 1, 1, 1, WIDTH, HEIGHT)])
-def test_pictures_of_another_size_are_refused_with_both_sizes(
+def test_images_of_another_size_are_refused_with_both_sizes(
     calibration: StereoCalibration | RectifiedCamera,
 ) -> None:
     with pytest.raises(CalibrationError, match=r"000004\.png: .*got 320x200, expected 320x240"):

@@ -21,17 +21,17 @@ from numba.extending import lower_builtin, models, register_model, type_callable
 from recon.stereo.kernels.simd.vectors import (
     LANES,
     absolute_difference,
-    broadcast_minimum,
+    broadcast_smallest,
     differing_bits,
+    larger,
     load,
     load_row,
-    maximum,
     mean,
-    minimum,
     narrow,
     put_after,
     put_before,
     ramp,
+    smaller,
     splat,
     store,
     store_row,
@@ -122,8 +122,8 @@ _binary(operator.mul, lambda builder, a, b: builder.mul(a, b))
 _binary(operator.rshift, lambda builder, a, b: builder.lshr(a, b))
 _binary(mean, _write_mean)
 _binary(differing_bits, _write_differing)
-_binary(minimum, _intrinsic("umin"))
-_binary(maximum, _intrinsic("umax"))
+_binary(smaller, _intrinsic("umin"))
+_binary(larger, _intrinsic("umax"))
 _binary(absolute_difference, _write_difference)
 
 
@@ -227,8 +227,8 @@ def _narrow(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.trunc(arguments[0], llvm_type(8))
 
 
-@compiled_as(broadcast_minimum, lambda lanes: lanes)
-def _broadcast_minimum(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+@compiled_as(broadcast_smallest, lambda lanes: lanes)
+def _broadcast_smallest(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     # A butterfly of exchanges between ever nearer lanes, which stays in registers.
     found, turn = arguments[0], LANES // 2
     while turn:

@@ -50,12 +50,12 @@ def ramp(first: np.uint16) -> Vector:
     return np.arange(LANES, dtype=np.uint16) + first
 
 
-def minimum(a: Vector, b: Vector) -> Vector:
+def smaller(a: Vector, b: Vector) -> Vector:
     """The smaller value of each lane."""
     return np.minimum(a, b)
 
 
-def maximum(a: Vector, b: Vector) -> Vector:
+def larger(a: Vector, b: Vector) -> Vector:
     """The larger value of each lane."""
     return np.maximum(a, b)
 
@@ -106,7 +106,7 @@ def put_after(vector: Vector, after: Vector) -> Vector:
     return np.concatenate((vector[1:], after[:1]))
 
 
-def broadcast_minimum(vector: Vector) -> Vector:
+def broadcast_smallest(vector: Vector) -> Vector:
     """The smallest value, in each lane."""
     return np.full_like(vector, vector.min())
 

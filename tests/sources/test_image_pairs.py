@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from recon.core.errors import SourceError
-from recon.sources.picture_pairs import list_pictures, pair_pictures
+from recon.sources.image_pairs import list_pictures, pair_images
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -22,7 +22,7 @@ def names(pairs: tuple[tuple[Path, Path], ...]) -> list[tuple[str, str]]:
 def test_names_that_differ_in_side_are_paired_by_their_numbers(tmp_path: Path) -> None:
     touch(tmp_path, "left1.png", "left02.png", "left10.png")
     touch(tmp_path, "right10.png", "right01.png", "right2.png", "notes.txt")
-    found = pair_pictures(str(tmp_path / "left*"), str(tmp_path / "right*.png"))
+    found = pair_images(str(tmp_path / "left*"), str(tmp_path / "right*.png"))
     assert not found.by_order
     assert names(found.pairs) == [
         ("left1.png", "right01.png"),
@@ -33,13 +33,13 @@ def test_names_that_differ_in_side_are_paired_by_their_numbers(tmp_path: Path) -
 
 def test_a_number_of_the_camera_does_not_count(tmp_path: Path) -> None:
     touch(tmp_path, "cam0_7.png", "cam0_8.png", "cam1_8.png", "cam1_7.png")
-    found = pair_pictures(str(tmp_path / "cam0*"), str(tmp_path / "cam1*"))
+    found = pair_images(str(tmp_path / "cam0*"), str(tmp_path / "cam1*"))
     assert names(found.pairs) == [("cam0_7.png", "cam1_7.png"), ("cam0_8.png", "cam1_8.png")]
 
 
 def test_folders_are_paired_by_name_whatever_the_suffix(tmp_path: Path) -> None:
     touch(tmp_path, "L/a.png", "L/b.png", "R/b.jpg", "R/a.jpg")
-    found = pair_pictures(tmp_path / "L", tmp_path / "R")
+    found = pair_images(tmp_path / "L", tmp_path / "R")
     assert names(found.pairs) == [("a.png", "a.jpg"), ("b.png", "b.jpg")]
 
 
@@ -47,14 +47,14 @@ def test_names_that_have_nothing_in_common_are_paired_by_order_and_that_is_told(
     tmp_path: Path,
 ) -> None:
     touch(tmp_path, "L/100.png", "L/200.png", "R/101.png", "R/202.png")
-    found = pair_pictures(tmp_path / "L", tmp_path / "R")
+    found = pair_images(tmp_path / "L", tmp_path / "R")
     assert found.by_order
     assert names(found.pairs) == [("100.png", "101.png"), ("200.png", "202.png")]
 
 
 def test_a_single_pair_needs_no_names_in_common(tmp_path: Path) -> None:
     touch(tmp_path, "a.png", "b.png")
-    found = pair_pictures(tmp_path / "a.png", str(tmp_path / "b.png"))
+    found = pair_images(tmp_path / "a.png", str(tmp_path / "b.png"))
     assert names(found.pairs) == [("a.png", "b.png")]
     assert not found.by_order
 
@@ -75,13 +75,13 @@ def test_pictures_of_which_most_have_no_partner_are_refused(
 ) -> None:
     touch(tmp_path, *left, *right)
     with pytest.raises(SourceError, match=message):
-        pair_pictures(str(tmp_path / "l*"), str(tmp_path / "r*"))
+        pair_images(str(tmp_path / "l*"), str(tmp_path / "r*"))
 
 
 def test_pictures_without_a_partner_are_left_out_and_named(tmp_path: Path) -> None:
     touch(tmp_path, *(f"left{n}.png" for n in (1, 2, 3, 5)), "left_notes.png")
     touch(tmp_path, *(f"right{n}.png" for n in (1, 2, 3, 4)), "right_7_again.png")
-    found = pair_pictures(str(tmp_path / "left*"), str(tmp_path / "right*"))
+    found = pair_images(str(tmp_path / "left*"), str(tmp_path / "right*"))
     assert [left.name for left, _ in found.pairs] == ["left1.png", "left2.png", "left3.png"]
     names = {path.name for path in found.lonely}
     assert names == {"left5.png", "left_notes.png", "right4.png", "right_7_again.png"}
@@ -90,7 +90,7 @@ def test_pictures_without_a_partner_are_left_out_and_named(tmp_path: Path) -> No
 def test_a_pattern_that_takes_both_sides_is_refused(tmp_path: Path) -> None:
     touch(tmp_path, "left1.png", "right1.png")
     with pytest.raises(SourceError, match=r"left1\.png: left and right are the same images"):
-        pair_pictures(str(tmp_path / "*"), str(tmp_path / "*"))
+        pair_images(str(tmp_path / "*"), str(tmp_path / "*"))
 
 
 def test_a_pattern_without_pictures_is_told_and_to_be_quoted(tmp_path: Path) -> None:

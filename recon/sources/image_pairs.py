@@ -20,7 +20,7 @@ Key = tuple[object, ...]
 
 
 @dataclass(frozen=True)
-class PicturePairs:
+class ImagePairs:
     """Images of two cameras, paired.
 
     Attributes:
@@ -34,7 +34,7 @@ class PicturePairs:
     lonely: tuple[Path, ...] = ()
 
 
-def pair_pictures(left: str | Path, right: str | Path) -> PicturePairs:
+def pair_images(left: str | Path, right: str | Path) -> ImagePairs:
     """Find the images of two cameras and pair them.
 
     Names match if they are equal apart from words and constant numbers of each side, such as
@@ -68,7 +68,7 @@ def pair_pictures(left: str | Path, right: str | Path) -> PicturePairs:
             got=f"{len(sides[0])} left, {len(sides[1])} right",
             expected="as many left as right, or names that identify the pairs",
         )
-    return PicturePairs(tuple(zip(*sides, strict=True)), by_order=len(sides[0]) > 1)
+    return ImagePairs(tuple(zip(*sides, strict=True)), by_order=len(sides[0]) > 1)
 
 
 def list_pictures(where: str | Path) -> list[Path]:
@@ -115,7 +115,7 @@ def _by_numbers(side: Sequence[Path]) -> dict[Key, Path]:
 
 def _match(
     sides: Sequence[Sequence[Path]], left: dict[Key, Path], right: dict[Key, Path]
-) -> PicturePairs:
+) -> ImagePairs:
     pairs = tuple((path, right[key]) for key, path in left.items() if key in right)
     paired = {path for pair in pairs for path in pair}
     lonely = tuple(path for side in sides for path in side if path not in paired)
@@ -127,4 +127,4 @@ def _match(
             got=f"{len(pairs)} pairs of {len(sides[0])} left, {len(sides[1])} right; {names}",
             hint="correct their names",
         )
-    return PicturePairs(pairs, by_order=False, lonely=lonely)
+    return ImagePairs(pairs, by_order=False, lonely=lonely)

@@ -16,7 +16,7 @@ _CREASE: Final = 0.92  # cosine of the angle between normals, below which there 
 _EXPOSURE: Final = 0.9
 
 
-def take_picture(stage: Stage, view: View, smooth_edges: bool) -> Float64:
+def take_image(stage: Stage, view: View, smooth_edges: bool) -> Float64:
     """Render one view.
 
     Args:
@@ -38,12 +38,12 @@ def take_picture(stage: Stage, view: View, smooth_edges: bool) -> Float64:
 
 
 def record(
-    picture: Float64, *, gain: float, offset_dn: float, noise_dn: float, key: list[int]
+    image: Float64, *, gain: float, offset_dn: float, noise_dn: float, key: list[int]
 ) -> UInt8:
     """Apply a sensor model to display values.
 
     Args:
-        picture: float64 (H, W, 3) in [0, 1].
+        image: float64 (H, W, 3) in [0, 1].
         gain: Factor on brightness.
         offset_dn: Grey levels added.
         noise_dn: Standard deviation of Gaussian noise, grey levels.
@@ -52,7 +52,7 @@ def record(
     Returns:
         uint8 (H, W, 3).
     """
-    levels = 255.0 * gain * picture + offset_dn
+    levels = 255.0 * gain * image + offset_dn
     if noise_dn > 0:
         levels += noise_dn * np.random.default_rng(key).standard_normal(levels.shape)
     return np.clip(np.rint(levels), 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Pictures whose disparity is known exactly."""
+"""Images whose disparity is known exactly."""
 
 from __future__ import annotations
 
@@ -45,5 +45,5 @@ def warped_pair(disparity: Float64) -> RectifiedPair:
 
 
 def inner(array: np.ndarray, left: int = 40, margin: int = 8) -> np.ndarray:
-    """The part of a map that both pictures show, off the border."""
+    """The part of a map that both images show, off the border."""
     return array[margin:-margin, left:-margin]
