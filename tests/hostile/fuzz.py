@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +19,8 @@ from recon.core.values import (
     OccupancyVoxels,
     PointCloud,
     RayCloud,
+    RectifiedCamera,
+    StereoPair,
     TriangleMesh,
 )
 from recon.io.cameras.calibration import read_calibration
@@ -35,17 +39,24 @@ from recon.io.trajectory import read_trajectory
 from recon.io.tree_file import read_tree, write_tree
 from recon.io.yaml_file import read_yaml
 from recon.map import OccupancySettings, ray_grain
+from recon.sources import open_source
 from recon.sources.times import read_dates, read_stamped_names
 from tests.hostile.calibrations import CAMERA_INFO, VALID
+from tests.sources.bags import Recording, write_bag
+from tests.stereo.match.test_onnx_matcher import match, pair_of, write_network
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file: how a valid one is written, and how it is read to its end."""
+    """A kind of file: how a valid one is written, and how it is read to its end.
+
+    ``every`` leaves out cases of files that take long to read: one of so many is tried.
+    """
 
     name: str
     write: Callable[[Path], Any]
     read: Callable[[Path], Any]
+    every: int = 1
 
 
 def _rng() -> np.random.Generator:
@@ -120,6 +131,18 @@ def _calibration(kind: str) -> Kind:
     return Kind(name, write, lambda path: read_calibration(path, 48, 32))
 
 
+def _bag(path: Path) -> None:
+    rng, camera = _rng(), RectifiedCamera(60.0, 7.5, 3.5, 7.5, 0.5, 16, 8)
+    images = rng.integers(0, 256, (2, 2, 8, 16), dtype=np.uint8)
+    pairs = [StereoPair(*both, 0.1 * index, index) for index, both in enumerate(images)]
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.move(write_bag(pairs, camera, Path(folder), Recording("ros1")), path)
+
+
+def _network(path: Path) -> None:
+    write_network(path, ["left", "right"], [(["left", "right"], "d", "Sub")])
+
+
 _IMAGE: Final = _rng().integers(0, 255, (9, 13, 3), np.uint8)
 _SENSOR: Final = """\
 T_BS: {cols: 4, rows: 4, data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
@@ -164,6 +187,12 @@ KINDS: Final[dict[str, Kind]] = {
         "c.ply", lambda p: write_ply(p, _cloud()), lambda p: list(read_ply_pieces(p, 7))
     ),
     "mesh ply": Kind("m.ply", lambda p: write_mesh(p, _mesh()), read_mesh),
+    **{
+        f"mesh {suffix}": Kind(f"m.{suffix}", lambda p: write_mesh(p, _mesh()), read_mesh, every)
+        for suffix, every in (("obj", 4), ("stl", 1), ("glb", 1))
+    },
+    "bag": Kind("d.bag", _bag, lambda p: list(open_source(p)), 10),
+    "network": Kind("n.onnx", _network, lambda p: match(p, pair_of(30, 10, (8, 12)))),
     "octomap ot": Kind("o.ot", _octomap(".ot"), read_octomap),
     "nav2": Kind("g.yaml", _grid, read_nav2),
     "nav2 image": Kind("g.pgm", _grid, lambda p: read_nav2(p.with_suffix(".yaml"))),
