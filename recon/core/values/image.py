@@ -53,6 +53,8 @@ class StereoPair:
 class RectifiedPair:
     """Two grey images with aligned rows.
 
+    Slices of other images are copied: kernels would be compiled anew for their layout.
+
     Attributes:
         left: uint8 (H, W), grey.
         right: uint8 (H, W), grey.
@@ -75,6 +77,10 @@ class RectifiedPair:
 
     def __post_init__(self) -> None:
         size = (self.camera.height_px, self.camera.width_px)
+        for name in ("left", "right", "left_rgb", "right_rgb", "valid"):
+            image = getattr(self, name)
+            if isinstance(image, np.ndarray):
+                object.__setattr__(self, name, np.ascontiguousarray(image))
         freeze(self, "left", np.uint8, size)
         freeze(self, "right", np.uint8, size)
         freeze(self, "left_rgb", np.uint8, (*size, 3))

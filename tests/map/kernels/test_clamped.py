@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -113,7 +114,7 @@ def test_what_a_later_part_looks_through_is_free_however_often_it_was_hit() -> N
     assert 3.5 + _log_odds(_drive(gone))[cell] > 0
 
 
-@settings(max_examples=30)
+@settings(max_examples=5 if numba.config.DISABLE_JIT else 30)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_moved_cells_equal_those_of_the_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)

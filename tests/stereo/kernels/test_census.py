@@ -19,6 +19,7 @@ def planes_of(
     grey: Image, descriptor: Descriptor, place: int = 0, size: int | None = None
 ) -> Image:
     height, width = grey.shape
+    grey.flags.writeable = False  # as that of a pair: kernels are compiled for it
     planes = np.full((height, descriptor.planes, width if size is None else size), 77, np.uint8)
     write_planes(grey, descriptor, place, 0, height, planes)
     return planes.transpose(1, 0, 2)

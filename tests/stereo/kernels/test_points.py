@@ -34,13 +34,16 @@ def make_maps(seed: int, height: int, width: int, *, known: float, channels: int
     values += rng.normal(0, 0.3, values.shape)
     values[rng.random(values.shape) < 0.05] = -3.0
     values[rng.random(values.shape) > known] = np.nan
-    return Maps(
+    made = Maps(
         values.astype(np.float32),
         rng.random(values.shape).astype(np.float32),
         rng.uniform(0.05, 0.6, values.shape).astype(np.float32),
         rng.integers(0, 256, (height, width, channels), dtype=np.uint8),
         rng.random(values.shape) < 0.9 if channels == 3 else np.zeros((0, 0), np.bool_),
     )
+    for image in made[:-1]:
+        image.flags.writeable = False  # as those of a disparity: kernels are compiled for them
+    return made
 
 
 maps = st.builds(

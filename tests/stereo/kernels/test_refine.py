@@ -180,7 +180,7 @@ def test_confidence_grows_with_the_margin_and_is_zero_without_a_second_best() ->
 
 
 def test_confidence_is_the_odds_of_margin_and_noise() -> None:
-    _, confidence, _, _ = refine_one(one_pixel((20, 60, 40, 100)), RULES._replace(odds=3))
+    _, confidence, _, _ = refine_one(one_pixel((20, 60, 40, 100)), RULES._replace(odds=3.0))
     margin = (100 - 20) / (25 + 20)
     # Slope 40, vertex 10, 25 pixels; the floor is 0.1.
     noise_px = 0.5 * np.pi * 10 / (40 * 5)
@@ -215,7 +215,7 @@ def test_sigma_of_a_pixel_without_a_second_best_is_that_of_a_wrong_one() -> None
 def test_rejected_pixels_have_nothing_left_but_a_reason() -> None:
     refined = refine_all(one_pixel((2, 6, 6, 20)), np.ones((1, 8), np.float32), RULES)
     mask = np.arange(8)[None] >= 6
-    reject(mask, Reason.SPECKLE, refined)
+    reject(mask, int(Reason.SPECKLE), refined)
     np.testing.assert_array_equal(refined.reason == Reason.SPECKLE, mask)
     assert np.isnan(refined.values[mask]).all()
     assert np.isnan(refined.sigma_px[mask]).all()

@@ -18,7 +18,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-PAGE = Path(__file__).parents[2] / "docs" / "walk-research.md"
+PAGE = Path(__file__).parents[3] / "docs" / "walk-research.md"
 
 
 def blocks(language: str) -> list[str]:
