@@ -97,10 +97,9 @@ def calibrate(
       recon calibrate both.mp4 --board chess:9x6:25mm
     """
     with session(quiet=quiet):
-        from recon.commands.calibrate import CalibrateOptions, run_calibration
+        from recon.commands.calibrate import run_calibration
         from recon.commands.config import load_config
         from recon.core.values.board import parse_board
-        from recon.report import present_calibration
         from recon.rig.calibrate.summary import tell_depths
 
         # kalibr's lens model has two radial terms.
@@ -109,8 +108,16 @@ def calibrate(
         if distance is not None:
             chosen.append(f"calibration.working_m={distance}")
         settings = load_config(config, [*fitting, *(set_ or ()), *chosen])
-        options = CalibrateOptions(out, form.value, report, threads, present_calibration)
-        run = run_calibration(left, right, parse_board(board), settings, options)
+        run = run_calibration(
+            left,
+            right,
+            parse_board(board),
+            settings,
+            file=out,
+            form=form.value,
+            out=report,
+            threads=threads,
+        )
     if json:
         print_json(run.summary)
     else:

@@ -64,16 +64,15 @@ def map_(
       recon evaluate map outputs/map/latest lidar_map.ply --align-to poses.txt
     """
     with session(quiet=quiet):
-        from recon.commands.evaluate_map import MapFiles, run_evaluate_map
-        from recon.report.map_errors import present_map_errors
+        from recon.commands.evaluate_map import run_evaluate_map
 
-        files = MapFiles(
-            run=run,
-            reference=reference,
+        figures = run_evaluate_map(
+            run,
+            reference,
             frame=reference_frame.value,
             align_to=align_to,
             icp=align is MapAlignment.icp,
             thresholds_m=parse_numbers(threshold, "--threshold") or (),
+            out=out,
         )
-        figures = run_evaluate_map(files, out, present_map_errors)
     print_json(figures) if json else print_evaluation(f"{run} against {reference}", figures)

@@ -70,9 +70,8 @@ def trajectory(
       recon evaluate trajectory trajectory_tum.txt groundtruth.txt --align sim3
     """
     with session(quiet=quiet):
-        from recon.commands.evaluate_trajectory import TrajectoryFiles, run_evaluate_trajectory
+        from recon.commands.evaluate_trajectory import run_evaluate_trajectory
         from recon.evaluation import TrajectoryRules
-        from recon.report.trajectory_report import present_trajectory
 
         asked = {
             "alignment": align.value,
@@ -81,6 +80,7 @@ def trajectory(
             "rpe_frames": rpe_frames,
         }
         rules = TrajectoryRules.parse(asked, where="recon evaluate trajectory")
-        files = TrajectoryFiles(estimate, truth, times, tolerance)
-        figures = run_evaluate_trajectory(files, rules, out, present_trajectory)
+        figures = run_evaluate_trajectory(
+            estimate, truth, rules, times=times, tolerance_s=tolerance, out=out
+        )
     print_json(figures) if json else print_evaluation(f"{estimate} against {truth}", figures)

@@ -45,9 +45,15 @@ def rectify(
     """
     with session(quiet=quiet):
         from recon.commands.config import load_config
-        from recon.commands.rectify import RectifyOptions, run_rectify
-        from recon.report import present_rectify
+        from recon.commands.rectify import run_rectify
 
-        options = RectifyOptions(calib, unit_m, out, threads, present_rectify)
-        run = run_rectify(left, right, load_config(config, set_ or ()), options)
+        run = run_rectify(
+            left,
+            right,
+            load_config(config, set_ or ()),
+            calibration=calib,
+            metres_per_unit=unit_m,
+            out=out,
+            threads=threads,
+        )
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

@@ -17,7 +17,7 @@ from recon.io.files import SMALL_FILE_BYTES, read_text
 from recon.io.yaml_file import parse_yaml
 from recon.map.settings import DriveSettings
 from recon.rig.audit.settings import AuditedSettings
-from recon.rig.calibrate import CalibrationSettings
+from recon.rig.calibrate.settings import CalibratedSettings
 from recon.rig.capture import CaptureSettings
 from recon.sources.settings import SourceSettings
 from recon.stereo.cloud import ANY_SCALE
@@ -29,12 +29,11 @@ _BYTES_PER_PIXEL: Final = 18
 """Two colour images, and the disparity with its confidence and deviation: the least of a pair."""
 
 
-class ReconConfig(DriveSettings, AuditedSettings, PaperConfig):
+class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfig):
     """Everything that determines a result; written beside each result as ``config.yaml``."""
 
     source: SourceSettings = SourceSettings()
     capture: CaptureSettings = CaptureSettings()
-    calibration: CalibrationSettings = CalibrationSettings()
     mesh: MeshSettings = MeshSettings()
     street: StreetSettings = StreetSettings()
 

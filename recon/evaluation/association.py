@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from recon.core.errors import EvaluationError
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64, Int32
+
+TOLERANCE_S: Final = 0.01
+"""Largest time difference of two associated poses, unless another is given."""
 
 
 def associate(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from recon.commands.calibrate import CalibrationRun
 from recon.report.canvas import (
     BAD,
     ESTIMATE,
@@ -19,6 +18,7 @@ from recon.report.canvas import (
     to_png,
 )
 from recon.rig.calibrate import DepthError
+from recon.rig.calibrate.result import CalibrationRun
 
 _CELLS = (8, 6)
 

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from recon.commands.calibrate import CalibrationRun
 from recon.commands.config import dump_config
 from recon.core.values import StereoPair
 from recon.io.atomic import write_bytes, write_text
@@ -28,6 +27,7 @@ from recon.report.epipolar_figures import (
 from recon.report.html import FigureBlock, ReportContent, Section, TableBlock, render_html
 from recon.report.present import command_line
 from recon.rig.calibrate import shared_pixels
+from recon.rig.calibrate.result import CalibrationRun
 from recon.run.directory import RunDirectory
 from recon.run.machine import versions
 from recon.stereo.rectify import Rectifier, epipolar_curves

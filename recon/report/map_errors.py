@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from recon.commands.evaluate_map import MapComparison
 from recon.core.values import PointCloud
 from recon.evaluation import nearest_distances
+from recon.evaluation.map_run import MapComparison
 from recon.io.models.ply import write_ply
 from recon.report.colour import ERROR_SCALE, colour_values
 from recon.run.directory import RunDirectory
@@ -25,7 +25,7 @@ def present_map_errors(comparison: MapComparison, directory: RunDirectory) -> No
     Raises:
         OutputError: A file cannot be written.
     """
-    limit_m = _SCALE_THRESHOLDS * max(comparison.files.thresholds_m)
+    limit_m = _SCALE_THRESHOLDS * max(comparison.thresholds_m)
     cloud, reference = comparison.cloud, comparison.reference
     for name, points, others in (("error", cloud, reference), ("missed", reference, cloud)):
         distance_m = nearest_distances(points.xyz, others.xyz)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from recon.commands.rectify import RectifyRun
 from recon.io.atomic import write_bytes
 from recon.report.epipolar_figures import (
     EpipolarPicture,
@@ -10,6 +9,7 @@ from recon.report.epipolar_figures import (
     level_lines,
     spread_points,
 )
+from recon.rig.rectification import RectifyRun
 from recon.run.directory import RunDirectory
 
 

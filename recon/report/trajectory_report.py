@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from recon.commands.evaluate_trajectory import TrajectoryRun
+from recon.evaluation.trajectory_run import TrajectoryRun
 from recon.io.atomic import write_bytes, write_text
 from recon.report.blocks import metrics_table
 from recon.report.html import FigureBlock, ReportContent, Section, TableBlock, render_html
@@ -69,7 +69,7 @@ def _content(run: TrajectoryRun, figures: Mapping[str, bytes]) -> ReportContent:
         ]),
     )  # fmt: skip
     return ReportContent(
-        title=f"{run.files.estimate.name} against {run.files.truth.name}",
+        title=f"{run.estimate.name} against {run.truth.name}",
         subtitle=f"{found.frames} poses compared {run.summary['associated']}, "
         f"{found.path_length_m:.1f} m of true path",
         command=command_line(),

@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.commands.calibrate import CalibrateOptions, run_calibration
+from recon.commands.calibrate import run_calibration
 from recon.commands.config import load_config
 from recon.core.errors import CalibrationError, OutputError, ReconError, SourceError
 from recon.core.values import StereoCalibration
 from recon.core.values.board import parse_board
 from recon.io.cameras.calibration import read_calibration
 from recon.io.images.image import read_image, write_image
-from recon.report import present_calibration
 from recon.rig.calibrate.board_views import find_views
 from recon.rig.calibrate.summary import tell_depths
 from recon.sources.image_pairs import pair_images
@@ -38,10 +37,17 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def calibrate(folder: Path, out: Path, form: str = "recon", board: str = "chess:9x6:25mm"):
-    options = CalibrateOptions(out / "rig.yaml", form, out / "report", 1, None)  # type: ignore[arg-type]
     terms = ["calibration.radial_terms=2"] if form == "kalibr" else []
     sides = (str(folder / "left*.png"), str(folder / "right*.png"))
-    return run_calibration(*sides, parse_board(board), load_config(None, QUICK + terms), options)
+    return run_calibration(
+        *sides,
+        parse_board(board),
+        load_config(None, QUICK + terms),
+        file=out / "rig.yaml",
+        form=form,  # type: ignore[arg-type]
+        out=out / "report",
+        threads=1,
+    )
 
 
 @pytest.mark.parametrize("form", ["recon", "opencv", "ros", "kalibr"])
@@ -63,13 +69,12 @@ def test_pictures_give_the_true_rig_in_every_format(drawn: Path, tmp_path: Path,
 
 
 def test_report_and_pictures_are_written(drawn: Path, tmp_path: Path) -> None:
-    options = CalibrateOptions(None, "recon", tmp_path / "out", 1, present_calibration)
     run = run_calibration(
         str(drawn / "left*.png"),
         str(drawn / "right*.png"),
         BOARD,
         load_config(None, QUICK),
-        options,
+        out=tmp_path / "out",
     )
     names = {path.name for path in (tmp_path / "out").rglob("*.png")}
     assert {"coverage.png", "epipolar_raw.png", "epipolar_rectified.png"} <= names
@@ -223,8 +228,7 @@ def test_a_video_gives_one_view_for_each_place_where_the_board_stands_still(
         right = str(write_video(tmp_path / "right.mkv", [right for _, right in frames]))
     else:
         left, right = write_video(tmp_path / "both.mkv", [np.hstack(both) for both in frames]), None
-    options = CalibrateOptions(None, "recon", tmp_path / "out", 1, None)
-    run = run_calibration(str(left), right, BOARD, load_config(None, QUICK), options)
+    run = run_calibration(str(left), right, BOARD, load_config(None, QUICK), out=tmp_path / "out")
     # In one of the nine places the right camera does not see the board.
     assert 9 <= run.summary["views"] <= 11
     assert run.summary["views_used"] == 8
@@ -235,11 +239,12 @@ def test_a_video_gives_one_view_for_each_place_where_the_board_stands_still(
 
 def test_one_video_and_one_folder_are_refused(tmp_path: Path) -> None:
     video = write_video(tmp_path / "left.mkv", [np.zeros((32, 32), np.uint8)] * 3)
-    options = CalibrateOptions(None, "recon", tmp_path / "out", 1, None)
     with pytest.raises(SourceError, match="two videos, or one video with both views"):
-        run_calibration(str(video), str(tmp_path), BOARD, load_config(None, QUICK), options)
+        run_calibration(
+            str(video), str(tmp_path), BOARD, load_config(None, QUICK), out=tmp_path / "out"
+        )
     with pytest.raises(SourceError, match="two videos, or one video with both views"):
-        run_calibration(str(tmp_path), None, BOARD, load_config(None, QUICK), options)
+        run_calibration(str(tmp_path), None, BOARD, load_config(None, QUICK), out=tmp_path / "out")
 
 
 @pytest.mark.real
@@ -247,9 +252,8 @@ def test_the_published_chessboard_pairs_calibrate_as_they_should(
     recon_data: Path, tmp_path: Path
 ) -> None:
     folder = recon_data / "calibration" / "opencv_chessboard"
-    options = CalibrateOptions(None, "recon", tmp_path / "out", 1, None)
     sides = (str(folder / "left*.jpg"), str(folder / "right*.jpg"))
-    summary = run_calibration(*sides, BOARD, load_config(None, QUICK), options).summary
+    summary = run_calibration(*sides, BOARD, load_config(None, QUICK), out=tmp_path / "out").summary
     assert summary["stereo_rms_px"] <= 0.45
     assert summary["baseline_squares"] == pytest.approx(3.34, abs=0.02)
     assert summary["epipolar_px"] <= 0.3
@@ -266,9 +270,9 @@ def test_the_published_views_captured_five_times_have_the_same_forecast(
             (tmp_path / f"{path.stem}_{number}.jpg").symlink_to(path)
     summaries = []
     for name, source in (("once", folder), ("five", tmp_path)):
-        options = CalibrateOptions(None, "recon", tmp_path / name, 1, None)
         sides = (str(source / "left*.jpg"), str(source / "right*.jpg"))
-        summaries.append(run_calibration(*sides, BOARD, load_config(None, QUICK), options).summary)
+        run = run_calibration(*sides, BOARD, load_config(None, QUICK), out=tmp_path / name)
+        summaries.append(run.summary)
     once, five = summaries
     assert five["rotation_spread_deg"] == pytest.approx(once["rotation_spread_deg"], rel=1e-6)
     # 0.12 degrees between the cameras, which is 5 % of the depth at 3.5 m.

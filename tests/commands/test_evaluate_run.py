@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.commands.evaluate_map import MapFiles, run_evaluate_map
+from recon.commands.evaluate_map import run_evaluate_map
 from recon.core.errors import EvaluationError, FormatError, SettingsError
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.geometry.transform import transform_cloud
 from recon.core.values import PointCloud, Trajectory
 from recon.io.models.ply import read_ply, write_ply
 from recon.io.trajectory import write_kitti_poses, write_tum
-from recon.report.map_errors import present_map_errors
 
 T_MAP_WORLD = make_transform(exp_so3(np.array([0.3, -1.2, 0.8])), np.zeros(3))
 
@@ -38,7 +37,7 @@ def run(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("frame", ["camera", "map"])
 def test_a_run_equals_itself_in_either_frame(run: Path, inside: str, frame: str) -> None:
     reference = run.parent / f"in_{frame}.ply"
-    figures = run_evaluate_map(MapFiles(run / inside, reference, frame=frame))
+    figures = run_evaluate_map(run / inside, reference, frame=frame)
     assert figures["f_score"] == 1.0
     assert figures["warnings"] == []
     # Both clouds are thinned on grids that start elsewhere, after a rotation of float32 points.
@@ -49,7 +48,7 @@ def test_a_run_equals_itself_in_either_frame(run: Path, inside: str, frame: str)
 def test_the_wrong_frame_does_not_fit_and_the_right_one_is_named(
     run: Path, right: str, wrong: str
 ) -> None:
-    figures = run_evaluate_map(MapFiles(run, run.parent / f"in_{right}.ply", frame=wrong))
+    figures = run_evaluate_map(run, run.parent / f"in_{right}.ply", frame=wrong)
     assert figures["f_score"] < 0.5
     (doubt,) = figures["warnings"]
     assert f"--reference-frame {right}" in doubt
@@ -58,13 +57,13 @@ def test_the_wrong_frame_does_not_fit_and_the_right_one_is_named(
 def test_clouds_that_do_not_meet_are_said_not_to(run: Path) -> None:
     reference = read_ply(run.parent / "in_camera.ply")
     write_ply(run.parent / "far.ply", replace(reference, xyz=reference.xyz + np.float32(50)))
-    (doubt,) = run_evaluate_map(MapFiles(run, run.parent / "far.ply"))["warnings"]
+    (doubt,) = run_evaluate_map(run, run.parent / "far.ply")["warnings"]
     assert "hardly meet" in doubt
 
 
 def test_a_cloud_of_no_run_is_taken_as_it_is(run: Path) -> None:
     reference = run.parent / "in_camera.ply"
-    figures = run_evaluate_map(MapFiles(reference, reference, frame="camera"))
+    figures = run_evaluate_map(reference, reference, frame="camera")
     assert figures["f_score"] == 1.0
 
 
@@ -72,7 +71,7 @@ def test_a_cloud_of_no_run_is_taken_as_it_is(run: Path) -> None:
 def test_a_broken_record_is_refused(run: Path, record: str) -> None:
     (run / "run.json").write_text(record)
     with pytest.raises(FormatError, match=r"run\.json.*T_map_world|T_map_world.*"):
-        run_evaluate_map(MapFiles(run, run.parent / "in_map.ply", frame="camera"))
+        run_evaluate_map(run, run.parent / "in_map.ply", frame="camera")
 
 
 @pytest.fixture
@@ -100,9 +99,9 @@ def drifted(tmp_path: Path) -> Path:
 
 
 def test_a_fit_of_the_paths_undoes_what_both_share(drifted: Path) -> None:
-    files = MapFiles(drifted / "drift", drifted / "reference.ply")
-    assert run_evaluate_map(files)["f_score"] < 0.7
-    found = run_evaluate_map(replace(files, align_to=drifted / "poses.txt"))
+    files = (drifted / "drift", drifted / "reference.ply")
+    assert run_evaluate_map(*files)["f_score"] < 0.7
+    found = run_evaluate_map(*files, align_to=drifted / "poses.txt")
     assert found["f_score"] == 1.0
     assert found["alignment"] == "poses"
     # The written path has twelve decimals; the turn made was 0.84 degrees.
@@ -111,7 +110,7 @@ def test_a_fit_of_the_paths_undoes_what_both_share(drifted: Path) -> None:
 
 def test_icp_lays_the_cloud_onto_the_reference(drifted: Path) -> None:
     found = run_evaluate_map(
-        MapFiles(drifted / "drift", drifted / "reference.ply", icp=True, thresholds_m=(0.1, 0.2))
+        drifted / "drift", drifted / "reference.ply", icp=True, thresholds_m=(0.1, 0.2)
     )
     assert found["by_threshold"][1]["f_score"] > 0.99
     assert found["icp_share"] > 0.9
@@ -120,7 +119,7 @@ def test_icp_lays_the_cloud_onto_the_reference(drifted: Path) -> None:
 
 def test_every_threshold_has_its_figures_and_the_first_stands_on_top(drifted: Path) -> None:
     found = run_evaluate_map(
-        MapFiles(drifted / "drift", drifted / "reference.ply", thresholds_m=(0.1, 0.5, 1.0))
+        drifted / "drift", drifted / "reference.ply", thresholds_m=(0.1, 0.5, 1.0)
     )
     scores = [one["f_score"] for one in found["by_threshold"]]
     assert scores == sorted(scores)
@@ -134,7 +133,7 @@ def test_what_stands_above_all_of_the_reference_is_not_judged(drifted: Path) -> 
     xyz = np.concatenate([cloud.xyz, crowns])
     write_ply(drifted / "drift" / "map" / "cloud.ply", PointCloud(xyz, frame="map"))
     found = run_evaluate_map(
-        MapFiles(drifted / "drift", drifted / "reference.ply", align_to=drifted / "poses.txt")
+        drifted / "drift", drifted / "reference.ply", align_to=drifted / "poses.txt"
     )
     assert found["precision"] < 0.8
     assert found["precision_in_reach"] == 1.0
@@ -142,8 +141,8 @@ def test_what_stands_above_all_of_the_reference_is_not_judged(drifted: Path) -> 
 
 
 def test_clouds_are_coloured_by_their_errors(drifted: Path) -> None:
-    files = MapFiles(drifted / "drift", drifted / "reference.ply", align_to=drifted / "poses.txt")
-    found = run_evaluate_map(files, drifted / "out", present_map_errors)
+    files, poses = (drifted / "drift", drifted / "reference.ply"), drifted / "poses.txt"
+    found = run_evaluate_map(*files, align_to=poses, out=drifted / "out")
     assert json.loads((drifted / "out" / "summary.json").read_text()) == found
     for name in ("error", "missed"):
         cloud = read_ply(drifted / "out" / f"{name}.ply")
@@ -158,12 +157,12 @@ def test_clouds_are_coloured_by_their_errors(drifted: Path) -> None:
 def test_what_cannot_be_aligned_is_told(drifted: Path) -> None:
     reference, poses = drifted / "reference.ply", drifted / "poses.txt"
     with pytest.raises(EvaluationError, match="has no path to align"):
-        run_evaluate_map(MapFiles(reference, reference, align_to=poses))
+        run_evaluate_map(reference, reference, align_to=poses)
     with pytest.raises(SettingsError, match="needs a reference in the axes of the poses"):
-        run_evaluate_map(MapFiles(drifted / "drift", reference, frame="map", align_to=poses))
+        run_evaluate_map(drifted / "drift", reference, frame="map", align_to=poses)
     lines = poses.read_text().splitlines()
     poses.write_text("\n".join(lines[:30]) + "\n")
     with pytest.raises(EvaluationError, match="got 30 poses, expected 41"):
-        run_evaluate_map(MapFiles(drifted / "drift", reference, align_to=poses))
+        run_evaluate_map(drifted / "drift", reference, align_to=poses)
     with pytest.raises(SettingsError, match="no threshold"):
-        run_evaluate_map(MapFiles(reference, reference, thresholds_m=()))
+        run_evaluate_map(reference, reference, thresholds_m=())

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.commands.evaluate_trajectory import TrajectoryFiles, run_evaluate_trajectory
+from recon.commands.evaluate_trajectory import run_evaluate_trajectory
 from recon.core.errors import EvaluationError, FormatError, SourceError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
 from recon.evaluation import TrajectoryRules
 from recon.io.trajectory import write_kitti_poses, write_tum
 from recon.report.trajectory_figures import widest_axes
-from recon.report.trajectory_report import present_trajectory
 
 RULES = TrajectoryRules()
 
@@ -36,8 +35,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_files_with_times_are_compared_by_time(folder: Path) -> None:
-    files = TrajectoryFiles(folder / "half.txt", folder / "truth_tum.txt")
-    found = run_evaluate_trajectory(files, RULES)
+    files = (folder / "half.txt", folder / "truth_tum.txt")
+    found = run_evaluate_trajectory(*files, RULES)
     assert found["associated"] == "by time"
     assert (found["frames"], found["estimate_poses"], found["true_poses"]) == (60, 60, 120)
     assert found["ate_m"] < 1e-6
@@ -45,40 +44,37 @@ def test_files_with_times_are_compared_by_time(folder: Path) -> None:
 
 
 def test_a_kitti_file_gets_its_times_from_a_file(folder: Path) -> None:
-    files = TrajectoryFiles(
-        folder / "half_kitti.txt", folder / "truth_tum.txt", folder / "times.txt"
-    )
-    assert run_evaluate_trajectory(files, RULES)["frames"] == 60
+    files = (folder / "half_kitti.txt", folder / "truth_tum.txt")
+    found = run_evaluate_trajectory(*files, RULES, times=folder / "times.txt")
+    assert found["frames"] == 60
 
 
 def test_kitti_and_tum_are_compared_in_order(folder: Path) -> None:
-    files = TrajectoryFiles(folder / "truth_tum.txt", folder / "truth.txt")
-    found = run_evaluate_trajectory(files, RULES)
+    files = (folder / "truth_tum.txt", folder / "truth.txt")
+    found = run_evaluate_trajectory(*files, RULES)
     assert (found["associated"], found["frames"]) == ("in order", 120)
     assert found["ate_m"] < 1e-6
 
 
 def test_without_times_the_numbers_of_poses_must_agree(folder: Path) -> None:
     with pytest.raises(EvaluationError, match=r"got 60 poses, expected 120 poses\); without times"):
-        run_evaluate_trajectory(
-            TrajectoryFiles(folder / "half_kitti.txt", folder / "truth.txt"), RULES
-        )
+        run_evaluate_trajectory(folder / "half_kitti.txt", folder / "truth.txt", RULES)
 
 
 def test_few_partners_are_warned_of(folder: Path) -> None:
-    files = TrajectoryFiles(folder / "half.txt", folder / "drifting.txt", tolerance_s=0.01)
+    files = (folder / "half.txt", folder / "drifting.txt")
     times = 5 + 0.2 * np.arange(60) + np.where(np.arange(60) < 20, 0.003, 0.05)
     path = Trajectory(np.tile(np.eye(4), (60, 1, 1)), times)
     poses = path.T_world_camera.copy()
     poses[:, 2, 3] = np.arange(60)
     write_tum(folder / "drifting.txt", Trajectory(poses, times))
-    found = run_evaluate_trajectory(files, RULES)
+    found = run_evaluate_trajectory(*files, RULES, tolerance_s=0.01)
     assert found["warnings"] == ["only 20 of 60 poses have a partner in time; see --tolerance"]
 
 
 def test_a_folder_gets_report_figures_and_aligned_paths(folder: Path) -> None:
-    files = TrajectoryFiles(folder / "half.txt", folder / "truth_tum.txt")
-    found = run_evaluate_trajectory(files, RULES, folder / "out", present_trajectory)
+    files = (folder / "half.txt", folder / "truth_tum.txt")
+    found = run_evaluate_trajectory(*files, RULES, out=folder / "out")
     written = {path.name for path in (folder / "out").iterdir()}
     figures = {"path", "error_along_path", "translation_by_length", "rotation_by_length"}
     assert written == {f"{name}.png" for name in figures} | {
@@ -89,21 +85,20 @@ def test_a_folder_gets_report_figures_and_aligned_paths(folder: Path) -> None:
     assert "half.txt against truth_tum.txt" in page
     assert page.count("<img") == 4
     assert run_evaluate_trajectory(
-        TrajectoryFiles(folder / "out" / "estimate_aligned_tum.txt", folder / "out/truth_tum.txt"),
+        folder / "out" / "estimate_aligned_tum.txt",
+        folder / "out/truth_tum.txt",
         TrajectoryRules(alignment="none"),
     )["ate_m"] == pytest.approx(found["ate_m"], abs=1e-9)
 
 
 def test_what_cannot_be_compared_leaves_no_folder(folder: Path) -> None:
-    for files, kind in (
-        (TrajectoryFiles(folder / "half.txt", folder / "none.txt"), FormatError),
-        (
-            TrajectoryFiles(folder / "truth.txt", folder / "truth_tum.txt", folder / "times.txt"),
-            SourceError,
-        ),
+    for estimate, truth, times, kind in (
+        ("half.txt", "none.txt", None, FormatError),
+        ("truth.txt", "truth_tum.txt", folder / "times.txt", SourceError),
     ):
+        files = (folder / estimate, folder / truth)
         with pytest.raises(kind):
-            run_evaluate_trajectory(files, RULES, folder / "out", present_trajectory)
+            run_evaluate_trajectory(*files, RULES, times=times, out=folder / "out")
         assert not (folder / "out").exists()
 
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.rectify import RectifyOptions, run_rectify
+from recon.commands.rectify import run_rectify
 from recon.core.errors import CalibrationError
 from recon.core.values import RectifiedCamera
 from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.image import read_image, write_image
-from recon.report import present_rectify
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetSettings
 from tests.scenery.boards import board_rig
@@ -39,9 +38,8 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_folder_is_rectified_by_its_features_and_says_up_to_scale(
     street: Path, tmp_path: Path
 ) -> None:
-    options = RectifyOptions(out=tmp_path / "out", threads=1, present=present_rectify)
     sides = (str(street / "left"), str(street / "right"))
-    run_rectify(*sides, load_config(), options)
+    run_rectify(*sides, load_config(), out=tmp_path / "out", threads=1)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["up_to_scale"] is True
     assert summary["row_error_px"] < 0.7
@@ -67,9 +65,9 @@ def test_a_calibration_gives_metric_pictures_that_other_commands_take(
     height, width = read_image(street / "left" / "0.png").shape[:2]
     rig = board_rig("fisheye", width, height)
     write_recon_calibration(tmp_path / "rig.yaml", rig)
-    options = RectifyOptions(tmp_path / "rig.yaml", out=tmp_path / "out", threads=1)
+    rig_file, out = tmp_path / "rig.yaml", tmp_path / "out"
     sides = (str(street / "left" / "0.png"), str(street / "right" / "0.png"))
-    run = run_rectify(*sides, load_config(), options)
+    run = run_rectify(*sides, load_config(), calibration=rig_file, out=out, threads=1)
     camera = read_calibration(tmp_path / "out" / "calibration.yaml", width, height)
     assert isinstance(camera, RectifiedCamera)
     assert camera.baseline_m == pytest.approx(rig.baseline_m)
@@ -80,18 +78,18 @@ def test_a_calibration_gives_metric_pictures_that_other_commands_take(
 def test_a_calibration_of_rectified_pictures_is_refused(street: Path, tmp_path: Path) -> None:
     camera = RectifiedCamera(270, 240, 120, 240, 0.5, 480, 240)
     write_recon_calibration(tmp_path / "c.yaml", camera)
-    options = RectifyOptions(tmp_path / "c.yaml", out=tmp_path / "out")
+    sides, file = (str(street / "left"), str(street / "right")), tmp_path / "c.yaml"
     with pytest.raises(CalibrationError, match=r"c\.yaml: .*already rectified"):
-        run_rectify(str(street / "left"), str(street / "right"), load_config(), options)
+        run_rectify(*sides, load_config(), calibration=file, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_blank_pictures_are_one_clear_line(tmp_path: Path) -> None:
     for side in ("l", "r"):
         write_image(tmp_path / f"{side}.png", np.full((100, 120), 80, np.uint8))
-    options = RectifyOptions(out=tmp_path / "out")
+    sides = (str(tmp_path / "l.png"), str(tmp_path / "r.png"))
     with pytest.raises(CalibrationError, match="too few matched features"):
-        run_rectify(str(tmp_path / "l.png"), str(tmp_path / "r.png"), load_config(), options)
+        run_rectify(*sides, load_config(), out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -101,7 +99,7 @@ def test_one_pair_is_enough_with_features_and_keeps_its_file_type(
     for side in ("left", "right"):
         write_image(tmp_path / side / "0.jpg", read_image(street / side / "0.png"))
     sides = (str(tmp_path / "left" / "0.jpg"), str(tmp_path / "right" / "0.jpg"))
-    run = run_rectify(*sides, load_config(), RectifyOptions(out=tmp_path / "out", threads=1))
+    run = run_rectify(*sides, load_config(), out=tmp_path / "out", threads=1)
     assert run.summary["row_error_px"] < 0.7
     for side, rectified in zip(("left", "right"), run.rectified, strict=True):
         written = read_image(tmp_path / "out" / side / "0.jpg").astype(int)
@@ -113,6 +111,4 @@ def test_one_pair_with_too_few_matches_asks_for_several(tmp_path: Path) -> None:
     for side in ("l", "r"):
         write_image(tmp_path / f"{side}.png", np.full((60, 80), 128, np.uint8))
     with pytest.raises(CalibrationError, match=r"l\.png: .*several pairs are needed.*--calib"):
-        run_rectify(
-            str(tmp_path / "l.png"), str(tmp_path / "r.png"), load_config(), RectifyOptions()
-        )
+        run_rectify(str(tmp_path / "l.png"), str(tmp_path / "r.png"), load_config())

@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from recon.core.settings import Settings
+from recon.stereo.settings import StereoSettings
 
 LensKind = Literal["radtan", "rational", "fisheye"]
 
@@ -52,3 +53,9 @@ class CalibrationSettings(Settings):
         default=0.25, gt=0, description="Assumed matching error for that prediction, in pixels."
     )
     seed: int = Field(default=0, ge=0, description="Seed of the resampling.")
+
+
+class CalibratedSettings(StereoSettings):
+    """Settings of a calibration, whose views are rectified as a run does."""
+
+    calibration: CalibrationSettings = CalibrationSettings()

@@ -1,0 +1,235 @@
+"""The map of a run beside a reference cloud: brought into its axes, and doubted where it is off."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from recon.core.errors import EvaluationError, FormatError, SettingsError
+from recon.core.geometry.alignment import fit_paths
+from recon.core.geometry.se3 import angle_rad, invert
+from recon.core.geometry.transform import transform_cloud
+from recon.core.values import PointCloud, Trajectory
+from recon.core.values.arrays import Float64
+from recon.evaluation.association import TOLERANCE_S, associate
+from recon.evaluation.map import evaluate_map, register_cloud, within_reach
+from recon.io.models.ply import read_ply
+from recon.io.trajectory import holds_times, read_trajectory
+from recon.run.directory import RECORD
+
+ReferenceFrame = Literal["camera", "map"]
+_PATH: Final = "trajectory_tum.txt"
+# From half of either cloud near the other it is a fit; below a tenth of both it is none.
+_FITS, _HARDLY_MEETS = 0.5, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class MapComparison:
+    """The result of a comparison, from which its clouds are coloured.
+
+    Attributes:
+        cloud: The estimate, in the axes of the reference, aligned.
+        reference: The reference.
+        thresholds_m: Distances below which a point counts as correct.
+        summary: The figures of ``summary.json``.
+    """
+
+    cloud: PointCloud
+    reference: PointCloud
+    thresholds_m: tuple[float, ...]
+    summary: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class MappedCloud:
+    """A cloud, and the run that it belongs to.
+
+    Attributes:
+        cloud: The cloud; as read, in map axes if it is of a run.
+        path: The path of the cameras; as read, in world axes; None = unknown.
+        folder: Folder of the run; None = no run.
+        T_map_world: float64 (4, 4), from world to map axes; None = no run.
+    """
+
+    cloud: PointCloud
+    path: Trajectory | None = None
+    folder: Path | None = None
+    T_map_world: Float64 | None = None
+
+
+def read_mapped_cloud(run: Path) -> MappedCloud:
+    """Read the map of a run, or a cloud.
+
+    Args:
+        run: A run's folder, or a PLY file. A PLY inside a run's folder is in that run's map axes.
+
+    Raises:
+        FormatError: A file cannot be read, or the folder does not contain a finished run.
+    """
+    folder = run if run.is_dir() else run.parent.parent
+    if run.is_dir():
+        if not (run / RECORD).is_file():
+            raise FormatError(
+                "folder does not contain a finished run", where=run, expected=f"a {RECORD}"
+            )
+    elif run.parent.name != "map" or not (folder / RECORD).is_file():
+        return MappedCloud(read_ply(run))
+    T_map_world = _read_axes(folder / RECORD)
+    cloud = read_ply(run / "map" / "cloud.ply" if run.is_dir() else run)
+    path = read_trajectory(folder / _PATH) if (folder / _PATH).is_file() else None
+    return MappedCloud(cloud, path, folder, T_map_world)
+
+
+def place_cloud(
+    mapped: MappedCloud, frame: ReferenceFrame, align_to: Path | None
+) -> tuple[MappedCloud, dict[str, Any]]:
+    """Bring a map into the axes of its reference.
+
+    Args:
+        mapped: The map; a cloud of no run is taken to be in the axes of the reference already.
+        frame: Axes of the reference: those of the first left camera, or the map's.
+        align_to: Ground-truth poses of the run's cameras, in the axes of the reference; the run's
+            path is aligned rigidly to them, and its map moves with it.
+
+    Returns:
+        The map, and how it was aligned.
+
+    Raises:
+        SettingsError: The poses are not in the axes of the reference.
+        EvaluationError: There is no path to align, or it has another length.
+    """
+    if frame == "map" and align_to is not None:
+        raise SettingsError(
+            "--align-to needs a reference in the axes of the poses",
+            where="--reference-frame",
+            got="map",
+            expected="camera",
+        )
+    T_map_world = mapped.T_map_world
+    if T_map_world is None and align_to is not None:
+        raise EvaluationError(
+            "a cloud without a run has no path to align", hint="give the folder of a run"
+        )
+    if T_map_world is None:
+        return mapped, {"alignment": "none"}
+    if frame == "map":
+        return replace(mapped, path=_moved(mapped.path, T_map_world)), {"alignment": "none"}
+    T = np.eye(4)
+    how: dict[str, Any] = {"alignment": "none"}
+    if align_to is not None:
+        T = _path_motion(mapped, align_to)
+        how = {"alignment": "poses", **_size("path", T)}
+    cloud = transform_cloud(mapped.cloud, T @ invert(T_map_world), frame="camera")
+    return replace(mapped, cloud=cloud, path=_moved(mapped.path, T)), how
+
+
+def fit_cloud(
+    mapped: MappedCloud, reference: PointCloud, reach_m: float
+) -> tuple[MappedCloud, dict[str, Any]]:
+    """Align a map to the reference by ICP; also returns how far that moved it.
+
+    Raises:
+        EvaluationError: The two hardly overlap.
+    """
+    T, share = register_cloud(mapped.cloud, reference, reach_m)
+    # Measured at the centre of the map: a rotation about a far origin would look like a shift.
+    middle = np.eye(4)
+    middle[:3, 3] = mapped.cloud.xyz.mean(axis=0, dtype=np.float64)
+    figures = {**_size("icp", invert(middle) @ T @ middle), "icp_share": share}
+    cloud = transform_cloud(mapped.cloud, T, frame=mapped.cloud.frame)
+    return replace(mapped, cloud=cloud, path=_moved(mapped.path, T)), figures
+
+
+def add_within_reach(
+    mapped: MappedCloud, reference: PointCloud, by_threshold: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """Add the figures of the points within reach of the reference; return the share beyond.
+
+    Nothing is added where the path of the cameras is unknown.
+    """
+    if mapped.path is None:
+        return {}
+    judged = within_reach(mapped.cloud, reference, mapped.path)
+    if not judged.any():
+        return {"beyond_reach": 1.0}
+    for found in by_threshold:
+        part = evaluate_map(mapped.cloud.select(judged), reference, found["threshold_m"])
+        found |= {"precision_in_reach": part.precision, "f_score_in_reach": part.f_score}
+    return {"beyond_reach": float(1 - judged.mean())}
+
+
+def doubt_axes(
+    mapped: MappedCloud,
+    reference: PointCloud,
+    figures: Mapping[str, Any],
+    frame: ReferenceFrame,
+    *,
+    aligned: bool,
+) -> list[str]:
+    """Warnings if the clouds are in different axes or far apart, so that figures are useless.
+
+    Args:
+        mapped: The map, in what should be the axes of the reference.
+        reference: The reference.
+        figures: What the comparison of the two gave.
+        frame: Axes of the reference, as given.
+        aligned: Whether the map was aligned to the reference.
+    """
+    best = max(figures["precision"], figures["recall"])
+    if best >= _FITS:
+        return []
+    cloud, T = mapped.cloud, mapped.T_map_world
+    if T is not None and not aligned:
+        name, T_other = ("map", T) if frame == "camera" else ("camera", invert(T))
+        moved = transform_cloud(cloud, T_other, frame=cloud.frame)
+        f_score = evaluate_map(moved, reference, figures["threshold_m"]).f_score
+        if f_score > max(2 * figures["f_score"], _HARDLY_MEETS):
+            found = f"the reference seems to be in the axes of the {name}: there F would be"
+            return [f"{found} {f_score:.2f}; use --reference-frame {name}"]
+    if best >= _HARDLY_MEETS:
+        return []
+    advice = "check --reference-frame, or align them with --align-to or --align icp"
+    apart = f"the median distance is {figures['median_m']:.3g} m"
+    return [f"map and reference hardly meet: {apart}; {advice}"]
+
+
+def _path_motion(mapped: MappedCloud, poses: Path) -> Float64:
+    """The rigid motion that brings the run's path closest to ground truth."""
+    if mapped.folder is None:
+        raise EvaluationError("a cloud without a run has no path to align")
+    path, truth = read_trajectory(mapped.folder / _PATH), read_trajectory(poses)
+    if holds_times(poses):
+        path, truth = associate(path, truth, TOLERANCE_S)
+    if len(path) != len(truth):
+        raise EvaluationError(
+            "run and true poses differ in length",
+            where=poses,
+            got=f"{len(truth)} poses",
+            expected=f"{len(path)}",
+        )
+    return fit_paths(path, truth).T_to_from
+
+
+def _moved(path: Trajectory | None, T: Float64) -> Trajectory | None:
+    return None if path is None else Trajectory(T @ path.T_world_camera, path.timestamps_s)
+
+
+def _size(name: str, T: Float64) -> dict[str, Any]:
+    moved_m, turned_deg = np.linalg.norm(T[:3, 3]), np.degrees(angle_rad(T))
+    return {f"{name}_moved_m": float(moved_m), f"{name}_turned_deg": float(turned_deg)}
+
+
+def _read_axes(record: Path) -> Float64:
+    """T_map_world as the run recorded it."""
+    try:
+        T_map_world = np.array(json.loads(record.read_text(encoding="utf-8"))["T_map_world"], float)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FormatError("record of the run has no T_map_world", where=record) from error
+    if T_map_world.shape != (4, 4) or not np.isfinite(T_map_world).all():
+        raise FormatError("T_map_world is not a 4x4 matrix", where=record)
+    return T_map_world

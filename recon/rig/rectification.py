@@ -1,0 +1,238 @@
+"""Rectification of recorded images, by a calibration or by their features, and how good it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from recon.core.errors import CalibrationError
+from recon.core.geometry.projection import map_pixels
+from recon.core.values import StereoCalibration, StereoPair
+from recon.core.values.arrays import Float64, UInt8
+from recon.io.cameras.calibration import read_calibration
+from recon.io.cameras.kitti import kitti_cameras_of
+from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.io.yaml_file import write_yaml
+from recon.rig.uncalibrated import (
+    UncalibratedRectification,
+    rectify_images,
+)
+from recon.run.directory import RunDirectory
+from recon.run.summary import plain
+from recon.sources.files import read_pair
+from recon.sources.image_pairs import ImagePairs
+from recon.stereo.rectify import (
+    RectificationSettings,
+    Rectifier,
+    epipolar_curves,
+    epipolar_lines,
+    match_exactly,
+    plan_turns,
+    to_grey,
+)
+
+_UNCALIBRATED_PAIRS: Final = 8
+"""Pairs of a folder whose features are matched where there is no calibration."""
+# A row error above this multiple of the median is a false match, not a calibration error.
+_WRONG: Final = 5.0
+_NEVER_WRONG_PX: Final = 0.5
+
+Lines = tuple[list[Float64], list[Float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class RectifyPlan:
+    """One way to rectify.
+
+    Attributes:
+        warp: Rectifies the images of a pair.
+        place: Maps float64 (N, 2) pixels of the left and right image to the rectified ones.
+        lines: Epipolar lines of such pixels in the left and right image as recorded.
+        write: Writes the calibration of the rectified images, or the homographies.
+        figures: Figures of the plan for ``summary.json``.
+    """
+
+    warp: Callable[[StereoPair], tuple[UInt8, UInt8]]
+    place: Callable[[Float64, Float64], tuple[Float64, Float64]]
+    lines: Callable[[Float64, Float64], Lines]
+    write: Callable[[RunDirectory], None]
+    figures: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class RectifyRun:
+    """Results of a run.
+
+    Attributes:
+        pair: The first pair, as recorded.
+        rectified: Its rectified images.
+        raw_px: float64 (N, 2) twice: feature matches of the first pair without false ones, in the
+            left and right image as recorded.
+        raw_lines: Their epipolar lines in the left and right image.
+        rectified_px: The same matches, rectified.
+        summary: The figures of ``summary.json``.
+    """
+
+    pair: StereoPair
+    rectified: tuple[UInt8, UInt8]
+    raw_px: tuple[Float64, Float64]
+    raw_lines: Lines
+    rectified_px: tuple[Float64, Float64]
+    summary: dict[str, Any]
+
+
+def plan_by_calibration(
+    path: Path, images: ImagePairs, settings: RectificationSettings, *, metres_per_unit: float
+) -> RectifyPlan:
+    """Rectification by a calibration file; depth is metric.
+
+    Raises:
+        CalibrationError: The calibration does not fit the images, or they are rectified already.
+        FormatError: The file cannot be read.
+    """
+    files = images.pairs[0]
+    height, width = read_pair(*files).left.shape[:2]
+    rig = read_calibration(
+        path,
+        width,
+        height,
+        metres_per_unit=metres_per_unit,
+        cameras=kitti_cameras_of(files[0]),
+    )
+    if not isinstance(rig, StereoCalibration):
+        raise CalibrationError(
+            "the calibration is of images that are already rectified",
+            where=path,
+            hint="use them directly with recon pair or recon map",
+        )
+    rectifier = Rectifier(rig, settings)
+    turns, camera = plan_turns(rig, settings), rectifier.camera
+    return RectifyPlan(
+        warp=rectifier.warp,
+        place=lambda a, b: (turns.place(rig, a), turns.place(rig, b, right=True)),
+        lines=lambda a, b: epipolar_curves(rig, a, b),
+        write=lambda run: write_recon_calibration(run.path("calibration.yaml"), camera),
+        figures={
+            "method": "calibration",
+            "up_to_scale": False,
+            "focal_px": camera.focal_px,
+            "field_of_view_deg": camera.field_of_view_deg,
+            "baseline_m": camera.baseline_m,
+        },
+    )
+
+
+def plan_by_features(images: ImagePairs) -> RectifyPlan:
+    """Rectification by homographies from feature matches; depth has no scale.
+
+    Raises:
+        CalibrationError: The features of the images fix no homographies.
+    """
+    step = max(1, len(images.pairs) // _UNCALIBRATED_PAIRS)
+    some = replace(images, pairs=images.pairs[::step][:_UNCALIBRATED_PAIRS])
+    greys = [(to_grey(pair.left), to_grey(pair.right)) for pair, _ in read_pairs(some)]
+    height, width = greys[0][0].shape
+    size = (width, height)
+    try:
+        result = rectify_images(greys)
+    except CalibrationError as error:
+        if len(images.pairs) > 1:
+            raise
+        raise CalibrationError(
+            error.what,
+            where=images.pairs[0][0],
+            got=error.got,
+            expected=error.expected,
+            hint=f"{error.hint}; or it has too few good matches, and several pairs are needed: "
+            "give two folders of one rig, or a calibration with --calib",
+        ) from error
+
+    def warp(pair: StereoPair) -> tuple[UInt8, UInt8]:
+        left, right = (
+            np.asarray(cv2.warpPerspective(image, H, size))
+            for image, H in ((pair.left, result.H_left), (pair.right, result.H_right))
+        )
+        return left, right
+
+    figures = _uncalibrated_figures(result)
+    return RectifyPlan(
+        warp=warp,
+        place=lambda a, b: (map_pixels(result.H_left, a), map_pixels(result.H_right, b)),
+        lines=lambda a, b: epipolar_lines(result.fundamental, a, b, size),
+        write=lambda run: write_yaml(
+            run.path("homographies.yaml"),
+            {
+                "note": "rectified = H * raw, up to scale; depth has no unit",
+                "width_px": width,
+                "height_px": height,
+                **{name: figures[name] for name in ("H_left", "H_right", "fundamental")},
+            },
+        ),
+        figures=figures,
+    )
+
+
+def _uncalibrated_figures(result: UncalibratedRectification) -> dict[str, Any]:
+    return {
+        "method": "features",
+        "up_to_scale": True,
+        "matches": result.matches,
+        "inliers": len(result.features),
+        "row_error_held_out_px": plain(result.held_out_px),
+        "disparity_range_px": list(result.disparity_px),
+        "H_left": result.H_left.tolist(),
+        "H_right": result.H_right.tolist(),
+        "fundamental": result.fundamental.tolist(),
+    }
+
+
+def read_pairs(images: ImagePairs) -> Iterator[tuple[StereoPair, tuple[Path, Path]]]:
+    """Yield the pairs with their files, one in memory at a time.
+
+    Raises:
+        CalibrationError: They differ in size.
+        ReconError: An image cannot be read.
+    """
+    shape: tuple[int, ...] | None = None
+    for files in images.pairs:
+        pair = read_pair(*files)
+        shape = shape or pair.left.shape[:2]
+        if pair.left.shape[:2] != shape:
+            raise CalibrationError(
+                "images differ in size",
+                where=files[0],
+                got=f"{pair.left.shape[1]}x{pair.left.shape[0]}",
+                expected=f"{shape[1]}x{shape[0]}",
+            )
+        yield pair, files
+
+
+def measure_rows(plan: RectifyPlan, pair: StereoPair) -> RectifyRun:
+    """Rectify a pair, and measure the row errors that are left by its feature matches.
+
+    Args:
+        plan: The way to rectify.
+        pair: The images as recorded.
+    """
+    found = match_exactly(to_grey(pair.left), to_grey(pair.right))
+    raw = (found.left_uv.astype(np.float64), found.right_uv.astype(np.float64))
+    left, right = plan.place(*raw)
+    rows = np.abs(left[:, 1] - right[:, 1])
+    limit = _WRONG * float(np.median(rows)) if len(rows) else 0.0
+    good = rows <= max(limit, _NEVER_WRONG_PX)
+    summary = {"pair": pair.name, **plan.figures, "features": int(good.sum())}
+    if good.any():
+        summary |= {
+            "row_error_px": float(rows[good].mean()),
+            "row_error_median_px": float(np.median(rows[good])),
+            "row_error_95_px": float(np.quantile(rows[good], 0.95)),
+        }
+    kept = (raw[0][good], raw[1][good])
+    return RectifyRun(
+        pair, plan.warp(pair), kept, plan.lines(*kept), (left[good], right[good]), summary
+    )
