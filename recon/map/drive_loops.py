@@ -122,12 +122,12 @@ class LoopWatch:
         folder: Path | None = None,
         stopwatch: Stopwatch | None = None,
     ) -> None:
-        self._settings = settings
+        self._drift = settings.drift
         self._stage = (stopwatch or Stopwatch()).stage
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
         self._waiting: deque[Future[None]] = deque()
         self._store = KeyframeMemory() if folder is None else KeyframeFiles(folder)
-        self._detector = LoopDetector(settings, self._store)
+        self._detector = LoopDetector(settings.drift, self._store)
         self._path_m: list[float] = []
         self._last: Float64 = np.eye(4)
 
@@ -189,7 +189,7 @@ class LoopWatch:
         loops = self._detector.agreeing()
         return DriveLoops(
             odometry=trajectory,
-            closure=close_loops(trajectory, path_m, loops, self._settings),
+            closure=close_loops(trajectory, path_m, loops, self._drift),
             keyframes=len(self._detector),
             found=len(self._detector.loops),
             refused=dict(self._detector.refused),
@@ -203,9 +203,7 @@ class LoopWatch:
     def _advance(self, T_world_camera: Float64, *, measured: bool) -> float:
         """Path length up to the next frame, as the detector measures it."""
         before = self._last if self._path_m else T_world_camera
-        step = path_lengths(
-            np.stack([before, T_world_camera]), np.array([True, measured]), self._settings.drift
-        )
+        step = path_lengths(np.stack([before, T_world_camera]), np.array([True, measured]))
         self._path_m.append((self._path_m[-1] if self._path_m else 0.0) + float(step[1]))
         self._last = T_world_camera
         return self._path_m[-1]

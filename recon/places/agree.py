@@ -10,7 +10,7 @@ import numpy as np
 from recon.core.geometry.se3 import invert
 from recon.core.values.arrays import Float64
 from recon.places.drift import Drift, drift_over, is_possible
-from recon.places.settings import LoopSettings
+from recon.places.settings import DriftSettings
 from recon.places.verify import Loop
 
 Poses: TypeAlias = Mapping[int, tuple[Float64, float]]
@@ -18,10 +18,17 @@ Poses: TypeAlias = Mapping[int, tuple[Float64, float]]
 
 LOOP_SIGMAS: Final = Drift(0.3, np.deg2rad(1.0))
 """Standard deviation of a verified loop, added to the drift: small, but never zero."""
+
+_MIN_AGREEING: Final = 3
+"""Loops of different keyframes that must agree."""
+
+_NEAR_M: Final = 12.0
+"""Path within which neighbouring loops are compared."""
+
 _MAJORITY: Final = 2  # keyframes that confirm a loop, for each that contradicts it
 
 
-def agreeing_loops(loops: Sequence[Loop], poses: Poses, settings: LoopSettings) -> list[Loop]:
+def agreeing_loops(loops: Sequence[Loop], poses: Poses, drift: DriftSettings) -> list[Loop]:
     """The loops that enough others confirm, and few contradict.
 
     Two loops and the odometry between their ends form a cycle that must close within the drift
@@ -32,29 +39,29 @@ def agreeing_loops(loops: Sequence[Loop], poses: Poses, settings: LoopSettings) 
     Args:
         loops: Verified loops.
         poses: For each keyframe of a loop its pose by odometry, and the path up to it.
-        settings: How near neighbours are, and how many must agree.
+        drift: How far odometry may drift.
     """
     paths_m = np.array([(poses[loop.first][1], poses[loop.last][1]) for loop in loops])
     agreeing = []
     for number, loop in enumerate(loops):
         firsts_m, lasts_m = np.abs(paths_m - paths_m[number]).T
-        near = np.flatnonzero(lasts_m <= settings.agree_m)
-        rings = {k: _closes(loop, loops[k], poses, settings) for k in near.tolist()}
+        near = np.flatnonzero(lasts_m <= _NEAR_M)
+        rings = {k: _closes(loop, loops[k], poses, drift) for k in near.tolist()}
         against = {loops[k].last for k, closes in rings.items() if not closes}
         # Loops to elsewhere on the path may contradict, but over that distance agree too easily.
-        same = {loops[k].last for k, closes in rings.items() if firsts_m[k] <= settings.agree_m}
-        if len(same - against) >= max(settings.min_agreeing, _MAJORITY * len(against)):
+        same = {loops[k].last for k, closes in rings.items() if firsts_m[k] <= _NEAR_M}
+        if len(same - against) >= max(_MIN_AGREEING, _MAJORITY * len(against)):
             agreeing.append(loop)
     return agreeing
 
 
-def _closes(one: Loop, other: Loop, poses: Poses, settings: LoopSettings) -> bool:
+def _closes(one: Loop, other: Loop, poses: Poses, settings: DriftSettings) -> bool:
     """Whether two loops agree within the drift of the odometry between them."""
     T_lasts, lasts_m = _between(one.last, other.last, poses)
     T_firsts, firsts_m = _between(one.first, other.first, poses)
     ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
-    drift = drift_over(lasts_m + firsts_m, settings.drift)
-    return is_possible(ring, drift, LOOP_SIGMAS, settings.drift)
+    drift = drift_over(lasts_m + firsts_m, settings)
+    return is_possible(ring, drift, LOOP_SIGMAS)
 
 
 def _between(first: int, last: int, poses: Poses) -> tuple[Float64, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import cv2
 import numpy as np
@@ -12,11 +13,25 @@ from recon.core.geometry.projection import project
 from recon.core.geometry.se3 import apply, as_transform, invert, make_transform, step_jacobian
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
-from recon.places.settings import VerifySettings
 
-_STEPS = 15
-_CAUCHY_SIGMAS = 2.0
-_SHARED = 0.5  # both directions see the same matches, so together they count once
+_ITERATIONS: Final = 500
+"""RANSAC's samples at most."""
+
+_REPROJECTION_PX: Final = 2.5
+"""RANSAC's inlier limit."""
+
+MIN_INLIERS: Final = 20
+"""Least number of matches that agree in both directions."""
+
+_SIGMA_UV_PX: Final = 1.0
+"""Standard deviation of a feature's column or row."""
+
+_SIGMA_D_PX: Final = 1.0
+"""Standard deviation of its disparity."""
+
+_STEPS: Final = 15
+_CAUCHY_SIGMAS: Final = 2.0
+_SHARED: Final = 0.5  # both directions see the same matches, so together they count once
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,27 +67,25 @@ class Alignment:
     information: Float64
 
 
-def locate(
-    points: Float64, uv: Float64, camera: RectifiedCamera, settings: VerifySettings
-) -> Float64 | None:
+def locate(points: Float64, uv: Float64, camera: RectifiedCamera) -> Float64 | None:
     """Pose of a camera that sees known points, ``T_points_camera``; None = too few agree.
 
     Ref:
         Fischler and Bolles, "Random sample consensus", CACM 1981.
     """
-    if len(points) < settings.min_inliers:
+    if len(points) < MIN_INLIERS:
         return None
     found, rotation, translation, inliers = cv2.solvePnPRansac(
         points,
         uv,
         camera.matrix,
         None,
-        iterationsCount=settings.iterations,
-        reprojectionError=settings.reprojection_px,
+        iterationsCount=_ITERATIONS,
+        reprojectionError=_REPROJECTION_PX,
         confidence=0.999,
         flags=cv2.SOLVEPNP_AP3P,
     )
-    if not found or inliers is None or len(inliers) < settings.min_inliers:
+    if not found or inliers is None or len(inliers) < MIN_INLIERS:
         return None
     among = inliers.reshape(-1)
     # RANSAC's own pose is a closed-form fit that one far point can throw off: refit to the set.
@@ -83,9 +96,7 @@ def locate(
     return invert(T) if np.isfinite(T).all() else None
 
 
-def refine(
-    first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCamera, s: VerifySettings
-) -> Alignment:
+def refine(first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCamera) -> Alignment:
     """Fit the motion to columns, rows and disparities in both frames, with Cauchy weights.
 
     Args:
@@ -93,22 +104,19 @@ def refine(
         last: The same in the later frame.
         T_first_last: float64 (4, 4), initial motion.
         camera: Of both frames.
-        s: Standard deviations, and the inlier limit.
     """
     T = T_first_last
     for _ in range(_STEPS):
-        H, g = _normal_equations(first, last, T, camera, s)
+        H, g = _normal_equations(first, last, T, camera)
         step = np.linalg.solve(H + 1e-9 * np.eye(6), -g)
         T = T @ as_transform(step)
         if np.linalg.norm(step) < 1e-6:
             break
-    H, _ = _normal_equations(first, last, T, camera, s)
-    return Alignment(T, agreement(first, last, T, camera, s), _SHARED * H)
+    H, _ = _normal_equations(first, last, T, camera)
+    return Alignment(T, agreement(first, last, T, camera), _SHARED * H)
 
 
-def agreement(
-    first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCamera, s: VerifySettings
-) -> Bool:
+def agreement(first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCamera) -> Bool:
     """bool (N,), matches whose reprojection error is within the limit in both frames."""
     agree = np.ones(len(first.xyz), np.bool_)
     for T, points, seen in (
@@ -117,7 +125,7 @@ def agreement(
     ):
         u, v, _ = project(apply(T, points), camera)
         # A point behind the camera has a NaN error, which compares as False.
-        agree &= np.hypot(u - seen[:, 0], v - seen[:, 1]) <= s.reprojection_px
+        agree &= np.hypot(u - seen[:, 0], v - seen[:, 1]) <= _REPROJECTION_PX
     return agree
 
 
@@ -132,7 +140,7 @@ def _start(
 
 
 def _normal_equations(
-    first: Seen, last: Seen, T: Float64, camera: RectifiedCamera, s: VerifySettings
+    first: Seen, last: Seen, T: Float64, camera: RectifiedCamera
 ) -> tuple[Float64, Float64]:
     """Gauss-Newton's matrix (6, 6) and gradient (6,) for a step in the axes of ``last``."""
     H, g = np.zeros((6, 6)), np.zeros(6)
@@ -142,7 +150,7 @@ def _normal_equations(
     # Points of the first frame, seen by the last: they move against it.
     back = apply(invert(T), first.xyz)
     for xyz, d_xyz, seen in ((moved, turn, first.uvd), (back, -step_jacobian(back), last.uvd)):
-        r, J = _residuals(xyz, d_xyz, seen, camera, s)
+        r, J = _residuals(xyz, d_xyz, seen, camera)
         weight = 1.0 / (1.0 + np.einsum("nk,nk->n", r, r) / _CAUCHY_SIGMAS**2)
         H += np.einsum("nki,n,nkj->ij", J, weight, J)
         g += np.einsum("nki,n,nk->i", J, weight, r)
@@ -150,10 +158,10 @@ def _normal_equations(
 
 
 def _residuals(
-    xyz: Float64, d_xyz: Float64, seen: Float64, camera: RectifiedCamera, s: VerifySettings
+    xyz: Float64, d_xyz: Float64, seen: Float64, camera: RectifiedCamera
 ) -> tuple[Float64, Float64]:
     """Whitened residuals (N, 3) and their derivatives (N, 3, 6); 0 for points behind a camera."""
-    sigma = np.array([s.sigma_uv_px, s.sigma_uv_px, s.sigma_d_px])
+    sigma = np.array([_SIGMA_UV_PX, _SIGMA_UV_PX, _SIGMA_D_PX])
     front = xyz[:, 2] > 0.1
     z = np.where(front, xyz[:, 2], 1.0)
     f, b = camera.focal_px, camera.baseline_m

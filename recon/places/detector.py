@@ -16,11 +16,27 @@ from recon.places.agree import LOOP_SIGMAS, agreeing_loops
 from recon.places.drift import drift_over, is_possible
 from recon.places.keyframe import Keyframe, make_keyframe, words_of
 from recon.places.places import Place, Places
-from recon.places.settings import LoopSettings
+from recon.places.settings import DriftSettings
 from recon.places.verify import Loop, verify
 
 CONTRADICTED: Final = "odometry contradicts"
 """Why a loop is refused that differs from odometry by more than its drift explains."""
+
+
+_DISTANCE_M: Final = 1.5
+"""Distance from the last keyframe at which a new one is taken."""
+
+_ANGLE_DEG: Final = 10.0
+"""Rotation since the last keyframe at which a new one is taken."""
+
+_MIN_LIKENESS: Final = 0.3
+"""Least likeness of a candidate, as a share of that of two neighbouring keyframes."""
+
+_VERIFIED: Final = 3
+"""Most candidates that are verified."""
+
+_APART_M: Final = 4.0
+"""Least path between two candidates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +99,12 @@ class LoopDetector:
     same frames in the same order give the same loops.
 
     Args:
-        settings: Of loop closure.
+        drift: How far odometry may drift.
         store: Where keyframes go.
     """
 
-    def __init__(self, settings: LoopSettings, store: KeyframeStore) -> None:
-        self._settings = settings
+    def __init__(self, drift: DriftSettings, store: KeyframeStore) -> None:
+        self._drift = drift
         self._store = store
         self._places = Places()
         self.loops: list[Loop] = []
@@ -120,7 +136,7 @@ class LoopDetector:
         """
         if not measured or not self._is_due(T_world_camera):
             return ()
-        keyframe = make_keyframe(frame, pair, disparity, self._settings.keyframes)
+        keyframe = make_keyframe(frame, pair, disparity)
         stored = self._compared(StoredKeyframe(keyframe, T_world_camera, path_m), pair)
         self._store.put(stored)
         self.restore(stored)
@@ -137,26 +153,25 @@ class LoopDetector:
         places = self._places
         known = zip(places.frames, places.T_world_camera, places.path_m.tolist(), strict=True)
         poses = {frame: (T, path_m) for frame, T, path_m in known}
-        return agreeing_loops(self.loops, poses, self._settings)
+        return agreeing_loops(self.loops, poses, self._drift)
 
     def _place(self, stored: StoredKeyframe) -> Place:
-        words = words_of(stored.keyframe.descriptors, self._settings.candidates)
+        words = words_of(stored.keyframe.descriptors)
         return Place(stored.keyframe.frame, stored.T_world_camera, stored.path_m, words)
 
     def _is_due(self, T_world_camera: Float64) -> bool:
         if not len(self._places):
             return True
         T = invert(self._places.T_world_camera[-1]) @ T_world_camera
-        settings = self._settings.keyframes
-        moved = float(np.linalg.norm(T[:3, 3])) >= settings.distance_m
-        return moved or float(np.rad2deg(angle_rad(T))) >= settings.angle_deg
+        moved = float(np.linalg.norm(T[:3, 3])) >= _DISTANCE_M
+        return moved or float(np.rad2deg(angle_rad(T))) >= _ANGLE_DEG
 
     def _compared(self, new: StoredKeyframe, pair: RectifiedPair) -> StoredKeyframe:
         """The keyframe with the loop to the first candidate that is verified, if any is."""
         place, refused = self._place(new), []
         for old in self._candidates(place):
             known = self._store.get(self._places.frames[old]).keyframe
-            verdict = verify(known, new.keyframe, pair.camera, self._settings.verify)
+            verdict = verify(known, new.keyframe, pair.camera)
             if verdict.loop is None:
                 refused.append(verdict.refused)
             elif self._possible(old, place, verdict.loop):
@@ -167,24 +182,23 @@ class LoopDetector:
 
     def _candidates(self, place: Place) -> list[int]:
         """Numbers of old keyframes that may be near, most similar first."""
-        candidates = self._settings.candidates
-        near = self._places.near(place, self._settings)
+        near = self._places.near(place, self._drift)
         if not near.any():
             return []
         likeness = self._places.likeness(place)
-        worth = np.flatnonzero(near & (likeness >= candidates.min_likeness * likeness[-1]))
+        worth = np.flatnonzero(near & (likeness >= _MIN_LIKENESS * likeness[-1]))
         chosen: list[int] = []
         path_m = self._places.path_m
         for number in worth[np.argsort(-likeness[worth], kind="stable")].tolist():
             gaps_m = np.abs(path_m[chosen] - path_m[number])
-            if gaps_m.min(initial=np.inf) >= candidates.apart_m:
+            if gaps_m.min(initial=np.inf) >= _APART_M:
                 chosen.append(number)
-            if len(chosen) == candidates.verified:
+            if len(chosen) == _VERIFIED:
                 break
         return chosen
 
     def _possible(self, old: int, new: Place, loop: Loop) -> bool:
         """Whether drift explains the difference between a loop and odometry."""
         T = invert(self._places.T_world_camera[old]) @ new.T_world_camera
-        drift = drift_over(new.path_m - float(self._places.path_m[old]), self._settings.drift)
-        return is_possible(invert(T) @ loop.T_first_last, drift, LOOP_SIGMAS, self._settings.drift)
+        drift = drift_over(new.path_m - float(self._places.path_m[old]), self._drift)
+        return is_possible(invert(T) @ loop.T_first_last, drift, LOOP_SIGMAS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,15 @@ from numpy.typing import NDArray
 from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.values.arrays import Bool, Float64
 from recon.places.settings import DriftSettings
+
+_LOST_FACTOR: Final = 20.0
+"""Metres that one metre of extrapolated path counts as."""
+
+_LOST_M: Final = 2.0
+"""Path that is added for each frame without a measurement."""
+
+SIGMAS: Final = 3.5
+"""Largest possible deviation from odometry, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -26,20 +36,19 @@ class Drift:
     angle_rad: float
 
 
-def path_lengths(T_world_camera: Float64, measured: Bool, settings: DriftSettings) -> Float64:
+def path_lengths(T_world_camera: Float64, measured: Bool) -> Float64:
     """Length of the path up to each frame, in which extrapolated metres count several times.
 
     Args:
         T_world_camera: float64 (N, 4, 4).
         measured: bool (N,), False where a pose is extrapolated.
-        settings: How much such frames count.
 
     Returns:
         float64 (N,), metres.
     """
     step_m = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
     lost = ~measured[1:]
-    step_m = np.where(lost, settings.lost_factor * step_m + settings.lost_m, step_m)
+    step_m = np.where(lost, _LOST_FACTOR * step_m + _LOST_M, step_m)
     return np.concatenate([np.zeros(min(1, len(measured))), np.cumsum(step_m)])
 
 
@@ -60,22 +69,19 @@ def spread_over(path_m: Float64, settings: DriftSettings) -> tuple[Float64, Floa
     return position_m, turn * np.sqrt(path_m)
 
 
-def is_possible(
-    T_difference: NDArray[np.float64], drift: Drift, other: Drift, settings: DriftSettings
-) -> bool:
+def is_possible(T_difference: NDArray[np.float64], drift: Drift, other: Drift) -> bool:
     """Whether a motion differs from odometry's by no more than drift explains.
 
     Args:
         T_difference: float64 (4, 4), inverse of odometry's motion times the other one.
         drift: Of odometry over that motion.
         other: Standard deviations of the other motion.
-        settings: How many standard deviations are possible.
     """
     off_m = float(np.linalg.norm(T_difference[:3, 3]))
     off_rad = float(angle_rad(T_difference))
     sigma_m = math.hypot(drift.position_m, other.position_m)
     sigma_rad = math.hypot(drift.angle_rad, other.angle_rad)
-    return off_m <= settings.sigmas * sigma_m and off_rad <= settings.sigmas * sigma_rad
+    return off_m <= SIGMAS * sigma_m and off_rad <= SIGMAS * sigma_rad
 
 
 def motion(T_world_camera: Float64, first: int, last: int) -> Float64:

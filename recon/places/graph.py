@@ -18,11 +18,34 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.places.drift import Drift, drift_over
 from recon.places.pose_graph import PoseEdge, optimise_poses
-from recon.places.settings import LoopSettings
+from recon.places.settings import DriftSettings
 from recon.places.verify import Loop
 
 _EASING: Final = 10.0  # factor by which the tolerance of loops falls from round to round
 _KEPT: Final = 0.25  # least weight of a loop that is believed
+
+
+_NODE_M: Final = 5.0
+"""Path between two nodes of the graph."""
+
+_MAX_NODES: Final = 400
+"""Longer drives get nodes farther apart: time is cubic."""
+
+_LOOP_SIGMA_M: Final = 0.05
+"""Standard deviation of a loop that more matches do not improve."""
+
+_LOOP_SHARE: Final = 0.03
+"""Standard deviation that is added per distance between its two frames: features that moved farther
+match worse, and not evenly."""
+
+_LOOP_SIGMA_DEG: Final = 0.1
+"""As the first, of its rotation."""
+
+_MAX_CHI2: Final = 22.5
+"""Chi-square at which the weight of a loop is a quarter: 0.1 % of right ones are beyond."""
+
+_MAX_BEND_CHI2: Final = 6.0
+"""Mean chi-square of the odometry edges above which no loop is believed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +69,7 @@ class Closure:
 
 
 def close_loops(
-    trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop], settings: LoopSettings
+    trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop], drift: DriftSettings
 ) -> Closure:
     """Correct a path so that its loops close.
 
@@ -59,23 +82,23 @@ def close_loops(
         trajectory: By odometry.
         path_m: float64 (N,), path up to each frame, by `path_lengths`.
         loops: Loops between frames of it.
-        settings: Nodes and tolerances.
+        drift: How far odometry may drift.
 
     Ref:
         Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
     """
     if not loops:
         return Closure(trajectory, (), ())
-    nodes = _nodes(path_m, settings)
-    steps = _odometry_edges(trajectory, path_m, nodes, settings)
-    ties = [_loop_edge(loop, trajectory, path_m, nodes, settings) for loop in loops]
+    nodes = _nodes(path_m)
+    steps = _odometry_edges(trajectory, path_m, nodes, drift)
+    ties = [_loop_edge(loop, trajectory, path_m, nodes, drift) for loop in loops]
     try:
-        poses, weights = _solve(trajectory.T_world_camera[nodes], steps, ties, settings)
+        poses, weights = _solve(trajectory.T_world_camera[nodes], steps, ties)
     except RegistrationError:  # a map by odometry alone is better than none
         return Closure(trajectory, (), tuple(loops))
     bend_chi2 = float(np.mean([misfit(edge, poses) for edge in steps]))
     kept = weights >= _KEPT
-    if bend_chi2 > settings.graph.max_bend_chi2 or not kept.any():
+    if bend_chi2 > _MAX_BEND_CHI2 or not kept.any():
         return Closure(trajectory, (), tuple(loops))
     return Closure(
         _bent(trajectory, path_m, nodes, poses),
@@ -92,35 +115,33 @@ def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
     return float(step @ edge.information @ step)
 
 
-def _nodes(path_m: Float64, settings: LoopSettings) -> NDArray[np.intp]:
+def _nodes(path_m: Float64) -> NDArray[np.intp]:
     """Frames at even distances along the path, including the first and the last."""
     length = float(path_m[-1])
-    count = min(settings.graph.max_nodes, max(2, math.ceil(length / settings.graph.node_m) + 1))
+    count = min(_MAX_NODES, max(2, math.ceil(length / _NODE_M) + 1))
     marks = np.searchsorted(path_m, np.linspace(0.0, length, count))
     return np.unique(np.concatenate([[0], marks, [len(path_m) - 1]]))
 
 
-def _solve(
-    start: Float64, steps: list[PoseEdge], ties: list[PoseEdge], settings: LoopSettings
-) -> tuple[Float64, Float64]:
+def _solve(start: Float64, steps: list[PoseEdge], ties: list[PoseEdge]) -> tuple[Float64, Float64]:
     """Poses of the nodes, and the weights of the loops."""
     poses = start
     worst = max(misfit(edge, poses) for edge in ties)
-    rounds = math.ceil(math.log(max(worst / settings.graph.max_chi2, 1.0), _EASING))
+    rounds = math.ceil(math.log(max(worst / _MAX_CHI2, 1.0), _EASING))
     for k in range(rounds, -1, -1):
-        tolerance = settings.graph.max_chi2 * _EASING**k
+        tolerance = _MAX_CHI2 * _EASING**k
         poses, weights = optimise_poses(poses, [*steps, *ties], tolerance)
     return poses, weights[len(steps) :]
 
 
 def _odometry_edges(
-    trajectory: Trajectory, path_m: Float64, nodes: NDArray[np.intp], settings: LoopSettings
+    trajectory: Trajectory, path_m: Float64, nodes: NDArray[np.intp], settings: DriftSettings
 ) -> list[PoseEdge]:
     poses = trajectory.T_world_camera
     edges = []
     for k, (first, last) in enumerate(pairwise(nodes)):
         # Where the camera stands still, 0.1 m keeps the information finite.
-        drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1), settings.drift)
+        drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1), settings)
         T = invert(poses[first]) @ poses[last]
         edges.append(PoseEdge(k, k + 1, T, _information(drift)))
     return edges
@@ -131,7 +152,7 @@ def _loop_edge(
     trajectory: Trajectory,
     path_m: Float64,
     nodes: NDArray[np.intp],
-    settings: LoopSettings,
+    settings: DriftSettings,
 ) -> PoseEdge:
     """The loop as an edge between the nodes nearest to its frames."""
     poses = trajectory.T_world_camera
@@ -140,11 +161,11 @@ def _loop_edge(
     to_last = invert(poses[loop.last]) @ poses[nodes[last]]
     way_m = abs(float(path_m[nodes[first]] - path_m[loop.first]))
     way_m += abs(float(path_m[nodes[last]] - path_m[loop.last]))
-    drift, graph = drift_over(way_m, settings.drift), settings.graph
+    drift = drift_over(way_m, settings)
     apart_m = float(np.linalg.norm(loop.T_first_last[:3, 3]))
     other = Drift(
-        math.hypot(drift.position_m, graph.loop_sigma_m, graph.loop_share * apart_m),
-        math.hypot(drift.angle_rad, math.radians(graph.loop_sigma_deg)),
+        math.hypot(drift.position_m, _LOOP_SIGMA_M, _LOOP_SHARE * apart_m),
+        math.hypot(drift.angle_rad, math.radians(_LOOP_SIGMA_DEG)),
     )
     covariance = np.linalg.inv(_turned(loop.information, to_last)) + np.linalg.inv(
         _information(other)

@@ -15,7 +15,6 @@ from recon.core.geometry.projection import unproject
 from recon.core.geometry.triangulation import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, Float64, UInt8, freeze
-from recon.places.settings import CandidateSettings, KeyframeSettings
 
 _DESCRIPTOR_BYTES: Final = 32
 _EDGE_PX: Final = 16  # half of the patch that a descriptor looks at
@@ -24,6 +23,31 @@ _SURPLUS: Final = 3  # corners to choose from, per feature
 # pairs of kitti_raw_0013's frames gave 111 loops instead of 110.
 _SCALE_STEP: Final = 1.3
 _SCALES: Final = 5
+
+
+FEATURES: Final = 500
+"""Features of a keyframe."""
+
+_CELL_PX: Final = 48
+"""Edge of the cells that features are spread over."""
+
+_FAST_THRESHOLD: Final = 10
+"""Threshold of the FAST corner detector."""
+
+_MIN_DISPARITY_PX: Final = 1.0
+"""Features with less disparity have no usable depth."""
+
+_MAX_DISPARITY_STEP_PX: Final = 1.0
+"""Largest difference between a disparity and its neighbours."""
+
+_COARSE_PX: Final = 8
+"""Every n-th disparity of a row and column is kept."""
+
+WORDS: Final = 4
+"""Words per descriptor (hash tables)."""
+
+_BITS: Final = 20
+"""Bits of a descriptor per word."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,39 +82,36 @@ def points_of(uvd: NDArray[Any], camera: RectifiedCamera) -> Float64:
     return unproject(uvd[:, 0].astype(np.float64), uvd[:, 1].astype(np.float64), depth, camera)
 
 
-def make_keyframe(
-    frame: int, pair: RectifiedPair, disparity: Disparity, settings: KeyframeSettings
-) -> Keyframe:
+def make_keyframe(frame: int, pair: RectifiedPair, disparity: Disparity) -> Keyframe:
     """Describe a frame for recognition.
 
     Args:
         frame: Its number.
         pair: Its images.
         disparity: What the matcher found in them.
-        settings: Number of features, and how they are spread.
 
     Ref:
         Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011.
     """
     orb = cv2.ORB.create(
-        nfeatures=_SURPLUS * settings.features,
+        nfeatures=_SURPLUS * FEATURES,
         scaleFactor=_SCALE_STEP,
         nlevels=_SCALES,
         edgeThreshold=_EDGE_PX,
-        fastThreshold=settings.fast_threshold,
+        fastThreshold=_FAST_THRESHOLD,
     )
-    corners = _spread(orb.detect(pair.left), pair.left.shape, settings)
+    corners = _spread(orb.detect(pair.left), pair.left.shape)
     described, descriptors = orb.compute(pair.left, corners)
     uv = _places_of(described)
     if descriptors is None:
         descriptors = np.zeros((0, _DESCRIPTOR_BYTES), np.uint8)
-    uvd = np.column_stack([uv, _disparity(disparity, uv, settings, pair.camera)])
-    half, step = settings.coarse_px // 2, settings.coarse_px
+    uvd = np.column_stack([uv, _disparity(disparity, uv, pair.camera)])
+    half, step = _COARSE_PX // 2, _COARSE_PX
     coarse = np.ascontiguousarray(disparity.values[half::step, half::step])
     return Keyframe(frame, uvd.astype(np.float32), descriptors, coarse)
 
 
-def words_of(descriptors: UInt8, settings: CandidateSettings) -> NDArray[np.uint32]:
+def words_of(descriptors: UInt8) -> NDArray[np.uint32]:
     """The distinct words of an image, sorted.
 
     A word is the value of some fixed bits of a descriptor: similar descriptors are likely to share
@@ -98,37 +119,34 @@ def words_of(descriptors: UInt8, settings: CandidateSettings) -> NDArray[np.uint
 
     Args:
         descriptors: uint8 (N, 32).
-        settings: Bits per word, and words per descriptor.
 
     Ref:
         Gionis, Indyk, Motwani, "Similarity search in high dimensions via hashing", VLDB 1999.
     """
-    bits = np.unpackbits(descriptors, axis=1)[:, _chosen_bits(settings.tables, settings.bits)]
-    values = bits.reshape(len(bits), settings.tables, settings.bits) @ (
-        1 << np.arange(settings.bits, dtype=np.uint32)
-    )
-    numbered = values + (np.arange(settings.tables, dtype=np.uint32) << settings.bits)
+    bits = np.unpackbits(descriptors, axis=1)[:, _chosen_bits()]
+    values = bits.reshape(len(bits), WORDS, _BITS) @ (1 << np.arange(_BITS, dtype=np.uint32))
+    numbered = values + (np.arange(WORDS, dtype=np.uint32) << _BITS)
     return np.unique(numbered.astype(np.uint32))
 
 
 @lru_cache
-def _chosen_bits(tables: int, bits: int) -> NDArray[np.intp]:
+def _chosen_bits() -> NDArray[np.intp]:
     """Which bits form the words; tables share none while there are enough bits."""
     shuffled = np.random.default_rng(0).permutation(8 * _DESCRIPTOR_BYTES)
-    return np.resize(shuffled, tables * bits)
+    return np.resize(shuffled, WORDS * _BITS)
 
 
-def _spread(corners: Sequence[Any], shape: tuple[int, ...], settings: KeyframeSettings) -> Any:
+def _spread(corners: Sequence[Any], shape: tuple[int, ...]) -> Any:
     """The strongest corners of all cells, one rank after the other, until there are enough."""
     uv = _places_of(corners)
     strength = np.array([corner.response for corner in corners], np.float32)
     octave = np.array([corner.octave for corner in corners], np.int32)
-    column, row = (uv // settings.cell_px).astype(np.int64).T
-    cell = row * -(-shape[1] // settings.cell_px) + column
+    column, row = (uv // _CELL_PX).astype(np.int64).T
+    cell = row * -(-shape[1] // _CELL_PX) + column
     by_cell = np.lexsort((octave, uv[:, 1], uv[:, 0], -strength, cell))
     sizes = np.unique(cell, return_counts=True)[1]
     rank = np.arange(len(cell)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    chosen = by_cell[np.lexsort((cell[by_cell], rank))[: settings.features]]
+    chosen = by_cell[np.lexsort((cell[by_cell], rank))[:FEATURES]]
     return [corners[number] for number in chosen.tolist()]
 
 
@@ -137,9 +155,7 @@ def _places_of(corners: Sequence[Any]) -> Float32:
     return np.asarray(cv2.KeyPoint.convert(corners), np.float32).reshape(-1, 2)
 
 
-def _disparity(
-    disparity: Disparity, uv: Float32, settings: KeyframeSettings, camera: RectifiedCamera
-) -> Float32:
+def _disparity(disparity: Disparity, uv: Float32, camera: RectifiedCamera) -> Float32:
     """Disparity (N,) at features; NaN where unknown, small, or inconsistent with neighbours."""
     height, width = disparity.values.shape
     column, row = np.rint(uv).astype(np.int64).T
@@ -151,6 +167,6 @@ def _disparity(
     around = np.where(np.isfinite(around), around, centre[:, None])
     middle = np.median(around, axis=1)
     with np.errstate(invalid="ignore"):
-        good = np.abs(around - middle[:, None]).max(axis=1) <= settings.max_disparity_step_px
-        good &= middle + camera.doffs_px >= settings.min_disparity_px
+        good = np.abs(around - middle[:, None]).max(axis=1) <= _MAX_DISPARITY_STEP_PX
+        good &= middle + camera.doffs_px >= _MIN_DISPARITY_PX
     return np.where(good, middle, np.nan).astype(np.float32)

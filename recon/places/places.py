@@ -10,10 +10,20 @@ from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.values.arrays import Bool, Float64
-from recon.places.drift import spread_over
-from recon.places.settings import LoopSettings
+from recon.places.drift import SIGMAS, spread_over
+from recon.places.settings import DriftSettings
 
 _LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms and 10 MB
+
+
+_MIN_PATH_M: Final = 25.0
+"""Least path between two places that are compared."""
+
+_VIEW_M: Final = 8.0
+"""Largest distance at which two places see enough in common."""
+
+_VIEW_DEG: Final = 45.0
+"""Largest such angle between their viewing directions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,16 +80,15 @@ class Places:
         """float64 (N,)."""
         return self._path_m[: len(self)]
 
-    def near(self, place: Place, settings: LoopSettings) -> Bool:
+    def near(self, place: Place, drift: DriftSettings) -> Bool:
         """bool (N,), places that drift allows to be in view of a later one."""
         way_m = place.path_m - self.path_m
-        sigma_m, sigma_rad = spread_over(np.maximum(way_m, 0.0), settings.drift)
+        sigma_m, sigma_rad = spread_over(np.maximum(way_m, 0.0), drift)
         T = invert(self.T_world_camera) @ place.T_world_camera
-        far_m = np.linalg.norm(T[:, :3, 3], axis=1) - settings.drift.sigmas * sigma_m
-        turned = angle_rad(T) - settings.drift.sigmas * sigma_rad
-        seen = settings.candidates
-        near = (far_m <= seen.view_m) & (turned <= np.deg2rad(seen.view_deg))
-        return np.asarray(near & (way_m >= seen.min_path_m))
+        far_m = np.linalg.norm(T[:, :3, 3], axis=1) - SIGMAS * sigma_m
+        turned = angle_rad(T) - SIGMAS * sigma_rad
+        near = (far_m <= _VIEW_M) & (turned <= np.deg2rad(_VIEW_DEG))
+        return np.asarray(near & (way_m >= _MIN_PATH_M))
 
     def likeness(self, place: Place) -> Float64:
         """float64 (N,), similarity of each to a place, in [0, 1]."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import cv2
 import numpy as np
@@ -11,11 +12,41 @@ from recon.core.geometry.projection import project
 from recon.core.geometry.se3 import angle_rad, apply, invert
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float32, Float64, UInt8, freeze
-from recon.places.align import Alignment, Seen, agreement, locate, refine
+from recon.places.align import MIN_INLIERS, Alignment, Seen, agreement, locate, refine
 from recon.places.keyframe import Keyframe, points_of
-from recon.places.settings import VerifySettings
 
 _CELLS = 4
+
+
+_MAX_HAMMING: Final = 64
+"""Largest Hamming distance of a match."""
+
+_MIN_INLIER_SHARE: Final = 0.3
+"""Least share of the matches that agree."""
+
+_SPREAD_CELLS: Final = 5
+"""Of 4 by 4 cells of each image, how many must hold inliers."""
+
+_BOTH_WAYS_M: Final = 0.5
+"""Largest distance between the poses found in either direction."""
+
+_BOTH_WAYS_DEG: Final = 2.0
+"""Largest angle between them."""
+
+_MAX_SIGMA_M: Final = 0.3
+"""Loops less certain than this in any direction are refused."""
+
+_DENSE_TOLERANCE_PX: Final = 1.0
+"""Largest difference between a predicted and a seen disparity that agree."""
+
+_DENSE_TOLERANCE_SHARE: Final = 0.03
+"""Share of the disparity that is added to it."""
+
+_MIN_DENSE_SHARE: Final = 0.75
+"""Least share of the dense points that agree."""
+
+_MIN_DENSE_POINTS: Final = 50
+"""Least number of dense points that both frames see."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,53 +88,47 @@ class Verdict:
     refused: str = ""
 
 
-def verify(
-    first: Keyframe, last: Keyframe, camera: RectifiedCamera, settings: VerifySettings
-) -> Verdict:
+def verify(first: Keyframe, last: Keyframe, camera: RectifiedCamera) -> Verdict:
     """Whether two keyframes show the same place.
 
     Matches must be mutually best. The motions found in either direction must be inverse to each
     other. The inliers must be many, a fair share of the matches, spread over both images, and
     determine the motion in all directions. The coarse disparities must agree with it, too.
     """
-    seen = match(first, last, camera, settings)
-    aligned = _aligned(*seen, camera, settings)
+    seen = match(first, last, camera)
+    aligned = _aligned(*seen, camera)
     if isinstance(aligned, str):
         return Verdict(None, aligned)
-    dense = dense_agreement(first, last, aligned.T_first_last, camera, settings)
-    if dense < settings.min_dense_share:
+    dense = dense_agreement(first, last, aligned.T_first_last, camera)
+    if dense < _MIN_DENSE_SHARE:
         return Verdict(None, "surfaces differ")
     inliers = int(aligned.agree.sum())
     T = aligned.T_first_last
     return Verdict(Loop(first.frame, last.frame, T, aligned.information, inliers, dense))
 
 
-def _aligned(
-    first: Seen, last: Seen, camera: RectifiedCamera, settings: VerifySettings
-) -> Alignment | str:
+def _aligned(first: Seen, last: Seen, camera: RectifiedCamera) -> Alignment | str:
     """The motion between the frames, or why it is not verified."""
-    T_there = locate(first.xyz, last.uvd[:, :2], camera, settings)
+    T_there = locate(first.xyz, last.uvd[:, :2], camera)
     if T_there is None:
         return "no common motion"
-    T_back = locate(last.xyz, first.uvd[:, :2], camera, settings)
+    T_back = locate(last.xyz, first.uvd[:, :2], camera)
     if T_back is None:
         return "no common motion"
-    if not _inverse(T_there, T_back, settings):
+    if not _inverse(T_there, T_back):
         return "there and back differ"
-    agree = agreement(first, last, T_there, camera, settings)
+    agree = agreement(first, last, T_there, camera)
     among = (first.select(agree), last.select(agree))
-    if int(agree.sum()) < settings.min_inliers:
+    if int(agree.sum()) < MIN_INLIERS:
         return "few inliers"
-    aligned = refine(*among, T_there, camera, settings)
-    return _weakness(*among, aligned, agree.size, camera, settings) or aligned
+    aligned = refine(*among, T_there, camera)
+    return _weakness(*among, aligned, agree.size, camera) or aligned
 
 
-def match(
-    first: Keyframe, last: Keyframe, camera: RectifiedCamera, settings: VerifySettings
-) -> tuple[Seen, Seen]:
+def match(first: Keyframe, last: Keyframe, camera: RectifiedCamera) -> tuple[Seen, Seen]:
     """Features that are each other's best match and have a depth in both frames."""
     ours, theirs = (np.isfinite(k.uvd[:, 2]) for k in (first, last))
-    pairs = _mutual(first.descriptors[ours], last.descriptors[theirs], settings.max_hamming)
+    pairs = _mutual(first.descriptors[ours], last.descriptors[theirs])
     uvds = (first.uvd[ours][pairs[:, 0]], last.uvd[theirs][pairs[:, 1]])
     seen = [Seen(uvd.astype(np.float64), points_of(uvd, camera)) for uvd in uvds]
     return seen[0], seen[1]
@@ -114,7 +139,6 @@ def dense_agreement(
     last: Keyframe,
     T_first_last: Float64,
     camera: RectifiedCamera,
-    settings: VerifySettings,
 ) -> float:
     """Share of the coarse disparities of one frame that the other confirms, in the worse direction.
 
@@ -123,8 +147,8 @@ def dense_agreement(
     hardly overlap.
     """
     shares = (
-        _confirmed(last, first, T_first_last, camera, settings),
-        _confirmed(first, last, invert(T_first_last), camera, settings),
+        _confirmed(last, first, T_first_last, camera),
+        _confirmed(first, last, invert(T_first_last), camera),
     )
     return min(shares)
 
@@ -134,17 +158,16 @@ def _confirmed(
     target: Keyframe,
     T_target_source: Float64,
     camera: RectifiedCamera,
-    settings: VerifySettings,
 ) -> float:
     """Share of the source's coarse points that the target sees where they should be."""
     uvd = _coarse_uvd(source, camera)
     u, v, d = project(apply(T_target_source, points_of(uvd, camera)), camera)
     step, half = _grid(target, camera)
     off = _interpolated(target.coarse, (u - half) / step, (v - half) / step) - d
-    tolerance = settings.dense_tolerance_px + settings.dense_tolerance_share * np.abs(d)
+    tolerance = _DENSE_TOLERANCE_PX + _DENSE_TOLERANCE_SHARE * np.abs(d)
     with np.errstate(invalid="ignore"):
         comparable = off <= tolerance  # False for NaN, unknown in one of the frames
-    if int(comparable.sum()) < settings.min_dense_points:
+    if int(comparable.sum()) < _MIN_DENSE_POINTS:
         return 0.0
     return float(np.mean(off[comparable] >= -tolerance[comparable]))
 
@@ -178,21 +201,21 @@ def _coarse_uvd(keyframe: Keyframe, camera: RectifiedCamera) -> Float64:
     return np.column_stack([column * step + half, row * step + half, d]).astype(np.float64)
 
 
-def _mutual(ours: UInt8, theirs: UInt8, max_hamming: int) -> np.ndarray:
+def _mutual(ours: UInt8, theirs: UInt8) -> np.ndarray:
     """Rows (M, 2) of descriptors that are each other's nearest."""
     if not len(ours) or not len(theirs):
         return np.zeros((0, 2), np.intp)
     found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(ours, theirs)
-    pairs = [(m.queryIdx, m.trainIdx) for m in found if m.distance <= max_hamming]
+    pairs = [(m.queryIdx, m.trainIdx) for m in found if m.distance <= _MAX_HAMMING]
     return np.array(pairs, np.intp).reshape(-1, 2)
 
 
-def _inverse(T_there: Float64, T_back: Float64, settings: VerifySettings) -> bool:
+def _inverse(T_there: Float64, T_back: Float64) -> bool:
     """Whether the two poses are inverse to each other."""
     around = T_there @ T_back
     off_deg = float(np.rad2deg(angle_rad(around)))
     off_m = float(np.linalg.norm(around[:3, 3]))
-    return off_m <= settings.both_ways_m and off_deg <= settings.both_ways_deg
+    return off_m <= _BOTH_WAYS_M and off_deg <= _BOTH_WAYS_DEG
 
 
 def _weakness(
@@ -201,17 +224,14 @@ def _weakness(
     aligned: Alignment,
     matches: int,
     camera: RectifiedCamera,
-    settings: VerifySettings,
 ) -> str:
     """Why the inliers are not enough; "" where they are."""
     inliers = int(aligned.agree.sum())
-    if inliers < max(settings.min_inliers, settings.min_inlier_share * matches):
+    if inliers < max(MIN_INLIERS, _MIN_INLIER_SHARE * matches):
         return "few inliers"
-    if min(_spread(seen.uvd[aligned.agree], camera) for seen in (first, last)) < (
-        settings.spread_cells
-    ):
+    if min(_spread(seen.uvd[aligned.agree], camera) for seen in (first, last)) < (_SPREAD_CELLS):
         return "inliers in one corner"
-    if _sigma_m(aligned.information) > settings.max_sigma_m:
+    if _sigma_m(aligned.information) > _MAX_SIGMA_M:
         return "motion not fixed"
     return ""
 

@@ -28,6 +28,7 @@ from recon.map.submap_store import SubmapEntry
 from recon.places import LoopSettings
 from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
 from recon.places.graph import close_loops
+from recon.places.settings import DriftSettings
 from recon.stereo.frame import ReconstructedFrame
 from tests.run.pools import observed_pool
 
@@ -196,7 +197,7 @@ def test_a_damaged_keyframe_is_told(frames, tmp_path):
 
 def test_loops_that_contradict_odometry_are_a_warning(closed):
     """The settings believe odometry to the millimetre, so that bending it is impossible."""
-    strict = LoopSettings.parse({"drift": {"share": 1e-6, "turn_deg": 1e-5}})
+    strict = DriftSettings(share=1e-6, turn_deg=1e-5)
     path = closed.odometry
     refused = close_loops(path, path.distances_m, list(closed.closure.closed), strict)
     loops = DriveLoops(path, refused, FRAMES, len(closed.closure.closed), {})
@@ -208,7 +209,7 @@ def test_loops_that_contradict_odometry_are_a_warning(closed):
 @pytest.mark.parametrize(("times", "warned"), [(2, False), (3, True)])
 def test_places_where_the_drive_cannot_have_been_are_a_warning(times, warned):
     path = _circle()
-    nothing = close_loops(path, path.distances_m, [], LoopSettings())
+    nothing = close_loops(path, path.distances_m, [], DriftSettings())
     loops = DriveLoops(path, nothing, FRAMES, 0, {CONTRADICTED: times})
 
     assert [("alike" in text) for text in loops.warnings()] == [True] * warned

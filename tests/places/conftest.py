@@ -13,7 +13,7 @@ from recon.core.values import Disparity, Reason, RectifiedPair, Trajectory
 from recon.places.detector import KeyframeMemory, LoopDetector
 from recon.places.drift import path_lengths
 from recon.places.keyframe import Keyframe, make_keyframe
-from recon.places.settings import LoopSettings
+from recon.places.settings import DriftSettings
 from recon.street.render import StreetCamera
 from recon.street.settings import CORNER_M, StreetSettings
 from recon.street.street import build_street
@@ -79,14 +79,13 @@ class Filmed:
         return self._frames[index]
 
     def keyframe(self, index: int) -> Keyframe:
-        return make_keyframe(index, *self.frame(index), LoopSettings().keyframes)
+        return make_keyframe(index, *self.frame(index))
 
-    def detect(self, frames, path: Trajectory, settings: LoopSettings | None = None, lost=()):
+    def detect(self, frames, path: Trajectory, drift: DriftSettings | None = None, lost=()):
         """A detector that has seen some frames, their poses being those of ``path``."""
-        settings = settings or LoopSettings()
         measured = ~np.isin(np.arange(len(path)), list(lost))
-        path_m = path_lengths(path.T_world_camera, measured, settings.drift)
-        detector = LoopDetector(settings, KeyframeMemory())
+        path_m = path_lengths(path.T_world_camera, measured)
+        detector = LoopDetector(drift or DriftSettings(), KeyframeMemory())
         for k in frames:
             pair, disparity = self.frame(k)
             pose = path.T_world_camera[k]

@@ -10,13 +10,14 @@ import pytest
 from recon.core.errors import RegistrationError
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
+from recon.places import graph
 from recon.places.drift import Drift, drift_over, is_possible, path_lengths
 from recon.places.graph import close_loops
-from recon.places.settings import DriftSettings, LoopSettings
+from recon.places.settings import DriftSettings
 from recon.places.verify import Loop
 from tests.places.conftest import drifted
 
-SETTINGS = LoopSettings()
+DRIFT = DriftSettings()
 INFORMATION = np.diag([0.05**-2] * 3 + [0.003**-2] * 3)
 LAP = 200
 
@@ -53,10 +54,10 @@ def _loop(truth: Trajectory, first: int, last: int) -> Loop:
     return Loop(first, last, se3.invert(poses[first]) @ poses[last], INFORMATION, 100, 1.0)
 
 
-def _close(odometry: Trajectory, loops: list[Loop], settings: LoopSettings = SETTINGS):
+def _close(odometry: Trajectory, loops: list[Loop]):
     measured = np.ones(len(odometry), np.bool_)
-    path_m = path_lengths(odometry.T_world_camera, measured, settings.drift)
-    return close_loops(odometry, path_m, loops, settings)
+    path_m = path_lengths(odometry.T_world_camera, measured)
+    return close_loops(odometry, path_m, loops, DRIFT)
 
 
 def _end_error_m(path: Trajectory, truth: Trajectory) -> float:
@@ -147,27 +148,25 @@ def test_the_first_pose_stays(odometry, loops):
     assert np.array_equal(_close(odometry, loops).trajectory.T_world_camera[0], np.eye(4))
 
 
-def test_a_long_drive_is_closed_with_few_nodes(odometry, truth, loops):
-    few = LoopSettings.parse({"graph": {"max_nodes": 12}})
+def test_a_long_drive_is_closed_with_few_nodes(odometry, truth, loops, monkeypatch):
+    monkeypatch.setattr(graph, "_MAX_NODES", 12)
 
-    closure = _close(odometry, loops, few)
+    closure = _close(odometry, loops)
     assert _end_error_m(closure.trajectory, truth) < 0.005 * truth.path_length_m
 
 
 def test_a_metre_without_measurement_counts_as_many():
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 2, 3] = [0.0, 1.0, 2.0, 3.0]
-    settings = DriftSettings(lost_factor=20.0, lost_m=2.0)
-
-    path_m = path_lengths(poses, np.array([True, True, False, True]), settings)
+    path_m = path_lengths(poses, np.array([True, True, False, True]))
     assert path_m.tolist() == [0.0, 1.0, 23.0, 24.0]
 
 
 def test_drift_grows_with_the_path_and_bounds_what_is_possible():
-    settings = DriftSettings(share=0.02, turn_deg=0.1, sigmas=3.0)
+    settings = DriftSettings(share=0.02, turn_deg=0.1)
     near, far = drift_over(50.0, settings), drift_over(500.0, settings)
     off = se3.make_transform(np.eye(3), np.array([5.0, 0.0, 0.0]))
 
     assert far.position_m > near.position_m
-    assert is_possible(off, far, Drift(0.0, 1e-3), settings)
-    assert not is_possible(off, near, Drift(0.0, 1e-3), settings)
+    assert is_possible(off, far, Drift(0.0, 1e-3))
+    assert not is_possible(off, near, Drift(0.0, 1e-3))

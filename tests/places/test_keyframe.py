@@ -5,17 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from recon.core.values import Disparity, Reason, RectifiedPair
-from recon.places.keyframe import make_keyframe, words_of
+from recon.places.keyframe import FEATURES, make_keyframe, words_of
 from recon.places.places import WordIndex
-from recon.places.settings import CandidateSettings, KeyframeSettings
 from tests.places.conftest import LAP
 from tests.places.test_verify import CAMERA
 
-WORDS = CandidateSettings()
-
 
 def _words(block, frame: int) -> np.ndarray:
-    return words_of(block.keyframe(frame).descriptors, WORDS)
+    return words_of(block.keyframe(frame).descriptors)
 
 
 def test_the_same_place_is_more_alike_than_any_other(block):
@@ -32,7 +29,7 @@ def test_features_are_spread_and_have_the_disparity_of_their_place(block):
     keyframe = block.keyframe(3)
     u, v, d = keyframe.uvd.T
 
-    assert 100 < len(d) <= KeyframeSettings().features
+    assert 100 < len(d) <= FEATURES
     columns = np.unique((u // 80).astype(int))
     assert set(columns) == {0, 1, 2, 3}
     truth = block.drive.camera.disparity_truth(3).values
@@ -52,7 +49,7 @@ def test_an_image_without_texture_gives_a_keyframe_without_features():
         np.full(grey.shape, Reason.LOW_TEXTURE, np.uint8),
     )
 
-    keyframe = make_keyframe(0, RectifiedPair(grey, grey, CAMERA), unknown, KeyframeSettings())
+    keyframe = make_keyframe(0, RectifiedPair(grey, grey, CAMERA), unknown)
 
     assert keyframe.uvd.shape == (0, 3)
-    assert words_of(keyframe.descriptors, WORDS).size == 0
+    assert words_of(keyframe.descriptors).size == 0

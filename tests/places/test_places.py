@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.core.geometry import se3
-from recon.places.drift import drift_over
+from recon.places import places as places_file
+from recon.places.drift import SIGMAS, drift_over
 from recon.places.places import Place, Places, WordIndex
-from recon.places.settings import LoopSettings
+from recon.places.settings import DriftSettings
 
 images = st.lists(st.sets(st.integers(0, 30)), max_size=20)
 
@@ -54,18 +55,18 @@ def _place(frame: int, x_m: float, path_m: float, turned_deg: float = 0.0) -> Pl
 
 
 def test_a_place_is_near_if_odometry_could_be_so_wrong():
-    settings = LoopSettings()
-    seen, drift = settings.candidates, settings.drift
-    reach_m = seen.view_m + drift.sigmas * drift_over(100.0, drift).position_m
-    turn_deg = seen.view_deg + np.degrees(drift.sigmas * drift_over(100.0, drift).angle_rad)
+    drift = DriftSettings()
+    far = drift_over(100.0, drift)
+    reach_m = places_file._VIEW_M + SIGMAS * far.position_m
+    turn_deg = places_file._VIEW_DEG + np.degrees(SIGMAS * far.angle_rad)
     places = Places()
     for share in (0.0, 0.99, 1.01):
         places.add(_place(len(places), share * reach_m, 0.0))
     for share in (0.99, 1.01):
         places.add(_place(len(places), 0.0, 0.0, share * turn_deg))
-    places.add(_place(9, 0.0, 100.0 - 0.9 * seen.min_path_m))
+    places.add(_place(9, 0.0, 100.0 - 0.9 * places_file._MIN_PATH_M))
 
-    near = places.near(_place(10, 0.0, 100.0), settings)
+    near = places.near(_place(10, 0.0, 100.0), drift)
     assert near.tolist() == [True, True, False, True, False, False]
 
 
@@ -91,7 +92,7 @@ def test_a_question_after_ten_kilometres_takes_milliseconds():
     seconds = []
     for _ in range(5):
         start = time.perf_counter()
-        places.near(asked, LoopSettings())
+        places.near(asked, DriftSettings())
         places.likeness(asked)
         seconds.append(time.perf_counter() - start)
     # Ten milliseconds on an idle core; comparing image with image takes half a second.

@@ -8,18 +8,17 @@ import pytest
 from recon.core.geometry import se3
 from recon.core.geometry.projection import project
 from recon.core.values import RectifiedCamera
+from recon.places import verify as verify_file
 from recon.places.align import Seen, refine
 from recon.places.keyframe import points_of
-from recon.places.settings import LoopSettings, VerifySettings
 from recon.places.verify import dense_agreement, verify
 from tests.places.conftest import LAP
 
-SETTINGS = LoopSettings().verify
 CAMERA = RectifiedCamera(180.0, 159.5, 59.5, 159.5, 0.54, 320, 120)
 
 
 def test_the_same_place_a_lap_later_is_recognised_to_centimetres(block):
-    loop = verify(block.keyframe(3), block.keyframe(LAP + 3), CAMERA, SETTINGS).loop
+    loop = verify(block.keyframe(3), block.keyframe(LAP + 3), CAMERA).loop
 
     off = se3.invert(block.drive.motion(3, LAP + 3)) @ loop.T_first_last
     # Disparities are off by 0.25 px, 5 cm at 7 m; over a hundred matches share that.
@@ -30,7 +29,7 @@ def test_the_same_place_a_lap_later_is_recognised_to_centimetres(block):
 
 
 def test_another_street_is_refused(block):
-    verdict = verify(block.keyframe(3), block.keyframe(60), CAMERA, SETTINGS)
+    verdict = verify(block.keyframe(3), block.keyframe(60), CAMERA)
 
     assert verdict.loop is None
     assert verdict.refused
@@ -39,7 +38,7 @@ def test_another_street_is_refused(block):
 def test_the_information_of_a_loop_is_that_of_its_errors(block):
     """Off by at most four standard deviations in each direction."""
     for k in (2, 4, 6):
-        loop = verify(block.keyframe(k), block.keyframe(LAP + k), CAMERA, SETTINGS).loop
+        loop = verify(block.keyframe(k), block.keyframe(LAP + k), CAMERA).loop
         off = se3.invert(block.drive.motion(k, LAP + k)) @ loop.T_first_last
         step = np.concatenate([off[:3, 3], se3.log_so3(off[:3, :3])])
         sigma = np.sqrt(np.diag(np.linalg.inv(loop.information)))
@@ -50,7 +49,7 @@ def test_surfaces_confirm_the_right_pose(block):
     first, last = block.keyframe(3), block.keyframe(LAP + 3)
 
     T = block.drive.motion(3, LAP + 3)
-    assert dense_agreement(first, last, T, CAMERA, SETTINGS) > 0.9
+    assert dense_agreement(first, last, T, CAMERA) > 0.9
 
 
 @pytest.mark.parametrize("offset_m", [(3.0, 0.0, 0.0), (-3.0, 0.0, 0.0), (0.0, -0.5, 0.0)])
@@ -59,20 +58,20 @@ def test_surfaces_contradict_a_wrong_pose(block, offset_m):
     first, last = block.keyframe(3), block.keyframe(LAP + 3)
     T = block.drive.motion(3, LAP + 3) @ se3.make_transform(np.eye(3), np.array(offset_m))
 
-    assert dense_agreement(first, last, T, CAMERA, SETTINGS) < 0.85
+    assert dense_agreement(first, last, T, CAMERA) < 0.85
 
 
 def test_surfaces_of_another_street_contradict(block):
-    share = dense_agreement(block.keyframe(3), block.keyframe(60), np.eye(4), CAMERA, SETTINGS)
+    share = dense_agreement(block.keyframe(3), block.keyframe(60), np.eye(4), CAMERA)
 
-    assert share < SETTINGS.min_dense_share
+    assert share < verify_file._MIN_DENSE_SHARE
 
 
-def test_matches_in_one_corner_prove_nothing(block):
+def test_matches_in_one_corner_prove_nothing(block, monkeypatch):
     first, last = block.keyframe(3), block.keyframe(LAP + 3)
-    everywhere = SETTINGS.model_copy(update={"spread_cells": 16})
+    monkeypatch.setattr(verify_file, "_SPREAD_CELLS", 16)
 
-    assert verify(first, last, CAMERA, everywhere).refused == "inliers in one corner"
+    assert verify(first, last, CAMERA).refused == "inliers in one corner"
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -86,7 +85,7 @@ def test_refinement_finds_the_motion_of_exact_points(seed):
     )
     start = T @ se3.make_transform(se3.exp_so3(rng.normal(0, 0.01, 3)), rng.normal(0, 0.2, 3))
 
-    aligned = refine(first, last, start, CAMERA, VerifySettings())
+    aligned = refine(first, last, start, CAMERA)
 
     assert np.allclose(aligned.T_first_last, T, atol=1e-6)
     assert aligned.agree.all()
