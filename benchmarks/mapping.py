@@ -157,9 +157,11 @@ def to_centres(xyz: Float64, resolution_m: float) -> Float64:
 
 def ours(ends_m: Float64, resolution_m: float) -> OccupancyBuilder:
     """A map of one frame, without point uncertainty, which OctoMap does not model."""
-    settings = OccupancySettings(resolution_m=resolution_m, max_range_m=RANGE_M + 1.0, min_points=1)
+    settings = OccupancySettings(resolution_m=resolution_m, max_range_m=RANGE_M + 1.0)
     builder = OccupancyBuilder(settings, np.eye(4))
-    cloud = PointCloud((ends_m - ORIGIN_M).astype(np.float32))
+    # Each stands for two points: a single one starts no ray.
+    two = np.full(len(ends_m), 2, np.int32)
+    cloud = PointCloud((ends_m - ORIGIN_M).astype(np.float32), count=two)
     builder.integrate(cloud, make_transform(np.eye(3), ORIGIN_M))
     return builder
 

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float32, Float64
 from recon.io.tree_file import read_tree, write_tree
-from recon.map import GroundSettings, add_floors
+from recon.map import add_floors
 from recon.map.drive_map import Tile
+from recon.map.ground import MAX_TILT_DEG
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,10 @@ class GroundStore:
 
     Args:
         folder: The folder of the files.
-        settings: Settings of the ground estimate.
     """
 
-    def __init__(self, folder: Path, settings: GroundSettings) -> None:
+    def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._settings = settings
         self._boxes: dict[str, Window] = {}
         self._parts: Counter[Tile] = Counter()
 
@@ -78,7 +77,7 @@ class GroundStore:
         """
         xyz = cloud.xyz
         if cloud.normals is not None:
-            upright = math.cos(math.radians(self._settings.max_tilt_deg))
+            upright = math.cos(math.radians(MAX_TILT_DEG))
             xyz = xyz[cloud.normals[:, 2] >= upright]
         self._parts[tile] += 1
         self._put(f"cloud_{tile[0]}_{tile[1]}_{self._parts[tile]}", xyz)
@@ -94,7 +93,7 @@ class GroundStore:
     def cloud_in(self, window: Window) -> PointCloud:
         """Candidate ground points in a window, frame ``map``."""
         points, floors = (self._read(kind, window) for kind in ("cloud", "floors"))
-        return add_floors(PointCloud(points, frame="map"), floors, self._settings)
+        return add_floors(PointCloud(points, frame="map"), floors)
 
     def _put(self, name: str, xyz: Float32) -> None:
         if len(xyz):

@@ -32,6 +32,7 @@ from recon.map import (
 )
 from recon.map.drive_map import DriveMap, Tile
 from recon.map.log_odds import log_odds
+from recon.map.occupancy import MIN_PROBABILITY
 from recon.map.occupancy_part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.run.directory import RunDirectory
@@ -83,7 +84,7 @@ class OccupancyWriter:
         self._path_m = path_m
         self._trusted = trusted
         self._directory = directory
-        self._store = GroundStore(directory.state("ground"), config.ground)
+        self._store = GroundStore(directory.state("ground"))
         self._resolution_m = config.occupancy.resolution_m
         self._edge_cells = drive.occupancy_tile_cells
         self._edge_m = self._edge_cells * self._resolution_m
@@ -175,7 +176,7 @@ class OccupancyWriter:
         """The space that the vehicle took up in a tile and its margin, by submap."""
         path = path.select(Window.around(tile, self._edge_m, _MARGIN_M).contains(path.points_m))
         width_m = self._config.grid.vehicle_width_m
-        free = log_odds(self._config.occupancy.min_probability)
+        free = log_odds(MIN_PROBABILITY)
         passed = {}
         for submap in np.unique(path.submap).tolist():
             points_m = path.points_m[path.submap == submap]

@@ -25,32 +25,37 @@ _FARTHEST_M: Final = 1e5
 _RIGID_TOLERANCE: Final = 1e-6
 
 
+_MAX_TILT_DEG: Final = 30.0
+"""Planes tilted more than this are no ground."""
+
+_MAX_RANGE_M: Final = 20.0
+"""How far away the ground is looked for: farther points are too uncertain to level by."""
+
+_INLIER_M: Final = 0.05
+"""Distance to the plane of points that support it."""
+
+_MIN_INLIERS: Final = 500
+"""Points that must support the plane, after thinning to 20 000."""
+
+_TRIALS: Final = 300
+"""Random planes that are tried."""
+
+
 class AxesSettings(Settings):
-    """How the ground is found, when the map is levelled by it, and where it has its origin."""
+    """Where the map has its origin, and when it is levelled by the ground."""
 
     origin: Literal["camera", "ground"] = Field(
         "camera",
         description="Origin of the map: the first left camera, or the ground below it, so that "
         "z = 0 is on the ground at the start.",
     )
-
     level_min_tilt_deg: float = Field(
         3.0,
         ge=0.0,
         le=90.0,
-        description="The map is levelled only where the camera is tilted more than this.",
+        description="The map is levelled only where the camera is tilted more than this. 0 levels "
+        "every map, 90 none, if the rig's own axes are wanted.",
     )
-    max_tilt_deg: float = Field(
-        30.0, gt=0.0, lt=90.0, description="Planes tilted more than this are no ground."
-    )
-    max_range_m: float = Field(20.0, gt=0.0, le=1000.0, description="Points used.")
-    inlier_m: float = Field(
-        0.05, gt=0.0, le=1.0, description="Distance to the plane of points that support it."
-    )
-    min_inliers: int = Field(
-        500, ge=3, description="Points that must support the plane, after thinning to 20 000."
-    )
-    trials: int = Field(300, ge=1, le=100_000, description="Random planes that are tried.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,54 +130,53 @@ def _height_along_z(ground: GroundPlane | None, turn: NDArray[Any]) -> float:
     return ground.height_m / float(turn[2] @ ground.normal)
 
 
-def estimate_ground(cloud: PointCloud, settings: AxesSettings) -> GroundPlane | None:
+def estimate_ground(cloud: PointCloud) -> GroundPlane | None:
     """Find the plane that the camera stands above: RANSAC, then least squares.
 
     Args:
         cloud: Points of one frame in camera axes.
-        settings: What counts as ground.
 
     Returns:
-        The plane below the camera, within ``max_tilt_deg`` of level, with the most support; or
+        The plane below the camera, within 30 degrees of level, with the most support; or
         None. The same cloud gives the same plane.
 
     Ref: M. Fischler and R. Bolles, "Random sample consensus", CACM 24, 1981.
     """
-    xyz = _candidates(cloud, settings)
-    if len(xyz) < settings.min_inliers:
+    xyz = _candidates(cloud)
+    if len(xyz) < _MIN_INLIERS:
         return None
-    normal, height = _best_plane(xyz, settings)
+    normal, height = _best_plane(xyz)
     for _ in range(3):
-        inside = np.abs(xyz @ normal + height) < settings.inlier_m
-        if inside.sum() < settings.min_inliers:
+        inside = np.abs(xyz @ normal + height) < _INLIER_M
+        if inside.sum() < _MIN_INLIERS:
             return None
         normal, height = _fit_plane(xyz[inside])
     plane = GroundPlane(normal, float(height), int(inside.sum()))
-    return plane if plane.tilt_deg <= settings.max_tilt_deg and height > 0 else None
+    return plane if plane.tilt_deg <= _MAX_TILT_DEG and height > 0 else None
 
 
-def _candidates(cloud: PointCloud, settings: AxesSettings) -> Float64:
+def _candidates(cloud: PointCloud) -> Float64:
     """Points in range that a tilted ground could hold, thinned evenly; float64 (N, 3)."""
     xyz = cloud.xyz.astype(np.float64)
     z = xyz[:, 2]
-    highest = z * math.tan(math.radians(settings.max_tilt_deg))
-    below = (z > 0) & (z < settings.max_range_m) & (xyz[:, 1] > -highest)
+    highest = z * math.tan(math.radians(_MAX_TILT_DEG))
+    below = (z > 0) & (z < _MAX_RANGE_M) & (xyz[:, 1] > -highest)
     xyz = xyz[below]
     return np.asarray(xyz[:: max(1, math.ceil(len(xyz) / 20_000))])
 
 
-def _best_plane(xyz: Float64, settings: AxesSettings) -> tuple[Float64, float]:
+def _best_plane(xyz: Float64) -> tuple[Float64, float]:
     """The plane through three points that most points support."""
     random = np.random.default_rng(0)
     few = xyz[:: max(1, len(xyz) // 4000)]
-    triples = few[random.integers(0, len(few), (settings.trials, 3))]
+    triples = few[random.integers(0, len(few), (_TRIALS, 3))]
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     length = np.linalg.norm(normals, axis=1)
     normals = normals / np.where(length > 0, length, 1.0)[:, None]
     normals *= np.where(normals[:, 1] > 0, -1.0, 1.0)[:, None]
     heights = -np.einsum("ij,ij->i", normals, triples[:, 0])
-    level = normals @ _UP_CAMERA >= math.cos(math.radians(settings.max_tilt_deg))
-    support = np.abs(few @ normals.T + heights) < settings.inlier_m
+    level = normals @ _UP_CAMERA >= math.cos(math.radians(_MAX_TILT_DEG))
+    support = np.abs(few @ normals.T + heights) < _INLIER_M
     votes = np.where(level & (heights > 0), support.sum(axis=0), -1)
     best = int(np.argmax(votes))
     return normals[best], float(heights[best])

@@ -16,6 +16,7 @@ from recon.core.values import OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Float64
 from recon.map import Submap, SubmapMotion
 from recon.map.fused_part import KNOWABLE, join_fused
+from recon.map.grid import JOINED_CELLS
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
 from recon.map.occupancy_part import OccupancyPart, join_occupancy
 from recon.map.settings import DriveSettings
@@ -85,7 +86,7 @@ class DriveMap:
         margin_m = max(_MARGIN_M, 2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
         self._margin_voxels = math.ceil(margin_m / config.fusion.voxel_m)
         # A cell depends on the cells joined to it, on their blob, and on adjacent cells.
-        beyond = config.grid.min_blob_cells + config.grid.joined_cells + 2
+        beyond = config.grid.min_blob_cells + JOINED_CELLS + 2
         self._margin_blocks = math.ceil(beyond / BLOCK_EDGE)
         self._reach = self._fitting_reach()
         shared = frozenset(KNOWABLE).intersection(*(reach.known for reach in self._reach))

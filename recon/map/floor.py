@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Bool, Float32, Int32
-from recon.map.ground import GroundSettings
+from recon.map.ground import CELL_M, MAX_TILT_DEG, MIN_POINTS
 from recon.map.log_odds import log_odds
 
 _FULL: Final = log_odds(0.6)
@@ -28,21 +28,20 @@ def find_floors(voxels: OccupancyVoxels) -> Float32:
     return ((_floors(voxels) + 0.5) * voxels.resolution_m).astype(np.float32)
 
 
-def add_floors(cloud: PointCloud, floors: Float32, settings: GroundSettings) -> PointCloud:
+def add_floors(cloud: PointCloud, floors: Float32) -> PointCloud:
     """A cloud to look for ground in: its points, and floors where it has too few.
 
     Args:
         cloud: The fused cloud in map axes.
         floors: float32 (N, 3), as `find_floors` gives them.
-        settings: Cells of the ground, and what makes a measured one.
 
     Returns:
         Points, and normals if the cloud has them (straight up for voxels); frame of the cloud.
     """
     known = cloud.xyz
     if cloud.normals is not None:
-        known = known[cloud.normals[:, 2] >= math.cos(math.radians(settings.max_tilt_deg))]
-    floors = floors[_unknown(floors, known, settings)]
+        known = known[cloud.normals[:, 2] >= math.cos(math.radians(MAX_TILT_DEG))]
+    floors = floors[_unknown(floors, known)]
     xyz = np.concatenate([cloud.xyz, floors])
     if cloud.normals is None:
         return PointCloud(xyz, frame=cloud.frame)
@@ -73,11 +72,11 @@ def _value_at(packed: NDArray[np.int64], log_odds: Float32, wanted: NDArray[np.i
     return np.where(packed[place] == wanted, log_odds[place], np.float32(np.nan))
 
 
-def _unknown(floors: Float32, known: Float32, settings: GroundSettings) -> Bool:
+def _unknown(floors: Float32, known: Float32) -> Bool:
     """Which floors lie in cells of the ground where fewer than ``min_points`` are known."""
-    cells, counts = np.unique(_columns(known, settings.cell_m), return_counts=True)
-    measured = cells[counts >= settings.min_points]
-    return np.isin(_columns(floors, settings.cell_m), measured, invert=True)
+    cells, counts = np.unique(_columns(known, CELL_M), return_counts=True)
+    measured = cells[counts >= MIN_POINTS]
+    return np.isin(_columns(floors, CELL_M), measured, invert=True)
 
 
 def _columns(xyz: Float32, cell_m: float) -> NDArray[np.int64]:

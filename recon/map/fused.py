@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
 from pydantic import Field
@@ -14,46 +15,50 @@ from recon.core.values import PointCloud, RectifiedCamera
 from recon.core.values.arrays import Float32
 from recon.map.fused_part import CONFIDENCE, KNOWABLE, NORMAL, RGB, VALUES, FusedPart
 
+_MIN_SIGMA_M: Final = 0.02
+"""Points more precise than this count as this precise: bounds the weight."""
+
+_MAX_SIGMA_M: Final = 0.6
+"""Points less precise than this are left out: they would smear over voxels."""
+
+_NOMINAL_ERROR_PX: Final = 0.3
+"""Error of a good match, by which the range of fusion is found."""
+
 
 class FusionSettings(Settings):
     """How clouds are fused."""
 
-    voxel_m: float = Field(0.1, gt=0.0, le=10.0, description="Edge of a voxel.")
+    voxel_m: float = Field(
+        0.1,
+        gt=0.0,
+        le=10.0,
+        description="Edge of a voxel. Half of it takes about four times the memory; scale it with "
+        "the scene.",
+    )
     min_count: int = Field(
-        3, ge=1, le=1000, description="Voxels seen by fewer frames are not exported."
+        3,
+        ge=1,
+        le=1000,
+        description="Voxels seen by fewer frames are not exported. Lower it for slow or sparse "
+        "drives, raise it where noise is left.",
     )
     precise_sigma_m: float | None = Field(
         0.08,
         gt=0.0,
         le=10.0,
-        description="Voxels at least this precise need one frame less; null = none does.",
-    )
-    min_sigma_m: float = Field(
-        0.02,
-        gt=0.0,
-        le=10.0,
-        description="Points more precise than this count as this precise: bounds the weight.",
+        description="Voxels at least this precise need one frame less; none = none does.",
     )
     max_depth_error_m: float | None = Field(
         0.25,
         gt=0.0,
         le=100.0,
-        description="Points are fused up to the depth at which `nominal_error_px` makes this "
-        "error; null = all.",
-    )
-    nominal_error_px: float = Field(
-        0.3, gt=0.0, le=10.0, description="Error of a good match, for that limit."
-    )
-    max_sigma_m: float = Field(
-        0.6,
-        gt=0.0,
-        le=100.0,
-        description="Points less precise than this are left out: they would smear over voxels.",
+        description="Points are fused up to the depth at which a matching error of 0.3 px makes "
+        "this error; none = all. Raise it to map farther and less precisely.",
     )
 
 
 def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
-    """The depth at which a matching error of ``nominal_error_px`` costs ``max_depth_error_m``.
+    """The depth at which a matching error of 0.3 px costs ``max_depth_error_m``.
 
     The error of a depth grows with its square, ``Z²·error_px / (f·b)``: beyond this range a rig
     measures less precisely than the map requires. The setting fits short and long baselines.
@@ -68,7 +73,7 @@ def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
     if settings.max_depth_error_m is None:
         return math.inf
     fb = camera.focal_px * camera.baseline_m
-    return math.sqrt(settings.max_depth_error_m * fb / settings.nominal_error_px)
+    return math.sqrt(settings.max_depth_error_m * fb / _NOMINAL_ERROR_PX)
 
 
 class MapBuilder:
@@ -161,13 +166,12 @@ class MapBuilder:
 
     def _weights(self, cloud: PointCloud) -> Float32:
         """Weight of each point; 0 = not used. float32 (N,)."""
-        s = self._settings
         confidence = np.float32(1) if cloud.confidence is None else cloud.confidence
         if cloud.sigma_m is None:
             return np.full(len(cloud), 1.0, np.float32) * confidence
-        bounded = np.maximum(cloud.sigma_m, np.float32(s.min_sigma_m))
+        bounded = np.maximum(cloud.sigma_m, np.float32(_MIN_SIGMA_M))
         weights = confidence / bounded**2
-        return np.where(cloud.sigma_m <= s.max_sigma_m, weights, 0).astype(np.float32)
+        return np.where(cloud.sigma_m <= _MAX_SIGMA_M, weights, 0).astype(np.float32)
 
     def _check(self, cloud: PointCloud) -> None:
         """Refuse what would silently spoil the map."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -17,32 +17,53 @@ from recon.core.values.arrays import Bool, Float64
 from recon.map.ground import GroundSurface
 from recon.map.log_odds import log_odds
 
+JOINED_CELLS: Final = 2
+"""Cells that were hit, but not surely, belong to an obstacle that they hang together with over so
+many cells, unless they touch a free one."""
+
 
 class GridSettings(Settings):
     """How voxels are flattened. Heights are of centres of voxels, above the local ground."""
 
     min_height_m: float = Field(
-        0.3, ge=0.0, le=10.0, description="Lower end of the band in which obstacles are looked for."
+        0.3,
+        ge=0.0,
+        le=10.0,
+        description="Lower end of the band in which obstacles are looked for: what the vehicle can "
+        "drive over.",
     )
     max_height_m: float = Field(
-        2.0, gt=0.0, le=100.0, description="Upper end of the band: what is higher is passed under."
+        2.0,
+        gt=0.0,
+        le=100.0,
+        description="Upper end of the band: what is higher is passed under. The height of the "
+        "vehicle.",
     )
     free_height_m: float = Field(
         0.8,
         gt=0.0,
         le=100.0,
         description="Free voxels below this height make a cell free; higher ones may be seen "
-        "over an obstacle that hides what is behind it.",
+        "over an obstacle that hides what is behind it. About half the height of the camera.",
     )
     occupied_probability: float = Field(
-        0.55, ge=0.5, lt=1.0, description="Voxels at least this probable are obstacles."
+        0.55,
+        ge=0.5,
+        lt=1.0,
+        description="Voxels at least this probable are obstacles. Raise it for fewer false ones.",
     )
     free_probability: float = Field(
-        0.35, gt=0.0, le=0.5, description="Voxels at most this probable are free."
+        0.35,
+        gt=0.0,
+        le=0.5,
+        description="Voxels at most this probable are free. Lower it to drive only where it is "
+        "sure.",
     )
-    min_voxels: int = Field(1, ge=1, description="Occupied voxels in a column that block it.")
     min_blob_cells: int = Field(
-        3, ge=1, description="Connected blocked cells fewer than this are taken for noise."
+        3,
+        ge=1,
+        description="Connected blocked cells fewer than this are taken for noise. 1 keeps thin "
+        "posts.",
     )
     vehicle_width_m: float = Field(
         0.6,
@@ -50,13 +71,6 @@ class GridSettings(Settings):
         le=10.0,
         description="Width of what carried the camera: cells that it passed over are free; 0 = "
         "only what was seen is free.",
-    )
-    joined_cells: int = Field(
-        2,
-        ge=0,
-        le=100,
-        description="Cells that were hit, but not surely, belong to an obstacle that they hang "
-        "together with over so many cells, unless they touch a free one.",
     )
 
 
@@ -113,8 +127,8 @@ def flatten(
     floor = _floor(ground, low, (rows, columns), voxels.resolution_m)
     height = (voxels.keys[:, 2] + 0.5) * voxels.resolution_m - floor[cell]
 
-    def any_in(which: Bool, least: int = 1) -> Bool:
-        found = np.bincount(cell[which], minlength=rows * columns) >= least
+    def any_in(which: Bool) -> Bool:
+        found = np.bincount(cell[which], minlength=rows * columns) > 0
         return np.asarray(found.reshape(rows, columns))
 
     s = settings
@@ -123,7 +137,7 @@ def flatten(
     full = voxels.log_odds >= log_odds(s.occupied_probability)
     empty = voxels.log_odds <= log_odds(s.free_probability)
     found = _Found(
-        blocked=any_in(hit & full, s.min_voxels),
+        blocked=any_in(hit & full),
         seen_through=any_in(empty & low_air),
         hit=any_in(hit),
         low_hit=any_in(hit & low_air),
@@ -137,7 +151,7 @@ def _decide(found: _Found, s: GridSettings) -> NDArray[np.int8]:
     blocked = _without_small_blobs(found.blocked, s.min_blob_cells)
     free = found.seen_through & ~blocked & ~(found.low_hit & _beside(blocked))
     unsure = found.hit & ~free & ~_beside(free)
-    for _ in range(s.joined_cells):
+    for _ in range(JOINED_CELLS):
         blocked |= unsure & _beside(blocked)
     cells = np.where(free, np.int8(FREE), np.int8(UNKNOWN))
     cells[blocked] = OCCUPIED

@@ -28,29 +28,39 @@ _DEEPEST_M: Final = 5.0
 _NEIGHBOURS: Final = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
 
 
+CELL_M: Final = 1.0
+"""Edge of a cell of the surface."""
+
+_WINDOW_M: Final = 0.3
+"""Points this far from the expected height may be ground: also the largest step from one cell to
+the next."""
+
+MAX_TILT_DEG: Final = 35.0
+"""Points with normals tilted more are no ground."""
+
+MIN_POINTS: Final = 3
+"""Points that make a measured cell."""
+
+_MAX_GAP_M: Final = 4.0
+"""How far a height is carried over cells without points."""
+
+
 class GroundSettings(Settings):
     """How the ground is followed."""
 
-    cell_m: float = Field(1.0, gt=0.0, le=20.0, description="Edge of a cell of the surface.")
     reach_m: float = Field(
-        25.0, gt=0.0, le=500.0, description="How far from the path the surface grows."
-    )
-    window_m: float = Field(
-        0.3,
+        25.0,
         gt=0.0,
-        le=2.0,
-        description="Points this far from the expected height may be ground: also the largest "
-        "step from one cell to the next.",
-    )
-    max_tilt_deg: float = Field(
-        35.0, gt=0.0, lt=90.0, description="Points with normals tilted more are no ground."
-    )
-    min_points: int = Field(3, ge=1, description="Points that make a measured cell.")
-    max_gap_m: float = Field(
-        4.0, ge=0.0, le=100.0, description="How far a height is carried over cells without points."
+        le=500.0,
+        description="How far from the path the surface grows, and with it the grid. Raise it with "
+        "occupancy.max_range_m.",
     )
     camera_height_m: float | None = Field(
-        None, gt=0.0, le=100.0, description="Height of the camera above ground; None = measured."
+        None,
+        gt=0.0,
+        le=100.0,
+        description="Height of the camera above ground; none = measured. Set it where the ground "
+        "near the path is not seen.",
     )
 
 
@@ -136,7 +146,7 @@ def estimate_ground_surface(
         field.grow(camera_height)
     return GroundSurface(
         heights_m=_smooth(field.heights, field.measured),
-        cell_m=settings.cell_m,
+        cell_m=CELL_M,
         origin_m=field.origin,
         camera_height_m=camera_height,
         drops_m=field.drops(),
@@ -171,8 +181,7 @@ class _Field:
     """The surface while it grows."""
 
     def __init__(self, cloud: PointCloud, path: Float64, settings: GroundSettings) -> None:
-        self._settings = settings
-        cell, rings = settings.cell_m, math.ceil(settings.reach_m / settings.cell_m)
+        cell, rings = CELL_M, math.ceil(settings.reach_m / CELL_M)
         path = np.concatenate([_densify(piece, cell / 2) for piece in _pieces(path)])
         low = np.floor(path[:, :2].min(axis=0) / cell) - rings
         columns, rows = (np.floor(path[:, :2].max(axis=0) / cell) - low + rings + 1).astype(int)
@@ -189,7 +198,7 @@ class _Field:
         near = self._ring.ravel()[self._cell] == 0
         drop = self._path_z.ravel()[self._cell[near]] - self._z[near]
         drop = drop[(drop > 2 * _BIN_M) & (drop < _DEEPEST_M)]
-        if len(drop) < self._settings.min_points:
+        if len(drop) < MIN_POINTS:
             return math.nan
         votes = np.bincount((drop / _BIN_M).astype(int), minlength=3)
         smooth = np.convolve(votes, [1, 1, 1], mode="same")
@@ -208,7 +217,7 @@ class _Field:
         wide = np.pad(votes, ((0, 0), (1, 1)))
         smooth = wide[:, :-2] + votes + wide[:, 2:]
         mode = (smooth.argmax(axis=1) + 0.5) * _BIN_M
-        enough = smooth.max(axis=1, initial=0) >= self._settings.min_points
+        enough = smooth.max(axis=1, initial=0) >= MIN_POINTS
         found[cells[enough]] = mode[enough]
         return np.asarray(found.reshape(self.heights.shape))
 
@@ -232,15 +241,15 @@ class _Field:
         """Give the cells of a ring the height of their points, or carry the expected one."""
         slot = np.searchsorted(cells, self._cell[points])
         z = self._z[points]
-        height, window = expected, self._settings.window_m
+        height, window = expected, _WINDOW_M
         for width in (window, window / 2):
             near = np.abs(z - height[slot]) <= width
             number = np.bincount(slot[near], minlength=len(cells))
             total = np.bincount(slot[near], weights=z[near], minlength=len(cells))
-            found = number >= self._settings.min_points
+            found = number >= MIN_POINTS
             height = np.where(found, total / np.maximum(number, 1), height)
-        gap = np.where(found, 0.0, gap + self._settings.cell_m)
-        lost = gap > self._settings.max_gap_m
+        gap = np.where(found, 0.0, gap + CELL_M)
+        lost = gap > _MAX_GAP_M
         self.heights.ravel()[cells] = np.where(lost, np.nan, height)
         self.measured.ravel()[cells] = found
         self._gap.ravel()[cells] = gap
@@ -273,7 +282,7 @@ class _Field:
         """Cell and height of each point that may be ground."""
         xyz = cloud.xyz.astype(np.float64)
         if cloud.normals is not None:
-            upright = math.cos(math.radians(self._settings.max_tilt_deg))
+            upright = math.cos(math.radians(MAX_TILT_DEG))
             xyz = xyz[cloud.normals[:, 2] >= upright]
         cells, inside = self._cells_of(xyz)
         cells, z = cells[inside], xyz[inside, 2]
@@ -283,7 +292,7 @@ class _Field:
     def _cells_of(self, xyz: Float64) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
         """Flat index of the cell of each point, and whether it lies on the field."""
         rows, columns = self.heights.shape
-        place = np.floor((xyz[:, :2] - self.origin) / self._settings.cell_m)
+        place = np.floor((xyz[:, :2] - self.origin) / CELL_M)
         inside = np.all((place >= 0) & (place < (columns, rows)), axis=1)
         column, row = np.where(inside, place.T, 0).astype(np.intp)
         return row * columns + column, np.asarray(inside)

@@ -149,7 +149,7 @@ class Mapper:
     def _builder_from(self, frame: ReconstructedFrame) -> SubmapBuilder:
         """The submap under construction; the first frame fixes the map axes."""
         if self._builder is None:
-            ground = estimate_ground(frame.cloud, self._config.axes)
+            ground = estimate_ground(frame.cloud)
             height_m = self._config.ground.camera_height_m
             self.T_map_world = map_axes(ground, self._config.axes, height_m)
             self._builder = self._new_builder()

@@ -13,7 +13,12 @@ import numpy as np
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, RayCloud, RayGrain
 from recon.map.kernels import raycast
-from recon.map.occupancy import OccupancySettings, check_camera_cloud, sigma_and_confidence
+from recon.map.occupancy import (
+    FREE_MARGIN_SIGMAS,
+    OccupancySettings,
+    check_camera_cloud,
+    sigma_and_confidence,
+)
 
 _UNITS_PER_CELL: Final = 64
 _LARGEST: Final = np.iinfo(np.int16).max - 1
@@ -49,7 +54,7 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
         sigma_m,
         settings.max_range_m,
         _beyond_m(settings),
-        settings.free_margin_sigmas,
+        FREE_MARGIN_SIGMAS,
     )
     points = voxels.VoxelPoints(
         xyz, (sure > 0).astype(np.float32), np.stack([sigma_m, sure], axis=1)

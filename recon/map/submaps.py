@@ -8,7 +8,7 @@ with it, and nothing has to be matched again.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from pydantic import Field
@@ -24,6 +24,9 @@ from recon.map.occupancy import OccupancyBuilder, OccupancySettings
 from recon.map.occupancy_part import OccupancyPart
 from recon.map.surface_points import SurfacePoints
 
+_MAX_FRAMES: Final = 100
+"""Frames after which a new submap begins at the latest, however slow the drive."""
+
 
 class SubmapSettings(Settings):
     """Where a drive is divided into submaps, and into which tiles its map.
@@ -33,13 +36,18 @@ class SubmapSettings(Settings):
     """
 
     length_m: float = Field(
-        25.0, gt=0.0, le=10_000.0, description="Path after which a new submap begins."
-    )
-    max_frames: int = Field(
-        100, ge=1, le=100_000, description="Frames after which a new submap begins at the latest."
+        25.0,
+        gt=0.0,
+        le=10_000.0,
+        description="Path after which a new submap begins. Shorter ones bend better with closed "
+        "loops and take less memory.",
     )
     tile_m: float = Field(
-        50.0, ge=5.0, le=10_000.0, description="Edge of the tiles, rounded to whole voxels."
+        50.0,
+        ge=5.0,
+        le=10_000.0,
+        description="Edge of the tiles, rounded to whole voxels. Smaller ones take less memory, "
+        "and more time.",
     )
 
 
@@ -185,7 +193,7 @@ class SubmapBuilder:
     def full(self) -> bool:
         """Whether the submap is to be closed."""
         s, limit = self._settings, self._max_bytes
-        long = self._path_m >= s.length_m or self._frames >= s.max_frames
+        long = self._path_m >= s.length_m or self._frames >= _MAX_FRAMES
         return long or (limit is not None and self._fused.nbytes + self._occupancy.nbytes >= limit)
 
     def current(self) -> Submap:

@@ -21,7 +21,6 @@ from recon.io.models.ply import read_ply, write_ply_tiles
 from recon.io.occupancy.nav2 import read_nav2
 from recon.io.occupancy.octomap import write_octomap
 from recon.map import (
-    GroundSettings,
     add_floors,
     drop_undecided,
     estimate_ground_surface,
@@ -75,7 +74,7 @@ def test_the_grid_of_tiles_is_that_of_the_whole(
     config = mapped.config
     cloud = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
-    floor = add_floors(cloud, find_floors(mapped.voxels), config.ground)
+    floor = add_floors(cloud, find_floors(mapped.voxels))
     ground = estimate_ground_surface(floor, path_m, config.ground)
     whole = flatten(mapped.voxels, ground, config.grid)
     narrow = load_config(None, [*SETTINGS, "grid.vehicle_width_m=0"])
@@ -169,7 +168,7 @@ def test_a_sample_of_nothing_is_nothing() -> None:
 
 
 def test_the_ground_of_a_window_is_looked_for_in_its_points_alone(tmp_path: Path) -> None:
-    store = GroundStore(tmp_path, GroundSettings())
+    store = GroundStore(tmp_path)
     up, east = np.float32([0, 0, 1]), np.float32([1, 0, 0])
     xyz = np.float32([[1, 1, 0], [2, 2, 0], [30, 1, 0], [3, 3, 0]])
     store.put_cloud((0, 0), PointCloud(xyz, normals=np.stack([up, up, up, east]), frame="map"))

@@ -31,7 +31,7 @@ class _Stops(Silent):
 def interrupt_run(folder: Path) -> None:
     """Write a drive to ``folder/drive`` and an interrupted run of it to ``folder/run``."""
     write_kitti(SyntheticSource(StreetSettings(**DRIVE)), folder / "drive")
-    config = load_config(None, ["checkpoints.every_frames=1", "submaps.max_frames=2"])
+    config = load_config(None, ["checkpoints.every_frames=1", "submaps.length_m=1"])
     request = MapRequest(folder / "drive", mesh=False)
     options = MapOptions(
         out=folder / "run", mesh=False, progress=_Stops(), arguments=request.arguments()

@@ -35,7 +35,7 @@ def test_map_axes_are_forward_left_up() -> None:
 
 @pytest.mark.parametrize(("pitch", "roll"), [(0.0, 0.0), (2.0, -1.0), (12.0, 0.0), (-8.0, 6.0)])
 def test_the_ground_is_found_among_walls_and_boxes(pitch: float, roll: float) -> None:
-    plane = estimate_ground(_street(pitch, roll), SETTINGS)
+    plane = estimate_ground(_street(pitch, roll))
     assert plane is not None
     # 6000 points with 1 cm of noise fix a plane much better than this.
     assert plane.height_m == pytest.approx(1.5, abs=0.01)
@@ -44,7 +44,7 @@ def test_the_ground_is_found_among_walls_and_boxes(pitch: float, roll: float) ->
 
 
 def test_the_same_cloud_gives_the_same_ground() -> None:
-    first, second = (estimate_ground(_street(5.0), SETTINGS) for _ in range(2))
+    first, second = (estimate_ground(_street(5.0)) for _ in range(2))
     assert first is not None
     assert second is not None
     np.testing.assert_array_equal(first.normal, second.normal)
@@ -53,28 +53,28 @@ def test_the_same_cloud_gives_the_same_ground() -> None:
 def test_a_wall_is_no_ground() -> None:
     rng = np.random.default_rng(1)
     wall = np.stack([rng.uniform(-5, 5, 8000), rng.uniform(-2, 2, 8000), np.full(8000, 6.0)], 1)
-    assert estimate_ground(PointCloud(wall.astype(np.float32)), SETTINGS) is None
+    assert estimate_ground(PointCloud(wall.astype(np.float32))) is None
 
 
 def test_a_ceiling_is_no_ground() -> None:
     rng = np.random.default_rng(1)
     above = np.stack([rng.uniform(-5, 5, 8000), np.full(8000, -1.5), rng.uniform(4, 15, 8000)], 1)
-    assert estimate_ground(PointCloud(above.astype(np.float32)), SETTINGS) is None
+    assert estimate_ground(PointCloud(above.astype(np.float32))) is None
 
 
 def test_an_empty_cloud_has_no_ground() -> None:
-    assert estimate_ground(PointCloud(np.zeros((0, 3), np.float32)), SETTINGS) is None
+    assert estimate_ground(PointCloud(np.zeros((0, 3), np.float32))) is None
 
 
 def test_small_tilts_keep_the_exact_axes() -> None:
-    plane = estimate_ground(_street(2.0), SETTINGS)
+    plane = estimate_ground(_street(2.0))
     np.testing.assert_array_equal(map_axes(plane, SETTINGS), map_axes(None, SETTINGS))
 
 
 @pytest.mark.parametrize(("pitch", "roll"), [(12.0, 0.0), (-10.0, 5.0)])
 def test_large_tilts_are_levelled(pitch: float, roll: float) -> None:
     street = _street(pitch, roll)
-    T = map_axes(estimate_ground(street, SETTINGS), SETTINGS)
+    T = map_axes(estimate_ground(street), SETTINGS)
     ground = apply(T, street.xyz[:6000].astype(np.float64))
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0, abs=1e-12)
     # Noise of the points is 1 cm; a degree that was left would give 7 cm.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from recon.core.values import OccupancyVoxels, PointCloud
+from recon.map import ground
 from recon.map.floor import add_floors, find_floors
 from recon.map.ground import GroundSettings, estimate_ground_surface
 
@@ -34,7 +35,7 @@ WALL = _columns(range(20), range(5, 6), dict.fromkeys(range(-8, 4), 2.0))
 
 
 def test_floors_are_occupied_voxels_below_free_ones() -> None:
-    added = add_floors(_empty(), find_floors(_voxels(ROAD, WALL)), SETTINGS)
+    added = add_floors(_empty(), find_floors(_voxels(ROAD, WALL)))
     assert len(added) == 100
     assert added.xyz[:, 2] == pytest.approx(-7.5 * EDGE_M)
     assert added.xyz[:, 1].max() < 1.0
@@ -46,7 +47,7 @@ def test_a_floor_may_share_its_evidence_with_the_voxel_above() -> None:
     undecided = _columns(range(5), range(5), {-8: 2.0, -7: 0.1, -6: -1.0})
     thick = _columns(range(10, 15), range(5), {-8: 2.0, -7: 2.0, -6: -1.0})
     unknown = _columns(range(20, 25), range(5), {-8: 2.0})
-    added = add_floors(_empty(), find_floors(_voxels(undecided, thick, unknown)), SETTINGS)
+    added = add_floors(_empty(), find_floors(_voxels(undecided, thick, unknown)))
     heights = {x0: added.xyz[np.floor(added.xyz[:, 0]) == x0, 2] for x0 in (0, 2, 4)}
     assert heights[0] == pytest.approx(-7.5 * EDGE_M)
     assert heights[2] == pytest.approx(-6.5 * EDGE_M)
@@ -58,22 +59,23 @@ def test_cells_that_the_cloud_measures_are_left_to_it() -> None:
     xyz = np.column_stack([rng.uniform(0, 2, 200), rng.uniform(0, 1, 200), np.full(200, -1.62)])
     up = np.tile(np.array([0, 0, 1], np.float32), (200, 1))
     cloud = PointCloud(xyz.astype(np.float32), normals=up, frame="map")
-    added = add_floors(cloud, find_floors(_voxels(ROAD)), SETTINGS)
+    added = add_floors(cloud, find_floors(_voxels(ROAD)))
     assert added.xyz[200:, 0].min() > 2.0
     # Points on a wall measure no ground.
     sideways = PointCloud(cloud.xyz, normals=up[:, [2, 0, 1]], frame="map")
-    assert add_floors(sideways, find_floors(_voxels(ROAD)), SETTINGS).xyz[200:, 0].min() < 1.0
+    assert add_floors(sideways, find_floors(_voxels(ROAD))).xyz[200:, 0].min() < 1.0
 
 
-def test_the_ground_reaches_as_far_as_the_voxels() -> None:
+def test_the_ground_reaches_as_far_as_the_voxels(monkeypatch: pytest.MonkeyPatch) -> None:
     path = np.array([[0.5, 0.5, 0.0], [2.0, 0.5, 0.0]])
     long = _columns(range(100), range(-5, 10), {-8: 2.0, -7: -1.0})
     near = np.column_stack([np.random.default_rng(1).uniform(0, 2, (300, 2)), np.full(300, -1.5)])
     cloud = PointCloud(near.astype(np.float32), frame="map")
     place = np.array([[18.0, 0.5]])
-    settings = GroundSettings(max_gap_m=2.0)
+    monkeypatch.setattr(ground, "_MAX_GAP_M", 2.0)
+    settings = GroundSettings()
     assert np.isnan(estimate_ground_surface(cloud, path, settings).height_at(place)).all()
-    floor = add_floors(cloud, find_floors(_voxels(long)), settings)
+    floor = add_floors(cloud, find_floors(_voxels(long)))
     height = estimate_ground_surface(floor, path, settings).height_at(place)
     assert height == pytest.approx(-7.5 * EDGE_M, abs=0.01)
 
@@ -81,4 +83,4 @@ def test_the_ground_reaches_as_far_as_the_voxels() -> None:
 def test_without_voxels_the_cloud_stays_as_it_is() -> None:
     none = OccupancyVoxels(np.zeros((0, 3), np.int32), np.zeros(0, np.float32), EDGE_M)
     cloud = PointCloud(np.ones((4, 3), np.float32), frame="map")
-    assert (add_floors(cloud, find_floors(none), SETTINGS).xyz == cloud.xyz).all()
+    assert (add_floors(cloud, find_floors(none)).xyz == cloud.xyz).all()

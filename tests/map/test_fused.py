@@ -68,7 +68,7 @@ def test_precise_points_pull_the_mean_by_the_square_of_their_precision() -> None
 def test_precision_is_bounded_and_hopeless_points_are_left_out() -> None:
     xyz = np.array([[0.05, 0.05, 0.05], [0.05, 0.05, 0.05], [3.0, 3.0, 3.0]])
     sigma = np.array([1e-9, 0.02, 5.0], np.float32)
-    fused = _build(_cloud(xyz, sigma_m=sigma), min_sigma_m=0.02, max_sigma_m=1.0).cloud(1)
+    fused = _build(_cloud(xyz, sigma_m=sigma)).cloud(1)
     assert len(fused) == 1
     assert fused.weight is not None
     assert fused.weight[0] == pytest.approx(2 / 0.02**2, rel=1e-5)
@@ -177,7 +177,7 @@ def test_clouds_that_would_spoil_the_map_are_refused(cloud: PointCloud, words: s
 
 def test_fusion_range_is_where_the_nominal_error_reaches_its_limit() -> None:
     camera = RectifiedCamera(700.0, 320.0, 120.0, 320.0, 0.5, 640, 240)
-    settings = FusionSettings(max_depth_error_m=0.2, nominal_error_px=0.3)
+    settings = FusionSettings(max_depth_error_m=0.2)
     range_m = fusion_range_m(camera, settings)
     assert depth_sigma(np.array([range_m]), 0.3, camera)[0] == pytest.approx(0.2, rel=1e-6)
 

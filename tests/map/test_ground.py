@@ -9,6 +9,7 @@ import pytest
 
 from recon.core.errors import MappingError
 from recon.core.values import PointCloud
+from recon.map import ground as ground_file
 from recon.map.ground import GroundSettings, GroundSurface, estimate_ground_surface
 
 CAMERA_M = 1.6
@@ -76,12 +77,15 @@ def test_normals_tell_the_ground_from_the_rest() -> None:
     assert np.abs(np.nanmean(_error(without))) > 2 * abs(np.nanmean(_error(surface)))
 
 
-def test_heights_are_carried_over_small_gaps_and_not_over_large_ones() -> None:
+def test_heights_are_carried_over_small_gaps_and_not_over_large_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     points = _ground()
     small = (np.abs(points[:, 1]) > 3) & (np.abs(points[:, 1]) < 5)
     assert np.isfinite(_error(_surface(points[~small]))).all()
     large = np.abs(points[:, 1]) > 3
-    surface = _surface(points[~large], max_gap_m=2.0)
+    monkeypatch.setattr(ground_file, "_MAX_GAP_M", 2.0)
+    surface = _surface(points[~large])
     assert np.isnan(surface.height_at(np.array([[30.0, 9.5], [30.0, -9.5]]))).all()
     assert np.isfinite(surface.height_at(np.array([[30.0, 2.0], [30.0, -2.0]]))).all()
 

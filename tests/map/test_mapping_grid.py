@@ -7,6 +7,7 @@ import pytest
 
 from recon.core.errors import MappingError
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
+from recon.map import grid as grid_file
 from recon.map.grid import GridSettings, drop_undecided, flatten
 from recon.map.ground import GroundSurface
 
@@ -107,15 +108,19 @@ def test_ground_seen_below_an_unknown_body_is_not_free() -> None:
     assert _cell(grid, 3.0, 1.0) == UNKNOWN
 
 
-def test_what_was_hit_behind_a_wall_belongs_to_it() -> None:
+def test_what_was_hit_behind_a_wall_belongs_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
     # The wall at x = 2 is sure; behind it the hits of an uncertain depth, then nothing.
     wall = (_box((2, 0, -1.0), (2.2, 4, -0.6)), 2.0)
     behind = (_box((2.2, 0, -1.0), (3.4, 4, -0.6)), 0.01)
     voxels = _voxels(*_road((0, 0), (2, 4)), wall, behind)
-    cells = [_cell(_flatten(voxels, _ground(), joined_cells=n), 2.5, 2.0) for n in (0, 1, 2)]
+    cells = []
+    for joined in (0, 1, 2):
+        monkeypatch.setattr(grid_file, "JOINED_CELLS", joined)
+        cells.append(_cell(_flatten(voxels, _ground()), 2.5, 2.0))
     assert cells == [UNKNOWN, UNKNOWN, OCCUPIED]
     # It goes on for so many cells, and no farther.
-    assert (_flatten(voxels, _ground(), joined_cells=3).cells[10] == OCCUPIED).sum() == 4
+    monkeypatch.setattr(grid_file, "JOINED_CELLS", 3)
+    assert (_flatten(voxels, _ground()).cells[10] == OCCUPIED).sum() == 4
 
 
 def test_what_was_hit_before_a_wall_does_not_make_it_thicker() -> None:

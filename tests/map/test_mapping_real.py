@@ -51,7 +51,7 @@ def test_the_driven_road_is_free_and_has_obstacles_beside_it(recon_data: Path) -
     drive = recon_data / "driven" / "kitti_06_51"
     poses = _poses(drive)[FRAMES]
     clouds = [_cloud(drive, index) for index in FRAMES]
-    T_map_world = map_axes(estimate_ground(clouds[0], AxesSettings()), AxesSettings())
+    T_map_world = map_axes(estimate_ground(clouds[0]), AxesSettings())
     fused = MapBuilder(FusionSettings(min_count=2))
     occupancy = OccupancyBuilder(OccupancySettings(), T_map_world)
     for cloud, T in zip(clouds, poses, strict=True):

@@ -11,12 +11,19 @@ import pytest
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import OccupancyVoxels, PointCloud
+from recon.map import occupancy
 from recon.map.axes import AXES_MAP_WORLD
 from recon.map.occupancy import OccupancyBuilder, OccupancySettings
 
 Cell = tuple[int, int, int]
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
 HERE = np.eye(4)
+
+
+@pytest.fixture(autouse=True)
+def _every_point_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One point is enough for a ray, so that single ones can be followed."""
+    monkeypatch.setattr(occupancy, "_MIN_POINTS", 1)
 
 
 def _cells(voxels: OccupancyVoxels) -> dict[Cell, float]:
@@ -27,7 +34,7 @@ def _cells(voxels: OccupancyVoxels) -> dict[Cell, float]:
 def _map(
     *frames: tuple[PointCloud, np.ndarray], T_map_world: np.ndarray = HERE, **settings: float
 ) -> OccupancyVoxels:
-    builder = OccupancyBuilder(OccupancySettings(**{"min_points": 1, **settings}), T_map_world)
+    builder = OccupancyBuilder(OccupancySettings(**settings), T_map_world)
     for cloud, T in frames:
         builder.integrate(cloud, T)
     return builder.voxels()
@@ -74,7 +81,7 @@ def test_confidence_scales_the_evidence() -> None:
 
 
 def test_free_space_ends_before_an_uncertain_point() -> None:
-    cells = _cells(_map((_points((0.1, 0.1, 10.1), sigma=0.5), HERE), free_margin_sigmas=2.0))
+    cells = _cells(_map((_points((0.1, 0.1, 10.1), sigma=0.5), HERE)))
     free = max(cell[2] for cell, value in cells.items() if value < 0)
     # 10.1 - 2 · 0.5 = 9.1 m lies in cell 45, which is not wholly free.
     assert free == 44
@@ -90,7 +97,9 @@ def test_points_beyond_the_range_free_and_hit_nothing() -> None:
     assert 47 <= max(cell[2] for cell in cells) <= 49
 
 
-def test_a_wall_is_not_eroded_by_grazing_rays_within_sigma() -> None:
+def test_a_wall_is_not_eroded_by_grazing_rays_within_sigma(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     # A wall 1 m to the right, seen at a flat angle by points whose error is that of stereo.
     rng = np.random.default_rng(0)
     frames = []
@@ -103,15 +112,17 @@ def test_a_wall_is_not_eroded_by_grazing_rays_within_sigma() -> None:
         cloud = PointCloud(xyz, sigma_m=sigma.astype(np.float32))
         frames.append((cloud, make_transform(np.eye(3), np.array([0, 0, 0.3 * step]))))
 
-    def kept(**settings: float) -> float:
+    def kept() -> float:
         """Share of the wall's cells, well inside, that are occupied."""
-        cells = _cells(_map(*frames, **settings))
+        cells = _cells(_map(*frames))
         wall = [cells.get((5, j, k), 0.0) for j in range(-4, 4) for k in range(30, 70)]
         return float(np.mean(np.array(wall) > 0))
 
     # Measured 0.99, 0.98 and 0.79: what erodes a wall is to take noisy points for exact.
     assert kept() > 0.97
-    assert kept(free_margin_sigmas=0.0, spread_sigmas=0.0) < 0.9
+    monkeypatch.setattr(occupancy, "FREE_MARGIN_SIGMAS", 0.0)
+    monkeypatch.setattr(occupancy, "_SPREAD_SIGMAS", 0.0)
+    assert kept() < 0.9
 
 
 def _wall_ahead(frames: int, error: float) -> list[tuple[PointCloud, np.ndarray]]:
@@ -161,9 +172,10 @@ def test_what_moves_away_is_forgotten() -> None:
     assert cells[0, 0, 25] < 0 < cells[0, 0, 45]
 
 
-def test_lone_points_start_no_ray() -> None:
+def test_lone_points_start_no_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud = _points((0.1, 0.1, 5.1), (0.11, 0.1, 5.1), (2.1, 0.1, 5.1))
-    cells = _cells(_map((cloud, HERE), min_points=2))
+    monkeypatch.setattr(occupancy, "_MIN_POINTS", 2)
+    cells = _cells(_map((cloud, HERE)))
     assert [cell for cell, value in cells.items() if value > 0] == [(0, 0, 25)]
 
 

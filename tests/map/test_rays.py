@@ -8,7 +8,7 @@ import pytest
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import OccupancyVoxels, PointCloud, RayCloud
-from recon.map import OccupancyBuilder, OccupancySettings, ray_grain, thin_rays
+from recon.map import OccupancyBuilder, OccupancySettings, occupancy, ray_grain, thin_rays
 from recon.map.kernels import raycast
 
 SETTINGS = OccupancySettings(resolution_m=0.2, max_range_m=20.0)
@@ -73,12 +73,12 @@ def test_coarser_voxels_can_be_made_of_them_too() -> None:
 @pytest.mark.parametrize("depth_m", [20.5, 24.0, 60.0, 3000.0])
 @pytest.mark.parametrize("sigma_m", [0.0, 0.5, 4.0])
 def test_points_out_of_range_free_what_they_freed_and_hit_nothing(
-    depth_m: float, sigma_m: float
+    depth_m: float, sigma_m: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    settings = SETTINGS.model_copy(update={"min_points": 1})
+    monkeypatch.setattr(occupancy, "_MIN_POINTS", 1)
     xyz = (np.float32([[0.013, 0.017, 1.0], [0.1, -0.05, 1.0]]) * np.float32(depth_m)).astype("f4")
     cloud = PointCloud(xyz, sigma_m=np.full(2, sigma_m, np.float32))
-    points, rays = _map(cloud, settings), _map(thin_rays(cloud, settings).cloud(), settings)
+    points, rays = _map(cloud, SETTINGS), _map(thin_rays(cloud, SETTINGS).cloud(), SETTINGS)
     assert not (rays.log_odds > 0).any()
     ours, theirs = _cells(points, points.log_odds < 0), _cells(rays, rays.log_odds < 0)
     # A thousandth of a radian turns a ray by a cell's edge now and then.

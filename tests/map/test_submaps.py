@@ -19,6 +19,7 @@ from recon.map import (
     SubmapMotion,
     SubmapSettings,
 )
+from recon.map import submaps as submaps_file
 from recon.map.axes import AXES_MAP_WORLD
 from recon.map.fused_part import join_fused
 from recon.map.occupancy_part import OccupancyPart, join_occupancy
@@ -100,12 +101,13 @@ def test_submaps_put_together_are_the_map_of_the_whole_drive() -> None:
     ("settings", "sizes"),
     [
         ({"length_m": 10.0}, [11, 10, 3]),
-        ({"length_m": 1000.0, "max_frames": 9}, [9, 9, 6]),
+        ({"length_m": 1000.0}, [9, 9, 6]),
     ],
 )
 def test_a_submap_ends_after_its_path_or_its_frames(
-    settings: dict[str, float], sizes: list[int]
+    settings: dict[str, float], sizes: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(submaps_file, "_MAX_FRAMES", 9 if sizes[0] == 9 else 100)
     submaps = _submaps(_builder(**settings), _frames())
     assert [submap.frames for submap in submaps] == sizes
     assert [submap.index for submap in submaps] == [0, 1, 2]
