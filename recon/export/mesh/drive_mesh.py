@@ -37,6 +37,13 @@ _SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))
 """The four sides of a tile: (axis, 1 for the far side)."""
 
 
+_OVERLAP_M: Final = 3.0
+"""Margin around a tile whose points its surface is fitted to as well."""
+
+_SEAM_M: Final = 0.15
+"""Widest gap that is closed where two tiles meet."""
+
+
 @dataclass(frozen=True)
 class MeshTile:
     """A tile whose mesh is written.
@@ -177,11 +184,10 @@ class _Mesher:
 
     def _cut(self, tile: Tile) -> TriangleMesh:
         """The surface of a tile with its margin, cut at the sides of the tile."""
-        overlap_m = self.settings.overlap_m
-        cloud = self.store.cloud_in(tile, overlap_m)
+        cloud = self.store.cloud_in(tile, _OVERLAP_M)
         if cloud is None:
             raise MeshingError("there is no point")
-        voxels = self.store.voxels_in(tile, overlap_m)
+        voxels = self.store.voxels_in(tile, _OVERLAP_M)
         use_voxels = self.settings.free_space and len(voxels) > 0
         mesh = reconstruct_mesh(
             cloud,
@@ -208,7 +214,7 @@ class _Mesher:
             neighbour = (tile[0] + int(step[0]), tile[1] + int(step[1]))
             border = self.borders.pop((neighbour, plane), None)
             if border is not None:
-                mesh = close_seam(mesh, plane, border, self.settings.seam_m)
+                mesh = close_seam(mesh, plane, border, _SEAM_M)
             else:
                 self.borders[tile, plane] = open_edges(mesh, plane)
         return mesh

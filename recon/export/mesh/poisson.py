@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from pydantic import Field
@@ -27,6 +28,13 @@ OCTREE_SCALE = 1.1
 Point = tuple[float, float, float]
 
 
+_SAMPLES_PER_NODE: Final = 1.5
+"""Points that an octree cell should hold."""
+
+_NORMALS_NEIGHBOURS: Final = 20
+"""Neighbours for normals where the cloud has none."""
+
+
 class MeshSettings(Settings):
     """How a surface is reconstructed and trimmed."""
 
@@ -34,55 +42,60 @@ class MeshSettings(Settings):
         default=None,
         ge=4,
         le=12,
-        description="Octree depth; null = chosen by cell_spacings, up to max_depth.",
+        description="Octree depth; none = chosen by cell_spacings, up to max_depth. Each step "
+        "halves the cells.",
     )
     cell_spacings: float = Field(
         default=1.5,
         gt=0,
         le=20,
-        description="Widest octree cell, in point spacings; noise in smaller ones becomes ripples.",
+        description="Widest octree cell, in point spacings; noise in smaller ones becomes ripples. "
+        "Raise it for a smoother surface.",
     )
     max_depth: int = Field(
-        default=10, ge=4, le=12, description="Largest depth that is chosen automatically."
-    )
-    samples_per_node: float = Field(
-        default=1.5, ge=1, le=50, description="Points that an octree cell should hold."
+        default=10,
+        ge=4,
+        le=12,
+        description="Largest depth that is chosen automatically: bounds time and memory.",
     )
     point_weight: float = Field(
-        default=4.0, ge=0, description="Weight of the points against their normals."
+        default=4.0,
+        ge=0,
+        description="Weight of the points against their normals. Lower is smoother.",
     )
     trim_density_quantile: float = Field(
-        default=0.01, ge=0, lt=1, description="Share of the vertices cut off as least supported."
+        default=0.01,
+        ge=0,
+        lt=1,
+        description="Share of the vertices cut off as least supported; 0 keeps all.",
     )
     max_distance_spacings: float | None = Field(
         default=2.0,
         gt=0,
         description="Farthest a vertex may lie from the points, in local point spacings; "
-        "null = keep all.",
+        "none = keep all. Lower it to keep holes open.",
     )
     min_component_faces: int = Field(
-        default=100, ge=1, description="Connected pieces with fewer faces are dropped."
+        default=100,
+        ge=1,
+        description="Connected pieces with fewer faces are dropped. Raise it against crumbs.",
     )
     target_faces: int | None = Field(
-        default=None, ge=4, description="Simplify to about so many faces; null = do not."
-    )
-    normals_neighbours: int = Field(
-        default=20, ge=3, le=1000, description="Neighbours for normals where the cloud has none."
+        default=None,
+        ge=4,
+        description="Simplify to about so many faces; none = do not. For viewers and other "
+        "programs with a limit.",
     )
     tile_m: float = Field(
-        default=50.0, gt=0, description="Edge of the tiles in which the map of a drive is meshed."
-    )
-    overlap_m: float = Field(
-        default=3.0,
-        ge=0,
-        description="Margin around a tile whose points its surface is fitted to as well.",
-    )
-    seam_m: float = Field(
-        default=0.15, ge=0, description="Widest gap that is closed where two tiles meet."
+        default=50.0,
+        gt=0,
+        description="Edge of the tiles in which the map of a drive is meshed. Smaller ones take "
+        "less memory.",
     )
     free_space: bool = Field(
         default=True,
-        description="Remove surfaces in space that the cameras of a drive saw to be free.",
+        description="Remove surfaces in space that the cameras of a drive saw to be free. Off "
+        "keeps what moved through.",
     )
 
 
@@ -115,7 +128,7 @@ def reconstruct_mesh(
 
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
-    cloud = oriented(usable(cloud), settings, viewpoint_m)
+    cloud = oriented(usable(cloud), viewpoint_m)
     depth = settings.depth or _fitting_depth(cloud.xyz, settings)
     return trimmed_surface(cloud, settings, Octree(depth), wrong)
 
@@ -155,7 +168,7 @@ def trimmed_surface(
         _required(cloud.normals),
         depth=octree.depth,
         scale=octree.scale,
-        samples_per_node=settings.samples_per_node,
+        samples_per_node=_SAMPLES_PER_NODE,
         point_weight=settings.point_weight,
     )
     supported = density >= np.quantile(density, settings.trim_density_quantile)
@@ -203,16 +216,16 @@ def usable(cloud: PointCloud) -> PointCloud:
     return cloud
 
 
-def oriented(cloud: PointCloud, settings: MeshSettings, viewpoint_m: Point | None) -> PointCloud:
+def oriented(cloud: PointCloud, viewpoint_m: Point | None) -> PointCloud:
     """The points that have a normal, or all points with estimated normals."""
     if cloud.normals is not None:
         # NaN fails the comparison, so it counts as no normal.
         known = np.asarray(np.linalg.norm(cloud.normals, axis=1) > 0.5)
         if known.sum() >= _MIN_POINTS:
             return cloud.select(known)
-    normals = open3d_clouds.estimate_normals(cloud.xyz, settings.normals_neighbours)
+    normals = open3d_clouds.estimate_normals(cloud.xyz, _NORMALS_NEIGHBOURS)
     if viewpoint_m is None:
-        normals = open3d_clouds.agree_normals(cloud.xyz, normals, settings.normals_neighbours)
+        normals = open3d_clouds.agree_normals(cloud.xyz, normals, _NORMALS_NEIGHBOURS)
     else:
         away = np.einsum("ij,ij->i", normals, np.asarray(viewpoint_m) - cloud.xyz) < 0
         normals = np.where(away[:, None], -normals, normals)

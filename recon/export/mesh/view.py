@@ -62,7 +62,7 @@ def reconstruct_view(
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
     cloud = usable(cloud.select(cloud.xyz[:, 2] > 0))
-    cloud = oriented(cloud, settings, viewpoint_m=(0.0, 0.0, 0.0))
+    cloud = oriented(cloud, viewpoint_m=(0.0, 0.0, 0.0))
     space = _ImageSpace(camera.focal_px, camera.baseline_m)
     seen = space.of_cloud(cloud)
     low, high = seen.xyz.min(axis=0), seen.xyz.max(axis=0)

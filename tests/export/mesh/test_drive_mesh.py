@@ -24,7 +24,7 @@ from recon.io.occupancy.octomap import write_octomap
 from recon.run.directory import RunDirectory
 
 STEP_M = 0.1
-SETTINGS = MeshSettings(tile_m=8.0, overlap_m=1.5, trim_density_quantile=0.0)
+SETTINGS = MeshSettings(tile_m=8.0, trim_density_quantile=0.0)
 
 
 def street(seed: int = 0) -> PointCloud:
@@ -189,7 +189,7 @@ def run(tmp_path: Path) -> Path:
 
 
 def mesh_of(run: Path, *settings: str) -> dict[str, Any]:
-    config = load_config(None, ["mesh.tile_m=8", "mesh.overlap_m=1.5", *settings])
+    config = load_config(None, ["mesh.tile_m=8", *settings])
     return run_mesh(run, config, MeshOptions(out=run.parent / "mesh", formats=("ply", "glb")))
 
 
