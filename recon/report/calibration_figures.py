@@ -18,6 +18,7 @@ from recon.report.canvas import (
     to_png,
 )
 from recon.rig.calibrate import DepthError
+from recon.rig.calibrate.bootstrap import CONFIDENCE, MATCH_SIGMA_PX
 from recon.rig.calibrate.result import CalibrationRun
 
 _CELLS = (8, 6)
@@ -75,7 +76,7 @@ def depth_error_figure(run: CalibrationRun) -> bytes:
     axes = figure.subplots()
     depths = [each.depth_m for each in run.spread.depths]
     matching = [100 * each.matching_m for each in run.spread.depths]
-    axes.plot(depths, matching, "o-", color=FAINT, label=_matching_label(run))
+    axes.plot(depths, matching, "o-", color=FAINT, label=_matching_label())
     axes.plot(
         [each.depth_m for each in known],
         [100 * each.calibration_m for each in known],
@@ -90,7 +91,7 @@ def depth_error_figure(run: CalibrationRun) -> bytes:
         color=ESTIMATE,
         alpha=0.15,
         linewidth=0,
-        label=f"{100 * run.config.calibration.confidence:.0f} % interval, middle of the picture",
+        label=f"{100 * CONFIDENCE:.0f} % interval, middle of the picture",
     )
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -107,8 +108,8 @@ def _reach_cm(each: DepthError) -> float:
     return 100 * max(abs(each.low_m), abs(each.high_m))
 
 
-def _matching_label(run: CalibrationRun) -> str:
-    return f"matching to {run.config.calibration.match_sigma_px:g} px"
+def _matching_label() -> str:
+    return f"matching to {MATCH_SIGMA_PX:g} px"
 
 
 def _frame(axes: Axes, width: int, height: int, title: str) -> None:

@@ -25,21 +25,32 @@ from recon.sources.video import split_views
 _USUAL_RATE_HZ: Final = 30.0
 
 
+_WARM_UP_FRAMES: Final = 15
+"""Frames dropped at the start, while the exposure adapts."""
+
+
 class CaptureSettings(Settings):
     """Settings of a recording."""
 
     width_px: int | None = Field(
         default=None, ge=16, description="Requested frame width. none = the driver's default."
     )
-    height_px: int | None = Field(default=None, ge=16, description="Requested frame height.")
-    rate_hz: float | None = Field(default=None, gt=0, description="Requested frame rate.")
-    frames: int | None = Field(default=None, ge=1, description="Stop after this many pairs.")
-    seconds: float | None = Field(default=None, gt=0, description="Stop after this many seconds.")
-    warm_up: int = Field(
-        default=15, ge=0, description="Frames dropped at the start, while exposure settles."
+    height_px: int | None = Field(
+        default=None, ge=16, description="Requested frame height; with width_px."
+    )
+    rate_hz: float | None = Field(
+        default=None, gt=0, description="Requested frame rate. none = the driver's default."
+    )
+    frames: int | None = Field(
+        default=None, ge=1, description="Stop after this many pairs. none = at Ctrl-C."
+    )
+    seconds: float | None = Field(
+        default=None, gt=0, description="Stop after this many seconds. none = at Ctrl-C."
     )
     lock_exposure: bool = Field(
-        default=True, description="Lock exposure and white balance if the driver supports it."
+        default=True,
+        description="Lock exposure and white balance if the driver supports it. Turn it off where "
+        "the light changes during the drive.",
     )
     side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = Field(
         default="left-right", description="Arrangement of the views in the frames of one device."
@@ -109,7 +120,7 @@ def warm_up(cameras: tuple[Camera, ...], settings: CaptureSettings) -> bool:
     """
     if not all(camera.live for camera in cameras):
         return False
-    for _ in range(settings.warm_up):
+    for _ in range(_WARM_UP_FRAMES):
         for camera in cameras:
             camera.grab()
     if not settings.lock_exposure:

@@ -19,6 +19,7 @@ from recon.core.errors import OutputError, ReconError, SourceError
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.io import atomic
 from recon.io.frames_csv import FRAMES, HEADER
+from recon.rig import capture
 from recon.rig.capture import CaptureSettings
 from recon.rig.capture_folder import CaptureFolder
 from recon.sources import open_source
@@ -60,7 +61,10 @@ class FakeCamera:
     def close(self) -> None: ...
 
 
-NO_WARM_UP = CaptureSettings(warm_up=0)
+@pytest.fixture(autouse=True)
+def _no_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Record from the first frame on."""
+    monkeypatch.setattr(capture, "_WARM_UP_FRAMES", 0)
 
 
 def never() -> bool:
@@ -100,7 +104,7 @@ def test_one_device_with_both_views_is_halved(pairs: list[StereoPair], tmp_path:
 def test_skew_is_recorded(tmp_path: Path) -> None:
     times = [0.1 * k for k in range(8)]
     cameras = (FakeCamera("l", times), FakeCamera("r", [t + 0.003 for t in times]))
-    summary = record(cameras, tmp_path, CaptureSettings(warm_up=0, frames=8), None, never)
+    summary = record(cameras, tmp_path, CaptureSettings(frames=8), None, never)
     assert summary["skew_mean_ms"] == pytest.approx(3)
     assert summary["gaps"] == 0
     rows = (tmp_path / FRAMES).read_text().splitlines()
@@ -111,7 +115,7 @@ def test_a_frame_lost_by_one_camera_is_dropped_of_the_other(tmp_path: Path) -> N
     times = [0.1 * k for k in range(10)]
     lossy = [t + 0.002 for t in times if round(10 * t) not in {3, 4}]
     cameras = (FakeCamera("l", times), FakeCamera("r", lossy))
-    summary = record(cameras, tmp_path, CaptureSettings(warm_up=0, frames=8), None, never)
+    summary = record(cameras, tmp_path, CaptureSettings(frames=8), None, never)
     assert summary["skew_max_ms"] == pytest.approx(2)
     assert summary["gaps"] == 1
     drives.write_calib(tmp_path, SMALL_CAMERA)
@@ -119,11 +123,14 @@ def test_a_frame_lost_by_one_camera_is_dropped_of_the_other(tmp_path: Path) -> N
     np.testing.assert_allclose(stamps, [t for t in times if round(10 * t) not in {3, 4}])
 
 
-def test_the_exposure_of_the_left_camera_is_held_on_both_sides(tmp_path: Path) -> None:
+def test_the_exposure_of_the_left_camera_is_held_on_both_sides(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(capture, "_WARM_UP_FRAMES", 4)
     times = [0.1 * k for k in range(10)]
     cameras = (FakeCamera("l", times), FakeCamera("r", times))
     cameras[1].exposure = 7.0
-    summary = record(cameras, tmp_path, CaptureSettings(warm_up=4, frames=3), None, never)
+    summary = record(cameras, tmp_path, CaptureSettings(frames=3), None, never)
     assert summary["exposure_locked"] is True
     assert cameras[1].exposure == cameras[0].exposure == 100.0
     assert "0.400000" in (tmp_path / FRAMES).read_text().splitlines()[1]
@@ -133,7 +140,7 @@ def test_a_camera_that_goes_silent_is_told_and_what_was_recorded_stays(tmp_path:
     times = [0.1 * k for k in range(6)]
     cameras = (FakeCamera("l", times), FakeCamera("/dev/video2", times[:4]))
     with pytest.raises(SourceError, match="/dev/video2: camera gives no more frames"):
-        record(cameras, tmp_path, NO_WARM_UP, None, never)
+        record(cameras, tmp_path, CaptureSettings(), None, never)
     drives.write_calib(tmp_path, SMALL_CAMERA)
     assert len(open_source(tmp_path)) == 4
 

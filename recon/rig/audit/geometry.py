@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.rig.audit import AuditSettings, RowAlignment, align_rows, measure_time_skew
+from recon.rig.audit import RowAlignment, align_rows, measure_time_skew
 from recon.rig.audit.sample import Sample
 from recon.stereo.rectify import PairFeatures, inspect_features
 
@@ -18,6 +18,10 @@ _LAG_FACTOR: Final = 1.25
 
 # A larger skew, in frames, is closer to a lag of one frame.
 _LARGEST_SKEW: Final = 0.75
+
+
+MIN_FEATURES: Final = 60
+"""Minimum number of features, in all, to judge geometry."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,23 +51,22 @@ class Geometry:
     skew: tuple[float, float] | None
 
 
-def measure_geometry(sample: Sample, camera: RectifiedCamera, settings: AuditSettings) -> Geometry:
+def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
     """Measure the geometry from the features of all pairs.
 
     Args:
         sample: The sampled pairs.
         camera: The rectified camera.
-        settings: Limits.
     """
     features = _pool(sample.features)
     matched = len(features)
-    alignment = _align(features, camera, settings)
+    alignment = _align(features, camera)
     skew = _time_skew(sample, camera, alignment)
     lag = _best_lag(sample, skew)
     if lag:
         features, skew = _pool(sample.lagged[lag]), None
-        alignment = _align(features, camera, settings)
-    swapped = inspect_features(features, camera.doffs_px, settings.min_features).negative_share
+        alignment = _align(features, camera)
+    swapped = inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_share
     disparity = _disparities(features, alignment, camera)
     return Geometry(
         len(sample.features), features, matched, alignment, disparity, swapped, lag, skew
@@ -78,13 +81,11 @@ def _pool(found: list[PairFeatures]) -> PairFeatures:
     )
 
 
-def _align(
-    features: PairFeatures, camera: RectifiedCamera, settings: AuditSettings
-) -> RowAlignment | None:
-    if len(features) < settings.min_features:
+def _align(features: PairFeatures, camera: RectifiedCamera) -> RowAlignment | None:
+    if len(features) < MIN_FEATURES:
         return None
     alignment = align_rows(features.left_uv, features.right_uv, camera)
-    enough = alignment is not None and alignment.agreeing >= settings.min_features
+    enough = alignment is not None and alignment.agreeing >= MIN_FEATURES
     return alignment if enough else None
 
 

@@ -4,17 +4,58 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from recon.core.values import RectifiedCamera, StereoCalibration
-from recon.rig.audit import AuditSettings, Finding
-from recon.rig.audit.geometry import Geometry
-from recon.rig.audit.sample import Sample
+from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, StereoCalibration
+from recon.rig.audit import Finding
+from recon.rig.audit.geometry import MIN_FEATURES, Geometry
+from recon.rig.audit.sample import BLANK_DN, Sample
 from recon.sources import StampedSource, StereoSource
 from recon.stereo.match import Matcher
 
 _SIDES = ("left", "right")
+
+
+_SWAPPED_SHARE: Final = 0.8
+"""Share of negative disparities from which the cameras count as swapped."""
+
+_ROW_PX: Final = 0.75
+"""Rms row error above which it is reported."""
+
+_BAD_ROW_PX: Final = 1.5
+"""Rms row error above which that finding is fatal."""
+
+_GAIN: Final = 1.2
+"""Brightness ratio above which a finding is reported."""
+
+_SHARPNESS_RATIO: Final = 0.65
+"""One camera counts as blurred below this sharpness relative to the other."""
+
+_SHARPNESS: Final = 0.14
+"""Both cameras count as blurred below this sharpness."""
+
+_REPEATED_SHARE: Final = 0.02
+"""Share of repeated frames that is still accepted."""
+
+_FROZEN_FRAMES: Final = 3
+"""Repeats in a row from which one camera counts as frozen."""
+
+_GAP_PERIODS: Final = 1.7
+"""Time step, in frame periods, above which frames count as missing."""
+
+_SKEW_FRAMES: Final = 0.1
+"""Time skew between the cameras above which it is reported, in frames."""
+
+_NEAR_SHARE: Final = 0.02
+"""Share of features beyond the disparity range above which they are reported."""
+
+_FAR_PX: Final = 1.5
+"""A scene with a smaller median disparity is too far for the baseline."""
+
+_MAX_SPEED_M_PER_S: Final = 70.0
+"""A higher apparent speed means that the baseline is wrong."""
 
 
 @dataclass(frozen=True)
@@ -34,20 +75,17 @@ class Gaps:
     usual_s: float = float("nan")
 
 
-def find_picture_faults(
-    sample: Sample, settings: AuditSettings, matcher: str | Matcher
-) -> Iterator[Finding]:
+def find_picture_faults(sample: Sample, matcher: str | Matcher) -> Iterator[Finding]:
     """Problems of single images: unreadable, black, blurred, of unequal brightness.
 
     Args:
         sample: The sampled images.
-        settings: Limits.
         matcher: The matcher that will be used, or its name.
     """
     if sample.broken is not None:
         code = "size" if "size" in sample.broken.what else "unreadable"
         yield Finding(code, True, str(sample.broken))
-    for side in _blank_sides(sample, settings):
+    for side in _blank_sides(sample):
         mean = np.median([pair[side] for pair in sample.brightness_dn])
         yield Finding(
             "black",
@@ -56,11 +94,11 @@ def find_picture_faults(
             f"{mean:.0f} of 255; check its cable, its lens cap and its exposure "
             "(16-bit images must fill their range)",
         )
-    yield from _find_blur(sample, settings)
+    yield from _find_blur(sample)
     gains = np.concatenate([np.zeros(0), *sample.gains])
-    if len(gains) >= settings.min_features:
+    if len(gains) >= MIN_FEATURES:
         gain = float(np.median(gains))
-        if not 1 / settings.gain < gain < settings.gain:
+        if not 1 / _GAIN < gain < _GAIN:
             # The census transform of sgm compares grey levels only with their neighbours.
             other = "" if matcher == "sgm" else ", or match with sgm"
             yield Finding(
@@ -71,47 +109,47 @@ def find_picture_faults(
             )
 
 
-def _blank_sides(sample: Sample, settings: AuditSettings) -> list[int]:
+def _blank_sides(sample: Sample) -> list[int]:
     """Cameras whose images are uniform in most pairs."""
-    blank = np.array(sample.contrast_dn).reshape(-1, 2) < settings.contrast_dn
+    blank = np.array(sample.contrast_dn).reshape(-1, 2) < BLANK_DN
     return [side for side in range(2) if len(blank) and blank[:, side].mean() >= 0.5]
 
 
-def _find_blur(sample: Sample, settings: AuditSettings) -> Iterator[Finding]:
+def _find_blur(sample: Sample) -> Iterator[Finding]:
     if not sample.sharpness:
         return
     left, right = np.median(sample.sharpness, axis=0)
     worse = _SIDES[int(right < left)]
-    if min(left, right) < settings.sharpness_ratio * max(left, right):
+    if min(left, right) < _SHARPNESS_RATIO * max(left, right):
         yield Finding(
             "blur",
             False,
             f"the {worse} camera is blurred: sharpness {min(left, right):.2f}, the other "
             f"{max(left, right):.2f}; focus it or clean its lens",
         )
-    elif max(left, right) < settings.sharpness:
+    elif max(left, right) < _SHARPNESS:
         yield Finding(
             "blur",
             False,
             f"both cameras are blurred: sharpness {left:.2f} and {right:.2f}, expected above "
-            f"{settings.sharpness:g}; focus them, expose shorter, or halve the image size",
+            f"{_SHARPNESS:g}; focus them, expose shorter, or halve the image size",
         )
 
 
-def find_series_faults(sample: Sample, gaps: Gaps, settings: AuditSettings) -> Iterator[Finding]:
+def find_series_faults(sample: Sample, gaps: Gaps) -> Iterator[Finding]:
     """Problems of the sequence: repeated frames, frozen cameras, gaps."""
     repeats = sample.repeats
-    if repeats.steps and repeats.both > settings.repeated_share * repeats.steps:
+    if repeats.steps and repeats.both > _REPEATED_SHARE * repeats.steps:
         yield Finding(
             "duplicates",
             False,
             f"{repeats.both} of {repeats.steps} frames repeat the previous one; the recorder wrote "
             "frames twice, or the rig stood still: drop them, or record at the cameras' own rate",
         )
-    blank = _blank_sides(sample, settings)
+    blank = _blank_sides(sample)
     for side, run in enumerate(repeats.frozen):
         # A camera with uniform images would count as frozen, too.
-        if run >= settings.frozen_frames and side not in blank:
+        if run >= _FROZEN_FRAMES and side not in blank:
             yield Finding(
                 "frozen",
                 True,
@@ -127,21 +165,21 @@ def find_series_faults(sample: Sample, gaps: Gaps, settings: AuditSettings) -> I
         )
 
 
-def find_gaps(source: StereoSource, settings: AuditSettings) -> Gaps:
+def find_gaps(source: StereoSource) -> Gaps:
     """Find time steps that are too long, in sources with known timestamps."""
     steps = np.diff(source.stamps_s) if isinstance(source, StampedSource) else np.zeros(0)
     usual_s = float(np.median(steps)) if len(steps) else 0.0
     if usual_s <= 0:
         return Gaps()
     after = int(np.argmax(steps))
-    count = int(np.count_nonzero(steps > settings.gap_periods * usual_s))
+    count = int(np.count_nonzero(steps > _GAP_PERIODS * usual_s))
     return Gaps(count, float(steps[after]), after, usual_s)
 
 
-def find_geometry_faults(geometry: Geometry, settings: AuditSettings) -> Iterator[Finding]:
+def find_geometry_faults(geometry: Geometry) -> Iterator[Finding]:
     """Problems of the geometry: swapped cameras, delays, row errors."""
     swapped, lag, skew = geometry.swapped_share, geometry.lag, geometry.skew
-    if swapped >= settings.swapped_share:
+    if swapped >= _SWAPPED_SHARE:
         yield Finding(
             "swapped",
             True,
@@ -156,17 +194,17 @@ def find_geometry_faults(geometry: Geometry, settings: AuditSettings) -> Iterato
             f"the {late} camera is {abs(lag)} frames late; shift its sequence, or pair the images "
             "by timestamp",
         )
-    elif skew is not None and abs(skew[0]) > max(settings.skew_frames, 4 * skew[1]):
+    elif skew is not None and abs(skew[0]) > max(_SKEW_FRAMES, 4 * skew[1]):
         yield Finding(
             "skew",
             False,
             f"the right images are taken {skew[0]:+.2f} frames after the left ones; trigger "
             "both cameras together, or drive slowly",
         )
-    yield from _find_row_faults(geometry, settings)
+    yield from _find_row_faults(geometry)
 
 
-def _find_row_faults(geometry: Geometry, settings: AuditSettings) -> Iterator[Finding]:
+def _find_row_faults(geometry: Geometry) -> Iterator[Finding]:
     alignment = geometry.alignment
     if alignment is None:
         if not geometry.pairs:
@@ -177,11 +215,11 @@ def _find_row_faults(geometry: Geometry, settings: AuditSettings) -> Iterator[Fi
             f"too few features match between left and right ({geometry.matched} matched) to check "
             "the geometry: the images show too little texture, or different scenes",
         )
-    elif alignment.rms_px > settings.row_px:
+    elif alignment.rms_px > _ROW_PX:
         pitch, roll = np.degrees([alignment.pitch_rad, alignment.roll_rad])
         yield Finding(
             "rows",
-            alignment.rms_px > settings.bad_row_px,
+            alignment.rms_px > _BAD_ROW_PX,
             f"rows of left and right are not aligned: {alignment.rms_px:.2f} px rms, mean "
             f"{alignment.mean_px:+.2f} px, spread {alignment.spread_px:.2f} px; rotating the right "
             f"camera by {pitch:+.3f} deg pitch and {roll:+.3f} deg roll corrects this: "
@@ -190,7 +228,7 @@ def _find_row_faults(geometry: Geometry, settings: AuditSettings) -> Iterator[Fi
 
 
 def find_range_faults(
-    geometry: Geometry, reach_px: int | None, camera: RectifiedCamera, settings: AuditSettings
+    geometry: Geometry, reach_px: int | None, camera: RectifiedCamera
 ) -> Iterator[Finding]:
     """Scenes that are too near or too far for the rig.
 
@@ -198,16 +236,15 @@ def find_range_faults(
         geometry: Measures of the matched features.
         reach_px: Largest disparity that will be searched, if that is fixed.
         camera: The rectified camera.
-        settings: Limits.
     """
     disparity_px = geometry.disparity_px
-    if len(disparity_px) < settings.min_features:
+    if len(disparity_px) < MIN_FEATURES:
         return
     scale = camera.focal_px * camera.baseline_m
     # A matcher's disparity is in image columns, without doffs.
     columns_px = disparity_px - camera.doffs_px
     near = float(np.mean(columns_px > reach_px)) if reach_px else 0.0
-    if reach_px and near > settings.near_share:
+    if reach_px and near > _NEAR_SHARE:
         reach_m = scale / (reach_px + camera.doffs_px)
         most = int(np.ceil(np.quantile(columns_px, 0.98) / 16) * 16)
         yield Finding(
@@ -217,7 +254,7 @@ def find_range_faults(
             f"({reach_px} px, {reach_m:.1f} m); give the matcher an ndisp of {most}",
         )
     middle = float(np.median(disparity_px))
-    if 0 < middle < settings.far_px:
+    if 0 < middle < _FAR_PX:
         yield Finding(
             "far",
             False,
@@ -231,12 +268,12 @@ def find_calibration_faults(
     sample: Sample,
     rig: RectifiedCamera | StereoCalibration,
     camera: RectifiedCamera,
-    settings: AuditSettings,
+    baseline_m: tuple[float, float],
 ) -> Iterator[Finding]:
-    """Implausible calibration: image size, baseline."""
+    """Implausible calibration: image size, baseline outside of the plausible ones."""
     for name, centre, size in _centres(rig):
         off = np.abs(np.array(centre) / size - 0.5)
-        if off.max() > settings.centre_share:
+        if off.max() > LARGEST_CENTRE_OFFSET:
             yield Finding(
                 "size",
                 True,
@@ -245,10 +282,10 @@ def find_calibration_faults(
                 "use images of the calibrated size",
             )
             break
-    shortest, longest = settings.baseline_m
+    shortest, longest = baseline_m
     speed = float(np.median(sample.speeds_m_per_s)) if sample.speeds_m_per_s else 0.0
     long = not shortest <= camera.baseline_m <= longest
-    if long or speed > settings.max_speed_m_per_s:
+    if long or speed > _MAX_SPEED_M_PER_S:
         moving = f", with which the rig moves at {speed:.0f} m/s" if speed > 0 else ""
         yield Finding(
             "baseline",

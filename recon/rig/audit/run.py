@@ -73,19 +73,19 @@ def run_audit(source: StereoSource, config: AuditedSettings, *, quick: bool = Fa
     Raises:
         CalibrationError: The calibration cannot rectify anything.
     """
-    settings = config.audit.for_quick_look() if quick else config.audit
+    settings = config.audit
     rectifier = Rectifier(source.calibration, config.rectification)
     camera = rectifier.camera
     sample = take_sample(source, rectifier, settings, quick=quick)
-    geometry = measure_geometry(sample, camera, settings)
-    gaps = find_gaps(source, settings)
+    geometry = measure_geometry(sample, camera)
+    gaps = find_gaps(source)
     reach_px = _reach_px(camera, config.matching)
     findings = [
-        *find_picture_faults(sample, settings, config.matching.matcher),
-        *find_series_faults(sample, gaps, settings),
-        *find_geometry_faults(geometry, settings),
-        *find_range_faults(geometry, reach_px, camera, settings),
-        *find_calibration_faults(sample, source.calibration, camera, settings),
+        *find_picture_faults(sample, config.matching.matcher),
+        *find_series_faults(sample, gaps),
+        *find_geometry_faults(geometry),
+        *find_range_faults(geometry, reach_px, camera),
+        *find_calibration_faults(sample, source.calibration, camera, settings.baseline_m),
     ]
     findings.sort(key=lambda finding: not finding.fatal)
     figures = audit_figures(source, sample, geometry, gaps, camera)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
+from typing import Final
 
 import numpy as np
 
@@ -32,6 +33,28 @@ _QUICK_REACH = 300
 # Smaller images have no features, and are too small to measure their sharpness.
 _LEAST_SIDE_PX = 16
 _NO_FEATURES = PairFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
+
+
+_RUNS: Final = 6
+"""Number of runs of consecutive frames on longer drives."""
+
+_PAIRS: Final = 12
+"""Pairs in which features are matched."""
+
+_FEATURES: Final = 1500
+"""Maximum number of features per image."""
+
+_QUICK_FEATURES: Final = 800
+"""The same in a quick audit."""
+
+_MAX_LAG: Final = 4
+"""Largest delay of one camera to look for, in frames."""
+
+_QUICK_LAG: Final = 3
+"""The same in a quick audit."""
+
+BLANK_DN: Final = 4.0
+"""An image counts as blank below this standard deviation, in grey levels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +123,9 @@ def take_sample(
     source: StereoSource, rectifier: Rectifier, settings: AuditSettings, *, quick: bool
 ) -> Sample:
     """Sample a drive; an error of a pair ends the sampling and is kept in ``broken``."""
-    stretches = plan_stretches(len(source), settings, quick=quick)
-    centres = plan_centres(stretches, settings, quick=quick)
-    sampler = _Sampler(source, rectifier, settings, centres)
+    stretches = plan_stretches(len(source), settings.frames, quick=quick)
+    centres = plan_centres(stretches, quick=quick)
+    sampler = _Sampler(source, rectifier, centres, quick=quick)
     try:
         for start, stop in stretches:
             sampler.look(start, stop)
@@ -111,14 +134,19 @@ def take_sample(
     return sampler.sample
 
 
-def plan_stretches(frames: int, settings: AuditSettings, *, quick: bool) -> list[tuple[int, int]]:
+def plan_stretches(frames: int, read: int, *, quick: bool) -> list[tuple[int, int]]:
     """First frame and end of each stretch: the whole drive, or stretches evenly spread over it.
 
     A quick audit stays near the start.
+
+    Args:
+        frames: Number of frames of the drive.
+        read: Number of frames to read in all.
+        quick: Whether the audit is a quick one.
     """
     frames = min(frames, _QUICK_REACH) if quick else frames
-    runs = _QUICK_RUNS if quick else settings.runs
-    length = 2 * settings.max_lag + 1 if quick else max(2, settings.frames // runs)
+    runs = _QUICK_RUNS if quick else _RUNS
+    length = 2 * _QUICK_LAG + 1 if quick else max(2, read // runs)
     if frames <= runs * length:
         return [(0, frames)]
     # In the middle of equal parts, since a drive may begin and end at rest.
@@ -126,16 +154,14 @@ def plan_stretches(frames: int, settings: AuditSettings, *, quick: bool) -> list
     return [(start, start + length) for start in starts]
 
 
-def plan_centres(
-    stretches: list[tuple[int, int]], settings: AuditSettings, *, quick: bool
-) -> list[int]:
+def plan_centres(stretches: list[tuple[int, int]], *, quick: bool) -> list[int]:
     """Frames whose features are matched, evenly spread, with a margin for the lags."""
-    pairs = _QUICK_RUNS if quick else settings.pairs
+    pairs, lag = (_QUICK_RUNS, _QUICK_LAG) if quick else (_PAIRS, _MAX_LAG)
     each = max(1, pairs // len(stretches))
     chosen: list[int] = []
     for start, stop in stretches:
         # On a short drive, several pairs with a few lags are better than one pair with all.
-        margin = min(settings.max_lag, (stop - start - 1) // (2 if quick else 3))
+        margin = min(lag, (stop - start - 1) // (2 if quick else 3))
         places = np.linspace(start + margin, stop - 1 - margin, each)
         chosen += sorted({int(place) for place in np.rint(places)})
     return chosen
@@ -148,11 +174,14 @@ class _Sampler:
         self,
         source: StereoSource,
         rectifier: Rectifier,
-        settings: AuditSettings,
         centres: list[int],
+        *,
+        quick: bool,
     ) -> None:
         self.sample = Sample()
-        self._source, self._rectifier, self._settings = source, rectifier, settings
+        self._source, self._rectifier = source, rectifier
+        self._lag = _QUICK_LAG if quick else _MAX_LAG
+        self._features = _QUICK_FEATURES if quick else _FEATURES
         self._centres = centres
         # The first, middle and last pair are kept; all would not fit into memory.
         self._kept = {centres[n] for n in (0, len(centres) // 2, -1)} if centres else set()
@@ -163,7 +192,7 @@ class _Sampler:
         """Read one stretch; a pair is measured once its neighbours have been read."""
         self.sample.repeats.restart()
         self._recent.clear()
-        reach = self._settings.max_lag
+        reach = self._lag
         waiting = [centre for centre in self._centres if start <= centre < stop]
         for pair in self._pairs(start, stop):
             self._recent[pair.index] = pair
@@ -179,10 +208,10 @@ class _Sampler:
 
     def _measure(self, centre: int) -> None:
         """Measure one pair, alone and against its neighbours."""
-        pair, sample, settings = self._recent[centre], self.sample, self._settings
+        pair, sample = self._recent[centre], self.sample
         sample.contrast_dn.append((float(pair.left.std()), float(pair.right.std())))
         sample.brightness_dn.append((float(pair.left.mean()), float(pair.right.mean())))
-        if min(sample.contrast_dn[-1]) < settings.contrast_dn:
+        if min(sample.contrast_dn[-1]) < BLANK_DN:
             self._note(pair, (np.nan, np.nan), _NO_FEATURES)
             return
         if min(pair.left.shape) < _LEAST_SIDE_PX:
@@ -190,7 +219,7 @@ class _Sampler:
             sample.flows.append(np.zeros(0))
             return
         sample.sharpness.append((measure_sharpness(pair.left), measure_sharpness(pair.right)))
-        features = match_features(pair.left, pair.right, settings.features)
+        features = match_features(pair.left, pair.right, self._features)
         sample.features.append(features)
         self._note(pair, sample.sharpness[-1], features)
         gains = measure_gain(pair.left, pair.right, features.left_uv, features.right_uv)
@@ -210,13 +239,13 @@ class _Sampler:
     def _compare_lags(self, centre: int, features: PairFeatures) -> None:
         """Match the left image with the right images before and after it."""
         ends = (min(self._recent), max(self._recent))
-        span = min(self._settings.max_lag, *(abs(end - centre) for end in ends))
+        span = min(self._lag, *(abs(end - centre) for end in ends))
         pair, sample = self._recent[centre], self.sample
         for lag in range(-span, span + 1):
             found = features
             if lag:
                 right = self._recent[centre + lag].right
-                found = match_features(pair.left, right, self._settings.features)
+                found = match_features(pair.left, right, self._features)
             agreeing = count_aligned(found.left_uv, found.right_uv, pair.camera)
             sample.by_lag[lag] = sample.by_lag.get(lag, 0) + agreeing
             sample.lagged.setdefault(lag, []).append(found)

@@ -27,6 +27,13 @@ MATCHED: Final = 0.02
 """Depth error due to matching at the default working distance, relative to it."""
 
 
+MATCH_SIGMA_PX: Final = 0.25
+"""Assumed matching error, by which depth errors are predicted."""
+
+CONFIDENCE: Final = 0.95
+"""Confidence level of the intervals."""
+
+
 @dataclass(frozen=True)
 class DepthError:
     """Predicted depth error at one distance.
@@ -38,7 +45,7 @@ class DepthError:
         low_m: Lower end of the interval of the error at the image centre; negative = measured too
             near.
         high_m: Upper end of that interval.
-        matching_m: Error due to matching, with `CalibrationSettings.match_sigma_px`.
+        matching_m: Error due to matching, with `MATCH_SIGMA_PX`.
     """
 
     depth_m: float
@@ -73,7 +80,7 @@ def resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibr
     Raises:
         CalibrationError: More than half of the resamples fail.
     """
-    rng = np.random.default_rng(settings.seed)
+    rng = np.random.default_rng(0)
     count, info = len(fit.views), fit.information
     vectors = _jackknife_vectors(fit)
     rigs = []
@@ -104,11 +111,11 @@ def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
     turns = [rig.T_right_left[:3, :3] @ fit.calibration.T_right_left[:3, :3].T for rig in rigs]
     cosines = np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1)
     return Spread(
-        focal_px=_interval([rig.left.matrix[0, 0] for rig in rigs], settings),
-        baseline_m=_interval([rig.baseline_m for rig in rigs], settings),
+        focal_px=_interval([rig.left.matrix[0, 0] for rig in rigs]),
+        baseline_m=_interval([rig.baseline_m for rig in rigs]),
         rotation_deg=float(np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2)))),
-        depths=tuple(_depth_error(fit, rigs, depth, settings) for depth in settings.depths_m),
-        working=_depth_error(fit, rigs, working_distance(fit.calibration, settings), settings),
+        depths=tuple(_depth_error(fit, rigs, depth) for depth in settings.depths_m),
+        working=_depth_error(fit, rigs, working_distance(fit.calibration, settings)),
     )
 
 
@@ -122,7 +129,7 @@ def working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> f
     if settings.working_m is not None:
         return settings.working_m
     focal_px = float(rig.left.matrix[0, 0])
-    return MATCHED * focal_px * rig.baseline_m / settings.match_sigma_px
+    return MATCHED * focal_px * rig.baseline_m / MATCH_SIGMA_PX
 
 
 def measure_depth(rig: StereoCalibration, left_px: Float64, right_px: Float64) -> Float64:
@@ -161,15 +168,13 @@ def _try_rig(state: RigState, step: Float64) -> StereoCalibration | None:
         return None
 
 
-def _interval(values: list[float], settings: CalibrationSettings) -> tuple[float, float]:
-    aside = (1 - settings.confidence) / 2
+def _interval(values: list[float]) -> tuple[float, float]:
+    aside = (1 - CONFIDENCE) / 2
     low, high = np.nanquantile(values, (aside, 1 - aside))
     return float(low), float(high)
 
 
-def _depth_error(
-    fit: StereoFit, rigs: list[StereoCalibration], depth_m: float, settings: CalibrationSettings
-) -> DepthError:
+def _depth_error(fit: StereoFit, rigs: list[StereoCalibration], depth_m: float) -> DepthError:
     rig = fit.calibration
     width, height = rig.left.width_px, rig.left.height_px
     places = np.array([[x * width, y * height] for y in _PLACES for x in _PLACES])
@@ -177,14 +182,14 @@ def _depth_error(
     right_px = project_into_image(rig.right, apply(rig.T_right_left, xyz))
     shared = np.asarray(np.isfinite(right_px).all(axis=1))
     focal_px = float(rig.left.matrix[0, 0])
-    matching_m = depth_m**2 * settings.match_sigma_px / (focal_px * rig.baseline_m)
+    matching_m = depth_m**2 * MATCH_SIGMA_PX / (focal_px * rig.baseline_m)
     if not shared[_MIDDLE]:
         return DepthError(depth_m, np.nan, np.nan, np.nan, matching_m)
     errors = np.array(
         [measure_depth(other, places[shared], right_px[shared]) - depth_m for other in rigs]
     )
     middle = errors[:, int(shared[:_MIDDLE].sum())]
-    low_m, high_m = _interval(list(middle), settings)
+    low_m, high_m = _interval(list(middle))
     # NaN: the lens of a resample may not be invertible at the image border.
     rms_m = float(np.sqrt(np.nanmean(errors**2)))
     return DepthError(depth_m, rms_m, low_m, high_m, matching_m)

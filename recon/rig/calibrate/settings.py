@@ -13,7 +13,7 @@ LensKind = Literal["radtan", "rational", "fisheye"]
 
 
 class CalibrationSettings(Settings):
-    """Lens model, outliers, acceptance and uncertainty."""
+    """Lens model, acceptance and uncertainty."""
 
     model: LensKind = Field(
         default="radtan",
@@ -21,23 +21,19 @@ class CalibrationSettings(Settings):
         "angle) or fisheye (150 degrees or more).",
     )
     radial_terms: Literal[2, 3] = Field(
-        default=3, description="Number of radial coefficients of radtan: k1 k2, or k1 k2 k3."
+        default=3,
+        description="Number of radial coefficients of radtan: k1 k2, or k1 k2 k3. 2 where the "
+        "corners of the images hold no board, or for programs that know no k3.",
     )
-    outlier_ratio: float = Field(
-        default=3.0,
-        gt=1,
-        description="Drop views whose error exceeds this multiple of the median of all views.",
-    )
-    outlier_px: float = Field(
-        default=0.3, ge=0, description="Never drop views with an rms error below this, in pixels."
-    )
-    min_views: int = Field(default=5, ge=3, description="Minimum number of views with the board.")
     max_rms_px: float = Field(
-        default=2.0, gt=0, description="Largest rms error of an accepted calibration, in pixels."
+        default=2.0,
+        gt=0,
+        description="Largest rms error of an accepted calibration, in pixels.",
     )
-    bootstrap: int = Field(default=500, ge=50, description="Number of bootstrap resamples.")
-    confidence: float = Field(
-        default=0.95, gt=0.5, lt=1, description="Confidence level of the intervals."
+    bootstrap: int = Field(
+        default=500,
+        ge=50,
+        description="Number of bootstrap resamples, of which the intervals come. Fewer are faster.",
     )
     depths_m: tuple[float, ...] = Field(
         default=(2.0, 5.0, 10.0, 20.0),
@@ -46,13 +42,9 @@ class CalibrationSettings(Settings):
     working_m: float | None = Field(
         default=None,
         gt=0,
-        description="Distance for which the verdict is made, in metres; unset: where the expected "
+        description="Distance for which the verdict is made, in metres; none = where the expected "
         "error of matching is 2 % of the distance.",
     )
-    match_sigma_px: float = Field(
-        default=0.25, gt=0, description="Assumed matching error for that prediction, in pixels."
-    )
-    seed: int = Field(default=0, ge=0, description="Seed of the resampling.")
 
 
 class CalibratedSettings(StereoSettings):

@@ -28,6 +28,16 @@ _DROPPING_ROUNDS: Final = 4
 _MISMATCH: Final = 3.0
 
 
+_OUTLIER_RATIO: Final = 3.0
+"""Views whose error exceeds this multiple of the median of all views are dropped …"""
+
+_OUTLIER_PX: Final = 0.3
+"""… but never those with an rms error below this."""
+
+_MIN_VIEWS: Final = 5
+"""Minimum number of views with the board."""
+
+
 @dataclass(frozen=True, eq=False)
 class StereoFit:
     """A calibrated rig, and how well it fits.
@@ -59,7 +69,7 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
     """Calibrate two cameras.
 
     Each camera is calibrated alone, then all parameters of both are refined together. Of views that
-    repeat each other, one is used. Views whose error exceeds `CalibrationSettings.outlier_ratio`
+    repeat each other, one is used. Views whose error exceeds three
     times the median are dropped.
 
     Args:
@@ -75,7 +85,7 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
     groups = group_views(views)
     kept = [group[0] for group in groups]
     repeated = tuple(view.name for group in groups for view in group[1:])
-    _check_count(kept, settings, repeated=len(repeated))
+    _check_count(kept, repeated=len(repeated))
     left, right = (
         calibrate_one([view.seen[side] for view in kept], size, settings) for side in (0, 1)
     )
@@ -87,12 +97,12 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
     dropped: dict[str, float] = {}
     for _ in range(_DROPPING_ROUNDS):
         errors = view_errors(kept, state)
-        limit = max(settings.outlier_ratio * float(np.median(errors)), settings.outlier_px)
+        limit = max(_OUTLIER_RATIO * float(np.median(errors)), _OUTLIER_PX)
         good = errors <= limit
         dropped |= {v.name: float(e) for v, e, g in zip(kept, errors, good, strict=True) if not g}
         kept, state = _keep(kept, state, good)
         alone = tuple(each[good] for each in alone)
-        _check_count(kept, settings, dropped, len(repeated))
+        _check_count(kept, dropped, len(repeated))
         state, information = solve(kept, state)
         if good.all():
             break
@@ -143,18 +153,17 @@ def _rms(errors: Float64) -> float:
 
 def _check_count(
     views: Sequence[View],
-    settings: CalibrationSettings,
     dropped: dict[str, float] | None = None,
     repeated: int = 0,
 ) -> None:
-    if len(views) >= settings.min_views:
+    if len(views) >= _MIN_VIEWS:
         return
     lost = f", after {', '.join(dropped)} did not fit" if dropped else ""
     lost += f", and {repeated} that repeat them" if repeated else ""
     raise CalibrationError(
         "too few views show the board in both images",
         got=f"{len(views)}{lost}",
-        expected=f"at least {settings.min_views}",
+        expected=f"at least {_MIN_VIEWS}",
         hint="take more, with the board tilted, and near and far",
     )
 
