@@ -41,6 +41,7 @@ from recon.map.workspace import Workspace
 from recon.odometry import Odometry, OdometryFrame, OdometryResult, make_odometry
 from recon.report.plots import grid_figure, loops_figure
 from recon.sources.synthetic import SyntheticSource
+from recon.street import StreetScene
 from recon.street.truth import true_surface
 
 THRESHOLDS_M = (0.2, 0.4)
@@ -126,8 +127,7 @@ def config_of(options: argparse.Namespace, drive: str) -> ReconConfig:
         street |= {"path": "block", "block_m": [64, 60], "frames": options.frames}
     else:
         street |= {"path": "straight", "repeat_m": 50.0, "frames": 110}
-    texts = [f"street.{name}={json.dumps(value)}" for name, value in street.items()]
-    return load_config(None, texts)
+    return load_config().model_copy(update={"street": StreetScene.parse(street)})
 
 
 def closing(

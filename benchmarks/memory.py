@@ -27,7 +27,7 @@ from recon.core.values import Trajectory
 from recon.io.atomic import write_text
 from recon.io.trajectory import write_kitti_poses
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street import StreetScene
 from tests.scenery.kitti import write_kitti
 
 FRAMES = (1000, 4000)
@@ -87,7 +87,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def render_period(folder: Path, width_px: int) -> Path:
     """Render a drive along one period of the street, in the KITTI layout."""
     period = round(REPEAT_M / STEP_M)
-    settings = StreetSettings(
+    settings = StreetScene(
         # Two more periods, so that the last image shows no end of the street.
         frames=3 * period,
         speed_m_per_frame=STEP_M,
@@ -105,7 +105,7 @@ def render_period(folder: Path, width_px: int) -> Path:
 class _Beginning(SyntheticSource):
     """A synthetic drive cut to its first frames."""
 
-    def __init__(self, settings: StreetSettings, length: int) -> None:
+    def __init__(self, settings: StreetScene, length: int) -> None:
         super().__init__(settings)
         self._length = length
 

@@ -4,6 +4,6 @@
 and obstacles. Only the settings are imported here, as the rest needs Open3D.
 """
 
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene, StreetSettings
 
-__all__ = ["StreetSettings"]
+__all__ = ["StreetScene", "StreetSettings"]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from recon.core.geometry import se3
 from recon.core.values.arrays import Float64
-from recon.street.settings import CORNER_M, StreetSettings
+from recon.street.settings import CORNER_M, StreetScene
 
 LANE_M = -1.55  # the car keeps to the right of the centre line
 _STEP_M = 0.25
@@ -74,7 +74,7 @@ class CentreLine:
         return np.where(along_m == self.loop_m, along_m, np.mod(along_m, self.loop_m))
 
 
-def centre_line(settings: StreetSettings, length_m: float) -> CentreLine:
+def centre_line(settings: StreetScene, length_m: float) -> CentreLine:
     """The road from 60 m before the start to ``length_m`` after it, or once around a block."""
     if settings.path == "block":
         return _block(*settings.block_m)
@@ -93,7 +93,7 @@ def _walk(along_m: Float64, heading_rad: Float64) -> Float64:
     return np.vstack([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
-def _heading(along_m: Float64, settings: StreetSettings) -> Float64:
+def _heading(along_m: Float64, settings: StreetScene) -> Float64:
     if settings.path == "straight":
         return np.zeros_like(along_m)
     rate = math.radians(settings.turn_deg_per_100m) / 100.0
@@ -117,13 +117,13 @@ def _block(length_m: float, width_m: float) -> CentreLine:
     return CentreLine(along, _walk(along, heading), heading, (0.0, lap), lap)
 
 
-def camera_poses(settings: StreetSettings, road: CentreLine) -> Float64:
+def camera_poses(settings: StreetScene, road: CentreLine) -> Float64:
     """``T_street_camera`` (frames, 4, 4) of the left camera, street axes."""
     along = settings.speed_m_per_frame * np.arange(settings.frames)
     return np.stack([_camera_pose(float(s), settings, road) for s in along])
 
 
-def _camera_pose(along_m: float, settings: StreetSettings, road: CentreLine) -> Float64:
+def _camera_pose(along_m: float, settings: StreetScene, road: CentreLine) -> Float64:
     """Position of the car on the road, its small motions, and the mounting of the rig."""
     phase = 0.7 * (settings.seed % 997)
     drift = 0.2 * settings.sway * math.sin(along_m / 11.0 + phase)

@@ -16,22 +16,21 @@ _LEAST_SIDE_M: Final = 2 * CORNER_M + 28.0  # two rows of houses, back to back
 
 
 class StreetSettings(Settings):
-    """A street, a rig, and the path of the rig through the street.
+    """A rendered street, the rig that drives through it, and how far.
 
     Equal settings give bit-identical images. A longer drive with the same seed continues along
     the same street.
     """
 
-    seed: int = Field(default=0, ge=0, lt=2**31, description="Seed of the street.")
-    frames: int = Field(default=40, ge=1, le=2000, description="Number of stereo pairs.")
-    speed_m_per_frame: float = Field(
-        default=1.0, ge=0.0, le=5.0, description="Distance driven between two frames."
+    seed: int = Field(
+        default=0, ge=0, lt=2**31, description="Seed of the street: another one, another street."
     )
-    frame_rate_hz: float = Field(
-        default=10.0, gt=0.0, description="Frame rate; affects only the timestamps."
+    frames: int = Field(
+        default=40, ge=1, le=2000, description="Number of stereo pairs, a metre apart."
     )
     path: Literal["curve", "straight", "block"] = Field(
-        default="curve", description="Shape of the street; block = repeated laps around a block."
+        default="curve",
+        description="Shape of the street; block = repeated laps around a block, for loops.",
     )
     turn_deg_per_100m: float = Field(
         default=20.0,
@@ -39,23 +38,9 @@ class StreetSettings(Settings):
         le=60.0,
         description="Mean curvature of a curved street; positive = to the left.",
     )
-    block_m: tuple[float, float] = Field(
-        default=(100.0, 70.0), description="Side lengths of the block for path = block."
+    width_px: int = Field(
+        default=640, ge=16, le=8192, description="Image width. Take that of your rig to try it."
     )
-    repeat_m: float | None = Field(
-        default=None,
-        ge=20.0,
-        le=1000.0,
-        description="Period after which a straight street repeats itself. none = never.",
-    )
-    sway: float = Field(
-        default=1.0,
-        ge=0.0,
-        le=5.0,
-        description="Amount of lateral drift and pitching of the car; 0 = none.",
-    )
-
-    width_px: int = Field(default=640, ge=16, le=8192, description="Image width.")
     height_px: int = Field(default=240, ge=16, le=8192, description="Image height.")
     focal_px: float = Field(default=360.0, gt=0.0, description="Focal length.")
     baseline_m: float = Field(
@@ -67,13 +52,38 @@ class StreetSettings(Settings):
     pitch_deg: float = Field(
         default=1.0, ge=-30.0, le=30.0, description="Pitch of the mounted rig; positive = down."
     )
+
+
+class StreetScene(StreetSettings):
+    """A street in every detail; the defaults are those of `recon demo`."""
+
+    speed_m_per_frame: float = Field(
+        default=1.0, ge=0.0, le=5.0, description="Distance driven between two frames."
+    )
+    frame_rate_hz: float = Field(
+        default=10.0, gt=0.0, description="Frame rate; affects only the timestamps."
+    )
+    block_m: tuple[float, float] = Field(
+        default=(100.0, 70.0), description="Side lengths of the block for path = block."
+    )
+    repeat_m: float | None = Field(
+        default=None,
+        ge=20.0,
+        le=1000.0,
+        description="Period after which a straight street repeats itself. None = never.",
+    )
+    sway: float = Field(
+        default=1.0,
+        ge=0.0,
+        le=5.0,
+        description="Amount of lateral drift and pitching of the car; 0 = none.",
+    )
     yaw_deg: float = Field(
         default=1.5, ge=-45.0, le=45.0, description="Yaw of the mounted rig; positive = right."
     )
     roll_deg: float = Field(
         default=0.3, ge=-30.0, le=30.0, description="Roll of the mounted rig; positive = clockwise."
     )
-
     noise_dn: float = Field(
         default=1.0,
         ge=0.0,
@@ -99,6 +109,11 @@ class StreetSettings(Settings):
         le=256,
         description="Rendering threads, 0 = one per core; does not affect the result.",
     )
+
+    @classmethod
+    def of(cls, settings: StreetSettings) -> StreetScene:
+        """The scene of settings: themselves, or with the other details of a demo."""
+        return settings if isinstance(settings, cls) else cls(**dict(settings))
 
     @model_validator(mode="after")
     def _check_shape(self) -> Self:

@@ -16,7 +16,7 @@ from recon.street import props
 from recon.street.buildings import draw_plan, house
 from recon.street.materials import ROAD_HALF_M
 from recon.street.path import BEHIND_M, CentreLine, camera_poses, centre_line
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene, StreetSettings
 from recon.street.soup import Material, Paint, TriangleSoup, merge, move, painted
 
 KERB_M: Final = 0.12  # pavement above road
@@ -38,7 +38,7 @@ class StreetWorld:
         to_sun: float64 (3,), unit vector towards the sun, street axes.
     """
 
-    settings: StreetSettings
+    settings: StreetScene
     soup: TriangleSoup
     camera: RectifiedCamera
     T_street_camera: Float64
@@ -84,6 +84,7 @@ class StreetWorld:
 
 def build_street(settings: StreetSettings) -> StreetWorld:
     """Lay out the street for some settings."""
+    settings = StreetScene.of(settings)
     length = settings.frames * settings.speed_m_per_frame + _AHEAD_M
     road = centre_line(settings, length + 60.0)
     layers: list[Callable[[CentreLine, float, np.random.Generator], Iterator[TriangleSoup]]] = [

@@ -9,7 +9,7 @@ import numpy as np
 from recon.core.geometry.se3 import make_transform
 from recon.core.values.arrays import Float64
 from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from recon.street.shapes import boxes
 from recon.street.soup import Material, Paint, merge
 from recon.street.street import StreetWorld, rig
@@ -28,7 +28,7 @@ class RoomSource(SyntheticSource):
 
     def __init__(self, heights_m: Float64) -> None:
         rig_like_euroc = {"width_px": 376, "height_px": 240, "focal_px": 229.0, "baseline_m": 0.11}
-        super().__init__(StreetSettings(frames=len(heights_m), **rig_like_euroc))
+        super().__init__(StreetScene(frames=len(heights_m), **rig_like_euroc))
         self.heights_m = heights_m
 
     @cached_property

@@ -20,7 +20,7 @@ from recon.report import present_map
 from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
-from recon.street import StreetSettings
+from recon.street import StreetScene
 from recon.street.settings import CORNER_M
 
 pytestmark = pytest.mark.slow
@@ -28,10 +28,10 @@ pytestmark = pytest.mark.slow
 RIG = {"width_px": 400, "height_px": 150, "focal_px": 225.0, "smooth_edges": False}
 SIDE_M, STEP_M = 60.0, 1.5
 LAP_M = 4 * SIDE_M - 8 * CORNER_M + 2 * math.pi * CORNER_M
-BLOCK = StreetSettings(
+BLOCK = StreetScene(
     path="block", block_m=(SIDE_M, SIDE_M), frames=162, speed_m_per_frame=STEP_M, seed=1, **RIG
 )
-ALIKE = StreetSettings(
+ALIKE = StreetScene(
     path="straight", repeat_m=40.0, frames=56, speed_m_per_frame=STEP_M, seed=1, **RIG
 )
 FILES = [
@@ -51,7 +51,7 @@ class _Filmed:
     description = "a rendered street"
     files: tuple[Path, ...] = ()
 
-    def __init__(self, settings: StreetSettings) -> None:
+    def __init__(self, settings: StreetScene) -> None:
         street = SyntheticSource(settings)
         self.name, self.calibration = street.name, street.calibration
         self.truth = SequenceTruth(street.trajectory)

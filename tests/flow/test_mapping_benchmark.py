@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street import StreetScene
 from tests.scenery.kitti import write_kitti
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "mapping.py"
@@ -23,7 +23,7 @@ BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "mapping.py"
 def result(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What the benchmark prints."""
     drive = tmp_path_factory.mktemp("drive")
-    street = StreetSettings(
+    street = StreetScene(
         frames=4, width_px=256, height_px=96, focal_px=150.0, speed_m_per_frame=0.4
     )
     write_kitti(SyntheticSource(street), drive)

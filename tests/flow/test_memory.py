@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street import StreetScene
 from tests.scenery.kitti import write_kitti
 
-STREET = StreetSettings(
+STREET = StreetScene(
     frames=100,
     width_px=320,
     height_px=120,

@@ -15,7 +15,7 @@ from recon.places.drift import path_lengths
 from recon.places.keyframe import Keyframe, make_keyframe
 from recon.places.settings import DriftSettings
 from recon.street.render import StreetCamera
-from recon.street.settings import CORNER_M, StreetSettings
+from recon.street.settings import CORNER_M, StreetScene
 from recon.street.street import build_street
 
 RIG = {"width_px": 320, "height_px": 120, "focal_px": 180.0, "smooth_edges": False}
@@ -65,7 +65,7 @@ class Drive:
 class Filmed:
     """A drive whose frames are rendered once, when they are first asked for."""
 
-    def __init__(self, settings: StreetSettings) -> None:
+    def __init__(self, settings: StreetScene) -> None:
         self.drive = Drive(StreetCamera(build_street(settings)))
         self._frames: dict[int, tuple[RectifiedPair, Disparity]] = {}
 
@@ -96,7 +96,7 @@ class Filmed:
 @pytest.fixture(scope="session")
 def block() -> Filmed:
     return Filmed(
-        StreetSettings(
+        StreetScene(
             path="block",
             block_m=BLOCK_M,
             frames=LAP + 20,
@@ -110,7 +110,7 @@ def block() -> Filmed:
 @pytest.fixture(scope="session")
 def alike() -> Filmed:
     return Filmed(
-        StreetSettings(
+        StreetScene(
             path="straight",
             repeat_m=60.0,
             frames=60,

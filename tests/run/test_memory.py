@@ -21,13 +21,11 @@ from recon.run import memory
 from recon.run.memory import MemorySettings, memory_overrides, parse_size_mb
 from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street import StreetScene
 from tests.scenery.kitti import write_kitti
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
-STREET = StreetSettings(
-    frames=12, width_px=256, height_px=96, focal_px=150.0, speed_m_per_frame=0.5
-)
+STREET = StreetScene(frames=12, width_px=256, height_px=96, focal_px=150.0, speed_m_per_frame=0.5)
 
 
 @pytest.mark.parametrize(

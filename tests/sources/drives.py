@@ -13,7 +13,7 @@ import yaml
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.io.images.image import write_image
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street import StreetScene
 
 RATE_HZ = 10.0
 EPOCH_S = 1_600_000_000
@@ -21,7 +21,7 @@ EPOCH_S = 1_600_000_000
 
 def rendered(frames: int, **settings: Any) -> tuple[list[StereoPair], RectifiedCamera]:
     """Grey pairs of a street, which every layout can store without loss."""
-    source = SyntheticSource(StreetSettings(frames=frames, threads=1, **settings))
+    source = SyntheticSource(StreetScene(frames=frames, threads=1, **settings))
     grey = [
         StereoPair(
             *(np.asarray(cv2.cvtColor(p, cv2.COLOR_RGB2GRAY)) for p in (pair.left, pair.right)),

@@ -7,7 +7,7 @@ import pytest
 
 from recon.street.path import R_STREET_LEVEL
 from recon.street.render import StreetCamera
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from recon.street.shapes import boxes, quads
 from recon.street.soup import Material, Paint, merge
 from recon.street.street import StreetWorld, build_street, rig
@@ -16,8 +16,8 @@ SMALL = {"frames": 4, "width_px": 320, "height_px": 120, "focal_px": 180.0, "noi
 
 
 @pytest.fixture(scope="session")
-def small_settings() -> StreetSettings:
-    return StreetSettings(seed=3, **SMALL)
+def small_settings() -> StreetScene:
+    return StreetScene(seed=3, **SMALL)
 
 
 @pytest.fixture(scope="session")
@@ -28,7 +28,7 @@ def street(small_settings) -> StreetCamera:
 @pytest.fixture(scope="session")
 def box_world() -> StreetWorld:
     """A level road, a wall 20 m ahead, a box of 2 × 2 × 1.8 m whose front is 8 m ahead."""
-    settings = StreetSettings(
+    settings = StreetScene(
         frames=1, width_px=200, height_px=100, focal_px=100.0, baseline_m=0.5, noise_dn=0.0
     )
     grey = Paint(Material.PLAIN, (0.5, 0.5, 0.5), 1)

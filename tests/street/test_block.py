@@ -11,7 +11,7 @@ from recon.core.errors import SettingsError
 from recon.street.materials import ROAD_HALF_M
 from recon.street.path import LANE_M, centre_line
 from recon.street.render import StreetCamera
-from recon.street.settings import CORNER_M, StreetSettings
+from recon.street.settings import CORNER_M, StreetScene
 from recon.street.street import build_street
 
 TINY = {"width_px": 96, "height_px": 40, "focal_px": 54.0, "smooth_edges": False}
@@ -23,7 +23,7 @@ LAP_M = 2 * sum(BLOCK_M) - 8 * CORNER_M + 2 * math.pi * CORNER_M
 @pytest.fixture(scope="module")
 def block() -> StreetCamera:
     """A drive whose frame 100 stands where frame 0 stood, one lap later."""
-    settings = StreetSettings(
+    settings = StreetScene(
         path="block", block_m=BLOCK_M, frames=111, speed_m_per_frame=LAP_M / 100, **TINY, **ON_RAILS
     )
     return StreetCamera(build_street(settings))
@@ -31,14 +31,14 @@ def block() -> StreetCamera:
 
 @pytest.fixture(scope="module")
 def repeated() -> StreetCamera:
-    settings = StreetSettings(
+    settings = StreetScene(
         path="straight", repeat_m=40.0, frames=41, speed_m_per_frame=4.0, **TINY, **ON_RAILS
     )
     return StreetCamera(build_street(settings))
 
 
 def test_the_line_around_a_block_closes():
-    road = centre_line(StreetSettings(path="block", block_m=BLOCK_M), 0.0)
+    road = centre_line(StreetScene(path="block", block_m=BLOCK_M), 0.0)
 
     assert road.loop_m == pytest.approx(LAP_M)
     # Steps of 0.25 m replace each corner's arc by chords, all four alike.
@@ -104,4 +104,4 @@ def test_a_repeated_street_has_the_same_shape_each_period(repeated):
 )
 def test_an_impossible_street_is_refused(values):
     with pytest.raises(SettingsError, match=r"block_m|repeat_m"):
-        StreetSettings.parse(values)
+        StreetScene.parse(values)

@@ -12,7 +12,7 @@ from recon.core.errors import SettingsError
 from recon.core.geometry import se3
 from recon.core.geometry.projection import project, unproject
 from recon.street.render import StreetCamera
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from recon.street.street import StreetWorld, build_street
 
 
@@ -170,7 +170,7 @@ def test_a_frame_that_is_not_there_is_refused(street):
 
 
 def test_another_size_and_baseline_are_taken():
-    settings = StreetSettings(
+    settings = StreetScene(
         frames=1, seed=1, width_px=96, height_px=64, focal_px=60.0, baseline_m=0.2
     )
     frame = StreetCamera(build_street(settings)).render(0)

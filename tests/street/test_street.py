@@ -8,14 +8,14 @@ import pytest
 from recon.core.errors import SettingsError
 from recon.core.geometry import se3
 from recon.street.path import camera_poses, centre_line
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from recon.street.street import StreetWorld, build_street
 
 RAILS = {"path": "straight", "sway": 0.0, "yaw_deg": 0.0, "pitch_deg": 0.0, "roll_deg": 0.0}
 
 
 def _poses(**settings) -> np.ndarray:
-    chosen = StreetSettings(**settings)
+    chosen = StreetScene(**settings)
     return camera_poses(chosen, centre_line(chosen, 200.0))
 
 
@@ -69,7 +69,7 @@ def test_the_same_settings_build_the_same_street(street, small_settings):
 
 
 def test_another_seed_builds_another_street(street):
-    other = build_street(StreetSettings(seed=4, frames=4))
+    other = build_street(StreetScene(seed=4, frames=4))
     assert len(other.soup) != len(street.world.soup)
 
 
@@ -99,4 +99,4 @@ def test_nothing_stands_in_the_lane_of_the_camera(street):
 @pytest.mark.parametrize("wrong", [{"frames": 0}, {"baseline_m": 0.0}, {"colour": 1}])
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(SettingsError):
-        StreetSettings.parse(wrong)
+        StreetScene.parse(wrong)

@@ -14,7 +14,7 @@ from recon.io.cameras.calibration import read_calibration
 from recon.rig.audit.run import mend_calibration, run_audit
 from recon.sources import StereoSource, open_source
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street import StreetScene
 from tests.rig.audit import faults
 from tests.sources import drives
 
@@ -25,7 +25,7 @@ FRAMES = 10
 @pytest.fixture(scope="module")
 def street() -> faults.Spoiled:
     """A rendered drive without a fault, kept in memory."""
-    size = StreetSettings(
+    size = StreetScene(
         seed=5, frames=FRAMES, width_px=400, height_px=136, focal_px=225.0, threads=1
     )
     source = SyntheticSource(size)
