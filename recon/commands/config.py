@@ -21,7 +21,7 @@ from recon.rig.calibrate.settings import CalibratedSettings
 from recon.rig.capture import CaptureSettings
 from recon.sources.settings import SourceSettings
 from recon.stereo.cloud import ANY_SCALE
-from recon.stereo.match import MatchingSettings, name_of, settings_of
+from recon.stereo.match import MATCHERS, MatchingSettings, field_of, name_of, settings_of
 from recon.street import StreetSettings
 
 _MOST_DOTS: Final = 10
@@ -43,6 +43,54 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfi
         limit_mb, most = self.memory.limit_mb, self.source.max_megapixels
         return most if limit_mb is None else min(most, limit_mb / _BYTES_PER_PIXEL)
 
+    def recorded(self, command: str) -> dict[str, Any]:
+        """The groups that determine the result of a command.
+
+        What is open by default and open here is left out; so are the settings of matchers that
+        are not used, and a street that is the usual one.
+        """
+        usual = (ReconConfig(), ReconConfig.parse(PAIR_DEFAULTS))
+        every = _recorded(self, usual)
+        groups = {name: every[name] for name in GROUPS.get(command, every) if name in every}
+        if "matching" in groups:
+            own = field_of(name_of(self.matching.matcher))
+            unused = {field_of(name) for name in MATCHERS} - {own}
+            groups["matching"] = {k: v for k, v in groups["matching"].items() if k not in unused}
+        if self.street == usual[0].street:
+            groups.pop("street", None)
+        return groups
+
+
+_FRAME: Final = ("source", "rectification", "matching", "cloud", "filters")
+_DRIVE: Final = (
+    *_FRAME,
+    "map_filters",
+    "odometry",
+    "loops",
+    "axes",
+    "fusion",
+    "occupancy",
+    "submaps",
+    "memory",
+    "ground",
+    "grid",
+    "mesh",
+    "street",
+)
+GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
+    "map": _DRIVE,
+    "demo": _DRIVE,
+    "occupancy": _DRIVE,
+    "mesh": ("mesh",),
+    "pair": (*_FRAME, "mesh"),
+    "disparity": ("source", "rectification", "matching"),
+    "rectify": ("rectification",),
+    "calibrate": ("source", "rectification", "calibration"),
+    "audit": ("source", "rectification", "matching", "audit"),
+    "evaluate": ("rectification", "matching"),
+    "paper": (*_FRAME, "mesh", "paper"),
+}
+"""The groups of settings that determine the result of each command."""
 
 PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
     "cloud": {"max_range_m": None, "max_relative_sigma": None},
@@ -163,9 +211,21 @@ def capture_overrides(
     return [f"capture.{key}={value}" for key, value in given.items() if value is not None]
 
 
-def dump_config(config: Settings) -> str:
-    """The configuration as YAML; `load_config` restores the same configuration."""
-    return str(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False))
+def dump_config(config: Settings, command: str) -> str:
+    """The settings that determine the result of a command, as YAML; `load_config` restores them."""
+    return str(yaml.safe_dump(config.recorded(command), sort_keys=False))
+
+
+def _recorded(settings: Settings, usual: Sequence[Settings]) -> dict[str, Any]:
+    """The plain values of settings, without what is open here and in all of the usual ones."""
+    plain = settings.model_dump(mode="json")
+    for name in type(settings).model_fields:
+        value, others = getattr(settings, name), [getattr(other, name) for other in usual]
+        if isinstance(value, Settings):
+            plain[name] = _recorded(value, others)
+        if plain[name] == {} or (value is None and all(other is None for other in others)):
+            del plain[name]
+    return plain
 
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:

@@ -275,7 +275,7 @@ def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str, common: Sequen
 def _write(
     summary: Figures, config: ReconConfig, options: MiddleburyOptions, directory: RunDirectory
 ) -> None:
-    write_text(directory.path("config.yaml"), dump_config(config))
+    write_text(directory.path("config.yaml"), dump_config(config, "evaluate"))
     if options.present is not None:
         options.present(summary, directory)
     directory.write_json("summary.json", summary)

@@ -73,8 +73,22 @@ def open_run(folder: Path) -> FinishedRun:
     untrusted = record.get(UNTRUSTED, [])
     if not isinstance(untrusted, list) or not all(type(n) is int for n in untrusted):
         raise FormatError(f"record of the run has no valid {UNTRUSTED}", where=folder / RECORD)
-    config = load_config(folder / CONFIG)
-    return FinishedRun(folder, str(mapped_by), config, T_map_world, tuple(untrusted))
+    return FinishedRun(
+        folder, str(mapped_by), _read_config(folder / CONFIG), T_map_world, tuple(untrusted)
+    )
+
+
+def _read_config(path: Path) -> ReconConfig:
+    """The settings of a run; those of another version may not be known or valid in this one."""
+    try:
+        return load_config(path)
+    except SettingsError as error:
+        raise SettingsError(
+            f"the settings of this run are not valid in this version: {error.what}",
+            where=error.where,
+            got=error.got,
+            hint="map the drive again",
+        ) from error
 
 
 def is_pair_run(folder: Path) -> bool:

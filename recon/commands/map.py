@@ -319,7 +319,7 @@ def _write(run: MapRun, directory: RunDirectory) -> None:
         directory.write_json("loops.json", run.mapped.loops.edges())
     if run.config.occupancy.keep_rays:
         directory.keep(RAYS, RAYS_FILE)
-    write_text(path("config.yaml"), dump_config(run.config))
+    write_text(path("config.yaml"), dump_config(run.config, "map"))
 
 
 def _base_in_map(run: MapRun) -> Trajectory:

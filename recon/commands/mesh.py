@@ -92,7 +92,7 @@ def run_mesh(source: Path, config: ReconConfig, options: MeshOptions) -> dict[st
             others = [suffix for suffix in dict.fromkeys(options.formats) if suffix != "ply"]
             for suffix in others:
                 write_mesh(directory.path(f"mesh/mesh.{suffix}"), read_mesh(whole), frame)
-            write_text(directory.path("config.yaml"), dump_config(config))
+            write_text(directory.path("config.yaml"), dump_config(config, "mesh"))
         summary = {
             "cloud": str(cloud_path),
             **figures,

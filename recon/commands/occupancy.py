@@ -93,7 +93,7 @@ def run_occupancy(request: OccupancyRequest) -> dict[str, Any]:
             written = writer.grid()
         warnings += written.warnings
         T_map_world = drive.run.T_map_world
-        write_text(directory.path("config.yaml"), dump_config(drive.config))
+        write_text(directory.path("config.yaml"), dump_config(drive.config, "map"))
         summary = {
             "run": str(request.run),
             "frames": len(drive.trajectory),

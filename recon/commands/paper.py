@@ -235,7 +235,7 @@ def _warnings(results: tuple[ExperimentResult, ...]) -> tuple[str, ...]:
 
 
 def _write(run: PaperRun, directory: RunDirectory) -> None:
-    write_text(directory.path("config.yaml"), dump_config(run.config))
+    write_text(directory.path("config.yaml"), dump_config(run.config, "paper"))
     for result in run.experiments:
         folder = result.experiment.folder
         layers = {}

@@ -39,6 +39,11 @@ class Settings(BaseModel):
             if field is None or value != field.get_default(call_default_factory=True):
                 yield name, value
 
+    def recorded(self, command: str) -> dict[str, Any]:
+        """What is written beside the results of a command, as plain values; here everything."""
+        del command
+        return self.model_dump(mode="json")
+
     @classmethod
     def parse(cls, values: Mapping[str, Any], *, where: str | None = None) -> Self:
         """Build settings from plain values.

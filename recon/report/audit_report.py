@@ -75,7 +75,7 @@ def _content(audit: Audit, source: StereoSource, config: ReconConfig) -> ReportC
                 if look.pair is not None
             ),
         ],
-        config=dump_config(config),
+        config=dump_config(config, "audit"),
         versions=versions(),
     )
 

@@ -122,7 +122,7 @@ def _content(run: CalibrationRun, figures: Mapping[str, bytes]) -> ReportContent
             ("Focal length", f"{s['focal_px']:.2f} px"),
         ],
         sections=sections,
-        config=dump_config(run.config),
+        config=dump_config(run.config, "calibrate"),
         versions=versions(),
     )
 

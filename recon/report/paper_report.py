@@ -67,7 +67,7 @@ def paper_report(run: PaperRun, command: str = "") -> ReportContent:
         warnings=run.warnings,
         figures=_figures(run),
         sections=sections,
-        config=dump_config(run.config),
+        config=dump_config(run.config, "paper"),
         versions=versions(),
     )
 

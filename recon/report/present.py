@@ -43,7 +43,7 @@ def present_map(run: MapRun, directory: RunDirectory) -> None:
             summary=run.summary,
             loops=mapped.loops,
             command=command_line(),
-            config=dump_config(run.config),
+            config=dump_config(run.config, "map"),
             warnings=run.warnings,
             versions=versions(),
         )
@@ -69,7 +69,7 @@ def present_pair(run: PairRun, directory: RunDirectory) -> None:
             mesh=run.mesh,
             summary=run.summary,
             command=command_line(),
-            config=dump_config(run.config),
+            config=dump_config(run.config, "pair"),
             warnings=run.warnings,
             versions=versions(),
         )

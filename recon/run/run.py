@@ -76,7 +76,7 @@ class Run(RunDirectory):
     def __enter__(self) -> Self:
         super().__enter__()
         if self._config is not None:
-            write_yaml(self.path(CONFIG), self._config.model_dump(mode="json"))
+            write_yaml(self.path(CONFIG), self._config.recorded(self.command))
         return self
 
     def stage(self, name: str) -> AbstractContextManager[None]:

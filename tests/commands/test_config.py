@@ -3,17 +3,47 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
-from recon.commands.config import PAIR_DEFAULTS, ReconConfig, dump_config, load_config
+from recon.commands.config import GROUPS, PAIR_DEFAULTS, ReconConfig, dump_config, load_config
 from recon.core.errors import SettingsError
 
 
-def test_a_dumped_configuration_loads_back_equal(tmp_path: Path) -> None:
-    config = load_config(overrides=["matching.sad.window_px=9", "cloud.max_range_m=null"])
-    (tmp_path / "config.yaml").write_text(dump_config(config))
-    assert load_config(tmp_path / "config.yaml") == config
+@pytest.mark.parametrize(
+    ("command", "defaults", "overrides"),
+    [
+        ("map", {}, ["matching.sad.window_px=9", "cloud.max_range_m=none", "memory.limit_mb=900"]),
+        ("map", {}, ["matching.matcher=sgm", "street.seed=3", "mesh.max_distance_spacings=none"]),
+        ("pair", PAIR_DEFAULTS, ["filters.statistical_neighbours=none", "filters.voxel_m=0.1"]),
+        ("pair", PAIR_DEFAULTS, ["matching.matcher=onnx", "matching.onnx.model=a.onnx"]),
+        ("calibrate", {}, ["calibration.model=fisheye", "calibration.depths_m=[1, 2]"]),
+        ("paper", PAIR_DEFAULTS, ["paper.as_printed=true"]),
+    ],
+)
+def test_a_dumped_configuration_loads_back_equal(
+    tmp_path: Path, command: str, defaults: dict[str, Any], overrides: list[str]
+) -> None:
+    config = load_config(None, overrides, defaults)
+    (tmp_path / "config.yaml").write_text(dump_config(config, command))
+    assert load_config(tmp_path / "config.yaml", defaults=defaults) == config
+
+
+def test_a_command_writes_only_what_determines_its_result() -> None:
+    drive = dump_config(load_config(), "map")
+    assert drive.count("\n") < 100
+    groups = yaml.safe_load(drive)
+    assert {"source", "odometry", "grid", "mesh"} <= {*groups}
+    assert not {"calibration", "capture", "audit", "paper", "street", "checkpoints"} & {*groups}
+    assert {*groups["matching"]} == {"matcher", "sad"}
+    assert {*yaml.safe_load(dump_config(load_config(), "mesh"))} == {"mesh"}
+
+
+@pytest.mark.parametrize("command", GROUPS)
+def test_the_groups_of_every_command_are_settings(command: str) -> None:
+    assert {*GROUPS[command]} <= {*ReconConfig.model_fields}
 
 
 def test_overrides_win_over_the_file_and_the_file_over_defaults(tmp_path: Path) -> None:

@@ -112,6 +112,15 @@ def test_an_altered_configuration_is_refused(change: str, finished: Path) -> Non
     assert not Path("out").exists()
 
 
+@pytest.mark.parametrize("command", ["occupancy", "mesh"])
+def test_a_run_with_settings_of_another_version_is_to_be_mapped_again(
+    command: str, finished: Path
+) -> None:
+    replaced(b"inspection: {every: 50}\n")(finished / "config.yaml")
+    assert_refused(run(*COMMANDS[command]), "map the drive again")
+    assert not Path("out").exists()
+
+
 def flipped(at: float) -> Alter:
     """Flip all bits of one byte."""
 
