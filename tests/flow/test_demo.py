@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-FRAMES = 24
+FRAMES = 12
 PRODUCTS = {
     "trajectory_kitti.txt",
     "trajectory_tum.txt",
