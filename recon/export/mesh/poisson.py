@@ -21,6 +21,7 @@ from recon.stereo.cloud import open3d_clouds
 
 _MIN_POINTS = 50
 MIN_DEPTH = 4
+_FARTHEST = 1000.0  # distance of a point from the middle, as a multiple of their median
 _SPACING_NEIGHBOURS = 7
 _SPACING_SAMPLES = 20_000
 #: MeshLab's octree is this much wider than the cloud.
@@ -192,7 +193,7 @@ def usable(cloud: PointCloud) -> PointCloud:
     """The finite points of a cloud, if they can span a surface.
 
     Raises:
-        MeshingError: The points are too few, coincident or collinear.
+        MeshingError: The points are too few, coincident or collinear, or one is far off.
     """
     finite = np.asarray(np.isfinite(cloud.xyz).all(axis=1))
     if finite.sum() < _MIN_POINTS:
@@ -202,6 +203,7 @@ def usable(cloud: PointCloud) -> PointCloud:
             expected=f"at least {_MIN_POINTS} finite points",
         )
     cloud = cloud.select(finite)
+    _refuse_outliers(cloud.xyz)
     centred = cloud.xyz.astype(np.float64) - cloud.xyz.mean(axis=0, dtype=np.float64)
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred)), 0))
     # float32 coordinates resolve about 1e-5 of the extent.
@@ -214,6 +216,19 @@ def usable(cloud: PointCloud) -> PointCloud:
             hint="subtract an offset from all coordinates" if distant else None,
         )
     return cloud
+
+
+def _refuse_outliers(xyz: Float32) -> None:
+    """Refuse a cloud whose box is so wide that an octree would have its points in one cell."""
+    away_m = np.linalg.norm(xyz.astype(np.float64) - np.median(xyz, axis=0), axis=1)
+    half_m, farthest_m = float(np.median(away_m)), float(away_m.max())
+    if farthest_m > _FARTHEST * half_m > 0:
+        raise MeshingError(
+            "a point lies far from all others",
+            got=f"{farthest_m:.3g} m from the middle, of which half of the points are within "
+            f"{half_m:.3g} m",
+            hint="remove outliers from the cloud",
+        )
 
 
 def oriented(cloud: PointCloud, viewpoint_m: Point | None) -> PointCloud:

@@ -130,6 +130,8 @@ def test_points_and_normals_that_are_not_finite_are_left_out() -> None:
         (np.full((500, 3), np.nan), "too few points"),
         (np.full((500, 3), 2.5), "one place or on one line"),
         (np.outer(np.linspace(0, 1, 500), [1.0, 2.0, 3.0]), "one place or on one line"),
+        (np.vstack([sphere(500).xyz, [1e6, 0, 5]]), "a point lies far from all others"),
+        (np.vstack([sphere(500).xyz, [0, 1e30, 5]]), "a point lies far from all others"),
         (np.random.default_rng(0).normal(size=(500, 3)) + 4e6, "subtract an offset"),
     ],
 )
