@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from recon.core.values import RectifiedCamera
 from recon.io.images.image import write_image
 from recon.io.images.pfm import read_pfm, write_pfm
 from recon.io.models.ply import read_ply
+from recon.report import paper_figures
 from tests.hostile import refusals
 from tests.scenery.planes import PlanePair, slanted_pair, step_pair
 
@@ -43,6 +45,14 @@ def write_scene(folder: Path, scene: PlanePair) -> None:
     values |= {"cx1": camera.cx_right_px, "doffs": camera.doffs_px, "width": WIDTH_PX}
     values |= {"baseline_mm": 1000 * camera.baseline_m, "height": HEIGHT_PX}
     (folder / "calib.txt").write_text(CALIB.format(**values))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse_surfaces() -> Iterator[None]:
+    """Draw few facets: matplotlib takes most of the time of these tests for them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper_figures, "_SURFACE_COLUMNS", 30)
+        yield
 
 
 @pytest.fixture(scope="module")
