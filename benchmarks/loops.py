@@ -39,7 +39,7 @@ from recon.map import (
 from recon.map.sequence import MappedSequence, map_sequence
 from recon.map.workspace import Workspace
 from recon.odometry import Odometry, OdometryFrame, OdometryResult, make_odometry
-from recon.report.plots import grid_figure, loops_figure
+from recon.report.paths import grid_figure, loops_figure
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetScene
 from recon.street.truth import true_surface

@@ -63,11 +63,10 @@ def audit(
     """
     with session(quiet=quiet):
         from recon.cli.show import announce
-        from recon.cli.show.audit_table import audit_lines
+        from recon.commands.audit import write_audit
         from recon.commands.config import load_config, source_overrides
-        from recon.report import present_audit
+        from recon.report.audit_table import audit_lines
         from recon.rig.audit.run import mend_calibration, run_audit
-        from recon.run.directory import RunDirectory
         from recon.sources import open_source
 
         asked = source_overrides(calib, left, right, tolerance, (start, end, stride))
@@ -79,8 +78,7 @@ def audit(
         if mend is not None:
             summary["mended"] = mend_calibration(drive, settings, found, mend)
         if out is not None:
-            with RunDirectory.for_command("audit", out) as directory:
-                present_audit(found, drive, settings, directory)
+            write_audit(found, drive, settings, out)
     if json:
         print_json(summary)
         return

@@ -53,7 +53,7 @@ def board(
         raise typer.BadParameter("name one board, such as chess:9x6:25mm")
     with session(quiet=quiet):
         from recon.core.values.board import parse_board
-        from recon.report.board_sheet import write_board
+        from recon.rig.board_sheet import write_board
 
         figures = write_board(out, parse_board(wanted), paper, dpi)
     print_json(figures) if json else print_figures("", figures)

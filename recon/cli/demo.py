@@ -39,7 +39,7 @@ def demo(
         from recon.commands.config import load_config
         from recon.commands.demo_source import demo_source
         from recon.commands.map import MapOptions, run_map
-        from recon.report import present_map
+        from recon.report.map_page import write_map_page
 
         given = {"frames": frames, "seed": seed}
         overrides = [f"street.{key}={value}" for key, value in given.items() if value is not None]
@@ -50,7 +50,7 @@ def demo(
             threads=threads,
             mesh=mesh,
             progress=choose_viewer(quiet=quiet, verbose=verbose),
-            present=present_map,
+            present=write_map_page,
         )
         run = run_map(demo_source(settings), settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

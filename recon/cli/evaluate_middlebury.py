@@ -89,8 +89,9 @@ def middlebury(
         from recon.cli.show import choose_viewer
         from recon.commands.config import load_config
         from recon.commands.evaluate_middlebury import MiddleburyOptions, run_middlebury
-        from recon.report.middlebury_pictures import draw_result, present_middlebury
-        from recon.report.middlebury_tables import latex_tables, text_tables
+        from recon.report.middlebury_page import draw_result, write_middlebury_page
+        from recon.report.middlebury_tables import middlebury_tables
+        from recon.report.table import Table, join
 
         options = MiddleburyOptions(
             matchers=_names(matcher),
@@ -102,10 +103,11 @@ def middlebury(
             auto_range=range_ is Range.auto,
             progress=choose_viewer(quiet=quiet, verbose=verbose),
             draw=draw_result,
-            present=present_middlebury,
+            present=write_middlebury_page,
         )
         summary = run_middlebury(folder, load_config(config, set_ or ()), options)
-        tables = latex_tables(summary) if latex else text_tables(summary)
+        form = Table.latex if latex else Table.text
+        tables = join(map(form, middlebury_tables(summary)))
     for warning in summary["warnings"]:
         typer.echo(f"warning: {warning}", err=True)
     if json:

@@ -107,7 +107,7 @@ def map_(
         from recon.commands.map import MapOptions, run_map
         from recon.commands.resume import MapRequest, open_requested, plan_map
         from recon.io.trajectory import read_trajectory
-        from recon.report import present_map
+        from recon.report.map_page import write_map_page
         from recon.rig.audit.run import quick_warnings
         from recon.sources import read_prior
 
@@ -131,7 +131,7 @@ def map_(
             resume=resume is not None,
             arguments=request.arguments(),
             progress=choose_viewer(quiet=quiet, verbose=verbose),
-            present=present_map,
+            present=write_map_page,
             warnings=found,
         )
         run = run_map(drive, settings, options)

@@ -44,12 +44,12 @@ def paper(
         from recon.commands.config import PAIR_DEFAULTS, load_config
         from recon.commands.paper import PaperOptions, headline, run_paper
         from recon.evaluation.paper.scenes import default_scenes_folder
-        from recon.report import present_paper
+        from recon.report.paper_page import write_paper_page
 
         overrides = [*(set_ or ()), *(["paper.as_printed=true"] if as_printed else ())]
         settings = load_config(config, overrides, PAIR_DEFAULTS)
         folder = scenes or default_scenes_folder()
-        run = run_paper(folder, settings, PaperOptions(out, threads, present_paper))
+        run = run_paper(folder, settings, PaperOptions(out, threads, write_paper_page))
     if json:
         print_json(run.summary)
     else:

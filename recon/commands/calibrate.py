@@ -8,7 +8,7 @@ from pathlib import Path
 from recon.commands.config import ReconConfig
 from recon.core.errors import OutputError, SourceError
 from recon.core.values.board import CalibrationBoard
-from recon.report import present_calibration
+from recon.report.calibration_page import write_calibration_page
 from recon.rig.calibrate import calibrate_stereo, measure_spread
 from recon.rig.calibrate.board_video import is_video, pick_views
 from recon.rig.calibrate.board_views import find_views
@@ -80,7 +80,7 @@ def run_calibration(
         if file is not None:
             summary["files"] = [str(path) for path in write_calibration(file, result, form)]
         with run.report(summary):
-            present_calibration(result, run)
+            write_calibration_page(result, run)
         run.finish(
             summary,
             source=" ".join(filter(None, (left, right))),

@@ -19,7 +19,7 @@ from recon.evaluation.map_run import (
     read_mapped_cloud,
 )
 from recon.io.models.ply import read_ply
-from recon.report.map_errors import present_map_errors
+from recon.report.map_errors import write_map_errors
 from recon.run import Run
 from recon.run.summary import plain
 
@@ -81,6 +81,6 @@ def run_evaluate_map(
         result = MapComparison(placed.cloud, truth, tuple(thresholds_m), summary)
         with Run("evaluate map", out) as directory:
             with directory.report(summary):
-                present_map_errors(result, directory)
+                write_map_errors(result, directory)
             directory.finish(summary, source=str(run), inputs=[reference])
     return summary

@@ -12,7 +12,7 @@ from recon.evaluation import TrajectoryRules, associate, compare_paths
 from recon.evaluation.association import TOLERANCE_S
 from recon.evaluation.trajectory_run import TrajectoryRun
 from recon.io.trajectory import holds_times, read_trajectory, write_tum
-from recon.report.trajectory_report import present_trajectory
+from recon.report.trajectory_page import write_trajectory_page
 from recon.run import Run
 from recon.run.summary import plain
 from recon.sources.times import read_times
@@ -62,7 +62,7 @@ def run_evaluate_trajectory(
             write_tum(run.path("estimate_aligned_tum.txt"), comparison.estimate)
             write_tum(run.path("truth_tum.txt"), comparison.truth)
             with run.report(summary):
-                present_trajectory(TrajectoryRun(estimate, truth, comparison, summary), run)
+                write_trajectory_page(TrajectoryRun(estimate, truth, comparison, summary), run)
             inputs = [path for path in (estimate, truth, times) if path is not None]
             run.finish(summary, source=str(estimate), inputs=inputs)
     return summary

@@ -12,7 +12,7 @@ from recon.evaluation import evaluate_disparity
 from recon.export.pair import mesh_frame, write_cloud_files, write_disparity_files
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.empty import check_cloud
-from recon.report import present_disparity, present_pair
+from recon.report.pair_page import write_disparity_images, write_pair_page
 from recon.rig.audit.pair_checks import check_found, find_pair_faults
 from recon.run import Run
 from recon.run.progress import SILENT, Progress
@@ -89,7 +89,7 @@ def run_pair(
             warnings=warnings,
         )
         with run.report(summary):
-            present_pair(result, run)
+            write_pair_page(result, run)
         run.finish(summary, source=result.name, inputs=given.files)
     return result
 
@@ -139,7 +139,7 @@ def run_disparity(
             warnings=warnings,
         )
         with run.report(summary):
-            present_disparity(result, run)
+            write_disparity_images(result, run)
         run.finish(summary, source=result.name, inputs=given.files)
     return result
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from recon.commands.config import ReconConfig
 from recon.io.images.image import write_image
-from recon.report import present_rectify
+from recon.report.epipolar import write_epipolar_images
 from recon.rig.rectification import (
     RectifyRun,
     measure_rows,
@@ -74,7 +74,7 @@ def run_rectify(
         summary["frames_left_out"] = len(images.lonely)
         summary["warnings"] = _warnings(summary, images)
         with run.report(summary):
-            present_rectify(result, run)
+            write_epipolar_images(result, run)
         inputs = [file for files in images.pairs for file in files]
         run.finish(summary, source=f"{left} {right}", inputs=inputs)
     return result

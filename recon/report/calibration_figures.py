@@ -2,124 +2,101 @@
 
 from __future__ import annotations
 
-import numpy as np
-from matplotlib.axes import Axes
+from typing import Final
 
-from recon.report.canvas import (
-    BAD,
-    ESTIMATE,
-    FAINT,
-    HALF_IN,
-    INK,
-    TRUTH,
-    WIDE_IN,
-    new_figure,
-    style_plot,
-    to_png,
-)
-from recon.rig.calibrate import DepthError
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from recon.report.style import BAD, ESTIMATE, FAINT, HALF_IN, INK, WIDE_IN, styled, to_png
 from recon.rig.calibrate.bootstrap import CONFIDENCE, MATCH_SIGMA_PX
 from recon.rig.calibrate.result import CalibrationRun
 
-_CELLS = (8, 6)
+_CELLS: Final = (8, 6)
 
 
+@styled
 def coverage_figure(run: CalibrationRun) -> bytes:
     """PNG of all detected corners in both images, over the cells of the coverage measure."""
     width, height = run.seen.size_px
-    figure = new_figure(WIDE_IN, WIDE_IN / 2 * height / width + 0.5)
+    figure = Figure((WIDE_IN, WIDE_IN / 2 * height / width + 0.5))
     for side, axes in enumerate(figure.subplots(1, 2)):
         name = ("left", "right")[side]
-        for view in run.fit.views:
-            pixels = view.seen[side].pixels
-            axes.plot(*pixels.T, ".", markersize=3.5, alpha=0.8)
+        colours = colormaps["turbo"](np.linspace(0.05, 0.95, len(run.fit.views)))
+        for view, colour in zip(run.fit.views, colours, strict=True):
+            axes.plot(*view.seen[side].pixels.T, ".", color=colour, markersize=3.5, alpha=0.8)
         share = run.summary[f"coverage_{name}"]
-        _frame(axes, width, height, f"{name.capitalize()}: {100 * share:.0f} % of the cells")
+        axes.set_title(f"{name.capitalize()}: {100 * share:.0f} % of the cells")
+        _frame(axes, width, height)
     return to_png(figure)
 
 
+@styled
 def errors_figure(run: CalibrationRun) -> bytes:
     """PNG of the RMS error of each view in both images, including dropped views."""
     names = [*(view.name for view in run.fit.views), *run.fit.dropped]
     used = len(run.fit.views)
-    figure = new_figure(WIDE_IN, 3.4)
+    figure = Figure((WIDE_IN, 3.4))
     axes = figure.subplots()
     place = np.arange(used)
-    axes.bar(place - 0.2, run.fit.errors_px[:, 0], 0.38, color=ESTIMATE, label="left")
-    axes.bar(place + 0.2, run.fit.errors_px[:, 1], 0.38, color=TRUTH, label="right")
+    axes.bar(place - 0.2, run.fit.errors_px[:, 0], 0.38, label="left")
+    axes.bar(place + 0.2, run.fit.errors_px[:, 1], 0.38, label="right")
     if run.fit.dropped:
         gone = np.arange(used, len(names))
         axes.bar(gone, list(run.fit.dropped.values()), 0.6, color=BAD, label="dropped")
         axes.set_yscale("log")
     axes.axhline(run.fit.rms_px, color=INK, linewidth=1, linestyle="--")
-    style_plot(axes, "", "rms error, px")
+    axes.set_ylabel("rms error, px")
     axes.set_xticks(np.arange(len(names)), names, rotation=60, ha="right", fontsize=7)
-    axes.legend(frameon=False, ncols=3)
+    axes.legend(ncols=3)
     return to_png(figure)
 
 
+@styled
 def rows_figure(run: CalibrationRun) -> bytes:
     """PNG of the row differences of the corners after rectification."""
-    figure = new_figure(HALF_IN, 3.4)
+    figure = Figure((HALF_IN, 3.4))
     axes = figure.subplots()
     reach = max(float(np.quantile(np.abs(run.rows_px), 0.999)), 0.05)
-    axes.hist(run.rows_px, bins=list(np.linspace(-reach, reach, 61)), color=ESTIMATE)
+    axes.hist(run.rows_px, bins=list(np.linspace(-reach, reach, 61)))
     axes.axvline(0, color=INK, linewidth=1)
-    style_plot(axes, "row left − row right, px", "corners")
+    axes.set(xlabel="row left − row right, px", ylabel="corners")
     return to_png(figure)
 
 
+@styled
 def depth_error_figure(run: CalibrationRun) -> bytes:
     """PNG of the depth error by depth: from matching, and from calibration with its interval."""
-    known = [each for each in run.spread.depths if np.isfinite(each.calibration_m)]
-    figure = new_figure(HALF_IN, 3.4)
+    errors = run.spread.depths
+    known = [each for each in errors if np.isfinite(each.calibration_m)]
+    known_m = [each.depth_m for each in known]
+    matching = [100 * each.matching_m for each in errors]
+    calibration = [100 * each.calibration_m for each in known]
+    reach = [100 * max(abs(each.low_m), abs(each.high_m)) for each in known]
+    figure = Figure((HALF_IN, 3.4))
     axes = figure.subplots()
-    depths = [each.depth_m for each in run.spread.depths]
-    matching = [100 * each.matching_m for each in run.spread.depths]
-    axes.plot(depths, matching, "o-", color=FAINT, label=_matching_label())
     axes.plot(
-        [each.depth_m for each in known],
-        [100 * each.calibration_m for each in known],
+        [each.depth_m for each in errors],
+        matching,
         "o-",
-        color=ESTIMATE,
-        label="calibration, over the picture",
+        color=FAINT,
+        label=f"matching to {MATCH_SIGMA_PX:g} px",
     )
-    axes.fill_between(
-        [each.depth_m for each in known],
-        [1e-3] * len(known),
-        [_reach_cm(each) for each in known],
-        color=ESTIMATE,
-        alpha=0.15,
-        linewidth=0,
-        label=f"{100 * CONFIDENCE:.0f} % interval, middle of the picture",
-    )
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    low = min([*matching, *(100 * each.calibration_m for each in known)])
-    axes.set_ylim(bottom=max(low / 3, 1e-3))
-    style_plot(axes, "depth, m", "depth error, cm")
-    axes.set_xticks(depths, [f"{depth:g}" for depth in depths])
+    axes.plot(known_m, calibration, "o-", color=ESTIMATE, label="calibration, over the picture")
+    label = f"{100 * CONFIDENCE:.0f} % interval, middle of the picture"
+    axes.fill_between(known_m, 1e-3, reach, color=ESTIMATE, alpha=0.15, linewidth=0, label=label)
+    axes.set(xscale="log", yscale="log", xlabel="depth, m", ylabel="depth error, cm")
+    axes.set_ylim(bottom=max(min([*matching, *calibration]) / 3, 1e-3))
+    axes.set_xticks([each.depth_m for each in errors], [f"{each.depth_m:g}" for each in errors])
     axes.minorticks_off()
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(fontsize=8)
     return to_png(figure)
 
 
-def _reach_cm(each: DepthError) -> float:
-    return 100 * max(abs(each.low_m), abs(each.high_m))
-
-
-def _matching_label() -> str:
-    return f"matching to {MATCH_SIGMA_PX:g} px"
-
-
-def _frame(axes: Axes, width: int, height: int, title: str) -> None:
-    axes.set_title(title, loc="left", fontsize=11, color=INK)
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
-    axes.set_aspect("equal")
+def _frame(axes: Axes, width: int, height: int) -> None:
+    """Draw the cells of an image, and its border."""
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
     axes.set_xticks(np.linspace(0, width, _CELLS[0] + 1)[1:-1], [])
     axes.set_yticks(np.linspace(0, height, _CELLS[1] + 1)[1:-1], [])
-    axes.grid(visible=True, color="#d8dee4", linewidth=0.8)
-    axes.tick_params(length=0)
-    for spine in axes.spines.values():
-        spine.set_color(FAINT)
+    axes.spines[:].set(visible=True, color=FAINT)

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.colors import Normalize
 from numpy.typing import NDArray
 
 from recon.core.errors import ShapeError
@@ -147,18 +148,9 @@ def colour_values(
     values: NDArray[Any], scale: str, limits: tuple[float, float], missing: Rgb = MISSING
 ) -> UInt8:
     """Colour values of any shape by a matplotlib colormap; NaN gets ``missing``."""
-    low, high = limits
-    span = max(high - low, np.finfo(np.float32).tiny)
-    unit = np.clip((np.asarray(values, dtype=np.float64) - low) / span, 0.0, 1.0)
-    known = np.isfinite(unit)
-    colours = scale_colours(scale)[np.where(known, unit * 255.0 + 0.5, 0).astype(np.uint8)]
-    return np.where(known[..., None], colours, np.asarray(missing, dtype=np.uint8))
-
-
-def scale_colours(scale: str) -> UInt8:
-    """uint8 (256, 3): the colours of a matplotlib colormap, from low to high."""
-    table = colormaps[scale](np.linspace(0.0, 1.0, 256), bytes=True)
-    return np.asarray(table[:, :3], dtype=np.uint8)
+    colormap = colormaps[scale].with_extremes(bad=unit_colour(missing))
+    shown = Normalize(*limits, clip=True)(np.ma.masked_invalid(values))
+    return np.asarray(colormap(shown, bytes=True)[..., :3])
 
 
 def value_range(

@@ -8,13 +8,15 @@ from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from recon.core.geometry.triangulation import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera
 from recon.evaluation.paper.methods import ABSOLUTE, AS_PRINTED, CORRECTED, TITLES, PatchFigure
-from recon.report.canvas import (
+from recon.report.colour import DISPARITY_SCALE, colour_values, value_range
+from recon.report.style import (
     BAD,
     ESTIMATE,
     FAINT,
@@ -22,12 +24,11 @@ from recon.report.canvas import (
     INK,
     TRUTH,
     WIDE_IN,
-    new_figure,
-    style_plot,
+    bare_figure,
+    styled,
     to_png,
     write_note,
 )
-from recon.report.colour import DISPARITY_SCALE, colour_values, value_range
 
 COLOURS: Final[Mapping[str, str]] = {CORRECTED: ESTIMATE, ABSOLUTE: TRUTH, AS_PRINTED: BAD}
 _SURFACE_COLUMNS: Final = 220
@@ -36,6 +37,7 @@ _ELEVATION_DEG: Final = 55.0
 _AZIMUTH_DEG: Final = -72.0
 
 
+@styled
 def surface_figure(disparity: Disparity) -> bytes:
     """The disparity map as a surface over the image, height = disparity; gaps stay open.
 
@@ -47,7 +49,7 @@ def surface_figure(disparity: Disparity) -> bytes:
     rows, columns = np.mgrid[0:height:step, 0:width:step]
     limits = value_range(values)
     colours = colour_values(values, DISPARITY_SCALE, limits)
-    figure = new_figure(HALF_IN, 5.2, layout=None)
+    figure = bare_figure(HALF_IN, 5.2)
     axes: Any = figure.add_axes((0.02, 0.02, 0.9, 0.98), projection="3d")
     axes.plot_surface(
         columns,
@@ -64,6 +66,7 @@ def surface_figure(disparity: Disparity) -> bytes:
     return to_png(figure)
 
 
+@styled
 def depth_curve_figure(
     camera: RectifiedCamera, believed: RectifiedCamera | None, disparities_px: NDArray[Any]
 ) -> bytes:
@@ -78,16 +81,11 @@ def depth_curve_figure(
     """
     last = float(camera.ndisp or np.nanmax(disparities_px, initial=1.0))
     d = np.linspace(last / _CURVE_SAMPLES, last, _CURVE_SAMPLES)
-    figure = new_figure(HALF_IN, 4.2)
+    figure = Figure((HALF_IN, 4.2))
     axes = figure.subplots()
-    axes.plot(
-        d,
-        depth_from_disparity(d, camera),
-        color=ESTIMATE,
-        linewidth=2.2,
-        label=f"Z = f·b / (d + doffs), f = {camera.focal_px:.7g} px, "
-        f"doffs = {camera.doffs_px:.7g} px",
-    )
+    doffs = f"doffs = {camera.doffs_px:.7g} px"
+    label = f"Z = f·b / (d + doffs), f = {camera.focal_px:.7g} px, {doffs}"
+    axes.plot(d, depth_from_disparity(d, camera), color=ESTIMATE, linewidth=2.2, label=label)
     if believed is not None:
         label = f"as printed: Z = f·b / d, f = {believed.focal_px:.7g} px"
         axes.plot(d, depth_from_disparity(d, believed), color=BAD, linewidth=2.2, label=label)
@@ -95,16 +93,16 @@ def depth_curve_figure(
     if known.size:
         low, high = np.percentile(known, (1.0, 99.0))
         axes.axvspan(low, high, color=FAINT, alpha=0.13, linewidth=0, label="disparities found")
-    axes.set_yscale("log")
+    axes.set(yscale="log", xlabel="disparity d (px)", ylabel="depth Z (m, logarithmic)")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    style_plot(axes, "disparity d (px)", "depth Z (m, logarithmic)")
-    figure.legend(loc="outside lower center", frameon=False, fontsize=9)
+    figure.legend(loc="outside lower center", fontsize=9)
     return to_png(figure)
 
 
+@styled
 def patches_figure(patches: Mapping[str, Sequence[PatchFigure]], bad_px: float) -> bytes:
     """Effect of the patch size: wrong pixels, mean error, pixels with a value."""
-    figure = new_figure(WIDE_IN, 3.8)
+    figure = Figure((WIDE_IN, 3.8))
     panels = (
         (f"off by more than {bad_px:g} px (%)", "bad_percent"),
         ("mean error (px)", "avgerr_px"),
@@ -112,10 +110,9 @@ def patches_figure(patches: Mapping[str, Sequence[PatchFigure]], bad_px: float) 
     )
     for axes, (label, name) in zip(figure.subplots(1, 3), panels, strict=True):
         _plot_patches(axes, patches, name)
-        style_plot(axes, "patch (px)", label)
-        axes.set_ylim(bottom=0)
+        axes.set(xlabel="patch (px)", ylabel=label, ylim=(0, None))
     handles = [Line2D([], [], **_line(method), label=TITLES[method]) for method in patches]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return to_png(figure)
 
 
@@ -146,6 +143,6 @@ def _style_surface(axes: Any, width: int, height: int) -> None:
     axes.set_box_aspect((1.0, height / width, 0.45), zoom=1.0)
     axes.view_init(elev=_ELEVATION_DEG, azim=_AZIMUTH_DEG)
     for axis, label in ((axes.xaxis, "column"), (axes.yaxis, "row"), (axes.zaxis, "disparity")):
-        axis.set_label_text(f"{label} (px)", color=INK)
+        axis.set_label_text(f"{label} (px)")
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.set_tick_params(labelsize=8, colors=INK)

@@ -16,7 +16,7 @@ from recon.commands.map import MapOptions, MapRun, run_map
 from recon.core.values import SequenceTruth, StereoPair
 from recon.io.trajectory import read_tum
 from recon.map.frame_result import FrameResult
-from recon.report import present_map
+from recon.report.map_page import write_map_page
 from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
@@ -82,7 +82,7 @@ def _run(
     drive: _Filmed, out: Path, *settings: str, resume: bool = False, breaks: int = -1
 ) -> MapRun:
     options = MapOptions(
-        out=out, mesh=False, resume=resume, progress=_Breaks(breaks), present=present_map
+        out=out, mesh=False, resume=resume, progress=_Breaks(breaks), present=write_map_page
     )
     return run_map(drive, load_config(None, settings), options)
 

@@ -79,7 +79,7 @@ def test_writing_into_a_file_is_an_output_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"PLY", b"# Octomap OcTree", b"# Octomap OcTree binary file\\n"]
+    "content", [b"", b"PLY", b"# Octomap OcTree", b"# Octomap OcTree binary file\n"]
 )
 def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "x.ot").write_bytes(content)

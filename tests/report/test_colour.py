@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matplotlib import colormaps
 
 from recon.core.errors import ShapeError
 from recon.core.values import (
@@ -25,15 +26,19 @@ from recon.report.colour import (
     colour_grid,
     colour_grid_errors,
     colour_reasons,
-    scale_colours,
     value_range,
 )
+
+
+def scale(name: str) -> np.ndarray:
+    """The 256 colours of a matplotlib colormap."""
+    return colormaps[name](np.arange(256), bytes=True)[:, :3]
 
 
 def test_lowest_and_highest_disparity_get_the_ends_of_the_scale() -> None:
     values = np.array([[0.0, 10.0, np.nan, -5.0, 99.0]], dtype=np.float32)
     colours = colour_disparity(values, 0.0, 10.0)
-    first, last = scale_colours("turbo")[[0, 255]]
+    first, last = scale("turbo")[[0, 255]]
     np.testing.assert_array_equal(colours[0, [0, 3]], [first, first])
     np.testing.assert_array_equal(colours[0, [1, 4]], [last, last])
     np.testing.assert_array_equal(colours[0, 2], MISSING)
@@ -75,7 +80,7 @@ def test_error_colours_depend_on_its_size_alone() -> None:
 def test_no_confidence_is_coloured_as_missing() -> None:
     colours = colour_confidence(np.array([[0.0, 1.0]], dtype=np.float32))
     np.testing.assert_array_equal(colours[0, 0], MISSING)
-    np.testing.assert_array_equal(colours[0, 1], scale_colours("viridis")[255])
+    np.testing.assert_array_equal(colours[0, 1], scale("viridis")[255])
 
 
 def test_each_reason_has_a_colour_and_a_label_of_its_own() -> None:

@@ -6,8 +6,8 @@ import csv
 import io
 from typing import Any
 
-from recon.report.latex import latex_tabular
-from recon.report.middlebury_tables import csv_table, latex_tables, markdown_tables, text_tables
+from recon.report.middlebury_tables import csv_table, middlebury_tables
+from recon.report.table import Table, join
 
 
 def masked(error: float | None, *, depth: bool) -> dict[str, Any]:
@@ -28,6 +28,10 @@ def summary(error: float | None = 3.25, *, depth: bool = True) -> dict[str, Any]
     sure = {name: {**one, "confidence": rated} for name, one in scenes.items()}
     sad = {"scenes": sure, "weighted": {**weighted, "confidence": rated}}
     return {"matchers": {"sad": sad, "opencv-bm": found}, "mean_over": list(scenes)}
+
+
+def text_tables(found: dict[str, Any]) -> str:
+    return join(map(Table.text, middlebury_tables(found)))
 
 
 def test_a_table_has_a_row_per_matcher_and_a_column_per_figure() -> None:
@@ -59,7 +63,7 @@ def test_seconds_in_the_row_of_means_are_their_mean() -> None:
 
 
 def test_markdown_has_as_many_cells_in_each_row() -> None:
-    for table in markdown_tables(summary()).split("\n\n"):
+    for table in join(map(Table.markdown, middlebury_tables(summary()))).split("\n\n"):
         assert len({line.count("|") for line in table.splitlines()[1:]}) == 1
 
 
@@ -100,7 +104,8 @@ def test_the_best_of_several_is_bold_in_latex() -> None:
     better = masked(2.5, depth=True)
     given["matchers"]["opencv-bm"]["scenes"]["Teddy"] = {"nonocc": better, "seconds": 0.125}
     tables = {
-        part.partition("\n")[0]: part.splitlines() for part in latex_tables(given).split("\n\n")
+        part.partition("\n")[0]: part.splitlines()
+        for part in join(map(Table.latex, middlebury_tables(given))).split("\n\n")
     }
     mean = tables["% Weighted mean, nonocc, dense"]
     assert mean[1] == r"\begin{tabular}{lrrrrrrrrrrrrr}"
@@ -116,7 +121,7 @@ def test_the_best_of_several_is_bold_in_latex() -> None:
 
 
 def test_signs_of_latex_are_escaped() -> None:
-    table = latex_tabular([("my_method", "50 %"), ("a&b–c", "{x}~^#$\\")])
+    table = Table("t", ("my_method", "50 %"), [("a&b–c", "{x}~^#$\\")]).latex()
     assert r"my\_method & 50 \% \\" in table
     assert r"a\&b--c & \{x\}\textasciitilde{}\textasciicircum{}\#\$\textbackslash{} \\" in table
 

@@ -1,0 +1,90 @@
+"""The report of a drive."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from recon.commands.map import MapRun
+from recon.core.geometry.se3 import apply
+from recon.report.images import stereo_figures
+from recon.report.page import write_page
+from recon.report.paths import drift_figure, grid_figure, health_figure, loops_figure, path_figure
+from recon.report.scene import Json, Scene, plot_scene
+from recon.report.table import number
+from recon.run.directory import RunDirectory
+
+_OCCUPANCY_ROWS: Final = (
+    ("occupied voxels, precision", "voxels", "precision"),
+    ("occupied voxels, recall", "voxels", "recall"),
+    ("occupied cells of the grid, intersection over union", "grid", "iou_occupied"),
+    ("free cells of the grid, intersection over union", "grid", "iou_free"),
+    ("occupied cells that the grid calls free", "grid", "occupied_called_free"),
+)
+
+
+def write_map_page(run: MapRun, directory: RunDirectory) -> None:
+    """Write ``report.html`` of a drive.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    write_page("map", directory, **map_content(run))
+
+
+def map_content(run: MapRun) -> Json:
+    """What the page of a drive shows: map and path first, then the data behind them."""
+    sample = run.mapped.sample
+    return {
+        "run": run,
+        "warnings": run.warnings,
+        "figures": _figures(run),
+        "view": _view(run),
+        "sample": stereo_figures(sample.pair, sample.disparity),
+        "occupancy_rows": _occupancy_rows(run),
+        "notes": [
+            (str(frame), "; ".join(record.notes) or "no measurement")
+            for frame, record in enumerate(run.mapped.health)
+            if record.notes or not record.ok
+        ],
+    }
+
+
+def _figures(run: MapRun) -> dict[str, bytes | None]:
+    path, health, T_map_world = run.mapped.trajectory, run.mapped.health, run.mapped.T_map_world
+    truth = None if run.truth is None else run.truth.trajectory
+    return {
+        "grid": None if run.grid is None else grid_figure(run.grid, path, T_map_world),
+        "path": path_figure(path, truth, T_map_world, health),
+        "loops": _loops(run),
+        "drift": None if truth is None else drift_figure(path, truth, health),
+        "health": health_figure(health) if health else None,
+    }
+
+
+def _loops(run: MapRun) -> bytes | None:
+    loops = run.mapped.loops
+    if loops is None or not loops.closure.closed:
+        return None
+    pairs = [(loop.first, loop.last) for loop in loops.closure.closed]
+    return loops_figure(loops.odometry, loops.closure.trajectory, pairs, run.mapped.T_map_world)
+
+
+def _view(run: MapRun) -> Json | None:
+    drives = [("path", run.mapped.trajectory)]
+    if run.truth is not None and run.truth.trajectory is not None:
+        drives.append(("true path", run.truth.trajectory))
+    paths = [
+        (name, np.asarray(apply(run.mapped.T_map_world, path.positions_m))) for name, path in drives
+    ]
+    return plot_scene(Scene(np.eye(4), run.cloud, run.mesh, paths))
+
+
+def _occupancy_rows(run: MapRun) -> list[tuple[str, ...]]:
+    """Voxels and grid compared with ground truth, if it is known."""
+    found = run.summary.get("occupancy") or {}
+    return [
+        (label, *(number(found[part + end].get(key), 3) for end in ("", "_exact")))
+        for label, part, key in (_OCCUPANCY_ROWS if found else ())
+    ]

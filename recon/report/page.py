@@ -1,0 +1,150 @@
+"""A report as one self-contained HTML file: fills the template of a page."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import io
+import math
+import re
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from PIL import Image
+from plotly.offline import get_plotlyjs
+
+from recon.io.atomic import write_text
+from recon.report.paths import timing_figure
+from recon.report.table import NOT_KNOWN
+from recon.run.directory import RunDirectory
+from recon.run.machine import versions
+
+_WEBP_QUALITY: Final = 80
+_NOT_TABULATED: Final = frozenset({"stages", "warnings", "findings"})
+
+
+def write_page(name: str, directory: RunDirectory, **content: Any) -> None:
+    """Write ``report.html`` of a run, with its command, ``config.yaml`` and versions.
+
+    Args:
+        name: The template, such as ``map``.
+        directory: The run.
+        content: What the template shows, see `render_page`.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    path = directory.path("config.yaml")
+    config = path.read_text(encoding="utf-8") if path.is_file() else ""
+    origin = {"command": command_line(), "config": config, "versions": versions()}
+    write_text(directory.path("report.html"), render_page(name, **origin, **content))
+
+
+def render_page(name: str, **content: Any) -> str:
+    """Render a page as one HTML document without any external resource.
+
+    All text is escaped. plotly.js is included once, and only if there is a 3-D view.
+
+    Args:
+        name: The template, such as ``map``.
+        content: What it shows. All pages know ``warnings``, ``verdict`` (heading of the warnings;
+            "" counts them), ``sound`` (whether they are shown in green, as remarks on a good
+            result), ``command``, ``config`` and ``versions``.
+    """
+    return page_environment().get_template(f"{name}.html.j2").render(content)
+
+
+def page_environment() -> Environment:
+    """Jinja with our templates and filters, for one page."""
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).with_name("templates")),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        extensions=["jinja2.ext.do"],
+    )
+    environment.tests["finite"] = _is_number
+    environment.filters.update(
+        embedded=_embedded, known=_known, leaves=summary_rows, words=_words,
+        last_part=lambda name: Path(name).name or name, shortest="{:.3g}".format, timing=_timing,
+    )  # fmt: skip
+    # Sections add their titles to the contents.
+    environment.globals.update(
+        warnings=(), verdict="", sound=False, command="", config="", versions={}, contents=[],
+        plotly=_packed_plotly,
+    )  # fmt: skip
+    return environment
+
+
+def command_line() -> str:
+    """The command line of this process, or "" if it is not one of recon."""
+    program = Path(sys.argv[0] if sys.argv else "")
+    started = program.name in {"recon", "recon.exe"} or program.parts[-2:] == (
+        "recon",
+        "__main__.py",
+    )
+    return shlex.join(["recon", *sys.argv[1:]]) if started else ""
+
+
+def summary_rows(summary: Mapping[Any, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Names and texts of a nested mapping, one row per leaf."""
+    rows: list[tuple[str, str]] = []
+    for key, value in summary.items():
+        if not prefix and key in _NOT_TABULATED:
+            continue
+        if isinstance(value, Mapping):
+            rows += summary_rows(value, f"{prefix}{key}.")
+        elif isinstance(value, Sequence) and any(isinstance(item, Mapping) for item in value):
+            rows += summary_rows(dict(enumerate(value)), f"{prefix}{key}.")
+        else:
+            rows.append((f"{prefix}{key}", _text(value)))
+    return rows
+
+
+def _known(value: Any, form: str) -> str:
+    return NOT_KNOWN if value is None else form % value
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return NOT_KNOWN
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return ", ".join(_text(item) for item in value) or "none"
+    return str(value)
+
+
+def _timing(summary: Mapping[str, Any]) -> bytes:
+    """The figure of the time by stage; empty if no stage was measured."""
+    stages = {name: s for name, s in (summary.get("stages") or {}).items() if _is_number(s)}
+    return timing_figure(stages) if stages else b""
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value of a summary is a finite number."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _packed_plotly() -> str:
+    """plotly.js, compressed: a third of its size, and no URL of it appears in the file."""
+    return base64.b64encode(gzip.compress(get_plotlyjs().encode("utf-8"), mtime=0)).decode("ascii")
+
+
+def _embedded(png: bytes) -> str:
+    """The URL of an image, as WebP if that is smaller (a quarter for noisy ones), else as PNG."""
+    buffer = io.BytesIO()
+    with Image.open(io.BytesIO(png)) as image:
+        image.convert("RGB").save(buffer, "WEBP", quality=_WEBP_QUALITY)
+    kind, smaller = min(("webp", buffer.getvalue()), ("png", png), key=lambda one: len(one[1]))
+    return f"data:image/{kind};base64,{base64.b64encode(smaller).decode('ascii')}"
+
+
+def _words(name: str) -> list[str]:
+    """The words of the name of a figure, between which a line may break."""
+    return re.split(r"(?<=[._])(?=[a-z])", name)

@@ -1,0 +1,67 @@
+"""The report of one pair, and its results as colour images."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from recon.core.geometry.triangulation import depth_from_disparity
+from recon.io.images.image import write_image
+from recon.report.colour import colour_confidence, colour_disparity, colour_reasons
+from recon.report.images import error_figure, stereo_figures
+from recon.report.page import write_page
+from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
+from recon.run.directory import RunDirectory
+from recon.stereo.pair_run import PairRun
+
+_ERROR_LIMIT_PX: Final = 4.0
+
+
+def write_pair_page(run: PairRun, directory: RunDirectory) -> None:
+    """Write ``report.html`` of a pair, and its results as colour images.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    write_disparity_images(run, directory)
+    write_page("pair", directory, **pair_content(run))
+
+
+def write_disparity_images(run: PairRun, directory: RunDirectory) -> None:
+    """Write disparity, confidence and reasons of a pair as colour images.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    images = {
+        "disparity_colour.png": colour_disparity(run.disparity.values),
+        "confidence_colour.png": colour_confidence(run.disparity.confidence),
+        "reason_colour.png": colour_reasons(run.disparity.reason),
+    }
+    for name, image in images.items():
+        write_image(directory.path(f"disparity/{name}"), image)
+
+
+def pair_content(run: PairRun) -> Json:
+    """What the page of a pair shows: disparity, accuracy and 3-D view."""
+    scene = Scene(T_UPRIGHT_CAMERA, run.cloud, run.mesh, eye_m=_beside_camera(run))
+    error: bytes | None = None
+    if run.truth is not None and run.truth.values.shape == run.disparity.values.shape:
+        error = error_figure(np.abs(run.disparity.values - run.truth.values), _ERROR_LIMIT_PX)
+    return {
+        "run": run,
+        "warnings": run.warnings,
+        "result": stereo_figures(run.pair, run.disparity),
+        "error": error,
+        "limit_px": _ERROR_LIMIT_PX,
+        "view": plot_scene(scene),
+    }
+
+
+def _beside_camera(run: PairRun) -> tuple[float, float, float]:
+    """A viewpoint slightly behind, left of and above the camera, from which depth is visible."""
+    depth_m = depth_from_disparity(run.disparity.values, run.pair.camera)
+    known = depth_m[np.isfinite(depth_m)]
+    far = float(np.median(known)) if known.size else 1.0
+    return (-0.1 * far, 0.25 * far, 0.25 * far)

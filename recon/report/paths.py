@@ -1,0 +1,328 @@
+"""Figures of a drive: paths, drift, grid, odometry health and timing. All return PNG bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from numpy.typing import ArrayLike, NDArray
+
+from recon.core.geometry.se3 import angle_rad, apply, invert
+from recon.core.values import UNKNOWN, OccupancyGrid, Trajectory
+from recon.core.values.arrays import Float64
+from recon.evaluation import TrajectoryComparison
+from recon.odometry.protocol import OdometryHealth
+from recon.report.colour import GRID_FREE, GRID_OCCUPIED, GRID_UNKNOWN, colour_grid, unit_colour
+from recon.report.images import colour_key
+from recon.report.style import (
+    BAD,
+    ESTIMATE,
+    FAINT,
+    HALF_IN,
+    INK,
+    TRUTH,
+    WIDE_IN,
+    nice_length,
+    styled,
+    to_png,
+    write_note,
+)
+from recon.report.thin import thin_grid
+
+Line = tuple[Float64, Mapping[str, Any]]
+"""Points (N, 2) and how matplotlib draws them."""
+
+_MAP_LABELS: Final = ("x, forward at the start (m)", "y, left at the start (m)")
+_MOST_CELLS: Final = 2400  # of a grid's figure, a side: some for each of its pixels
+_MARGIN_CELLS: Final = 10
+_PATH_MARGIN_M: Final = 3.0
+_ESTIMATE_LINE: Final = {"color": ESTIMATE, "linewidth": 1.8, "label": "estimate"}
+_TRUTH_LINE: Final = {"color": TRUTH, "linewidth": 3.5, "alpha": 0.75, "label": "truth"}
+
+
+def path_figure(
+    estimate: Trajectory,
+    truth: Trajectory | None,
+    T_map_world: NDArray[Any],
+    health: Sequence[OdometryHealth] = (),
+) -> bytes:
+    """Top view of the path in map axes; poses that are not trusted are marked.
+
+    Args:
+        estimate: The estimated path.
+        truth: The true path, in the same world, or None.
+        T_map_world: (4, 4), from world to map axes.
+        health: One record per pose of ``estimate``, or none.
+    """
+    path = seen_from_above(estimate, T_map_world)
+    lines: list[Line] = [(path, _ESTIMATE_LINE)]
+    if truth is not None:
+        lines.insert(0, (seen_from_above(truth, T_map_world), _TRUTH_LINE))
+    bad = _bad_frames(health, len(estimate))
+    if len(bad):
+        look = {"marker": "x", "linestyle": "", "markersize": 8, "markeredgewidth": 2}
+        lines.append((path[bad], {**look, "color": BAD, "label": f"not trusted ({len(bad)})"}))
+    return _top_view(lines, path, _MAP_LABELS)
+
+
+def loops_figure(
+    before: Trajectory,
+    after: Trajectory,
+    loops: Sequence[tuple[int, int]],
+    T_map_world: NDArray[Any],
+) -> bytes:
+    """The path before and after loop closure, and the gaps that were closed.
+
+    Args:
+        before: The path by odometry.
+        after: The corrected path of the same frames.
+        loops: The two frames of each loop.
+        T_map_world: (4, 4), from world to map axes.
+    """
+    odometry, closed = (seen_from_above(path, T_map_world) for path in (before, after))
+    gaps = [np.concatenate([odometry[list(pair)], [[np.nan, np.nan]]]) for pair in loops]
+    joined = np.concatenate([np.zeros((0, 2)), *gaps])
+    look = {"marker": "o", "linewidth": 0.8, "markersize": 2.5}
+    lines: list[Line] = [
+        (odometry, {"color": FAINT, "linewidth": 1.4, "linestyle": "--", "label": "odometry"}),
+        (closed, {**_ESTIMATE_LINE, "label": "loops closed"}),
+        (joined, {**look, "color": BAD, "label": f"loops ({len(loops)})"}),
+    ]
+    return _top_view(lines, closed, _MAP_LABELS)
+
+
+def compared_paths_figure(comparison: TrajectoryComparison) -> bytes:
+    """Both paths, projected on the two world axes along which the true one extends farthest."""
+    axes = list(widest_axes(comparison.truth.positions_m))
+    truth, estimate = (
+        path.positions_m[:, axes] for path in (comparison.truth, comparison.estimate)
+    )
+    labels = ("{} (m)".format("xyz"[axes[0]]), "{} (m)".format("xyz"[axes[1]]))
+    return _top_view([(truth, _TRUTH_LINE), (estimate, _ESTIMATE_LINE)], truth, labels)
+
+
+@styled
+def _top_view(lines: Sequence[Line], path: Float64, labels: tuple[str, str]) -> bytes:
+    """Draw lines in a plane with equal axes, with the start and end of one path."""
+    figure = Figure((WIDE_IN, _height_in(np.concatenate([points for points, _ in lines]))))
+    axes = figure.subplots()
+    for points, look in lines:
+        axes.plot(*points.T, **look)
+    _mark_ends(axes, path)
+    axes.set(xlabel=labels[0], ylabel=labels[1])
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(loc="best")
+    return to_png(figure)
+
+
+@styled
+def drift_figure(
+    estimate: Trajectory, truth: Trajectory, health: Sequence[OdometryHealth] = ()
+) -> bytes:
+    """Drift of position and rotation from ground truth, with both paths starting at the identity.
+
+    Args:
+        estimate: The estimated path.
+        truth: The true path, with one pose per pose of ``estimate``.
+        health: One record per pose, or none.
+    """
+    if len(estimate) != len(truth):
+        figure = Figure((WIDE_IN, 4.6))
+        note = f"{len(estimate)} poses, but {len(truth)} true ones: not compared"
+        write_note(figure.subplots(), note)
+        return to_png(figure)
+    drift = invert(truth.T_world_camera) @ estimate.T_world_camera
+    figure, all_axes = _errors_along(
+        truth, np.linalg.norm(drift[:, :3, 3], axis=1), np.degrees(angle_rad(drift))
+    )
+    bad = truth.distances_m[_bad_frames(health, len(estimate))]
+    width = float(np.median(np.diff(truth.distances_m))) if len(truth) > 1 else 1.0
+    for axes in all_axes:
+        _shade(axes, bad, width)
+    return to_png(figure)
+
+
+@styled
+def pose_errors_figure(comparison: TrajectoryComparison) -> bytes:
+    """Position and rotation error of each aligned pose, along the true path."""
+    degrees = np.degrees(comparison.rotation_errors_rad)
+    figure, (upper, _) = _errors_along(comparison.truth, comparison.position_errors_m, degrees)
+    upper.axhline(comparison.metrics.ate_m, color=FAINT, linestyle="--", label="root mean square")
+    upper.legend(loc="best")
+    return to_png(figure)
+
+
+def _errors_along(
+    truth: Trajectory, position_m: ArrayLike, rotation_deg: ArrayLike
+) -> tuple[Figure, tuple[Axes, Axes]]:
+    figure = Figure((WIDE_IN, 4.6))
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    upper.plot(truth.distances_m, position_m)
+    lower.plot(truth.distances_m, rotation_deg)
+    upper.set(ylabel="position error (m)", ylim=(0, None))
+    lower.set(xlabel="distance along the true path (m)", ylabel="rotation error (°)")
+    lower.set_ylim(bottom=0)
+    return figure, (upper, lower)
+
+
+@styled
+def errors_by_length_figure(comparison: TrajectoryComparison, *, rotation: bool) -> bytes:
+    """Relative error of the segments by length: mean and interquartile range."""
+    values = comparison.segment_deg_per_100m if rotation else comparison.segment_percent
+    lengths = np.unique(comparison.segments.length_m)
+    groups = [values[comparison.segments.length_m == length] for length in lengths]
+    quarters = np.array([np.percentile(group, (25, 75)) for group in groups])
+    figure = Figure((HALF_IN, 3.4))
+    axes = figure.subplots()
+    # One bar per length, as a line shows nothing for one or two lengths.
+    axes.vlines(lengths, *quarters.T, color=ESTIMATE, alpha=0.35, linewidth=8)
+    axes.plot(lengths, [float(np.mean(group)) for group in groups], "o-")
+    margin = max(10.0, 0.05 * float(np.ptp(lengths)))
+    axes.set_xlim(max(0.0, lengths[0] - margin), lengths[-1] + margin)
+    label = "rotation error (°/100 m)" if rotation else "translation error (%)"
+    axes.set(xlabel="length of the segments (m)", ylabel=label, ylim=(0, None))
+    return to_png(figure)
+
+
+def widest_axes(positions_m: Float64) -> tuple[int, int]:
+    """The two axes along which a path extends farthest, in order of the axes."""
+    first, second = sorted(np.argsort(-np.ptp(positions_m, axis=0), kind="stable")[:2].tolist())
+    return first, second
+
+
+@styled
+def grid_figure(
+    grid: OccupancyGrid, trajectory: Trajectory | None, T_map_world: NDArray[Any]
+) -> bytes:
+    """The occupancy grid with the path; axes in metres, cropped to the known cells.
+
+    Args:
+        grid: The map.
+        trajectory: The path of the camera, or None.
+        T_map_world: (4, 4), from world to map axes.
+    """
+    grid = thin_grid(_crop_to_known(grid), _MOST_CELLS)
+    near = np.asarray(grid.origin_m)
+    far = near + np.asarray(grid.cells.shape[::-1]) * grid.resolution_m
+    path = np.zeros((0, 2)) if trajectory is None else seen_from_above(trajectory, T_map_world)
+    corners = np.concatenate([[near, far], path - _PATH_MARGIN_M, path + _PATH_MARGIN_M])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    figure = Figure((WIDE_IN, _height_in(corners)))
+    axes = figure.subplots()
+    axes.set_facecolor(unit_colour(GRID_UNKNOWN))
+    axes.imshow(colour_grid(grid), extent=(near[0], far[0], near[1], far[1]))
+    axes.plot(*path.T, linewidth=1.6)
+    _mark_ends(axes, path)
+    axes.grid(visible=False)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    axes.set(xlabel=_MAP_LABELS[0], ylabel=_MAP_LABELS[1])
+    _draw_scale_bar(axes, low, high - low)
+    keys = (("free", GRID_FREE), ("occupied", GRID_OCCUPIED), ("unknown", GRID_UNKNOWN))
+    handles = [colour_key(*key) for key in keys]
+    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    return to_png(figure)
+
+
+@styled
+def timing_figure(stages: Mapping[str, float]) -> bytes:
+    """Time and share of each stage, in the order of the mapping."""
+    figure = Figure((HALF_IN, max(1.6, 0.42 * len(stages) + 0.9)))
+    axes = figure.subplots()
+    seconds = np.asarray(list(stages.values()), dtype=np.float64)
+    total = max(float(seconds.sum()), 1e-12)
+    bars = axes.barh(list(stages), seconds, height=0.62)
+    axes.bar_label(bars, [f"{value:.2f} s · {value / total:.0%}" for value in seconds], padding=4)
+    axes.invert_yaxis()
+    axes.set(xlabel="time (s)", xlim=(0, max(float(seconds.max(initial=0.0)), 1e-12) * 1.28))
+    axes.grid(visible=False, axis="y")
+    return to_png(figure)
+
+
+@styled
+def health_figure(health: Sequence[OdometryHealth]) -> bytes:
+    """Odometry health of each frame; frames whose pose is not trusted are shaded red."""
+    rows = (
+        ("inlier tracks", [float(record.inliers) for record in health]),
+        ("overlap with\nthe map (share)", [record.overlap for record in health]),
+        ("ICP correction (m)", [record.correction_m for record in health]),
+    )
+    figure = Figure((WIDE_IN, 5.6))
+    all_axes = figure.subplots(len(rows), 1, sharex=True)
+    for axes, (label, values) in zip(all_axes, rows, strict=True):
+        known = np.isfinite(values)
+        if known.any():
+            # Values measured only every few frames have no neighbours to connect by a line.
+            axes.plot(values, linewidth=1.3, marker="" if known.all() else ".")
+            axes.set_ylim(bottom=0)
+        else:
+            write_note(axes, "not measured")
+        _shade(axes, _bad_frames(health, len(health)), 1.0)
+        axes.set_ylabel(label)
+    all_axes[-1].set_xlabel("frame")
+    figure.align_ylabels()
+    return to_png(figure)
+
+
+def seen_from_above(trajectory: Trajectory, T_map_world: NDArray[Any]) -> Float64:
+    """float64 (N, 2): x and y of the camera in map axes."""
+    return np.asarray(apply(T_map_world, trajectory.positions_m)[:, :2])
+
+
+def _height_in(points: NDArray[Any]) -> float:
+    """Height in inches of a wide figure that shows these (N, 2) points with equal axes."""
+    extent = np.nanmax(points, axis=0) - np.nanmin(points, axis=0) if len(points) else np.ones(2)
+    ratio = float(extent[1]) / max(float(extent[0]), 1e-9)
+    return float(np.clip((WIDE_IN - 0.8) * ratio + 1.1, 3.0, 9.0))
+
+
+def _mark_ends(axes: Axes, path: NDArray[Any]) -> None:
+    """Mark where a path (N, 2) starts and ends."""
+    # One label above and one below, as a drive may end where it started.
+    ends = ((0, "start", 9, "o", 9), (-1, "end", -18, "s", 7))
+    for number, text, up, marker, size in ends if len(path) else ():
+        place = path[number]
+        axes.plot(
+            *place,
+            marker=marker,
+            color=ESTIMATE,
+            markersize=size,
+            markeredgecolor="white",
+            zorder=5,
+        )
+        label = axes.annotate(text, place, (0, up), textcoords="offset points", ha="center")
+        label.set_path_effects([withStroke(linewidth=3, foreground="white")])
+
+
+def _bad_frames(health: Sequence[OdometryHealth], poses: int) -> NDArray[np.intp]:
+    """Indices of the poses that are not trusted."""
+    return np.flatnonzero([not record.ok for record in health[:poses]])
+
+
+def _shade(axes: Axes, places: NDArray[Any], width: float) -> None:
+    for place in places:
+        axes.axvspan(place - 0.5 * width, place + 0.5 * width, color=BAD, alpha=0.2, linewidth=0)
+
+
+def _crop_to_known(grid: OccupancyGrid) -> OccupancyGrid:
+    """The part of a grid with all known cells, and a margin."""
+    known = np.argwhere(grid.cells != UNKNOWN)
+    if not len(known):
+        return grid
+    top, left = np.maximum(known.min(axis=0) - _MARGIN_CELLS, 0).tolist()
+    bottom, right = (known.max(axis=0) + _MARGIN_CELLS + 1).tolist()
+    x, y = grid.origin_m
+    origin_m = (x + left * grid.resolution_m, y + top * grid.resolution_m)
+    return OccupancyGrid(grid.cells[top:bottom, left:right], grid.resolution_m, origin_m)
+
+
+def _draw_scale_bar(axes: Axes, low: NDArray[Any], size_m: NDArray[Any]) -> None:
+    length = nice_length(float(size_m[0]) / 6)
+    left, bottom = low + size_m * (0.03, 0.06)
+    ends = [left, left + length]
+    axes.plot(ends, [bottom, bottom], color=INK, linewidth=4, solid_capstyle="butt")
+    middle = (left + length / 2, bottom)
+    axes.annotate(f"{length:g} m", middle, (0, 5), textcoords="offset points", ha="center")

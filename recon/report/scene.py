@@ -1,0 +1,280 @@
+"""A cloud, a mesh and paths in 3-D, as plain data for plotly.js.
+
+The colour of a point is one byte: its index in a palette of at most 256 colours. A list of
+``rgb()`` strings would be ten times the size.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from plotly import graph_objects as go
+
+from recon.core.geometry.se3 import apply
+from recon.core.values import PointCloud, TriangleMesh
+from recon.core.values.arrays import Float32, Float64, UInt8
+from recon.report.colour import value_range
+from recon.report.thin import thin_cloud, thin_mesh
+
+MAX_POINTS: Final = 120_000
+MAX_FACES: Final = 80_000
+# From camera axes (x right, y down, z forward) to x forward and z up.
+T_UPRIGHT_CAMERA: Final[Float64] = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+_TITLES: Final = {"x": "x forward (m)", "y": "y left (m)", "z": "z up (m)"}
+_AXIS: Final = {
+    "color": "#aab4be", "gridcolor": "#2c343c", "zeroline": False, "showbackground": False,
+}  # fmt: skip
+_LAYOUT: Final = {
+    "template": "none",
+    "paper_bgcolor": "#14181d",
+    "font_color": "#dfe5ea",
+    "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+    "legend": {
+        "x": 0.0, "y": 0.0, "yanchor": "bottom", "itemsizing": "constant",
+        "bgcolor": "rgba(20,24,29,0.8)",
+    },
+    "uirevision": "kept",  # changing the colouring does not reset the view
+    "scene_aspectmode": "manual",
+}  # fmt: skip
+_PATH_COLOURS: Final = ("#ff5252", "#ffb74d", "#81c784")
+_OUTLIER_SHARE: Final = 0.002
+# Candidate viewpoints: from behind (x is forward), from the sides, and from above.
+_TURNS_RAD: Final = np.radians(np.arange(-75.0, 76.0, 15.0))
+_ABOVE_RAD: Final = np.radians((25.0, 35.0, 50.0))
+# Tangents across and up: plotly's 45 degrees, with a margin.
+_HALF_VIEW: Final = np.array([0.62, 0.36])
+_CELLS: Final = np.array([48, 28])  # of the view, to count how much of it is filled
+_TRIED_POINTS: Final = 4000
+_CENTRED: Final = 4  # rounds of moving the look-at point to the middle of what is seen
+_FARTHEST_EYE: Final = 2.2  # in units of plotly: a cube of edge 2 then fills most of the view
+# Nearer than the centre, as near objects fill more of the view.
+_LOOK_AT: Final = np.full(3, -0.1)
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The content of a 3-D view, all in one frame.
+
+    Attributes:
+        T_view_frame: float64 (4, 4), rotates that frame to x forward and z up.
+        cloud: Points, or None.
+        mesh: A surface, or None.
+        paths: Named camera paths, float64 (N, 3).
+        eye_m: Initial viewpoint, view axes; None = above, from where the content fills the view.
+    """
+
+    T_view_frame: Float64
+    cloud: PointCloud | None = None
+    mesh: TriangleMesh | None = None
+    paths: Sequence[tuple[str, Float64]] = ()
+    eye_m: tuple[float, float, float] | None = None
+
+
+def plot_scene(
+    scene: Scene, max_points: int = MAX_POINTS, max_faces: int = MAX_FACES
+) -> Json | None:
+    """The ``data`` and ``layout`` that plotly.js draws, as plain JSON values.
+
+    ``layout.meta`` lists the colourings of the cloud, the first trace: a ``label``, and the
+    ``marker`` that it gets when that one is chosen.
+
+    Args:
+        scene: What to draw. The mesh is initially hidden if there is also a cloud.
+        max_points: The cloud is thinned evenly to at most this number.
+        max_faces: The mesh is simplified to about this number of triangles.
+
+    Returns:
+        The plot; None if there is neither a point nor a triangle.
+    """
+    T = scene.T_view_frame
+    cloud = None if scene.cloud is None else _without_outliers(scene.cloud)
+    figure = go.Figure(layout=_LAYOUT)
+    if cloud is not None and len(cloud):
+        thinned = thin_cloud(cloud, max_points)
+        colourings = _colourings(thinned, apply(T, thinned.xyz))
+        figure.add_trace(_cloud_trace(thinned, len(cloud), T, colourings[0]["marker"]))
+        figure.layout.meta = colourings
+    if scene.mesh is not None and len(scene.mesh.faces):
+        hidden = bool(figure.data)
+        figure.add_trace(_mesh_trace(thin_mesh(scene.mesh, max_faces), T, hidden=hidden))
+    if not figure.data:
+        return None
+    for number, (name, path) in enumerate(scene.paths):
+        figure.add_trace(_path_trace(name, path, T, _PATH_COLOURS[number % len(_PATH_COLOURS)]))
+    _set_view(figure, scene, _visible_points(cloud, scene))
+    plot: Json = json.loads(figure.to_json())
+    return plot
+
+
+def quantise_colours(rgb: UInt8) -> tuple[UInt8, UInt8]:
+    """Reduce colours uint8 (N, 3) to a palette.
+
+    Returns:
+        The palette, uint8 (P, 3) with 1 <= P <= 256, and uint8 (N,) indices into it.
+    """
+    if not len(rgb):
+        return np.zeros((1, 3), dtype=np.uint8), np.zeros(0, dtype=np.uint8)
+    image = Image.fromarray(rgb[None]).quantize(256, Image.Quantize.MEDIANCUT)
+    palette = np.array(image.getpalette(), dtype=np.uint8).reshape(-1, 3)
+    return palette, np.asarray(image)[0]
+
+
+def _cloud_trace(thinned: PointCloud, points: int, T: Float64, marker: Json) -> go.Scatter3d:
+    return go.Scatter3d(
+        mode="markers",
+        name=f"cloud ({len(thinned):,} of {points:,} points)",
+        hoverinfo="skip",
+        marker={"size": 1.6, "showscale": False, **marker},
+        **_xyz(apply(T, thinned.xyz)),
+    )
+
+
+def _mesh_trace(mesh: TriangleMesh, T: Float64, *, hidden: bool) -> go.Mesh3d:
+    colouring: Json = {"color": "#b8c4ce"}
+    if mesh.rgb is not None:
+        # One colour per face, as palette indices cannot be interpolated.
+        of_faces = np.rint(mesh.rgb[mesh.faces].mean(axis=1)).astype(np.uint8)
+        colouring = _palette_scale(of_faces)
+        colouring |= {"intensity": colouring.pop("color"), "intensitymode": "cell"}
+    return go.Mesh3d(
+        name=f"mesh ({len(mesh.faces):,} triangles)",
+        hoverinfo="skip",
+        showlegend=True,
+        showscale=False,
+        visible="legendonly" if hidden else True,
+        lighting={"ambient": 0.65, "diffuse": 0.5, "specular": 0.05},
+        **_xyz(apply(T, mesh.vertices)),
+        **dict(zip("ijk", mesh.faces.T, strict=True)),
+        **colouring,
+    )
+
+
+def _path_trace(name: str, path: Float64, T: Float64, colour: str) -> go.Scatter3d:
+    return go.Scatter3d(
+        mode="lines",
+        name=name,
+        line={"color": colour, "width": 6},
+        hovertemplate="frame %{pointNumber}<br>x %{x:.2f} y %{y:.2f} z %{z:.2f} m",
+        **_xyz(apply(T, path)),
+    )
+
+
+def _xyz(points: NDArray[Any]) -> Json:
+    return dict(zip("xyz", points.astype(np.float32).T, strict=True))
+
+
+def _colourings(cloud: PointCloud, xyz: Float32) -> list[Json]:
+    """By the image if the points have colours, and by height."""
+    low, high = value_range(xyz[:, 2])
+    height = np.clip((xyz[:, 2] - low) / (high - low) * 255.0, 0, 255).astype(np.uint8)
+    scale = {"color": height, "colorscale": "Turbo", "cmin": 0, "cmax": 255}
+    by_height = [{"label": "height", "marker": scale}]
+    if cloud.rgb is None:
+        return by_height
+    return [{"label": "picture", "marker": _palette_scale(cloud.rgb)}, *by_height]
+
+
+def _palette_scale(rgb: UInt8) -> Json:
+    """A scale with one colour per palette entry, and the index of each point in it."""
+    palette, index = quantise_colours(rgb)
+    colours = palette if len(palette) > 1 else np.repeat(palette, 2, axis=0)
+    last = len(colours) - 1
+    scale = [[n / last, f"rgb({r},{g},{b})"] for n, (r, g, b) in enumerate(colours.tolist())]
+    return {"color": index, "colorscale": scale, "cmin": 0, "cmax": last}
+
+
+def _without_outliers(cloud: PointCloud) -> PointCloud:
+    """Drop the few points far from all others, which would shrink the rest."""
+    if not len(cloud):
+        return cloud
+    low, high = np.quantile(cloud.xyz, (_OUTLIER_SHARE, 1.0 - _OUTLIER_SHARE), axis=0)
+    room = 0.1 * (high - low)
+    inside = ((cloud.xyz >= low - room) & (cloud.xyz <= high + room)).all(axis=1)
+    return cloud.select(inside)
+
+
+def _visible_points(cloud: PointCloud | None, scene: Scene) -> Float64:
+    """float64 (N, 3): the initially visible points, view axes."""
+    parts = [np.zeros((0, 3)), *(path for _, path in scene.paths)]
+    if cloud is not None and len(cloud):
+        parts.append(cloud.xyz.astype(np.float64))
+    elif scene.mesh is not None:
+        parts.append(scene.mesh.vertices.astype(np.float64))
+    return np.asarray(apply(scene.T_view_frame, np.concatenate(parts)))
+
+
+def _set_view(figure: go.Figure, scene: Scene, seen: Float64) -> None:
+    """Set axes in true proportion, and the camera."""
+    box = _bounding_box(seen)
+    # Units of plotly.js: the longest side of the box gets 2 of them.
+    unit = 2.0 / float(np.ptp(box, axis=0).max())
+    if scene.eye_m is None:
+        eye, look_at = _whole_view((seen - box.mean(axis=0)) * unit)
+    else:
+        eye, look_at = (np.asarray(scene.eye_m) - box.mean(axis=0)) * unit, _LOOK_AT
+        # Seen from the position of a long lens, everything would be small in this wider view.
+        eye *= min(1.0, _FARTHEST_EYE / max(float(np.linalg.norm(eye)), 1e-9))
+    figure.update_layout(
+        scene_aspectratio=_named(unit * np.ptp(box, axis=0)),
+        scene_camera={"eye": _named(eye), "center": _named(look_at)},
+    )
+    for n, (axis, title) in enumerate(_TITLES.items()):
+        axes = {"title_text": title, "range": box[:, n].tolist(), **_AXIS}
+        figure.layout.scene[f"{axis}axis"].update(axes)
+
+
+def _named(values: Float64) -> dict[str, float]:
+    return dict(zip("xyz", values.tolist(), strict=True))
+
+
+def _bounding_box(seen: Float64) -> Float64:
+    """float64 (2, 3): bounds of points, with a small margin."""
+    if not len(seen):
+        return np.array([[-1.0] * 3, [1.0] * 3])
+    middle, half = (seen.max(axis=0) + seen.min(axis=0)) / 2, np.ptp(seen, axis=0) / 2
+    half = np.maximum(half, max(float(half.max()) * 0.02, 0.01))  # nothing is entirely flat
+    return np.stack([middle - 1.02 * half, middle + 1.02 * half])
+
+
+def _whole_view(seen: Float64) -> tuple[Float64, Float64]:
+    """The viewpoint that sees all points, and in which they fill most of the view.
+
+    Args:
+        seen: float64 (N, 3), in units of plotly relative to the centre of the box.
+
+    Returns:
+        float64 (3,) twice: the viewpoint, and the point that it looks at.
+    """
+    points = seen[:: max(1, len(seen) // _TRIED_POINTS)] if len(seen) else np.zeros((1, 3))
+    tried = [_view_from(points, turn, above) for turn in _TURNS_RAD for above in _ABOVE_RAD]
+    _, eye, look_at = max(tried, key=lambda view: view[0])
+    return eye, look_at
+
+
+def _view_from(points: Float64, turn_rad: float, above_rad: float) -> tuple[int, Float64, Float64]:
+    """The nearest view of all points from one direction: cells filled, viewpoint, look-at point."""
+    level = -np.array([np.cos(turn_rad), np.sin(turn_rad), 0.0])
+    towards = np.cos(above_rad) * level + [0.0, 0.0, np.sin(above_rad)]
+    across = np.array([-level[1], level[0], 0.0])
+    axes = np.stack([across, np.cross(towards, across)])
+    look_at, place = np.zeros(3), np.zeros((1, 2))
+    away = 0.0
+    for _ in range(_CENTRED):
+        flat, near = (points - look_at) @ axes.T, (points - look_at) @ towards
+        # A point at distance z before the eye is in view up to z times the tangent of half of it.
+        away = max(float((np.abs(flat) / _HALF_VIEW + near[:, None]).max()), 0.1)
+        place = flat / (away - near)[:, None]
+        look_at = look_at + away * (place.max(axis=0) + place.min(axis=0)) / 2 @ axes
+    cells = np.floor((place / _HALF_VIEW + 1) / 2 * _CELLS)
+    # Not to be moved after the last measurement of what is in view.
+    centre = look_at - away * (place.max(axis=0) + place.min(axis=0)) / 2 @ axes
+    return len(np.unique(cells, axis=0)), centre + away * towards, centre

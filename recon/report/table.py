@@ -1,0 +1,103 @@
+"""A table, and its text for terminals, Markdown, LaTeX and CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+Row = Sequence[str]
+
+NOT_KNOWN: Final = "–"
+"""The text of a figure that is not known."""
+
+_LATEX: Final = str.maketrans({
+    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
+    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--",
+})  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table.
+
+    Attributes:
+        title: What it shows.
+        head: Titles of the columns.
+        rows: The cells; the first of a row names it.
+        best: Where the best, that is the smallest, number is looked for: in each column, in each
+            row, or nowhere.
+    """
+
+    title: str
+    head: Row
+    rows: Sequence[Row]
+    best: Literal["columns", "rows", "nowhere"] = "nowhere"
+
+    def text(self) -> str:
+        """Lay the table out in columns, for a terminal."""
+        lines = [self.head, *self.rows]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        padded = (
+            "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])])
+            for line in lines
+        )
+        return "\n".join([self.title, *(line.rstrip() for line in padded)])
+
+    def markdown(self) -> str:
+        """Write the table in Markdown."""
+        rule = ["---", *["---:"] * (len(self.head) - 1)]
+        lines = [f"| {' | '.join(row)} |" for row in (self.head, rule, *self.rows)]
+        return "\n".join([f"### {self.title}", *lines])
+
+    def latex(self) -> str:
+        """Write the table as a ``tabular`` of plain LaTeX, the best of several numbers in bold."""
+        best = self.best_cells()
+        head, *body = [
+            " & ".join(_latex_cell(cell, bold=(r, c) in best) for c, cell in enumerate(row))
+            + r" \\"
+            for r, row in enumerate([self.head, *self.rows], start=-1)
+        ]
+        begin = rf"\begin{{tabular}}{{l{'r' * (len(self.head) - 1)}}}"
+        lines = [f"% {self.title}", begin, r"\hline", head, r"\hline", *body, r"\hline"]
+        return "\n".join([*lines, r"\end{tabular}"])
+
+    def best_cells(self) -> set[tuple[int, int]]:
+        """Row and column of the smallest number, as it is shown, of each line of several."""
+        lines: dict[int, dict[tuple[int, int], float]] = {}
+        for r, row in enumerate(self.rows if self.best != "nowhere" else ()):
+            for c, cell in enumerate(row):
+                if c and cell != NOT_KNOWN:
+                    line = lines.setdefault(c if self.best == "columns" else r, {})
+                    line[r, c] = float(cell.removesuffix(" %"))
+        return {
+            place
+            for line in lines.values()
+            if len(line) > 1
+            for place, number in line.items()
+            if number == min(line.values())
+        }
+
+
+def join(texts: Iterable[str]) -> str:
+    """Join the texts of tables, with an empty line between two."""
+    return "\n\n".join(texts) + "\n"
+
+
+def csv_text(rows: Iterable[Sequence[Any]]) -> str:
+    """Write rows as CSV."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows(rows)
+    return out.getvalue()
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """Write a number with fixed digits, or `NOT_KNOWN`."""
+    return NOT_KNOWN if value is None else f"{value:.{digits}f}"
+
+
+def _latex_cell(text: str, *, bold: bool) -> str:
+    escaped = text.translate(_LATEX)
+    return rf"\textbf{{{escaped}}}" if bold else escaped

@@ -1,0 +1,45 @@
+// A click on an image shows it alone, as large as the window; another click goes back.
+const dialog = document.querySelector("dialog");
+for (const image of document.querySelectorAll(".block img")) {
+  image.addEventListener("click", () => {
+    dialog.firstElementChild.src = image.src;
+    dialog.showModal();
+  });
+}
+dialog.addEventListener("click", () => dialog.close());
+
+const PLOTLY_CONFIG = { displaylogo: false, responsive: true, scrollZoom: true };
+const views = document.querySelectorAll(".view");
+
+async function loadPlotly() {
+  const packed = document.getElementById("plotly").textContent;
+  const bytes = Uint8Array.from(atob(packed), (letter) => letter.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const code = document.createElement("script");
+  code.textContent = await new Response(stream).text();
+  document.head.append(code);
+}
+
+async function drawView(view) {
+  const element = view.querySelector(".scene");
+  const scene = JSON.parse(view.querySelector("script").textContent);
+  const buttons = view.querySelectorAll("button");
+  element.textContent = "";
+  await Plotly.newPlot(element, scene.data, scene.layout, PLOTLY_CONFIG);
+  buttons.forEach((button, chosen) => button.addEventListener("click", () => {
+    const [cloud, ...others] = scene.data;
+    const marker = { ...cloud.marker, ...scene.layout.meta[chosen].marker };
+    // What a click in the legend has hidden or shown stays so.
+    const data = [{ ...cloud, marker }, ...others].map(
+      (trace, n) => ({ ...trace, visible: element.data[n].visible })
+    );
+    Plotly.react(element, data, element.layout, PLOTLY_CONFIG);
+    buttons.forEach((other) => other.setAttribute("aria-pressed", other === button));
+  }));
+}
+
+if (views.length) {
+  loadPlotly().then(() => Promise.all([...views].map(drawView))).catch((error) => {
+    for (const view of views) view.textContent = "No view in 3-D here: " + error;
+  });
+}

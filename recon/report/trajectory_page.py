@@ -1,0 +1,27 @@
+"""The report of a trajectory compared with ground truth."""
+
+from __future__ import annotations
+
+from recon.evaluation.trajectory_run import TrajectoryRun
+from recon.io.atomic import write_bytes
+from recon.report.page import write_page
+from recon.report.paths import compared_paths_figure, errors_by_length_figure, pose_errors_figure
+from recon.run.directory import RunDirectory
+
+
+def write_trajectory_page(run: TrajectoryRun, directory: RunDirectory) -> None:
+    """Write ``report.html`` of a comparison, and its figures as PNG files.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    figures = {
+        "path": compared_paths_figure(run.comparison),
+        "error_along_path": pose_errors_figure(run.comparison),
+        "translation_by_length": errors_by_length_figure(run.comparison, rotation=False),
+        "rotation_by_length": errors_by_length_figure(run.comparison, rotation=True),
+    }
+    for name, png in figures.items():
+        write_bytes(directory.path(f"{name}.png"), png)
+    warnings = run.summary["warnings"]
+    write_page("trajectory", directory, run=run, figures=figures, warnings=warnings)

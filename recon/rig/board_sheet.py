@@ -1,0 +1,218 @@
+"""A calibration board as a printable sheet, to scale: PDF or PNG."""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch, Rectangle
+from matplotlib.path import Path as Outline
+
+from recon.core.errors import OutputError, SettingsError
+from recon.core.values.arrays import Float64
+from recon.core.values.board import CalibrationBoard
+from recon.io.atomic import write_bytes
+from recon.rig.opencv_boards import dark_rectangles
+
+_PAPERS_MM: Final = {
+    "a4": (210.0, 297.0), "a3": (297.0, 420.0), "a2": (420.0, 594.0), "a1": (594.0, 841.0),
+    "a0": (841.0, 1189.0), "letter": (215.9, 279.4), "legal": (215.9, 355.6),
+    "tabloid": (279.4, 431.8),
+}  # fmt: skip
+_AUTO: Final = ("a4", "a3", "a2", "a1", "a0")
+_CUSTOM: Final = re.compile(r"(\d+(?:\.\d*)?)\s*[x×]\s*(\d+(?:\.\d*)?)\s*mm", re.IGNORECASE)
+_KINDS: Final = (".pdf", ".png")
+_MM_PER_IN: Final = 25.4
+_POINT_MM: Final = _MM_PER_IN / 72
+# Detectors need a white border around the pattern, and printers leave a few millimetres blank.
+_MARGIN_SQUARES: Final = 0.4
+_SMALLEST_MARGIN_MM: Final = 10.0
+_RULER_MM: Final = 100.0
+_LARGEST_PNG_PX: Final = 40_000
+_FAINT: Final = "#6e7781"
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Paper, oriented so that a board fits.
+
+    Attributes:
+        name: Name of the paper size.
+        width_mm: Width.
+        height_mm: Height.
+    """
+
+    name: str
+    width_mm: float
+    height_mm: float
+
+
+def write_board(
+    path: Path, board: CalibrationBoard, paper: str | None = None, dpi: float = 300.0
+) -> dict[str, Any]:
+    """Draw a board to scale in the centre of a sheet, with a ruler to check the print.
+
+    Args:
+        path: ``.pdf`` or ``.png``.
+        board: The board, with a square size.
+        paper: Name of a paper size, or ``600x400mm``; None = the smallest A size that fits.
+        dpi: Approximate resolution of a PNG; a square has a whole number of pixels.
+
+    Returns:
+        A description of the sheet as plain values.
+
+    Raises:
+        SettingsError: The board has no size, or does not fit on the paper.
+        OutputError: The suffix is neither, or the file cannot be written.
+    """
+    kind = path.suffix.lower()
+    if kind not in _KINDS:
+        raise OutputError(
+            "a board is printed from PDF or PNG",
+            where=path,
+            got=kind or "no suffix",
+            expected=" or ".join(_KINDS),
+        )
+    if not board.metric:
+        raise SettingsError(
+            "a board to print needs the size of its squares",
+            got=str(board),
+            hint="name it, as in chess:9x6:25mm",
+        )
+    sheet = choose_sheet(board, paper)
+    exact_dpi = _whole_pixels(board, dpi)
+    if kind == ".png":
+        _check_pixels(sheet, exact_dpi)
+    write_bytes(path, _draw(board, sheet, kind[1:], exact_dpi))
+    width_mm, height_mm = (1e3 * length for length in board.size_m)
+    figures = {
+        "board": str(board),
+        "square_mm": 1e3 * board.square_m,
+        "pattern_width_mm": width_mm,
+        "pattern_height_mm": height_mm,
+        "paper": sheet.name,
+        "paper_width_mm": sheet.width_mm,
+        "paper_height_mm": sheet.height_mm,
+        "file": str(path),
+    }
+    return figures | ({"dpi": exact_dpi} if kind == ".png" else {})
+
+
+def choose_sheet(board: CalibrationBoard, paper: str | None = None) -> Sheet:
+    """The paper for a board, in portrait or landscape orientation.
+
+    Raises:
+        SettingsError: The paper is unknown, or the board does not fit.
+    """
+    names = _AUTO if paper is None else (paper.strip().lower(),)
+    sheets = [_turned(name, board) for name in names]
+    fitting = [sheet for sheet in sheets if _scale_to_fit(board, sheet) >= 1]
+    if fitting:
+        return fitting[0]
+    largest_mm = 1e3 * board.square_m * _scale_to_fit(board, sheets[-1])
+    width_mm, height_mm = (1e3 * length for length in board.size_m)
+    raise SettingsError(
+        f"the board does not fit on {sheets[-1].name}",
+        got=f"{width_mm:g} x {height_mm:g} mm without margin",
+        expected=f"squares of at most {np.floor(10 * largest_mm) / 10:g} mm there",
+        hint="a larger --paper (a3, a2, 600x400mm), or smaller squares",
+    )
+
+
+def _turned(name: str, board: CalibrationBoard) -> Sheet:
+    custom = _CUSTOM.fullmatch(name)
+    if custom is None and name not in _PAPERS_MM:
+        raise SettingsError(
+            "unknown paper", got=name, expected=", ".join(_PAPERS_MM) + " or 600x400mm"
+        )
+    sides = (float(custom[1]), float(custom[2])) if custom else _PAPERS_MM[name]
+    if min(sides) <= 2 * _SMALLEST_MARGIN_MM:
+        raise SettingsError("paper is too small for any board", got=name)
+    across = board.size_m[0] >= board.size_m[1]
+    short, long = sorted(sides)
+    return Sheet(name, long, short) if across else Sheet(name, short, long)
+
+
+def _scale_to_fit(board: CalibrationBoard, sheet: Sheet) -> float:
+    """The factor by which the squares could grow (above 1) or must shrink on a sheet."""
+    scales = []
+    sides = zip((sheet.width_mm, sheet.height_mm), board.squares, strict=True)
+    for paper_mm, squares in sides:
+        by_square = paper_mm / (squares + 2 * _MARGIN_SQUARES)
+        by_printer = (paper_mm - 2 * _SMALLEST_MARGIN_MM) / squares
+        scales.append(min(by_square, by_printer) / (1e3 * board.square_m))
+    return min(scales)
+
+
+def _whole_pixels(board: CalibrationBoard, dpi: float) -> float:
+    """The resolution nearest to ``dpi`` at which a square has a whole number of pixels."""
+    square_in = 1e3 * board.square_m / _MM_PER_IN
+    return max(round(square_in * dpi), 1) / square_in
+
+
+def _check_pixels(sheet: Sheet, dpi: float) -> None:
+    longest = round(max(sheet.width_mm, sheet.height_mm) / _MM_PER_IN * dpi)
+    if longest > _LARGEST_PNG_PX:
+        raise SettingsError(
+            "picture of the board would be too large",
+            got=f"{longest} px",
+            expected=f"at most {_LARGEST_PNG_PX} px",
+            hint="a smaller --dpi, or PDF, which has none",
+        )
+
+
+def _draw(board: CalibrationBoard, sheet: Sheet, kind: str, dpi: float) -> bytes:
+    figure = Figure((sheet.width_mm / _MM_PER_IN, sheet.height_mm / _MM_PER_IN), facecolor="white")
+    axes = _page(figure, sheet)
+    width_mm, height_mm = (1e3 * length for length in board.size_m)
+    left_mm, top_mm = (sheet.width_mm - width_mm) / 2, (sheet.height_mm - height_mm) / 2
+    if kind == "png":  # align squares with pixels
+        pixel_mm = _MM_PER_IN / dpi
+        left_mm, top_mm = (round(mm / pixel_mm) * pixel_mm for mm in (left_mm, top_mm))
+    # The first inner corner is one square inside the corner of the pattern.
+    first_mm = np.array([left_mm, top_mm]) + 1e3 * board.square_m
+    dark_mm = 1e3 * dark_rectangles(board) + np.tile(first_mm, 2)
+    axes.add_patch(PathPatch(_outline(dark_mm), facecolor="black", linewidth=0))
+    _note(axes, board, sheet, top_mm)
+    buffer = io.BytesIO()
+    # Without the date, equal boards give equal files.
+    undated = {"CreationDate": None} if kind == "pdf" else {}
+    figure.savefig(buffer, format=kind, dpi=dpi, metadata=undated)
+    return buffer.getvalue()
+
+
+def _page(figure: Figure, sheet: Sheet) -> Axes:
+    """Axes over the whole sheet, in millimetres from its upper left corner."""
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_axis_off()
+    axes.set_xlim(0, sheet.width_mm)
+    axes.set_ylim(sheet.height_mm, 0)
+    return axes
+
+
+def _outline(boxes_mm: Float64) -> Outline:
+    """All boxes (N, 4) as one path, so that neighbours are filled without a seam."""
+    x0, y0, x1, y1 = boxes_mm.T
+    corners = np.stack([x0, y0, x1, y0, x1, y1, x0, y1, x0, y0], axis=1).reshape(-1, 2)
+    one = [Outline.MOVETO, Outline.LINETO, Outline.LINETO, Outline.LINETO, Outline.CLOSEPOLY]
+    return Outline(corners, one * len(boxes_mm))
+
+
+def _note(axes: Axes, board: CalibrationBoard, sheet: Sheet, margin_mm: float) -> None:
+    """A description of the board, and a ruler to check the scale of a print."""
+    size_mm = min(2.5, 0.2 * margin_mm)
+    y = sheet.height_mm - max(0.4 * margin_mm, 5.0)
+    ruler_mm = min(_RULER_MM, 10 * (sheet.width_mm // 25))
+    left = sheet.width_mm - ruler_mm - 2 * _SMALLEST_MARGIN_MM / 2
+    axes.add_patch(Rectangle((left, y), ruler_mm, 0.3, facecolor=_FAINT, linewidth=0))
+    for end in (left, left + ruler_mm - 0.3):
+        axes.add_patch(Rectangle((end, y - 1.0), 0.3, 2.3, facecolor=_FAINT, linewidth=0))
+    font: dict[str, Any] = {"fontsize": size_mm / _POINT_MM, "color": _FAINT, "va": "bottom"}
+    axes.text(_SMALLEST_MARGIN_MM, y, f"{board}   print at 100 %", **font)
+    axes.text(left + ruler_mm / 2, y - 0.5, f"{ruler_mm:g} mm", ha="center", **font)

@@ -1,0 +1,165 @@
+from __future__ import annotations
+
+import base64
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon.core.values import PointCloud, TriangleMesh
+from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
+
+
+def unpack(packed: dict[str, str]) -> np.ndarray[Any, Any]:
+    return np.frombuffer(base64.b64decode(packed["bdata"]), dtype=packed["dtype"])
+
+
+def plot(scene: Scene, **limits: int) -> Json:
+    """The plot of a scene that is not empty."""
+    found = plot_scene(scene, **limits)
+    assert found is not None
+    return found
+
+
+def test_points_are_turned_upright() -> None:
+    """Camera axes: forward is z and up is -y; in the view forward is x and up is z."""
+    ahead_and_up = PointCloud(np.array([[0, -2, 5], [0, -2, 5]], dtype=np.float32))
+    trace = plot(Scene(T_UPRIGHT_CAMERA, ahead_and_up))["data"][0]
+    assert [unpack(trace[axis])[0] for axis in "xyz"] == [5.0, 0.0, 2.0]
+
+
+def test_colours_of_points_come_back_from_their_scale() -> None:
+    rgb = np.array([[10, 20, 30], [200, 100, 0]], dtype=np.uint8)
+    cloud = PointCloud(np.array([[0, 0, 0], [1, 1, 1]], dtype=np.float32), rgb=rgb)
+    marker = plot(Scene(np.eye(4), cloud))["data"][0]["marker"]
+    named = [marker["colorscale"][place][1] for place in unpack(marker["color"])]
+    assert named == ["rgb(10,20,30)", "rgb(200,100,0)"]
+    assert marker["cmax"] == len(marker["colorscale"]) - 1
+    assert marker["colorscale"][0][0] == 0.0
+    assert marker["colorscale"][-1][0] == 1.0
+
+
+def test_coloured_cloud_can_also_be_shown_by_height(cloud: PointCloud) -> None:
+    both = plot(Scene(np.eye(4), cloud))
+    colourings = both["layout"]["meta"]
+    assert [colouring["label"] for colouring in colourings] == ["picture", "height"]
+    lengths = {len(unpack(colouring["marker"]["color"])) for colouring in colourings}
+    assert lengths == {len(unpack(both["data"][0]["x"]))}
+    plain = PointCloud(cloud.xyz, frame="map")
+    assert len(plot(Scene(np.eye(4), plain))["layout"]["meta"]) == 1
+
+
+def test_coordinates_are_packed_as_the_types_that_take_least(
+    cloud: PointCloud, mesh: TriangleMesh
+) -> None:
+    points, faces = plot(Scene(np.eye(4), cloud, mesh))["data"]
+    assert {points[axis]["dtype"] for axis in "xyz"} == {"f4"}
+    assert points["marker"]["color"]["dtype"] == "u1"
+    assert {faces[corner]["dtype"] for corner in "ijk"} == {"i4"}
+    corners = np.stack([unpack(faces[corner]) for corner in "ijk"], axis=1)
+    np.testing.assert_array_equal(corners, mesh.faces)
+
+
+def test_mesh_is_hidden_at_first_beside_a_cloud_and_shown_alone(
+    cloud: PointCloud, mesh: TriangleMesh
+) -> None:
+    both = plot(Scene(np.eye(4), cloud, mesh))["data"]
+    alone = plot(Scene(np.eye(4), None, mesh))["data"]
+    assert [trace["type"] for trace in both] == ["scatter3d", "mesh3d"]
+    assert both[1]["visible"] == "legendonly"
+    assert alone[0]["visible"] is True
+
+
+def test_mesh_without_colours_is_drawn(mesh: TriangleMesh) -> None:
+    grey = TriangleMesh(mesh.vertices, mesh.faces)
+    trace = plot(Scene(np.eye(4), None, grey))["data"][0]
+    assert trace["color"].startswith("#")
+
+
+def test_axes_have_true_proportion_and_the_longest_is_two(cloud: PointCloud) -> None:
+    flat = PointCloud(cloud.xyz * np.array([1.0, 0.5, 0.1], dtype=np.float32))
+    layout = plot(Scene(np.eye(4), flat))["layout"]["scene"]
+    sides = {axis: np.ptp(layout[f"{axis}axis"]["range"]) for axis in "xyz"}
+    aspect = layout["aspectratio"]
+    assert max(aspect.values()) == pytest.approx(2.0)
+    assert aspect["y"] / aspect["x"] == pytest.approx(sides["y"] / sides["x"])
+
+
+def test_eye_in_metres_is_where_the_layout_looks_from() -> None:
+    corners = np.array([[0, 0, 0], [10, 10, 10]], dtype=np.float32)
+    scene = Scene(np.eye(4), PointCloud(corners), eye_m=(-5.0, 5.0, 5.0))
+    eye = plot(scene)["layout"]["scene"]["camera"]["eye"]
+    # 10 m before the middle of a box of 10.2 m, whose side is 2 units.
+    assert eye["x"] == pytest.approx(-2.0 / 1.02)
+    assert eye["y"] == pytest.approx(0.0)
+
+
+def test_what_is_far_off_is_looked_at_from_nearer_in_the_same_direction() -> None:
+    corners = np.array([[0, 0, 0], [1, 1, 1]], dtype=np.float32)
+    scene = Scene(np.eye(4), PointCloud(corners), eye_m=(-9.5, 0.5, 10.5))
+    eye = plot(scene)["layout"]["scene"]["camera"]["eye"]
+    assert eye["x"] == pytest.approx(-eye["z"])
+    assert np.hypot(eye["x"], eye["z"]) == pytest.approx(2.2)
+
+
+def test_a_point_far_from_all_others_does_not_make_the_rest_small(cloud: PointCloud) -> None:
+    far = np.concatenate([cloud.xyz, [[1e4, 0, 0]]]).astype(np.float32)
+    layout = plot(Scene(np.eye(4), PointCloud(far)))["layout"]["scene"]
+    assert np.ptp(layout["xaxis"]["range"]) < 20.0
+
+
+@pytest.mark.parametrize("paths", [(), (("path", np.zeros((3, 3))),), (("p", np.zeros((0, 3))),)])
+def test_scene_of_one_place_is_valid_json(paths: Any) -> None:
+    one = PointCloud(np.zeros((1, 3), dtype=np.float32))
+    json.dumps(plot(Scene(np.eye(4), one, None, paths)), allow_nan=False)
+
+
+def test_scene_of_nothing_is_not_drawn() -> None:
+    empty = PointCloud(np.zeros((0, 3), dtype=np.float32))
+    assert plot_scene(Scene(np.eye(4), empty, None, (("path", np.zeros((3, 3))),))) is None
+
+
+def test_large_cloud_is_thinned_and_takes_few_bytes_per_point() -> None:
+    generator = np.random.default_rng(0)
+    rgb = generator.integers(0, 256, (50_000, 3), dtype=np.uint8)
+    cloud = PointCloud(generator.uniform(0, 50, (50_000, 3)).astype(np.float32), rgb=rgb)
+    scene = plot(Scene(np.eye(4), cloud), max_points=20_000)
+    points = len(unpack(scene["data"][0]["x"]))
+    assert 10_000 < points <= 20_000
+    # 12 bytes of position and three times 1 of colour, times 4/3 for base64; the scales are small.
+    assert len(json.dumps(scene)) < 20 * points + 50_000
+
+
+def drive(angle_deg: float, length_m: float = 300.0) -> PointCloud:
+    """A straight street, 16 m wide, between fronts of 7 m."""
+    rng, turn = np.random.default_rng(0), np.radians(angle_deg)
+    along, aside = rng.uniform(0, length_m, 4000), rng.choice([-8.0, 8.0], 4000)
+    x, y = np.cos(turn) * along - np.sin(turn) * aside, np.sin(turn) * along + np.cos(turn) * aside
+    return PointCloud(np.stack([x, y, rng.uniform(0, 7, 4000)], axis=1).astype(np.float32))
+
+
+def seen_places(cloud: PointCloud) -> np.ndarray:
+    """Where the points are in the first view: -1 to 1 from border to border, across and up."""
+    scene = plot(Scene(np.eye(4), cloud))["layout"]["scene"]
+    box = np.array([scene[f"{axis}axis"]["range"] for axis in "xyz"])
+    unit = scene["aspectratio"]["x"] / np.ptp(box[0])
+    eye, centre = (np.array(list(scene["camera"][key].values())) for key in ("eye", "center"))
+    ahead = (centre - eye) / np.linalg.norm(centre - eye)
+    right = np.cross(ahead, [0, 0, 1]) / np.linalg.norm(np.cross(ahead, [0, 0, 1]))
+    rays = (cloud.xyz - box.mean(axis=1)) * unit - eye
+    # plotly's field of view: 45 degrees from bottom to top, here 1.7 times as much across.
+    half = np.tan(np.radians(22.5)) * np.array([1.7, 1.0])
+    places = np.stack([rays @ right, rays @ np.cross(right, ahead)], axis=1)
+    return places / (rays @ ahead)[:, None] / half
+
+
+@pytest.mark.parametrize("angle_deg", [0, 45, 90, -60, 135])
+def test_a_long_drive_fills_the_first_view_whatever_its_direction(angle_deg: float) -> None:
+    places = seen_places(drive(angle_deg))
+    assert np.abs(places).max() <= 1
+    # From one border almost to the other, in one direction at least, and not as a thin strip:
+    # seen from its side it would cover 2 % of the view.
+    assert np.ptp(places, axis=0).max() > 1.6
+    cells = np.unique(np.floor((places + 1) * 12), axis=0)
+    assert len(cells) > 0.1 * 24**2
