@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.geometry.se3 import apply, as_transform, invert
+from recon.core.least_squares import Problem, minimise
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, frozen_array
 from recon.odometry.kernels import bundle
@@ -133,28 +134,23 @@ def adjust(window: TrackWindow, camera: RectifiedCamera) -> TrackWindow:
         return window
     usable = window.seen.sum(axis=0) >= 2
     part = TrackWindow(window.T_world_camera, window.uvd[:, usable], window.xyz_world[usable])
-    part = _levenberg_marquardt(part, camera)
+    model = _model(camera)
+    part = minimise(
+        Problem(
+            cost=lambda window: _cost(window, model),
+            linearise=lambda window: _linearise(window, model),
+            step=lambda window, normal, damping: _moved(
+                window, *bundle.solve_step(normal, damping)
+            ),
+        ),
+        part,
+        rounds=_ITERATIONS,
+        damping=1e-4,
+        min_gain=_MIN_GAIN,
+    )
     xyz_world = window.xyz_world.copy()
     xyz_world[usable] = part.xyz_world
     return TrackWindow(part.T_world_camera, window.uvd, xyz_world)
-
-
-def _levenberg_marquardt(window: TrackWindow, camera: RectifiedCamera) -> TrackWindow:
-    model = _model(camera)
-    damping = 1e-4
-    cost, normal = _cost(window, model), _linearise(window, model)
-    for _ in range(_ITERATIONS):
-        proposal = _moved(window, *bundle.solve_step(normal, damping))
-        proposed = _cost(proposal, model)
-        if not proposed < cost:
-            damping *= 10.0
-            continue
-        gain = (cost - proposed) / cost
-        window, cost, damping = proposal, proposed, 0.1 * damping
-        if gain < _MIN_GAIN:
-            break
-        normal = _linearise(window, model)
-    return window
 
 
 def pose_information(window: TrackWindow, camera: RectifiedCamera) -> Float64:

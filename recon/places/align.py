@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.geometry.projection import project
-from recon.core.geometry.se3 import apply, as_transform, invert, make_transform, step_jacobian
+from recon.core.geometry.se3 import apply, as_transform, invert, step_jacobian
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
+from recon.odometry.pnp import find_consensus, fit_pose
 
 _ITERATIONS: Final = 500
 """RANSAC's samples at most."""
@@ -68,32 +68,19 @@ class Alignment:
 
 
 def locate(points: Float64, uv: Float64, camera: RectifiedCamera) -> Float64 | None:
-    """Pose of a camera that sees known points, ``T_points_camera``; None = too few agree.
-
-    Ref:
-        Fischler and Bolles, "Random sample consensus", CACM 1981.
-    """
-    if len(points) < MIN_INLIERS:
-        return None
-    found, rotation, translation, inliers = cv2.solvePnPRansac(
+    """Return the pose of a camera that sees known points, ``T_points_camera``; None = no pose."""
+    consensus = find_consensus(
         points,
         uv,
-        camera.matrix,
-        None,
-        iterationsCount=_ITERATIONS,
-        reprojectionError=_REPROJECTION_PX,
-        confidence=0.999,
-        flags=cv2.SOLVEPNP_AP3P,
+        camera,
+        limit_px=_REPROJECTION_PX,
+        iterations=_ITERATIONS,
+        min_inliers=MIN_INLIERS,
     )
-    if not found or inliers is None or len(inliers) < MIN_INLIERS:
+    if consensus is None:
         return None
-    among = inliers.reshape(-1)
-    # RANSAC's own pose is a closed-form fit that one far point can throw off: refit to the set.
-    rotation, translation = cv2.solvePnPRefineLM(
-        points[among], uv[among], camera.matrix, None, *_start(points, uv, among, camera)
-    )
-    T = make_transform(cv2.Rodrigues(rotation)[0], translation)
-    return invert(T) if np.isfinite(T).all() else None
+    T = fit_pose(points[consensus.agree], uv[consensus.agree], camera)
+    return T if np.isfinite(T).all() else None
 
 
 def refine(first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCamera) -> Alignment:
@@ -127,16 +114,6 @@ def agreement(first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedC
         # A point behind the camera has a NaN error, which compares as False.
         agree &= np.hypot(u - seen[:, 0], v - seen[:, 1]) <= _REPROJECTION_PX
     return agree
-
-
-def _start(
-    points: Float64, uv: Float64, among: NDArray[np.int32], camera: RectifiedCamera
-) -> tuple[Float64, Float64]:
-    """An initial pose from the inliers."""
-    _, rotation, translation = cv2.solvePnP(
-        points[among], uv[among], camera.matrix, None, flags=cv2.SOLVEPNP_SQPNP
-    )
-    return rotation, translation
 
 
 def _normal_equations(

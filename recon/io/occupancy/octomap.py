@@ -12,6 +12,7 @@ from typing import IO
 import numpy as np
 
 from recon.core.errors import MappingError
+from recon.core.kernels.voxels import pack_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Int32
 from recon.io.atomic import atomic_path
@@ -104,17 +105,15 @@ def _nodes(voxels: OccupancyVoxels, depth: int, pieces: IO[bytes]) -> list[_Node
     _check(voxels)
     if len(voxels) == 0:
         return []
-    x, y, z = ((voxels.keys.astype(np.int64) + KEY_LIMIT) >> depth).T
-    # One combined key, as numpy sorts rows slowly.
-    number = (x << 32) | (y << 16) | z
+    cubes = (voxels.keys.astype(np.int64) + KEY_LIMIT) >> depth
+    number = pack_keys(cubes)  # numpy sorts rows slowly
     order = np.argsort(number, kind="stable")
-    begins = np.flatnonzero(np.diff(number[order], prepend=-1))
+    begins = np.flatnonzero(np.diff(number[order], prepend=number[order[:1]] - 1))
     nodes = []
     for inside in np.split(order, begins[1:]):
         branch = encode_branch(voxels.keys[inside], voxels.log_odds[inside], depth)
-        first = int(inside[0])
-        cube = (int(x[first]), int(y[first]), int(z[first]))
-        node = _Node(cube, replace(branch, full=b"", binary=b""))
+        x, y, z = cubes[inside[0]].tolist()
+        node = _Node((x, y, z), replace(branch, full=b"", binary=b""))
         node.full, node.binary = _append(pieces, branch.full), _append(pieces, branch.binary)
         nodes.append(node)
     return nodes

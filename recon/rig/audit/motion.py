@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import cv2
@@ -9,9 +10,11 @@ import numpy as np
 
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
+from recon.odometry.pnp import find_consensus, fit_pose
 
 _MIN_POINTS: Final = 20
 _MIN_DISPARITY_PX: Final = 2.0
+_AGREE_PX: Final = 2.0
 # Features must move at least this many rows per frame to reveal a time skew.
 _MIN_FLOW_PX: Final = 1.0
 
@@ -57,13 +60,18 @@ def measure_speed(
     depth_m = camera.focal_px * camera.baseline_m / disparity[near].astype(np.float64)
     rays = np.linalg.inv(camera.matrix) @ np.vstack([left_uv[near].T, np.ones(near.sum())])
     xyz = (rays * depth_m).T
-    cv2.setRNGSeed(0)
-    done, _, moved_m, agreeing = cv2.solvePnPRansac(
-        xyz, later_uv[near].astype(np.float64), camera.matrix, None, reprojectionError=2.0
+    found = find_consensus(
+        xyz,
+        later_uv[near].astype(np.float64),
+        camera,
+        limit_px=_AGREE_PX,
+        iterations=100,
+        min_inliers=max(_MIN_POINTS, math.ceil(0.4 * near.sum())),
     )
-    if not done or agreeing is None or len(agreeing) < max(_MIN_POINTS, 0.4 * near.sum()):
+    if found is None:
         return None
-    return float(np.linalg.norm(moved_m))
+    T = fit_pose(xyz[found.agree], later_uv[near][found.agree].astype(np.float64), camera)
+    return float(np.linalg.norm(T[:3, 3]))
 
 
 def measure_time_skew(row_error_px: Float64, row_flow_px: Float64) -> tuple[float, float] | None:

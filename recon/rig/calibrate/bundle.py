@@ -18,13 +18,12 @@ import numpy as np
 
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import apply, exp_so3, make_transform, orthonormalise
+from recon.core.least_squares import Problem, minimise
 from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64, Int32
 from recon.stereo.rectify.lens import project, project_with_jacobian
 
 _ROUNDS: Final = 100
-_FIRST_DAMPING: Final = 1e-3
-_LARGEST_DAMPING: Final = 1e12
 # Relative decrease of the cost at which the solver has converged.
 _STILL: Final = 1e-12
 # The eight coefficients of a rational lens are not all observable: each has a zero-mean prior of
@@ -107,14 +106,13 @@ class Information:
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Normal equations of one view: shared (A, a), mixed (B), board pose (C, c); and its cost."""
+    """Normal equations of one view: shared (A, a), mixed (B), board pose (C, c)."""
 
     A: Float64
     B: Float64
     C: Float64
     a: Float64
     c: Float64
-    cost: float
 
 
 def solve(
@@ -131,26 +129,19 @@ def solve(
         CalibrationError: The initial guess has points behind a camera.
     """
     w = np.ones(len(views)) if weights is None else weights
-    state, damping = start, _FIRST_DAMPING
-    blocks = _linearise(views, state)
-    cost = _cost(blocks, state, w)
-    if not np.isfinite(cost):
+    if not np.isfinite(_cost(views, start, w)):
         raise CalibrationError("no initial guess puts the board in front of the cameras")
-    for _ in range(_ROUNDS):
-        trial = _step(blocks, state, w, damping)
-        trial_blocks = _linearise(views, trial) if trial else []
-        trial_cost = _cost(trial_blocks, trial, w) if trial else np.inf
-        if trial is not None and trial_cost <= cost:  # False for NaN: a point behind a camera
-            gain = cost - trial_cost
-            state, blocks, cost = trial, trial_blocks, trial_cost
-            damping = max(damping / 10, 1e-12)
-            if gain <= _STILL * cost:
-                break
-        else:
-            damping *= 10
-            if damping > _LARGEST_DAMPING:
-                break
-    return state, _information(blocks, state, w)
+    state = minimise(
+        Problem(
+            cost=lambda state: _cost(views, state, w),
+            linearise=lambda state: _linearise(views, state),
+            step=lambda state, blocks, damping: _step(blocks, state, w, damping),
+        ),
+        start,
+        rounds=_ROUNDS,
+        min_gain=_STILL,
+    )
+    return state, _information(_linearise(views, state), state, w)
 
 
 def shared_size(state: RigState) -> int:
@@ -212,7 +203,7 @@ def _view_blocks(view: View, state: RigState, number: int) -> _Blocks:
         errors.append((seen.pixels - pixels).ravel())
         at += _camera_size(camera)
     S, P, r = np.concatenate(J_shared), np.concatenate(J_own), np.concatenate(errors)
-    return _Blocks(S.T @ S, S.T @ P, P.T @ P, S.T @ r, P.T @ r, float(r @ r))
+    return _Blocks(S.T @ S, S.T @ P, P.T @ P, S.T @ r, P.T @ r)
 
 
 def _by_motion(xyz: Float64) -> Float64:
@@ -242,10 +233,13 @@ def _shared_numbers(state: RigState) -> Float64:
     return np.concatenate([*numbers, np.zeros(_POSE * (len(state.cameras) - 1))])
 
 
-def _cost(blocks: Sequence[_Blocks], state: RigState, weights: Float64) -> float:
+def _cost(views: Sequence[View], state: RigState, weights: Float64) -> float:
+    """Weighted sum of squared pixel errors and of the prior; NaN for a point behind a camera."""
     numbers = _shared_numbers(state)
-    fits = sum(w * block.cost for w, block in zip(weights, blocks, strict=True))
-    return float(fits + numbers @ _prior(state) @ numbers)
+    total = float(numbers @ _prior(state) @ numbers)
+    for number, (view, w) in enumerate(zip(views, weights, strict=True)):
+        total += w * sum(float((error**2).sum()) for error in state.residuals(view, number))
+    return total
 
 
 def _step(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 import cv2
 import numpy as np
 
 from recon.core.geometry.se3 import exp_so3
+from recon.core.least_squares import Problem, minimise
 from recon.core.values.arrays import Bool, Float64
 
 _FEWEST: Final = 8
@@ -15,9 +17,13 @@ _FEWEST: Final = 8
 _DRAWS: Final = (
     (cv2.USAC_MAGSAC, 1.0), (cv2.USAC_MAGSAC, 0.5), (cv2.USAC_MAGSAC, 0.25), (cv2.RANSAC, 1.0),
 )  # fmt: skip
-_ROUNDS: Final = 60
+# Rounds of reweighting, and steps of each.
+_REWEIGHTED: Final = 30
+_ROUNDS: Final = 6
 _STEP: Final = 1e-6
+# A change of the parameters, radians, below which reweighting ends.
 _STILL: Final = 1e-8
+_LEAST_GAIN: Final = 1e-3
 # Errors below about this size, in pixels, are weighted alike.
 _SMALLEST_PX: Final = 0.1
 
@@ -105,23 +111,38 @@ def fit_fundamental(F: Float64, left_px: Float64, right_px: Float64) -> Float64:
     def apart(step: Float64) -> Float64:
         return np.asarray(line_distances(matrix(step), a, b) / N[0, 0])
 
-    step, damping = np.zeros(7), 1e-3
-    error = apart(step)
-    for _ in range(_ROUNDS):
-        weights = 1.0 / np.maximum(np.abs(error), _SMALLEST_PX + np.median(np.abs(error)))
-        J = np.stack([(apart(step + _STEP * e) - error) / _STEP for e in np.eye(7)], axis=1)
-        A = J.T @ (J * weights[:, None])
-        damped = A + damping * np.diag(np.diag(A))
-        trial = step + np.linalg.lstsq(damped, -J.T @ (weights * error), rcond=1e-12)[0]
-        trial_error = apart(trial)
-        gain = 1 - (weights @ trial_error**2) / max(weights @ error**2, 1e-300)
-        if gain > 0:  # False for NaN
-            step, error, damping = trial, trial_error, damping / 5
-            if gain < _STILL:
-                break
-        else:
-            damping *= 10
+    step = np.zeros(7)
+    for _ in range(_REWEIGHTED):
+        error = np.abs(apart(step))
+        weights = 1.0 / np.maximum(error, _SMALLEST_PX + np.median(error))
+        before, step = step, _fit_weighted(apart, step, weights)
+        if np.abs(step - before).max() < _STILL:
+            break
     return np.asarray(N.T @ matrix(step) @ N)
+
+
+def _fit_weighted(apart: Callable[[Float64], Float64], start: Float64, weights: Float64) -> Float64:
+    """Return the step (7,) of least weighted squares, from numerical derivatives."""
+
+    def linearise(step: Float64) -> tuple[Float64, Float64]:
+        error = apart(step)
+        J = np.stack([(apart(step + _STEP * e) - error) / _STEP for e in np.eye(len(step))], axis=1)
+        return J.T @ (J * weights[:, None]), J.T @ (weights * error)
+
+    def solve(step: Float64, normal: tuple[Float64, Float64], damping: float) -> Float64:
+        A, a = normal
+        return step - np.linalg.lstsq(A + damping * np.diag(np.diag(A)), a, rcond=1e-12)[0]
+
+    return minimise(
+        Problem(
+            cost=lambda step: float(weights @ apart(step) ** 2),
+            linearise=linearise,
+            step=solve,
+        ),
+        start,
+        rounds=_ROUNDS,
+        min_gain=_LEAST_GAIN,
+    )
 
 
 def epipoles(F: Float64) -> tuple[Float64, Float64]:

@@ -120,7 +120,7 @@ def save_in_turn(self, name, data):
 compiling = []
 IndexDataCacheFile._load_index, IndexDataCacheFile._save_data = load_and_meet, save_in_turn
 IndexDataCacheFile._save_index = save_index_in_turn
-from recon.core.kernels.compiled import when_compiling
+from recon.core.kernels.cache import when_compiling
 (meeting / f"{mine} is ready").touch()
 wait(f"{other} is ready", 60)
 with when_compiling(compiling.append):

@@ -1,0 +1,69 @@
+"""Levenberg-Marquardt: the loop that every non-linear least-squares fit here shares.
+
+Each fit brings its own cost, linearisation and step, which is where they differ: some eliminate
+points or board poses (Schur complement), one runs compiled.
+
+Ref: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+State = TypeVar("State")
+Linear = TypeVar("Linear")
+
+_MORE, _LESS = 10.0, 0.1
+"""Factors of the damping after a step that fails, and after one that succeeds."""
+_LEAST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e12
+
+
+@dataclass(frozen=True)
+class Problem(Generic[State, Linear]):
+    """What is fitted.
+
+    Attributes:
+        cost: Gives the cost of a state; NaN or infinite where it is impossible.
+        linearise: Gives the normal equations at a state.
+        step: Gives the state after a step with so much damping; None = impossible.
+    """
+
+    cost: Callable[[State], float]
+    linearise: Callable[[State], Linear]
+    step: Callable[[State, Linear, float], State | None]
+
+
+def minimise(
+    problem: Problem[State, Linear],
+    start: State,
+    *,
+    rounds: int,
+    min_gain: float,
+    damping: float = 1e-3,
+) -> State:
+    """Minimise a cost by damped Gauss-Newton steps, each of which must lower it.
+
+    Args:
+        problem: What is fitted.
+        start: Initial guess, of finite cost.
+        rounds: Largest number of steps tried.
+        min_gain: Relative decrease of the cost below which a step is the last.
+        damping: The first damping, relative to the diagonal of the normal equations.
+    """
+    state, lowest, linear = start, problem.cost(start), problem.linearise(start)
+    for _ in range(rounds):
+        trial = problem.step(state, linear, damping)
+        trial_cost = float("inf") if trial is None else problem.cost(trial)
+        if trial is None or not trial_cost < lowest:  # also where it is NaN
+            damping *= _MORE
+            if damping > _LARGEST_DAMPING:
+                break
+            continue
+        gain = (lowest - trial_cost) / lowest
+        state, lowest, damping = trial, trial_cost, max(damping * _LESS, _LEAST_DAMPING)
+        if gain < min_gain:
+            break
+        linear = problem.linearise(state)
+    return state
