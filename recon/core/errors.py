@@ -74,7 +74,7 @@ def _clip(text: str) -> str:
 
 
 def _visible(letter: str) -> str:
-    """A letter of a message; control characters and bytes of odd file names are escaped."""
+    """Return a letter of a message; control characters and bytes of odd file names are escaped."""
     if letter.isprintable() or letter.isspace():
         return letter
     return letter.encode("unicode_escape", "backslashreplace").decode()

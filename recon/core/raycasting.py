@@ -43,7 +43,7 @@ class RayScene:
         )
 
     def first_hit(self, origin: Float64, directions: NDArray[Any]) -> Int32:
-        """The first triangle on each ray.
+        """Return the first triangle on each ray.
 
         Args:
             origin: (3,), common origin of the rays.
@@ -57,7 +57,7 @@ class RayScene:
         return np.where(faces == _NO_HIT, -1, faces.astype(np.int64)).astype(np.int32)
 
     def distance(self, points: NDArray[Any]) -> Float32:
-        """Distance of each point (N, 3) to the nearest triangle: float32 (N,), metres."""
+        """Return distance of each point (N, 3) to the nearest triangle: float32 (N,), metres."""
         wanted = o3d.core.Tensor.from_numpy(np.array(points, dtype=np.float32))
         found = self._scene.compute_distance(wanted, nthreads=self._threads)
         return np.asarray(found.numpy(), dtype=np.float32)
@@ -65,7 +65,7 @@ class RayScene:
     def blocked(
         self, origins: NDArray[Any], reaches: NDArray[Any], near: float = 0.0, far: float = 1.0
     ) -> Bool:
-        """Whether a triangle intersects the segment from ``origin`` to ``origin + reach``.
+        """Return whether a triangle intersects the segment from ``origin`` to ``origin + reach``.
 
         Args:
             origins: (3,) or (N, 3), metres.

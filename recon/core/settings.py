@@ -62,7 +62,7 @@ class Settings(BaseModel):
 
 
 def merge(base: Mapping[str, Any], update: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested mappings merged; other values of ``update`` replace those of ``base``."""
+    """Return nested mappings merged; other values of ``update`` replace those of ``base``."""
     merged = dict(base)
     for key, value in update.items():
         below = merged.get(key)
@@ -83,17 +83,17 @@ def _complete(field: FieldInfo, value: Any) -> Any:
 
 
 def can_be_none(field: FieldInfo) -> bool:
-    """Whether None is a value of a field; its text is then ``none``, or YAML's ``null``."""
+    """Return whether None is a value of a field; its text is then ``none``, or YAML's ``null``."""
     return type(None) in alternatives(field.annotation)
 
 
 def alternatives(annotation: Any) -> tuple[Any, ...]:
-    """The types that a union allows; of any other type, itself."""
+    """Return the types that a union allows; of any other type, itself."""
     return get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
 
 
 def setting_names(settings: type[BaseModel]) -> Iterator[str]:
-    """The dotted names of all settings of a model, including nested models."""
+    """Yield the dotted names of all settings of a model, including nested models."""
     for name, field in settings.model_fields.items():
         yield name
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):

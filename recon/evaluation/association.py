@@ -45,7 +45,7 @@ def associate(
 
 
 def nearest_times(times_s: Float64, others_s: Float64) -> Int32:
-    """int32 (N,): for each time, the index of the nearest of the others (M ≥ 1, sorted)."""
+    """Return int32 (N,): for each time, the index of the nearest of the others (M ≥ 1, sorted)."""
     after = np.clip(np.searchsorted(others_s, times_s), 0, len(others_s) - 1)
     before = np.maximum(after - 1, 0)
     earlier = np.abs(times_s - others_s[before]) <= np.abs(others_s[after] - times_s)

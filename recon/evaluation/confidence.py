@@ -124,7 +124,7 @@ def measure_sparsification(
 
 
 def share_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float = 1.0) -> float:
-    """Share of the pixels, in [0, 1], whose error is within some standard deviations.
+    """Return the share of the pixels, in [0, 1], whose error is within some standard deviations.
 
     For a normal distribution, it is 0.683 within one and 0.954 within two.
 
@@ -142,21 +142,21 @@ def share_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float
 
 
 def _shared_by_equals(confidence: Float32, wrong: Float64) -> Float64:
-    """Wrong pixels in order of decreasing confidence, averaged over equal confidences."""
+    """Return wrong pixels in order of decreasing confidence, averaged over equal confidences."""
     _, group, size = np.unique(-confidence, return_inverse=True, return_counts=True)
     share = np.bincount(group, weights=wrong) / size
     return np.asarray(np.repeat(share, size), dtype=np.float64)
 
 
 def _pixels(estimate: Disparity, truth: DisparityTruth) -> tuple[Float32, Float64]:
-    """Confidence and absolute error of the pixels that have a value and a known truth."""
+    """Return confidence and absolute error of the pixels that have a value and a known truth."""
     both = _compared(estimate, truth)
     error_px = np.abs(estimate.values[both].astype(np.float64) - truth.values[both])
     return estimate.confidence[both], error_px
 
 
 def _compared(estimate: Disparity, truth: DisparityTruth) -> Bool:
-    """bool (H, W), the pixels that have a value and a known truth."""
+    """Return bool (H, W), the pixels that have a value and a known truth."""
     if estimate.values.shape != truth.values.shape:
         raise EvaluationError(
             "disparity and truth differ in size",

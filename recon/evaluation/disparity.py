@@ -105,7 +105,7 @@ def evaluate_depth(
 
 
 def values_of(estimate: Disparity | ArrayLike) -> Float32:
-    """The values of an estimate: float32 (H, W), pixels.
+    """Return the values of an estimate: float32 (H, W), pixels.
 
     Raises:
         ShapeError: It is no map of real numbers.
@@ -114,7 +114,7 @@ def values_of(estimate: Disparity | ArrayLike) -> Float32:
 
 
 def truth_of(truth: DisparityTruth | ArrayLike) -> DisparityTruth:
-    """A ground truth, made from its values if need be.
+    """Return a ground truth, made from its values if need be.
 
     Raises:
         ShapeError: It is no map of real numbers.
@@ -125,14 +125,14 @@ def truth_of(truth: DisparityTruth | ArrayLike) -> DisparityTruth:
 def _compared(
     estimate: Disparity | ArrayLike, truth: DisparityTruth | ArrayLike, *, occluded: bool
 ) -> tuple[Float64, Float64]:
-    """float64 (N,) twice, values and truth of the compared pixels."""
+    """Return float64 (N,) twice, values and truth of the compared pixels."""
     values, known = values_of(estimate), truth_of(truth)
     counted = _counted(values, known, occluded=occluded)
     return values[counted].astype(np.float64), known.values[counted].astype(np.float64)
 
 
 def _counted(values: Float32, truth: DisparityTruth, *, occluded: bool) -> Bool:
-    """bool (H, W), the compared pixels."""
+    """Return bool (H, W), the compared pixels."""
     if values.shape != truth.values.shape:
         raise EvaluationError(
             "disparity and truth differ in size",

@@ -79,7 +79,7 @@ def within_reach(cloud: PointCloud, reference: PointCloud, path: Trajectory) -> 
 
 
 def _heights_m(xyz: Float32, path: Trajectory) -> Float64:
-    """float64 (N,): height above the nearest camera, along its y axis."""
+    """Return float64 (N,): height above the nearest camera, along its y axis."""
     nearest = open3d_clouds.nearest(xyz, path.positions_m)[0][:, 0]
     down = path.T_world_camera[nearest, :3, 1]
     return np.asarray(-np.einsum("ni,ni->n", down, xyz - path.positions_m[nearest]))
@@ -110,7 +110,7 @@ def register_cloud(
 
 
 def nearest_distances(xyz: Float32, reference_xyz: Float32) -> Float32:
-    """Distance of each point to the nearest reference point.
+    """Return the distance of each point to the nearest reference point.
 
     Args:
         xyz: float32 (N, 3), metres.
@@ -143,5 +143,5 @@ def _check(cloud: PointCloud, reference: PointCloud, threshold_m: float) -> None
 
 
 def _thinned(cloud: PointCloud, voxel_m: float) -> Float32:
-    """float32 (M, 3), the mean point of each voxel."""
+    """Return float32 (M, 3), the mean point of each voxel."""
     return open3d_clouds.voxel_downsample(cloud.xyz, np.zeros((len(cloud), 0)), voxel_m)[0]

@@ -199,7 +199,7 @@ def doubt_axes(
 
 
 def _path_motion(mapped: MappedCloud, poses: Path) -> Float64:
-    """The rigid motion that brings the run's path closest to ground truth."""
+    """Return the rigid motion that brings the run's path closest to ground truth."""
     if mapped.folder is None:
         raise EvaluationError("a cloud without a run has no path to align")
     path, truth = read_trajectory(mapped.folder / _PATH), read_trajectory(poses)
@@ -225,7 +225,7 @@ def _size(name: str, T: Float64) -> dict[str, Any]:
 
 
 def _read_axes(record: Path) -> Float64:
-    """T_map_world as the run recorded it."""
+    """Return T_map_world as the run recorded it."""
     try:
         T_map_world = np.array(json.loads(record.read_text(encoding="utf-8"))["T_map_world"], float)
     except (OSError, ValueError, KeyError, TypeError) as error:

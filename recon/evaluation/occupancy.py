@@ -109,7 +109,7 @@ def _compare_voxels(
 
 
 def _near(keys: Int32, others: Int32, tolerance: int) -> Bool:
-    """Which voxels have one of the others within ``tolerance`` cells on every axis."""
+    """Return which voxels have one of the others within ``tolerance`` cells on every axis."""
     steps = np.arange(-tolerance, tolerance + 1)
     known = np.unique(_pack(others))
     found = np.zeros(len(keys), dtype=np.bool_)
@@ -119,13 +119,13 @@ def _near(keys: Int32, others: Int32, tolerance: int) -> Bool:
 
 
 def _pack(keys: NDArray[Any]) -> NDArray[np.int64]:
-    """One number for each voxel key (N, 3)."""
+    """Return one number for each voxel key (N, 3)."""
     wide = keys.astype(np.int64) + (1 << (_BITS - 1))
     return np.asarray((wide[:, 0] << (2 * _BITS)) | (wide[:, 1] << _BITS) | wide[:, 2])
 
 
 def grid_on_truth(grid: OccupancyGrid, truth: OccupancyTruth) -> NDArray[np.int8]:
-    """The cells of a grid, cropped or padded with UNKNOWN to the extent of the true grid."""
+    """Return the cells of a grid, cropped or padded with UNKNOWN to the extent of the true grid."""
     offset_m = np.array(truth.grid.origin_m) - np.array(grid.origin_m)
     right, down = np.rint(offset_m / grid.resolution_m).astype(int).tolist()
     rows, columns = (np.arange(n) for n in truth.seen.shape)
@@ -159,11 +159,11 @@ def _iou(estimate: Bool, true: Bool, seen: Bool, tolerance: int) -> float:
 
 
 def _grown(cells: Bool, tolerance: int) -> Bool:
-    """The cells dilated by ``tolerance`` cells."""
+    """Return the cells dilated by ``tolerance`` cells."""
     kernel = np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
     return np.asarray(cv2.dilate(cells.astype(np.uint8), kernel) > 0)
 
 
 def _share(which: Bool) -> float:
-    """Share of True values; NaN if empty."""
+    """Return the share of True values; NaN if empty."""
     return float(which.mean()) if which.size else float("nan")

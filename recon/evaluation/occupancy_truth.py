@@ -24,7 +24,7 @@ def compare_with_source(
     grid: OccupancyGrid,
     warnings: list[str],
 ) -> OccupancyMetrics | None:
-    """Metrics of a run if its source knows the true occupancy, else None."""
+    """Return metrics of a run if its source knows the true occupancy, else None."""
     if not isinstance(source, KnowsOccupancy):
         return None
     truth = known_occupancy(source, config, mapped.T_map_world)
@@ -37,7 +37,7 @@ def known_occupancy(
     T_map_world: Float64,
     least_frames: int = LEAST_FRAMES,
 ) -> OccupancyTruth:
-    """True occupancy of a source, in the cells, axes and height band of a map."""
+    """Return True occupancy of a source, in the cells, axes and height band of a map."""
     return source.occupancy_truth(
         resolution_m=config.occupancy.resolution_m,
         band_m=(config.grid.min_height_m, config.grid.max_height_m),
@@ -50,7 +50,7 @@ def known_occupancy(
 def compare(
     voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth, warnings: list[str]
 ) -> OccupancyMetrics | None:
-    """The metrics, or None and a warning that says why."""
+    """Return the metrics, or None and a warning that says why."""
     try:
         return evaluate_occupancy(voxels, grid, truth)
     except EvaluationError as error:

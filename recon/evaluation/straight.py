@@ -37,7 +37,7 @@ def open_roll_axis(estimate: Trajectory, truth: Trajectory) -> Float64 | None:
 
 
 def without_roll(estimate: Trajectory, truth: Trajectory, axis: Float64) -> Trajectory:
-    """The estimate with its poses rolled alike about an axis until their rotations fit best.
+    """Return the estimate with its poses rolled alike about an axis until their rotations fit best.
 
     Positions stay as they are: across the axis they are too close to it to be moved.
     """

@@ -118,7 +118,7 @@ class TrajectoryComparison:
 def evaluate_trajectory(
     estimate: Trajectory, truth: Trajectory, rules: TrajectoryRules | None = None
 ) -> TrajectoryMetrics:
-    """The errors of an estimated trajectory, see `compare_paths`."""
+    """Return the errors of an estimated trajectory, see `compare_paths`."""
     return compare_paths(estimate, truth, rules).metrics
 
 
@@ -180,7 +180,7 @@ def compare_paths(
 
 
 def align(estimate: Trajectory, truth: Trajectory, alignment: str) -> Similarity:
-    """The transform of the estimate for `TrajectoryRules.alignment`."""
+    """Return the transform of the estimate for `TrajectoryRules.alignment`."""
     if alignment == "none":
         return Similarity(np.eye(4))
     if alignment == "origin":
@@ -239,7 +239,7 @@ def segments_of(distances_m: Float64, lengths_m: tuple[float, ...], step: int) -
 def motion_errors(
     estimate: Trajectory, truth: Trajectory, first: Int32, last: Int32
 ) -> tuple[Float64, Float64]:
-    """Errors of the motion between two frames.
+    """Return errors of the motion between two frames.
 
     Returns:
         Translation in metres (N,) and rotation in radians (N,).
@@ -249,7 +249,7 @@ def motion_errors(
 
 
 def _motion(trajectory: Trajectory, first: Int32, last: Int32) -> Float64:
-    """float64 (N, 4, 4), poses of the last frames relative to the first ones."""
+    """Return float64 (N, 4, 4), poses of the last frames relative to the first ones."""
     poses = trajectory.T_world_camera
     motion: Float64 = invert(poses[first]) @ poses[last]
     return motion
@@ -258,7 +258,7 @@ def _motion(trajectory: Trajectory, first: Int32, last: Int32) -> Float64:
 def _by_length(
     segments: Segments, percent: Float64, deg_per_100m: Float64
 ) -> tuple[LengthErrors, ...]:
-    """Mean errors of the segments of each length."""
+    """Return the mean errors of the segments of each length."""
     found = []
     for length_m in np.unique(segments.length_m):
         of_length = segments.length_m == length_m

@@ -28,7 +28,7 @@ class Fields:
         return name in self._values
 
     def get(self, name: str) -> Any:
-        """The value of a field, of any type.
+        """Return the value of a field, of any type.
 
         Raises:
             FormatError: The field is missing; all methods raise this.
@@ -41,18 +41,18 @@ class Fields:
         return self._values[name]
 
     def below(self, name: str) -> Fields:
-        """The mapping in a field."""
+        """Return the mapping in a field."""
         value = self.get(name)
         if not isinstance(value, Mapping):
             raise self._wrong(name, value, "a mapping")
         return Fields(value, self._path, f"{self._prefix}{name}.")
 
     def text(self, name: str) -> str:
-        """The value of a field as text."""
+        """Return the value of a field as text."""
         return str(self.get(name))
 
     def numbers(self, name: str, shape: tuple[int, ...] | None = None) -> Float64:
-        """The value as float64 of that shape; None = a list of any length."""
+        """Return the value as float64 of that shape; None = a list of any length."""
         value = self.get(name)
         try:
             # Via text, as PyYAML reads 1e-05 (no dot) as text.
@@ -68,11 +68,11 @@ class Fields:
         return array.reshape(shape)
 
     def number(self, name: str) -> float:
-        """The value as one number."""
+        """Return the value as one number."""
         return float(self.numbers(name, (1,))[0])
 
     def count(self, name: str) -> int:
-        """The value as one positive integer."""
+        """Return the value as one positive integer."""
         value = self.number(name)
         if value != int(value) or value < 1:
             raise self._wrong(name, value, "a positive integer")

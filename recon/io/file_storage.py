@@ -57,7 +57,7 @@ def _parse(text: str, path: StrPath) -> Any:
 
 
 def _value(node: Any) -> Float64 | str | None:
-    """A number, the numbers of a list or matrix, or a text; None for anything else."""
+    """Return a number, the numbers of a list or matrix, or a text; None for anything else."""
     if isinstance(node, Mapping):
         return _value(node["data"]) if isinstance(node.get("data"), list) else None
     if isinstance(node, list) and any(isinstance(part, list | dict) for part in node):
@@ -75,7 +75,7 @@ def _parse_xml(text: str) -> dict[str, Any] | None:
 
 
 def _xml_node(element: ET.Element) -> Any:
-    """A list or text, and a mapping for a matrix."""
+    """Return a list or text, and a mapping for a matrix."""
     data = element.find("data")
     if data is not None:
         return {"data": (data.text or "").split()}

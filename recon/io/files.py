@@ -46,7 +46,7 @@ def naming(path: StrPath) -> Iterator[None]:
 
 @contextmanager
 def reading(path: StrPath) -> Iterator[None]:
-    """Name the file in every error raised while its content is parsed.
+    """Yield the name the file in every error raised while its content is parsed.
 
     Content from outside can make a parser raise anything. Around parsing, and only there, every
     exception is a fault of the file; elsewhere it is a fault of ours and must not pass as one.

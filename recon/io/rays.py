@@ -96,7 +96,7 @@ class RayFile:
             raise FormatError("sizes of the rays are impossible", where=path, got=sizes_m)
 
     def __len__(self) -> int:
-        """Number of frames.
+        """Return the number of frames.
 
         Raises:
             FormatError: The file is truncated.
@@ -125,7 +125,7 @@ class RayFile:
                 yield _unpack(content, count, self.grain.unit_m)
 
     def _head(self, file: IO[bytes]) -> tuple[int, int] | None:
-        """Number of rays and checksum of the frame that starts here; None at the end."""
+        """Return the number of rays and checksum of the frame that starts here; None at the end."""
         head = file.read(_FRAME.size)
         if not head:
             return None

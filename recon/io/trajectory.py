@@ -38,7 +38,7 @@ def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Traje
 
 @reader
 def holds_times(path: StrPath) -> bool:
-    """Whether a trajectory file has timestamps: TUM files do, KITTI files do not.
+    """Return whether a trajectory file has timestamps: TUM files do, KITTI files do not.
 
     Raises:
         FormatError: The file is missing or in neither format.

@@ -42,13 +42,13 @@ def parse_yaml(text: str, where: StrPath) -> Any:
 
 
 def _depth(text: str) -> int:
-    """The most brackets open at once; PyYAML's time grows with their square."""
+    """Return the most brackets open at once; PyYAML's time grows with their square."""
     steps = (1 if bracket in "[{" else -1 for bracket in _BRACKET.findall(text))
     return max(accumulate(steps), default=0)
 
 
 def _count(value: Any, known: dict[int, int]) -> int:
-    """Number of values that a value holds with all its aliases expanded."""
+    """Return the number of values that a value holds with all its aliases expanded."""
     if not isinstance(value, dict | list):
         return 1
     if id(value) not in known:

@@ -118,7 +118,7 @@ def explain_motion(
 
 
 def noise_sigma(grey: UInt8) -> float:
-    """Standard deviation of the noise of an image, grey values.
+    """Return the standard deviation of the noise of an image, grey values.
 
     From the median of mixed fourth differences, in which gradients and straight edges cancel.
 
@@ -142,7 +142,7 @@ def _sample(
     T_before_now: Float64,
     camera: RectifiedCamera,
 ) -> _Samples:
-    """Every n-th pixel with a disparity that stays in the image."""
+    """Return every n-th pixel with a disparity that stays in the image."""
     step, (height, width) = _STRIDE_PX, left.shape
     # Slopes need a neighbour on either side.
     row, column = np.nonzero(before.disparity.valid[1:-1:step, 1:-1:step])
@@ -175,7 +175,7 @@ def _interpolated(image: UInt8, u: Float64, v: Float64) -> Float64:
 
 
 def _textured(samples: _Samples, count: Int64, sigma: float) -> NDArray[np.bool_]:
-    """bool (P,), patches with gradients in every direction that exceed the noise."""
+    """Return bool (P,), patches with gradients in every direction that exceed the noise."""
     x, y = samples.slope.T
     xx, yy, xy = (_mean(samples, values, count) for values in (x * x, y * y, x * y))
     least = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
@@ -184,7 +184,7 @@ def _textured(samples: _Samples, count: Int64, sigma: float) -> NDArray[np.bool_
 
 
 def _correlation(samples: _Samples, count: Int64, noise: tuple[float, float]) -> Float64:
-    """Correlation (P,) of each patch between the two images, corrected for noise."""
+    """Return the correlation (P,) of each patch between the two images, corrected for noise."""
     one, other = samples.before, samples.now
     mean, mean_other = (_mean(samples, values, count) for values in (one, other))
     both = _mean(samples, one * other, count) - mean * mean_other
@@ -197,10 +197,10 @@ def _correlation(samples: _Samples, count: Int64, noise: tuple[float, float]) ->
 
 
 def _power(samples: _Samples, values: Float64, count: Int64) -> Float64:
-    """Variance of values (N,) in each patch, noise included."""
+    """Return the variance of values (N,) in each patch, noise included."""
     return _mean(samples, values**2, count) - _mean(samples, values, count) ** 2
 
 
 def _mean(samples: _Samples, values: Float64, count: Int64) -> Float64:
-    """Mean of values (N,) in each patch; 0 in empty ones."""
+    """Return the mean of values (N,) in each patch; 0 in empty ones."""
     return np.asarray(np.bincount(samples.patch, values) / np.maximum(count, 1))

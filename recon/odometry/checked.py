@@ -72,7 +72,7 @@ class CheckedOdometry:
         return replace(result, health=replace(result.health, ok=not doubts, notes=notes))
 
     def state(self) -> dict[str, Any]:
-        """Everything that later poses depend on."""
+        """Return everything that later poses depend on."""
         last = self._state
         if last is None:
             return {"odometry": self._odometry.state(), "last": None}
@@ -96,7 +96,7 @@ class CheckedOdometry:
     def _doubts(
         self, health: OdometryHealth, before: Sight, frame: OdometryFrame, T_before_now: Float64
     ) -> list[str]:
-        """What speaks against a motion; empty where it is to be trusted."""
+        """Return what speaks against a motion; empty where it is to be trusted."""
         length_m = float(np.linalg.norm(T_before_now[:3, 3]))
         if health.sigma_m > _MAX_SIGMA_M + _MAX_SIGMA_SHARE * length_m:
             return [f"the motion is known to {health.sigma_m:.2f} m only"]

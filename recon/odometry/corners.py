@@ -30,7 +30,7 @@ _BORDER_PX: Final = 8
 
 
 def find_corners(grey: UInt8, taken_uv: Float32) -> Float32:
-    """The best corners of each cell of an image, away from those already tracked.
+    """Return the best corners of each cell of an image, away from those already tracked.
 
     Cells keep one strongly textured region from taking all features: only features spread over the
     image determine the motion well.
@@ -57,7 +57,7 @@ def find_corners(grey: UInt8, taken_uv: Float32) -> Float32:
 
 
 def _peaks(score: Float32) -> Bool:
-    """Local maxima of the score that are good enough and away from the border."""
+    """Return local maxima of the score that are good enough and away from the border."""
     size = 2 * _DISTANCE_PX + 1
     peak = score >= cv2.dilate(score, np.ones((size, size), np.uint8))
     peak &= score > _MIN_SCORE
@@ -68,7 +68,7 @@ def _peaks(score: Float32) -> Bool:
 
 
 def _free(shape: tuple[int, ...], taken_uv: Float32) -> Bool:
-    """Pixels away from every feature already tracked."""
+    """Return pixels away from every feature already tracked."""
     free = np.ones(shape, np.uint8)
     for u, v in np.rint(taken_uv).astype(int).tolist():
         cv2.circle(free, (u, v), _DISTANCE_PX, 0, -1)
@@ -76,7 +76,7 @@ def _free(shape: tuple[int, ...], taken_uv: Float32) -> Bool:
 
 
 def _cell_of(uv: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """Number of the cell of each pixel (N, 2)."""
+    """Return the number of the cell of each pixel (N, 2)."""
     size = _CELL_PX
     columns = -(-shape[1] // size)
     u = np.clip(np.rint(uv[:, 0]).astype(np.int64), 0, shape[1] - 1)
@@ -92,7 +92,7 @@ def _count_per_cell(uv: Float32, shape: tuple[int, ...]) -> NDArray[np.int64]:
 
 
 def _rank_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Position of each element within its run of equal values."""
+    """Return the position of each element within its run of equal values."""
     index = np.arange(len(groups))
     starts = np.r_[True, groups[1:] != groups[:-1]] if len(groups) else np.zeros(0, np.bool_)
     rank: NDArray[np.int64] = index - np.maximum.accumulate(np.where(starts, index, 0))

@@ -13,10 +13,10 @@ _LEAST_INFORMATION: Final = 1e-4
 
 
 def covariance_of(information: Float64) -> Float64:
-    """Covariance (6, 6) of an information matrix (6, 6), which may be singular."""
+    """Return the covariance (6, 6) of an information matrix (6, 6), which may be singular."""
     return np.asarray(np.linalg.inv(information + _LEAST_INFORMATION * np.eye(6)))
 
 
 def step_covariance(sigma_m: float, sigma_deg: float) -> Float64:
-    """Covariance (6, 6) of a step that is equally uncertain in all directions."""
+    """Return the covariance (6, 6) of a step that is equally uncertain in all directions."""
     return np.diag(np.repeat([sigma_m**2, np.deg2rad(sigma_deg) ** 2], 3))

@@ -140,7 +140,7 @@ class FusedOdometry:
         return result
 
     def state(self) -> dict[str, Any]:
-        """Everything that later poses depend on."""
+        """Return everything that later poses depend on."""
         return {
             "visual": self._visual.state(),
             "icp": self._icp.state(),
@@ -164,11 +164,11 @@ class FusedOdometry:
         self._mapped = bool(state["mapped"])
 
     def _icp_may_help(self, prior: _Prior) -> bool:
-        """Whether ICP, if as certain as the last time, would change the prior."""
+        """Return whether ICP, if as certain as the last time, would change the prior."""
         return icp_may_help(prior.covariance, self._icp_covariance)
 
     def _with_icp(self, prior: _Prior, frame: OdometryFrame) -> OdometryResult:
-        """The prior with ICP's correction; the frame is added to ICP's map."""
+        """Return the prior with ICP's correction; the frame is added to ICP's map."""
         points = select_points(frame, self._settings.max_range_m)
         result = self._corrected(prior, points)
         if result.health.ok and len(points) >= _MIN_POINTS:
@@ -186,7 +186,7 @@ class FusedOdometry:
         return _Prior(orthonormalise(T), covariance, visual)
 
     def _corrected(self, prior: _Prior, points: PointCloud) -> OdometryResult:
-        """The prior, moved by the part of ICP's correction that passes the gate."""
+        """Return the prior, moved by the part of ICP's correction that passes the gate."""
         health = prior.visual.result.health
         if not self._mapped or len(points) < _MIN_POINTS:
             note = "no map for ICP yet" if not self._mapped else "too few points for ICP"
@@ -201,14 +201,14 @@ class FusedOdometry:
         return OdometryResult(T, _health(health, alignment, correction, verdict))
 
     def _align(self, prior: _Prior, points: PointCloud) -> IcpAlignment:
-        """ICP from the prior; from an extrapolated one with a wider threshold first."""
+        """Return ICP from the prior; from an extrapolated one with a wider threshold first."""
         T = prior.T_world_camera
         if not prior.seen:
             T = self._icp.align(points.xyz, T, _LOST_THRESHOLD_M).T_world_camera
         return self._icp.align(points.xyz, T, _THRESHOLD_M)
 
     def _measure(self, prior: _Prior, alignment: IcpAlignment) -> Correction:
-        """What ICP would change, and how the frame fits the map before and after."""
+        """Return what ICP would change, and how the frame fits the map before and after."""
         T_prior_icp = invert(prior.T_world_camera) @ alignment.T_world_camera
         near = apply(invert(prior.T_world_camera), self._icp.map_points())
         surfaces = describe_surfaces(near, _SURFACE_M)

@@ -96,13 +96,13 @@ def judge(correction: Correction, offset: Float64, prior_covariance: Float64) ->
 
 
 def icp_may_help(prior: Float64, icp: Float64) -> bool:
-    """Whether ICP with some covariance would improve a prior in any direction."""
+    """Return whether ICP with some covariance would improve a prior in any direction."""
     share, _ = _shares(prior, prior + icp)
     return bool(share.max() >= _MIN_SHARE)
 
 
 def best_covariance() -> Float64:
-    """Covariance (6, 6) of ICP at its best: what the bias of the surfaces leaves."""
+    """Return the covariance (6, 6) of ICP at its best: what the bias of the surfaces leaves."""
     return step_covariance(_ICP_FLOOR_M, _ICP_FLOOR_DEG)
 
 
@@ -112,14 +112,14 @@ def icp_covariance(fit: Fit) -> Float64:
 
 
 def _worthwhile(prior: Float64, both: Float64, news: Float64) -> Float64:
-    """The Kalman step, without the directions of small gain."""
+    """Return the Kalman step, without the directions of small gain."""
     share, directions = _shares(prior, both)
     kept = np.where(share >= _MIN_SHARE, share, 0.0)
     return np.asarray(directions @ (kept * np.linalg.solve(directions, news)))
 
 
 def _shares(prior: Float64, both: Float64) -> tuple[Float64, Float64]:
-    """Gains (6,) in independent directions, and these directions (6, 6), one per column.
+    """Return gains (6,) in independent directions, and these directions (6, 6), one per column.
 
     Whitened by ``both = L·Lᵀ``, the Kalman gain ``prior·both⁻¹`` is symmetric; its eigenvalues are
     the gains.

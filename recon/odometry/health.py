@@ -12,7 +12,7 @@ _MANY: Final = 0.1
 
 
 def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:
-    """One line per distinct warning, and per stretch of frames without a trusted pose."""
+    """Return one line per distinct warning, and per stretch of frames without a trusted pose."""
     texts = dict.fromkeys(line for record in health for line in record.warnings)
     lines = [f"{_named(health, line)}: {line}" for line in texts]
     bad = [index for index, record in enumerate(health) if not record.ok]
@@ -30,7 +30,7 @@ def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:
 
 
 def _named(health: Sequence[OdometryHealth], line: str) -> str:
-    """The range of frames that a warning is about, first to last."""
+    """Return the range of frames that a warning is about, first to last."""
     about = [index for index, record in enumerate(health) if line in record.warnings]
     return _frames(about[0], about[-1])
 

@@ -57,7 +57,7 @@ class KissOdometry:
         return self._keep(alignment.T_world_camera, health)
 
     def state(self) -> dict[str, Any]:
-        """Everything that later poses depend on."""
+        """Return everything that later poses depend on."""
         return {"icp": self._icp.state(), "poses": [{"T": pose} for pose in self._poses]}
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -70,7 +70,7 @@ class KissOdometry:
         return OdometryResult(T_world_camera, health)
 
     def _extrapolated(self) -> Float64:
-        """The last pose, moved by the last motion."""
+        """Return the last pose, moved by the last motion."""
         if len(self._poses) < 2:
             return self._poses[-1] if self._poses else np.eye(4)
         before, last = self._poses

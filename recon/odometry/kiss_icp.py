@@ -133,14 +133,14 @@ class KissIcp:
             self._icp.correct(frame, pose)
 
     def map_points(self) -> Float64:
-        """float64 (M, 3), the points of the local map, world axes, in ascending order."""
+        """Return float64 (M, 3), the points of the local map, world axes, in ascending order."""
         with _our_errors():
             points = np.array(self._icp.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3)
         # The order of kiss-icp's hash map depends on its history; sorted order does not.
         return points[np.lexsort(points.T[::-1])]
 
     def state(self) -> dict[str, Any]:
-        """Everything that later results depend on, as arrays and plain values."""
+        """Return everything that later results depend on, as arrays and plain values."""
         icp = self._icp
         return {
             "points": np.array(icp.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3),
@@ -180,7 +180,7 @@ class _AdaptiveThreshold:
         self._count = 1
 
     def get_threshold(self) -> float:
-        """Root mean square of the deviations so far, metres."""
+        """Return the root mean square of the deviations so far, metres."""
         return math.sqrt(self._sum_m2 / self._count)
 
     def update_model_deviation(self, model_deviation: Float64) -> None:
@@ -219,12 +219,12 @@ class _RangedKissIcp(KissICP):  # type: ignore[misc]
         return source[near], frame
 
     def clip(self, points: Float64) -> Float64:
-        """Points within range."""
+        """Return points within range."""
         clipped: Float64 = self.preprocessor.preprocess(points, np.zeros(0), np.eye(4))
         return clipped
 
     def align(self, source: Float64, guess: Float64, threshold_m: float) -> Float64:
-        """Pose of a source in the map; the guess if there is nothing to align."""
+        """Return the pose of a source in the map; the guess if there is nothing to align."""
         # The guess enters where kiss-icp's motion model does: as last pose times last delta.
         self.last_delta = orthonormalise(np.linalg.inv(self.last_pose) @ guess)
         if not len(source) or self.local_map.empty():
@@ -278,7 +278,7 @@ def _points(xyz: NDArray[np.floating]) -> Float64:
 
 
 def _pose(T: NDArray[np.floating]) -> Float64:
-    """A writable orthonormal copy: kiss-icp aborts the process if the rotation is not."""
+    """Return a writable orthonormal copy: kiss-icp aborts the process if the rotation is not."""
     pose = np.array(T, dtype=np.float64)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise RegistrationError("pose for ICP is not a finite 4x4 matrix", got=pose.shape)

@@ -26,7 +26,7 @@ class KnownPoses:
         self._begun = False
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """The known pose of the frame.
+        """Return the known pose of the frame.
 
         Raises:
             RegistrationError: There is no pose for the frame.
@@ -46,7 +46,7 @@ class KnownPoses:
         return OdometryResult(self._T_first_world @ self._poses[index], OdometryHealth())
 
     def state(self) -> dict[str, Any]:
-        """Everything that later poses depend on."""
+        """Return everything that later poses depend on."""
         return {"T_first_world": self._T_first_world, "begun": self._begun}
 
     def restore(self, state: dict[str, Any]) -> None:

@@ -31,7 +31,7 @@ class Motion:
     interval_s: float = 0.0
 
     def predict(self, timestamp_s: float) -> Float64:
-        """The pose (4, 4) at a time: with constant velocity, where times are known."""
+        """Return the pose (4, 4) at a time: with constant velocity, where times are known."""
         passed_s = timestamp_s - self.timestamp_s
         share = passed_s / self.interval_s if self.interval_s > 0.0 else 1.0
         if not 0.0 < share <= _LONGEST_GAP:
@@ -50,7 +50,7 @@ class Motion:
 
 
 def part_of(T: Float64, share: float) -> Float64:
-    """A fraction or multiple of a motion (4, 4): rotation and translation in proportion."""
+    """Return a fraction or multiple of a motion (4, 4): rotation and translation in proportion."""
     if share == 1.0:
         return T
     return make_transform(exp_so3(share * log_so3(T[:3, :3])), share * T[:3, 3])

@@ -97,6 +97,6 @@ def fit_pose(
 
 
 def _pose(rotation: Float64, translation: Float64) -> Float64:
-    """T_world_camera from OpenCV's rotation vector and translation."""
+    """Return T_world_camera from OpenCV's rotation vector and translation."""
     R, _ = cv2.Rodrigues(rotation)
     return invert(make_transform(R, translation))

@@ -51,7 +51,7 @@ def select_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
 
 
 def all_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
-    """Every pixel with a depth up to a range, as a LiDAR odometry would take them."""
+    """Return every pixel with a depth up to a range, as a LiDAR odometry would take them."""
     camera = frame.pair.camera
     depth = depth_from_disparity(frame.disparity.values, camera)
     sigma = depth_sigma(depth, frame.disparity.sigma_px, camera)
@@ -59,13 +59,13 @@ def all_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
 
 
 def textured(grey: UInt8, min_gradient: float) -> Bool:
-    """bool (H, W), where the image changes along the row: only that fixes a disparity."""
+    """Return bool (H, W), where the image changes along the row: only that fixes a disparity."""
     gradient = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3)
     return np.asarray(np.abs(gradient) > min_gradient)
 
 
 def consistent(disparity: Disparity, max_step_px: float) -> Bool:
-    """bool (H, W), where a disparity is close to the median of its 5×5 neighbours.
+    """Return bool (H, W), where a disparity is close to the median of its 5×5 neighbours.
 
     Pixels without a match count as far away, so the rims of matched regions fall out too.
     """

@@ -65,7 +65,7 @@ def locate_camera(
 
 
 def enough_agree(agreeing: int, tracks: int) -> bool:
-    """Whether so many of the tracks agree that the pose counts as measured."""
+    """Return whether so many of the tracks agree that the pose counts as measured."""
     return agreeing >= max(MIN_INLIERS, _MIN_INLIER_SHARE * tracks)
 
 
@@ -75,7 +75,7 @@ def _agreement(
     uv: Float64,
     camera: RectifiedCamera,
 ) -> LocatedCamera:
-    """Which points agree with a pose; none, where it is not finite."""
+    """Return which points agree with a pose; none, where it is not finite."""
     u, v, _ = project(apply(invert(T_world_camera), xyz_world), camera)
     error_px = np.hypot(u - uv[:, 0], v - uv[:, 1])
     # A point behind the camera has a NaN error, which compares as False.

@@ -62,7 +62,7 @@ class MotionPrior:
         )
 
     def knows(self, time_s: float) -> bool:
-        """Whether the path has a pose at a time."""
+        """Return whether the path has a pose at a time."""
         return self._pose_at(time_s) is not None
 
     def motion(self, from_s: float, to_s: float) -> Float64 | None:
@@ -77,12 +77,12 @@ class MotionPrior:
         return orthonormalise(T)
 
     def sigmas(self, T_from_to: Float64) -> tuple[float, float]:
-        """Standard deviations of a motion: translation in metres, rotation in degrees."""
+        """Return standard deviations of a motion: translation in metres, rotation in degrees."""
         s, length_m = self.settings, float(np.linalg.norm(T_from_to[:3, 3]))
         return s.sigma_m + s.sigma_share * length_m, s.sigma_deg
 
     def _pose_at(self, time_s: float) -> Float64 | None:
-        """The pose (4, 4) at a time, interpolated; None = outside the path or in a gap."""
+        """Return the pose (4, 4) at a time, interpolated; None = outside the path or in a gap."""
         times_s = self.path.timestamps_s
         if not times_s[0] <= time_s <= times_s[-1]:
             return None

@@ -79,7 +79,7 @@ def find_axes(
 
 
 def first_moving(prior: Trajectory, stamps_s: Float64, settings: PriorSettings) -> int:
-    """The last frame before a prior moves; 0 if it never does."""
+    """Return the last frame before a prior moves; 0 if it never does."""
     path = MotionPrior(prior, _in_axes(settings, "camera"))
     start: float | None = None
     for index, stamp_s in enumerate(stamps_s.tolist()):
@@ -108,7 +108,7 @@ def _in_axes(settings: PriorSettings, axes: Axes) -> PriorSettings:
 
 
 def _in_sigmas(T: Float64, settings: PriorSettings) -> float:
-    """Size of a motion in standard deviations of a short one."""
+    """Return the size of a motion in standard deviations of a short one."""
     step = as_step(T)
     turned_deg = float(np.rad2deg(np.linalg.norm(step[3:])))
     return max(float(np.linalg.norm(step[:3])) / settings.sigma_m, turned_deg / settings.sigma_deg)

@@ -91,7 +91,7 @@ class Odometry(Protocol):
         ...
 
     def state(self) -> dict[str, Any]:
-        """Everything that later poses depend on, as a tree of arrays and plain values."""
+        """Return everything that later poses depend on, as a tree of arrays and plain values."""
         ...
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -104,12 +104,12 @@ class Odometry(Protocol):
 
 
 def tree_of(value: Any) -> dict[str, Any]:
-    """The fields of a dataclass by name, as part of a state."""
+    """Return the fields of a dataclass by name, as part of a state."""
     return {field.name: getattr(value, field.name) for field in fields(value)}
 
 
 def pose_in(state: dict[str, Any], name: str) -> Float64:
-    """A pose of a state: float64 (4, 4), finite.
+    """Return a pose of a state: float64 (4, 4), finite.
 
     Raises:
         ShapeError: It is something else.
@@ -118,7 +118,7 @@ def pose_in(state: dict[str, Any], name: str) -> Float64:
 
 
 def finite_in(state: dict[str, Any], name: str, shape: tuple[int | None, ...]) -> Float64:
-    """Numbers of a state: float64 of some shape, finite, writable.
+    """Return numbers of a state: float64 of some shape, finite, writable.
 
     Raises:
         ShapeError: They are something else.

@@ -78,7 +78,7 @@ def describe_surfaces(xyz: Float64, edge_m: float) -> Surfaces:
 
 
 def fit_surfaces(xyz: Float64, surfaces: Surfaces) -> Fit:
-    """How points (N, 3), in the axes of the surfaces, fit them."""
+    """Return how points (N, 3), in the axes of the surfaces, fit them."""
     cell, hit = _look_up(xyz, surfaces)
     overlap = float(hit.mean()) if len(hit) else 0.0
     flat = np.flatnonzero(hit)[surfaces.information[cell[hit]].any(axis=(1, 2))]
@@ -93,7 +93,7 @@ def fit_surfaces(xyz: Float64, surfaces: Surfaces) -> Fit:
 
 
 def _thin_information(covariance: Float64, edge_m: float) -> Float64:
-    """Inverse covariance (M, 3, 3) along the thin axes, zero along the others."""
+    """Return the inverse covariance (M, 3, 3) along the thin axes, zero along the others."""
     spread, axes = np.linalg.eigh(covariance)
     thin = np.sqrt(np.maximum(spread, 0.0)) < THIN_SHARE * edge_m
     strength = np.where(thin, 1.0 / (np.maximum(spread, 0.0) + NOISE_M**2), 0.0)
@@ -102,7 +102,7 @@ def _thin_information(covariance: Float64, edge_m: float) -> Float64:
 
 
 def _distance_m(off: Float64, information: Float64) -> Float64:
-    """Distances (N,) along the thin axes: Mahalanobis distances, scaled to metres."""
+    """Return distances (N,) along the thin axes: Mahalanobis distances, scaled to metres."""
     square = np.einsum("ni,nij,nj->n", off, information, off)
     strength = np.einsum("nii->n", information)
     distance: Float64 = np.sqrt(np.maximum(square, 0.0) / strength)
@@ -110,7 +110,7 @@ def _distance_m(off: Float64, information: Float64) -> Float64:
 
 
 def _look_up(xyz: Float64, surfaces: Surfaces) -> tuple[NDArray[np.int64], Bool]:
-    """Index of the cell of each point, and whether there is one."""
+    """Return the index of the cell of each point, and whether there is one."""
     if not len(surfaces.keys):
         return np.zeros(len(xyz), np.int64), np.zeros(len(xyz), np.bool_)
     keys = _keys(xyz, surfaces.edge_m)
@@ -119,7 +119,7 @@ def _look_up(xyz: Float64, surfaces: Surfaces) -> tuple[NDArray[np.int64], Bool]
 
 
 def _keys(xyz: Float64, edge_m: float) -> NDArray[np.int64]:
-    """int64 (N,), the packed cell of each point."""
+    """Return int64 (N,), the packed cell of each point."""
     return pack_keys(np.floor(xyz / edge_m).astype(np.int64))
 
 

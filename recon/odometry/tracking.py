@@ -66,14 +66,14 @@ def follow(source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32) -> tupl
 
 
 def _comparable(source: UInt8, target: UInt8) -> UInt8:
-    """The target, adapted to the exposure of the source if the two differ."""
+    """Return the target, adapted to the exposure of the source if the two differ."""
     ours, theirs = (np.ravel(cv2.meanStdDev(image)) for image in (source, target))
     same = np.abs(theirs - ours) <= _MAX_EXPOSURE_CHANGE * ours
     return target if same.all() else exposed_as(source, target)
 
 
 def sample_disparity(disparity: Disparity, uv: Float32) -> Float32:
-    """The matcher's disparity of features: the median around each, where that is consistent.
+    """Return the matcher's disparity of features: the median around each, where that is consistent.
 
     Tracking features into the right image instead gave two to four times the drift on real
     drives, probably because patches at the edge of an object contain the background, too.
@@ -106,7 +106,7 @@ def _lucas_kanade(
     guess_uv: Float32,
     levels: int,
 ) -> tuple[Float32, Bool]:
-    """One way of `follow`."""
+    """Return one way of `follow`."""
     end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
     there, status, _ = cv2.calcOpticalFlowPyrLK(
         source,

@@ -128,7 +128,7 @@ class VisualOdometry:
         return self._estimate(seen, frame.pair.camera)
 
     def state(self) -> dict[str, Any]:
-        """Everything that later poses depend on."""
+        """Return everything that later poses depend on."""
         last = self._state
         if last is None:
             return {"last": None}
@@ -150,13 +150,13 @@ class VisualOdometry:
             )
 
     def _begin(self, frame: OdometryFrame, motion: Motion) -> VisualState:
-        """A new window that starts at a pose."""
+        """Return a new window that starts at a pose."""
         window = self._replenish(_empty(motion.T_world_camera), frame)
         time_s = frame.pair.timestamp_s
         return VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
 
     def _prior_motion(self, from_s: float, to_s: float) -> Float64 | None:
-        """The motion between two times by the prior; None = not known."""
+        """Return the motion between two times by the prior; None = not known."""
         return None if self._prior is None else self._prior.motion(from_s, to_s)
 
     def _contradicts(self, state: VisualState, seen: _Seen, frame: OdometryFrame) -> bool:
@@ -173,7 +173,7 @@ class VisualOdometry:
     def _by_tracking(
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
-        """The frame, registered by tracking; None = that fails."""
+        """Return the frame, registered by tracking; None = that fails."""
         return self._register(
             state.window, self._observe(state, frame, predicted), frame, predicted
         )
@@ -181,7 +181,7 @@ class VisualOdometry:
     def _by_matching(
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
-        """The frame, registered by matching over the whole image; None = that fails."""
+        """Return the frame, registered by matching over the whole image; None = that fails."""
         uv, uv_now = match_features(state.left, frame.pair.left, _RELOCATE_FEATURES, any_scale=True)
         camera, T_world_then = frame.pair.camera, state.window.T_world_camera[-1]
         then = np.column_stack([uv, self._disparity(state.disparity, camera, uv)])
@@ -197,7 +197,7 @@ class VisualOdometry:
     def _register(
         self, window: TrackWindow, uvd: Float64, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
-        """The window with the new frame added, if enough features agree on one motion."""
+        """Return the window with the new frame added, if enough features agree on one motion."""
         camera = frame.pair.camera
         tracks = np.flatnonzero(np.isfinite(uvd[:, 0]))
         found = locate_camera(window.xyz_world[tracks], uvd[tracks, :2], camera, predicted)
@@ -234,7 +234,7 @@ class VisualOdometry:
         return VisualEstimate(OdometryResult(motion.T_world_camera, health), information)
 
     def _observe(self, state: VisualState, frame: OdometryFrame, predicted: Float64) -> Float64:
-        """Column, row and disparity (N, 3) in the new frame of the points of the window."""
+        """Return column, row and disparity (N, 3) in the new frame of the points of the window."""
         window = state.window
         uvd = np.full((len(window.xyz_world), 3), np.nan)
         alive = np.flatnonzero(window.seen[-1])
@@ -248,12 +248,12 @@ class VisualOdometry:
         return uvd
 
     def _disparity(self, disparity: Disparity, camera: RectifiedCamera, uv: Float32) -> Float64:
-        """Disparity (N,) of features; NaN = unknown, or too small to give a depth."""
+        """Return the disparity (N,) of features; NaN = unknown, or too small to give a depth."""
         d = sample_disparity(disparity, uv).astype(np.float64)
         return np.where(d + camera.doffs_px < MIN_DISPARITY_PX, np.nan, d)
 
     def _replenish(self, window: TrackWindow, frame: OdometryFrame) -> TrackWindow:
-        """The window with new points where the newest frame has too few."""
+        """Return the window with new points where the newest frame has too few."""
         taken = window.uvd[-1, window.seen[-1], :2].astype(np.float32)
         uv = find_corners(frame.pair.left, taken)
         d = self._disparity(frame.disparity, frame.pair.camera, uv)
@@ -261,7 +261,7 @@ class VisualOdometry:
         return window.with_points(uvd, _points(uvd, window.T_world_camera[-1], frame.pair.camera))
 
     def _estimate(self, seen: _Seen, camera: RectifiedCamera) -> VisualEstimate:
-        """The pose of a registered frame, its health and its information."""
+        """Return the pose of a registered frame, its health and its information."""
         window = seen.window
         information = _information(window, camera)
         newest = window.seen[-1]
@@ -280,16 +280,16 @@ class VisualOdometry:
 
 
 def _information(window: TrackWindow, camera: RectifiedCamera) -> Float64:
-    """Information (6, 6) of the newest pose, scaled because errors of tracks correlate."""
+    """Return information (6, 6) of the newest pose, scaled because errors of tracks correlate."""
     return _INDEPENDENCE * pose_information(window, camera)
 
 
 def _points(uvd: Float64, T_world_camera: Float64, camera: RectifiedCamera) -> Float64:
-    """World points (N, 3) of features with a disparity."""
+    """Return the world points (N, 3) of features with a disparity."""
     depth = depth_from_disparity(uvd[:, 2], camera).astype(np.float64)
     return apply(T_world_camera, unproject(uvd[:, 0], uvd[:, 1], depth, camera))
 
 
 def _empty(T_world_camera: Float64) -> TrackWindow:
-    """A window of one frame without points."""
+    """Return a window of one frame without points."""
     return TrackWindow(T_world_camera[None], np.zeros((1, 0, 3)), np.zeros((0, 3)))

@@ -67,7 +67,7 @@ class TrackWindow:
         return np.isfinite(self.uvd[:, :, 0])
 
     def with_frame(self, T_world_camera: Float64, uvd: Float64) -> TrackWindow:
-        """The window with one more frame."""
+        """Return the window with one more frame."""
         return replace(
             self,
             T_world_camera=np.concatenate([self.T_world_camera, T_world_camera[None]]),
@@ -75,7 +75,7 @@ class TrackWindow:
         )
 
     def with_points(self, uvd: Float64, xyz_world: Float64) -> TrackWindow:
-        """The window with more points, first seen in the newest frame."""
+        """Return the window with more points, first seen in the newest frame."""
         unseen = np.full((len(self.uvd) - 1, len(uvd), 3), np.nan)
         return replace(
             self,
@@ -84,7 +84,7 @@ class TrackWindow:
         )
 
     def trimmed(self, frames: int) -> TrackWindow:
-        """The newest frames, and the points still tracked or seen twice in them."""
+        """Return the newest frames, and the points still tracked or seen twice in them."""
         uvd = self.uvd[-frames:]
         seen = np.isfinite(uvd[:, :, 0])
         keep = seen[-1] | (seen.sum(axis=0) >= 2)
@@ -114,7 +114,7 @@ def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
 
 
 def misfits(window: TrackWindow, camera: RectifiedCamera) -> Bool:
-    """bool (N,), points whose newest observation is an outlier."""
+    """Return bool (N,), points whose newest observation is an outlier."""
     residual = np.nan_to_num(reprojection(window, camera))
     sigmas = [_SIGMA_UV_PX, _SIGMA_UV_PX, _SIGMA_D_PX]
     square = np.square(residual / np.array(sigmas)).sum(axis=1)
@@ -154,7 +154,7 @@ def adjust(window: TrackWindow, camera: RectifiedCamera) -> TrackWindow:
 
 
 def pose_information(window: TrackWindow, camera: RectifiedCamera) -> Float64:
-    """Information of the newest frame's observations on its pose, given the frames before.
+    """Return information of the newest frame's observations on its pose, given the frames before.
 
     Returns:
         float64 (6, 6), information of a step (translation in metres, rotation vector in radians)

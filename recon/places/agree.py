@@ -29,7 +29,7 @@ _MAJORITY: Final = 2  # keyframes that confirm a loop, for each that contradicts
 
 
 def agreeing_loops(loops: Sequence[Loop], poses: Poses, drift: DriftSettings) -> list[Loop]:
-    """The loops that enough others confirm, and few contradict.
+    """Return the loops that enough others confirm, and few contradict.
 
     Two loops and the odometry between their ends form a cycle that must close within the drift
     over its two odometry sections. False loops would have to be wrong in the same way several
@@ -56,7 +56,7 @@ def agreeing_loops(loops: Sequence[Loop], poses: Poses, drift: DriftSettings) ->
 
 
 def _closes(one: Loop, other: Loop, poses: Poses, settings: DriftSettings) -> bool:
-    """Whether two loops agree within the drift of the odometry between them."""
+    """Return whether two loops agree within the drift of the odometry between them."""
     T_lasts, lasts_m = _between(one.last, other.last, poses)
     T_firsts, firsts_m = _between(one.first, other.first, poses)
     ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
@@ -65,6 +65,6 @@ def _closes(one: Loop, other: Loop, poses: Poses, settings: DriftSettings) -> bo
 
 
 def _between(first: int, last: int, poses: Poses) -> tuple[Float64, float]:
-    """``T_first_last`` by odometry, and the path between the two."""
+    """Return ``T_first_last`` by odometry, and the path between the two."""
     (T_world_first, from_m), (T_world_last, to_m) = poses[first], poses[last]
     return invert(T_world_first) @ T_world_last, abs(to_m - from_m)

@@ -47,7 +47,7 @@ class Seen:
     xyz: Float64
 
     def select(self, rows: NDArray[np.bool_]) -> Seen:
-        """Some of the points."""
+        """Return some of the points."""
         return Seen(self.uvd[rows], self.xyz[rows])
 
 
@@ -104,7 +104,7 @@ def refine(first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCame
 
 
 def agreement(first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCamera) -> Bool:
-    """bool (N,), matches whose reprojection error is within the limit in both frames."""
+    """Return bool (N,), matches whose reprojection error is within the limit in both frames."""
     agree = np.ones(len(first.xyz), np.bool_)
     for T, points, seen in (
         (T_first_last, last.xyz, first.uvd),
@@ -119,7 +119,7 @@ def agreement(first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedC
 def _normal_equations(
     first: Seen, last: Seen, T: Float64, camera: RectifiedCamera
 ) -> tuple[Float64, Float64]:
-    """Gauss-Newton's matrix (6, 6) and gradient (6,) for a step in the axes of ``last``."""
+    """Return Gauss-Newton's matrix (6, 6) and gradient (6,) for a step in the axes of ``last``."""
     H, g = np.zeros((6, 6)), np.zeros(6)
     # Points of the last frame, seen by the first: they move with the step.
     moved = apply(T, last.xyz)

@@ -67,7 +67,7 @@ class KeyframeStore(Protocol):
         ...
 
     def get(self, frame: int) -> StoredKeyframe:
-        """The keyframe of a frame, as it was put."""
+        """Return the keyframe of a frame, as it was put."""
         ...
 
 
@@ -88,7 +88,7 @@ class KeyframeMemory:
         self._kept[stored.keyframe.frame] = stored
 
     def get(self, frame: int) -> StoredKeyframe:
-        """The keyframe of a frame."""
+        """Return the keyframe of a frame."""
         return self._kept[frame]
 
 
@@ -111,7 +111,7 @@ class LoopDetector:
         self.refused: Counter[str] = Counter()
 
     def __len__(self) -> int:
-        """Number of keyframes."""
+        """Return the number of keyframes."""
         return len(self._places)
 
     def add(
@@ -149,7 +149,7 @@ class LoopDetector:
         self.refused.update(stored.refused)
 
     def agreeing(self) -> list[Loop]:
-        """The loops that enough loops of other keyframes confirm."""
+        """Return the loops that enough loops of other keyframes confirm."""
         places = self._places
         known = zip(places.frames, places.T_world_camera, places.path_m.tolist(), strict=True)
         poses = {frame: (T, path_m) for frame, T, path_m in known}
@@ -167,7 +167,7 @@ class LoopDetector:
         return moved or float(np.rad2deg(angle_rad(T))) >= _ANGLE_DEG
 
     def _compared(self, new: StoredKeyframe, pair: RectifiedPair) -> StoredKeyframe:
-        """The keyframe with the loop to the first candidate that is verified, if any is."""
+        """Return the keyframe with the loop to the first candidate that is verified, if any is."""
         place, refused = self._place(new), []
         for old in self._candidates(place):
             known = self._store.get(self._places.frames[old]).keyframe
@@ -181,7 +181,7 @@ class LoopDetector:
         return replace(new, refused=tuple(refused))
 
     def _candidates(self, place: Place) -> list[int]:
-        """Numbers of old keyframes that may be near, most similar first."""
+        """Return numbers of old keyframes that may be near, most similar first."""
         near = self._places.near(place, self._drift)
         if not near.any():
             return []
@@ -198,7 +198,7 @@ class LoopDetector:
         return chosen
 
     def _possible(self, old: int, new: Place, loop: Loop) -> bool:
-        """Whether drift explains the difference between a loop and odometry."""
+        """Return whether drift explains the difference between a loop and odometry."""
         T = invert(self._places.T_world_camera[old]) @ new.T_world_camera
         drift = drift_over(new.path_m - float(self._places.path_m[old]), self._drift)
         return is_possible(invert(T) @ loop.T_first_last, drift, LOOP_SIGMAS)

@@ -37,7 +37,7 @@ class Drift:
 
 
 def path_lengths(T_world_camera: Float64, measured: Bool) -> Float64:
-    """Length of the path up to each frame, in which extrapolated metres count several times.
+    """Return length of the path up to each frame, in which extrapolated metres count several times.
 
     Args:
         T_world_camera: float64 (N, 4, 4).
@@ -53,7 +53,7 @@ def path_lengths(T_world_camera: Float64, measured: Bool) -> Float64:
 
 
 def drift_over(path_m: float, settings: DriftSettings) -> Drift:
-    """Drift over a path.
+    """Return the drift over a path.
 
     The scale error is constant and the heading a random walk. The position error of the latter is
     that of a straight drive, the worst case: ``turn·√(path³/3)``.
@@ -63,14 +63,14 @@ def drift_over(path_m: float, settings: DriftSettings) -> Drift:
 
 
 def spread_over(path_m: Float64, settings: DriftSettings) -> tuple[Float64, Float64]:
-    """`drift_over` of many paths (N,): standard deviations of positions and of rotations."""
+    """Return `drift_over` of many paths (N,): standard deviations of positions and of rotations."""
     turn = math.radians(settings.turn_deg)
     position_m = np.hypot(settings.share * path_m, turn * np.sqrt(path_m**3 / 3.0))
     return position_m, turn * np.sqrt(path_m)
 
 
 def is_possible(T_difference: NDArray[np.float64], drift: Drift, other: Drift) -> bool:
-    """Whether a motion differs from odometry's by no more than drift explains.
+    """Return whether a motion differs from odometry's by no more than drift explains.
 
     Args:
         T_difference: float64 (4, 4), inverse of odometry's motion times the other one.
@@ -85,6 +85,6 @@ def is_possible(T_difference: NDArray[np.float64], drift: Drift, other: Drift) -
 
 
 def motion(T_world_camera: Float64, first: int, last: int) -> Float64:
-    """``T_first_last`` (4, 4) of two poses of a stack."""
+    """Return ``T_first_last`` (4, 4) of two poses of a stack."""
     T: Float64 = invert(T_world_camera[first]) @ T_world_camera[last]
     return T

@@ -108,7 +108,7 @@ def close_loops(
 
 
 def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
-    """Chi-square of an edge."""
+    """Return chi-square of an edge."""
     T = invert(T_world_node[edge.first]) @ T_world_node[edge.last]
     off = invert(edge.T_first_last) @ T
     step = as_step(off)
@@ -116,7 +116,7 @@ def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
 
 
 def _nodes(path_m: Float64) -> NDArray[np.intp]:
-    """Frames at even distances along the path, including the first and the last."""
+    """Return frames at even distances along the path, including the first and the last."""
     length = float(path_m[-1])
     count = min(_MAX_NODES, max(2, math.ceil(length / _NODE_M) + 1))
     marks = np.searchsorted(path_m, np.linspace(0.0, length, count))
@@ -124,7 +124,7 @@ def _nodes(path_m: Float64) -> NDArray[np.intp]:
 
 
 def _solve(start: Float64, steps: list[PoseEdge], ties: list[PoseEdge]) -> tuple[Float64, Float64]:
-    """Poses of the nodes, and the weights of the loops."""
+    """Return poses of the nodes, and the weights of the loops."""
     poses = start
     worst = max(misfit(edge, poses) for edge in ties)
     rounds = math.ceil(math.log(max(worst / _MAX_CHI2, 1.0), _EASING))
@@ -154,7 +154,7 @@ def _loop_edge(
     nodes: NDArray[np.intp],
     settings: DriftSettings,
 ) -> PoseEdge:
-    """The loop as an edge between the nodes nearest to its frames."""
+    """Return the loop as an edge between the nodes nearest to its frames."""
     poses = trajectory.T_world_camera
     first, last = (_nearest_node(path_m, nodes, frame) for frame in (loop.first, loop.last))
     to_first = invert(poses[nodes[first]]) @ poses[loop.first]
@@ -179,12 +179,12 @@ def _nearest_node(path_m: Float64, nodes: NDArray[np.intp], frame: int) -> int:
 
 
 def _information(drift: Drift) -> Float64:
-    """Information (6, 6) of a step with these standard deviations."""
+    """Return the information (6, 6) of a step with these standard deviations."""
     return np.diag([drift.position_m**-2] * 3 + [drift.angle_rad**-2] * 3)
 
 
 def _turned(information: Float64, T_frame_node: Float64) -> Float64:
-    """Information of a step in a node's axes, from that in a frame's axes near it."""
+    """Return the information of a step in a node's axes, from that in a frame's axes near it."""
     R, t = T_frame_node[:3, :3], T_frame_node[:3, 3]
     adjoint = np.zeros((6, 6))
     adjoint[:3, :3] = adjoint[3:, 3:] = R
@@ -196,7 +196,7 @@ def _turned(information: Float64, T_frame_node: Float64) -> Float64:
 def _bent(
     trajectory: Trajectory, path_m: Float64, nodes: NDArray[np.intp], T_world_node: Float64
 ) -> Trajectory:
-    """Every pose moved with the nodes before and after it, interpolated by distance."""
+    """Return every pose moved with the nodes before and after it, interpolated by distance."""
     old = trajectory.T_world_camera
     before = np.clip(np.searchsorted(nodes, np.arange(len(old)), side="right") - 1, 0, None)
     before = np.minimum(before, len(nodes) - 2)

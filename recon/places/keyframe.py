@@ -72,12 +72,12 @@ class Keyframe:
         freeze(self, "coarse", np.float32, (None, None))
 
     def xyz(self, camera: RectifiedCamera) -> Float64:
-        """float64 (N, 3), the features in camera axes; NaN where the depth is unknown."""
+        """Return float64 (N, 3), the features in camera axes; NaN where the depth is unknown."""
         return points_of(self.uvd, camera)
 
 
 def points_of(uvd: NDArray[Any], camera: RectifiedCamera) -> Float64:
-    """Points (N, 3) in camera axes of columns, rows and disparities (N, 3)."""
+    """Return points (N, 3) in camera axes of columns, rows and disparities (N, 3)."""
     depth = depth_from_disparity(uvd[:, 2], camera).astype(np.float64)
     return unproject(uvd[:, 0].astype(np.float64), uvd[:, 1].astype(np.float64), depth, camera)
 
@@ -112,7 +112,7 @@ def make_keyframe(frame: int, pair: RectifiedPair, disparity: Disparity) -> Keyf
 
 
 def words_of(descriptors: UInt8) -> NDArray[np.uint32]:
-    """The distinct words of an image, sorted.
+    """Return the distinct words of an image, sorted.
 
     A word is the value of some fixed bits of a descriptor: similar descriptors are likely to share
     one, different ones are not, and no vocabulary has to be trained.
@@ -131,7 +131,7 @@ def words_of(descriptors: UInt8) -> NDArray[np.uint32]:
 
 @lru_cache
 def _chosen_bits() -> NDArray[np.intp]:
-    """Which bits form the words; tables share none while there are enough bits."""
+    """Return which bits form the words; tables share none while there are enough bits."""
     shuffled = np.random.default_rng(0).permutation(8 * _DESCRIPTOR_BYTES)
     return np.resize(shuffled, WORDS * _BITS)
 
@@ -151,7 +151,7 @@ def _spread(corners: Sequence[Any], shape: tuple[int, ...]) -> Any:
 
 
 def _places_of(corners: Sequence[Any]) -> Float32:
-    """Columns and rows (N, 2) of corners, of which there may be none."""
+    """Return columns and rows (N, 2) of corners, of which there may be none."""
     return np.asarray(cv2.KeyPoint.convert(corners), np.float32).reshape(-1, 2)
 
 

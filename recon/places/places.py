@@ -81,7 +81,7 @@ class Places:
         return self._path_m[: len(self)]
 
     def near(self, place: Place, drift: DriftSettings) -> Bool:
-        """bool (N,), places that drift allows to be in view of a later one."""
+        """Return bool (N,), places that drift allows to be in view of a later one."""
         way_m = place.path_m - self.path_m
         sigma_m, sigma_rad = spread_over(np.maximum(way_m, 0.0), drift)
         T = invert(self.T_world_camera) @ place.T_world_camera
@@ -91,7 +91,7 @@ class Places:
         return np.asarray(near & (way_m >= _MIN_PATH_M))
 
     def likeness(self, place: Place) -> Float64:
-        """float64 (N,), similarity of each to a place, in [0, 1]."""
+        """Return float64 (N,), similarity of each to a place, in [0, 1]."""
         return self._words.likeness(place.words)
 
 
@@ -112,7 +112,7 @@ class _Run:
     owners: NDArray[np.uint16]
 
     def followed_by(self, other: _Run) -> _Run:
-        """Two runs as one."""
+        """Return two runs as one."""
         words = np.concatenate([self.words, other.words])
         owners = np.concatenate([self.owners, other.owners + np.uint16(self.count)])
         # The stable sort detects the two sorted runs and merges them.
@@ -120,7 +120,7 @@ class _Run:
         return _Run(self.first, self.count + other.count, words[order], owners[order])
 
     def shared(self, words: NDArray[np.uint32]) -> NDArray[np.intp]:
-        """int64 (count,), number of words that each image shares with another one."""
+        """Return int64 (count,), number of words that each image shares with another one."""
         begin, end = (np.searchsorted(self.words, words, side) for side in ("left", "right"))
         # words[k] is in the run at begin[k] … end[k] - 1.
         found = end - begin
@@ -152,7 +152,7 @@ class WordIndex:
         self._runs.append(run)
 
     def likeness(self, words: NDArray[np.uint32]) -> Float64:
-        """float64 (N,), shared words of each image and another one, normalised to [0, 1]."""
+        """Return float64 (N,), shared words of each image and another one, normalised to [0, 1]."""
         shared = np.zeros(len(self._sizes))
         for run in self._runs:
             shared[run.first : run.first + run.count] = run.shared(words)

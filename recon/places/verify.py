@@ -89,7 +89,7 @@ class Verdict:
 
 
 def verify(first: Keyframe, last: Keyframe, camera: RectifiedCamera) -> Verdict:
-    """Whether two keyframes show the same place.
+    """Return whether two keyframes show the same place.
 
     Matches must be mutually best. The motions found in either direction must be inverse to each
     other. The inliers must be many, a fair share of the matches, spread over both images, and
@@ -108,7 +108,7 @@ def verify(first: Keyframe, last: Keyframe, camera: RectifiedCamera) -> Verdict:
 
 
 def _aligned(first: Seen, last: Seen, camera: RectifiedCamera) -> Alignment | str:
-    """The motion between the frames, or why it is not verified."""
+    """Return the motion between the frames, or why it is not verified."""
     T_there = locate(first.xyz, last.uvd[:, :2], camera)
     if T_there is None:
         return "no common motion"
@@ -126,7 +126,7 @@ def _aligned(first: Seen, last: Seen, camera: RectifiedCamera) -> Alignment | st
 
 
 def match(first: Keyframe, last: Keyframe, camera: RectifiedCamera) -> tuple[Seen, Seen]:
-    """Features that are each other's best match and have a depth in both frames."""
+    """Return features that are each other's best match and have a depth in both frames."""
     ours, theirs = (np.isfinite(k.uvd[:, 2]) for k in (first, last))
     pairs = _mutual(first.descriptors[ours], last.descriptors[theirs])
     uvds = (first.uvd[ours][pairs[:, 0]], last.uvd[theirs][pairs[:, 1]])
@@ -159,7 +159,7 @@ def _confirmed(
     T_target_source: Float64,
     camera: RectifiedCamera,
 ) -> float:
-    """Share of the source's coarse points that the target sees where they should be."""
+    """Return the share of the source's coarse points that the target sees where they should be."""
     uvd = _coarse_uvd(source, camera)
     u, v, d = project(apply(T_target_source, points_of(uvd, camera)), camera)
     step, half = _grid(target, camera)
@@ -173,7 +173,7 @@ def _confirmed(
 
 
 def _interpolated(values: Float32, column: Float64, row: Float64) -> Float64:
-    """Values (N,) between samples; NaN beyond them, or where one of the four is unknown."""
+    """Return values (N,) between samples; NaN beyond them, or where one of the four is unknown."""
     rows, columns = values.shape
     with np.errstate(invalid="ignore"):
         inside = (column >= 0) & (column < columns - 1) & (row >= 0) & (row < rows - 1)
@@ -187,14 +187,14 @@ def _interpolated(values: Float32, column: Float64, row: Float64) -> Float64:
 
 
 def _grid(keyframe: Keyframe, camera: RectifiedCamera) -> tuple[int, int]:
-    """Pixels between coarse samples, and the place of the first."""
+    """Return pixels between coarse samples, and the place of the first."""
     rows = keyframe.coarse.shape[0]
     step = max(1, round(camera.height_px / rows)) if rows else 1
     return step, step // 2
 
 
 def _coarse_uvd(keyframe: Keyframe, camera: RectifiedCamera) -> Float64:
-    """Columns, rows and disparities (N, 3) of the coarse samples that have one."""
+    """Return columns, rows and disparities (N, 3) of the coarse samples that have one."""
     row, column = np.nonzero(keyframe.coarse + camera.doffs_px > 1.0)
     step, half = _grid(keyframe, camera)
     d = keyframe.coarse[row, column]
@@ -202,7 +202,7 @@ def _coarse_uvd(keyframe: Keyframe, camera: RectifiedCamera) -> Float64:
 
 
 def _mutual(ours: UInt8, theirs: UInt8) -> np.ndarray:
-    """Rows (M, 2) of descriptors that are each other's nearest."""
+    """Return rows (M, 2) of descriptors that are each other's nearest."""
     if not len(ours) or not len(theirs):
         return np.zeros((0, 2), np.intp)
     found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(ours, theirs)
@@ -211,7 +211,7 @@ def _mutual(ours: UInt8, theirs: UInt8) -> np.ndarray:
 
 
 def _inverse(T_there: Float64, T_back: Float64) -> bool:
-    """Whether the two poses are inverse to each other."""
+    """Return whether the two poses are inverse to each other."""
     around = T_there @ T_back
     off_deg = float(np.rad2deg(angle_rad(around)))
     off_m = float(np.linalg.norm(around[:3, 3]))
@@ -225,7 +225,7 @@ def _weakness(
     matches: int,
     camera: RectifiedCamera,
 ) -> str:
-    """Why the inliers are not enough; "" where they are."""
+    """Return why the inliers are not enough; "" where they are."""
     inliers = int(aligned.agree.sum())
     if inliers < max(MIN_INLIERS, _MIN_INLIER_SHARE * matches):
         return "few inliers"

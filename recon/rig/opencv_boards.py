@@ -16,12 +16,12 @@ _PREFIX: Final = "DICT_"
 
 
 def dictionary_names() -> list[str]:
-    """Names of OpenCV's marker dictionaries, in upper case, without ``DICT_``."""
+    """Return names of OpenCV's marker dictionaries, in upper case, without ``DICT_``."""
     return sorted({n[len(_PREFIX) :].upper() for n in dir(cv2.aruco) if n.startswith(_PREFIX)})
 
 
 def dark_rectangles(board: CalibrationBoard) -> Float64:
-    """float64 (M, 4), the dark rectangles of a board: x0, y0, x1, y1 in metres.
+    """Return float64 (M, 4), the dark rectangles of a board: x0, y0, x1, y1 in metres.
 
     The origin is the first inner corner, as in `CalibrationBoard.corners_m`.
 
@@ -65,14 +65,14 @@ def find_charuco(grey: UInt8, board: CalibrationBoard) -> tuple[Int32, Float64]:
 
 
 def find_markers(grey: UInt8, dictionary: str) -> Int32:
-    """int32 (N,), ids of the markers of a dictionary found in an image."""
+    """Return int32 (N,), ids of the markers of a dictionary found in an image."""
     detector = cv2.aruco.ArucoDetector(_dictionary(dictionary))
     numbers = detector.detectMarkers(grey)[1]
     return np.zeros(0, np.int32) if numbers is None else np.asarray(numbers, np.int32).ravel()
 
 
 def marker_count(board: CalibrationBoard) -> int:
-    """Number of markers on a ChArUco board."""
+    """Return the number of markers on a ChArUco board."""
     columns, rows = board.squares
     return columns * rows // 2
 
@@ -102,7 +102,7 @@ def _charuco(board: CalibrationBoard) -> Any:
 
 
 def _marker_cells(board: CalibrationBoard, number: int, corners: Float64) -> Float64:
-    """float64 (M, 4), dark cells of the marker with the given corners (4, 2), metres."""
+    """Return float64 (M, 4), dark cells of the marker with the given corners (4, 2), metres."""
     dictionary = _dictionary(board.dictionary)
     cells = dictionary.markerSize + 2
     bits = cv2.aruco.generateImageMarker(dictionary, number, cells)

@@ -89,7 +89,7 @@ class RectifyRun:
 def plan_by_calibration(
     path: Path, images: ImagePairs, settings: RectificationSettings, *, metres_per_unit: float
 ) -> RectifyPlan:
-    """Rectification by a calibration file; depth is metric.
+    """Return the rectification by a calibration file; depth is metric.
 
     Raises:
         CalibrationError: The calibration does not fit the images, or they are rectified already.
@@ -128,7 +128,7 @@ def plan_by_calibration(
 
 
 def plan_by_features(images: ImagePairs) -> RectifyPlan:
-    """Rectification by homographies from feature matches; depth has no scale.
+    """Return the rectification by homographies from feature matches; depth has no scale.
 
     Raises:
         CalibrationError: The features of the images fix no homographies.

@@ -34,7 +34,7 @@ _PASSING: Final = (OutputError, MemoryLimitError, OSError, MemoryError, Keyboard
 
 
 def state_folder(folder: Path) -> Path:
-    """Folder where an unfinished run keeps the state it resumes from."""
+    """Return the folder where an unfinished run keeps the state it resumes from."""
     return folder / _PARTIAL / _STATE
 
 
@@ -66,7 +66,7 @@ class RunDirectory:
 
     @classmethod
     def for_command(cls, command: str, out: Path | None, *, resume: bool = False) -> Self:
-        """The requested folder, or a new one under ``outputs/``."""
+        """Return the requested folder, or a new one under ``outputs/``."""
         if out is None:
             return cls(default_folder(command), latest=True)
         # A run in a default folder keeps its link when it is resumed.
@@ -74,13 +74,13 @@ class RunDirectory:
         return cls(out, latest=resume and stamped, resume=resume)
 
     def path(self, name: str) -> Path:
-        """Path to write the file ``name`` to; its parent folder is created."""
+        """Return the path to write the file ``name`` to; its parent folder is created."""
         target = self._partial / name
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
 
     def state(self, name: str) -> Path:
-        """Path of the state file ``name``, which is deleted when the run is done."""
+        """Return the path of the state file ``name``, which is deleted when the run is done."""
         target = self._partial / _STATE / name
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
@@ -94,7 +94,7 @@ class RunDirectory:
             shutil.copyfile(source, target)
 
     def files(self) -> list[str]:
-        """Sorted names of the files written so far, without those of the state."""
+        """Return sorted names of the files written so far, without those of the state."""
         written = (p.relative_to(self._partial) for p in self._partial.rglob("*") if p.is_file())
         return sorted(p.as_posix() for p in written if p.parts[0] not in (_STATE, _LOCK))
 

@@ -52,14 +52,14 @@ def serial_algebra() -> Iterator[None]:
 
 
 def available_cores() -> int:
-    """Cores that this process may use; in a container, fewer than the machine has."""
+    """Return cores that this process may use; in a container, fewer than the machine has."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far, in 10⁶ bytes."""
+    """Return the largest resident memory of this process so far, in 10⁶ bytes."""
     # On Linux, the peak from getrusage is inherited from the parent process.
     told = _PEAK.search(_STATUS.read_text()) if _STATUS.exists() else None
     if told is not None:
@@ -69,7 +69,7 @@ def peak_memory_mb() -> float:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that affect results."""
+    """Return versions of Python and of the packages that affect results."""
     return {"python": platform.python_version(), **{name: _version(name) for name in _RECORDED}}
 
 

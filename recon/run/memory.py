@@ -65,7 +65,7 @@ class MemorySettings(Settings):
 
 
 def memory_overrides(limit: str | None) -> list[str]:
-    """The override for a size such as ``2G`` or ``1500M``; None = no override.
+    """Return the override for a size such as ``2G`` or ``1500M``; None = no override.
 
     Raises:
         SettingsError: The text is not a size.

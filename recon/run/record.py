@@ -16,7 +16,7 @@ _PIECE_BYTES: Final = 1 << 20
 
 
 def fingerprint(files: Iterable[Path]) -> dict[str, Any]:
-    """Number, size and one SHA-256 of a list of files, in that order.
+    """Return the number, size and one SHA-256 of a list of files, in that order.
 
     The hash covers each file's name and bytes, so a renamed frame changes it too.
     """

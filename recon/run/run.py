@@ -129,7 +129,7 @@ class Run(RunDirectory):
         )
 
     def _cost(self) -> dict[str, Any]:
-        """Seconds in all and per stage (stages overlap), and peak memory."""
+        """Return seconds in all and per stage (stages overlap), and peak memory."""
         return {
             "seconds": round(time.perf_counter() - self._start, 3),
             "stages": {name: round(value, 3) for name, value in self.watch.seconds.items()},

@@ -24,7 +24,7 @@ def plain(value: Any) -> Any:
 
 
 def cost(stopwatch: Stopwatch, total_seconds: float) -> dict[str, Any]:
-    """Cost of a run: total seconds, seconds per stage (stages overlap), and peak memory."""
+    """Return cost of a run: total seconds, seconds per stage (stages overlap), and peak memory."""
     return {
         "seconds": round(total_seconds, 3),
         "stages": {name: round(value, 3) for name, value in stopwatch.seconds.items()},

@@ -84,7 +84,7 @@ class BagSource:
         return sum(self.roll.alone)
 
     def lines(self, count: int) -> list[int] | None:
-        """The line of each pair in a file with one line per frame; see `Roll.lines`."""
+        """Return the line of each pair in a file with one line per frame; see `Roll.lines`."""
         return self.roll.lines(count)
 
     @property
@@ -235,7 +235,7 @@ def _read_rig(
     settings: SourceSettings,
     path: Path,
 ) -> tuple[Rig, tuple[Path, ...], str]:
-    """The calibration, the files it was read from, and a note on its origin."""
+    """Return the calibration, the files it was read from, and a note on its origin."""
     infos = [camera_info_topic(bag, topic) for topic in topics]
     if settings.calibration is not None:
         first = next(islice(bag.images(topics[0]), pairs.left[0], None))

@@ -15,7 +15,7 @@ _LISTED = 20
 
 
 def choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], str]:
-    """The left and right image topic: from the settings, else guessed from the topic names.
+    """Return the left and right image topic: from the settings, else guessed from the topic names.
 
     Of several pairs, rectified ones are preferred, then uncompressed ones, then alphabetical order.
 
@@ -76,7 +76,7 @@ def list_others(bag: Bag, used: Sequence[str]) -> str:
 
 
 def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
-    """The CameraInfo topic of an image topic: at the same level, or one level up."""
+    """Return the CameraInfo topic of an image topic: at the same level, or one level up."""
     place = PurePosixPath(image_topic.removesuffix("/compressed")).parent
     for candidate in (place / "camera_info", place.parent / "camera_info"):
         topic = bag.topics.get(str(candidate))
@@ -86,7 +86,7 @@ def camera_info_topic(bag: Bag, image_topic: str) -> str | None:
 
 
 def names_rectified(image_topic: str) -> bool:
-    """Whether a topic has rectified images, according to ROS naming conventions."""
+    """Return whether a topic has rectified images, according to ROS naming conventions."""
     return "rect" in image_topic.removesuffix("/compressed").rsplit("/", 1)[-1]
 
 

@@ -94,7 +94,7 @@ def open_folders(folder: Path, settings: SourceSettings) -> PictureSource:
 
 
 def find_views(folder: Path, settings: SourceSettings) -> tuple[Path, Path] | None:
-    """The folders of the left and right images; both are ``folder`` if it contains both."""
+    """Return the folders of the left and right images; both are ``folder`` if it contains both."""
     if settings.right is not None:
         left = folder / settings.left if settings.left else folder
         inside = folder / settings.right
@@ -116,7 +116,7 @@ def find_views(folder: Path, settings: SourceSettings) -> tuple[Path, Path] | No
 
 
 def _with_pictures(folder: Path) -> Path | None:
-    """The folder itself or its subfolder with the images, or None."""
+    """Return the folder itself or its subfolder with the images, or None."""
     places = [folder / name for name in _INSIDE]
     return next((p for p in places if p.is_dir() and any(map(is_picture, p.iterdir()))), None)
 
@@ -162,7 +162,7 @@ def _list_both(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
 def _choose(
     pairs: list[tuple[Path, Path]], roll: Roll, settings: SourceSettings, folder: Path
 ) -> tuple[list[tuple[Path, Path]], Roll]:
-    """The pairs that the settings choose."""
+    """Return the pairs that the settings choose."""
     roll = roll.choose(settings, folder)
     return pairs if roll.chosen is None else [pairs[k] for k in roll.chosen], roll
 
@@ -184,7 +184,7 @@ def _existing(path: Path) -> Path | None:
 
 
 def _stamps(left: list[Path], right: list[Path]) -> tuple[Float64, Float64] | None:
-    """The timestamps in the file names, or None unless all names are timestamps."""
+    """Return the timestamps in the file names, or None unless all names are timestamps."""
     first, second = (stamps_of_names([path.stem for path in paths]) for paths in (left, right))
     return None if first is None or second is None else (first, second)
 
@@ -209,7 +209,7 @@ def _pair_by_stamp(
 
 
 def _by_name(left: list[Path], right: list[Path]) -> _Frames | None:
-    """Frames by names that are equal or differ only in the side.
+    """Return frames by names that are equal or differ only in the side.
 
     None if most images have no partner, so that their names tell nothing.
     """
@@ -247,13 +247,13 @@ def _by_index(left: list[Path], right: list[Path], by: str, folder: Path) -> _Fr
 
 
 def _with_times(found: _Pairing, path: Path) -> _Pairing:
-    """The pairs with the times of a file, which win over those in names."""
+    """Return the pairs with the times of a file, which win over those in names."""
     stamps_s = read_times_of_pairs(path, found.roll)
     return replace(found, stamps_s=stamps_s, how=f"{found.how}, times of {_TIMES}", texts=(path,))
 
 
 def _times(found: _Pairing, settings: SourceSettings) -> tuple[Float64, str]:
-    """Timestamps of the pairs, and a note if they are assumed."""
+    """Return timestamps of the pairs, and a note if they are assumed."""
     if found.stamps_s is not None and settings.rate_hz is None:
         return found.stamps_s, ""
     rate_hz = settings.rate_hz or DEFAULT_RATE_HZ

@@ -72,7 +72,7 @@ def pair_images(left: str | Path, right: str | Path) -> ImagePairs:
 
 
 def list_pictures(where: str | Path) -> list[Path]:
-    """The images of a folder or pattern in natural order: 2 before 10.
+    """Return the images of a folder or pattern in natural order: 2 before 10.
 
     Raises:
         SourceError: There are none.
@@ -99,7 +99,7 @@ def _by_name(side: Sequence[Path]) -> dict[Key, Path]:
 
 
 def _by_numbers(side: Sequence[Path]) -> dict[Key, Path]:
-    """Images by those numbers in their names that vary within the side.
+    """Return images by those numbers in their names that vary within the side.
 
     Names with more or fewer numbers than most are left out.
     """

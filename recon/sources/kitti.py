@@ -87,7 +87,7 @@ def open_kitti(
 
 
 def choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
-    """The grey pair of cameras, or the colour pair if only that is complete.
+    """Return the grey pair of cameras, or the colour pair if only that is complete.
 
     Raises:
         SourceError: There is no complete pair.
@@ -114,7 +114,7 @@ def choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
 
 
 def list_pairs(left: Path, right: Path) -> tuple[list[tuple[Path, Path]], Roll]:
-    """Left and right image of each frame, paired by equal names.
+    """Return the left and right image of each frame, paired by equal names.
 
     Raises:
         SourceError: Most images have no partner, or there are no images.
@@ -139,7 +139,7 @@ def _names(folder: Path) -> set[str]:
 def _read_times(
     folder: Path, roll: Roll, settings: SourceSettings
 ) -> tuple[Float64, tuple[Path, ...]]:
-    """Times of the frames in seconds, and their file; no file if a rate is given."""
+    """Return times of the frames in seconds, and their file; no file if a rate is given."""
     if settings.rate_hz is not None:
         return np.array(roll.kept) / settings.rate_hz, ()
     path = folder / "times.txt"

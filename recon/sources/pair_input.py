@@ -135,7 +135,7 @@ def _with_camera(given: PairInput, known: KnownCamera) -> PairInput:
 
 
 def with_truth(given: PairInput, path: Path | None) -> PairInput:
-    """The pair with ground truth from a file, of which every known pixel counts.
+    """Return the pair with ground truth from a file, of which every known pixel counts.
 
     Args:
         given: The pair.

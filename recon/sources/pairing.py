@@ -56,7 +56,7 @@ class StampPairs:
     alone: tuple[int, int]
 
     def chosen(self, which: range | None) -> StampPairs:
-        """Some of the pairs; None = all."""
+        """Return some of the pairs; None = all."""
         if which is None:
             return self
         left, right = ([side[k] for k in which] for side in (self.left, self.right))
@@ -95,7 +95,7 @@ class Roll:
         return self.paired if self.chosen is None else [self.paired[k] for k in self.chosen]
 
     def choose(self, settings: SourceSettings, where: Path) -> Roll:
-        """The same recording, of which the frames from ``start`` to ``end`` are used.
+        """Return the same recording, of which the frames from ``start`` to ``end`` are used.
 
         Raises:
             SourceError: There are none.
@@ -114,7 +114,7 @@ class Roll:
         return replace(self, chosen=chosen)
 
     def lines(self, count: int) -> list[int] | None:
-        """The line of each pair in a file with one line per frame, such as ``times.txt``.
+        """Return the line of each pair in a file with one line per frame, such as ``times.txt``.
 
         One line per pair fits at once, whether of all pairs or of those used. Else names that are
         counters give the line, so that it stays the right one where images are missing; else the
@@ -149,13 +149,13 @@ def natural_key(name: str) -> list[tuple[int, str]]:
 
 
 def partner_names(name: str) -> list[str]:
-    """Possible names of the right camera for a name of the left one, most likely first."""
+    """Return possible names of the right camera for a name of the left one, most likely first."""
     found = [other for left, right in SIDES for other in _replaced(name, left, right)]
     return list(dict.fromkeys(found))
 
 
 def _replaced(name: str, left: str, right: str) -> list[str]:
-    """A name with the mark of the left side replaced by that of the right one."""
+    """Return a name with the mark of the left side replaced by that of the right one."""
     matches = list(re.finditer(_bounded(left), name))
     if not matches:
         return []
@@ -170,7 +170,7 @@ def _has(name: str, mark: str) -> bool:
 
 
 def _bounded(mark: str) -> str:
-    """The pattern of a mark; a single letter or digit counts only if it stands alone."""
+    """Return the pattern of a mark; a single letter or digit counts only if it stands alone."""
     return rf"(?<![A-Za-z0-9]){mark}(?![A-Za-z0-9])" if len(mark) == 1 else mark
 
 
@@ -190,7 +190,7 @@ def split_sides(names: Iterable[str]) -> tuple[list[str], list[str]]:
 
 
 def find_partners(names: Iterable[str]) -> list[tuple[str, str]]:
-    """All (left, right) pairs among some names, in natural order."""
+    """Return all (left, right) pairs among some names, in natural order."""
     known = set(names)
     pairs = []
     for name in sorted(known, key=natural_key):
@@ -201,7 +201,7 @@ def find_partners(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def stamp_of_name(stem: str) -> float | None:
-    """Timestamp in a file name: seconds, or an integer number of ms, µs or ns since 1970.
+    """Return timestamp in a file name: seconds, or an integer number of ms, µs or ns since 1970.
 
     Returns:
         Seconds, or None if the name is not a timestamp.
@@ -214,7 +214,7 @@ def stamp_of_name(stem: str) -> float | None:
 
 
 def stamps_of_names(stems: Sequence[str]) -> Float64 | None:
-    """Timestamps in the file names of one camera.
+    """Return timestamps in the file names of one camera.
 
     Returns:
         float64 (N,), seconds; None unless all names are timestamps, or if they are counters, such
@@ -227,7 +227,7 @@ def stamps_of_names(stems: Sequence[str]) -> Float64 | None:
 
 
 def _are_counters(stems: Sequence[str]) -> bool:
-    """Whether names with as many digits as a timestamp count frames.
+    """Return whether names with as many digits as a timestamp count frames.
 
     Today's times have no leading zero. Those of a clock that starts at 0 may have one, but are
     many of their units (ms, µs or ns) apart, and no camera is timed in whole seconds.

@@ -79,7 +79,7 @@ class PictureSource:
         return sum(self.roll.alone)
 
     def lines(self, count: int) -> list[int] | None:
-        """The line of each pair in a file with one line per frame; see `Roll.lines`."""
+        """Return the line of each pair in a file with one line per frame; see `Roll.lines`."""
         return self.roll.lines(count)
 
     @property
@@ -171,7 +171,7 @@ def pair_listed(
 def pair_named(
     frames: Sequence[tuple[Path | None, Path | None]], where: Path | None = None
 ) -> tuple[list[tuple[Path, Path]], Roll]:
-    """The pairs among frames of which an image may be missing.
+    """Return the pairs among frames of which an image may be missing.
 
     Args:
         frames: Left and right image of each frame in order; None = missing.
@@ -196,7 +196,7 @@ def _existing(path: Path) -> Path | None:
 
 
 def picture_size(path: Path, settings: SourceSettings) -> tuple[int, int]:
-    """Width and height of an image file, which must not be larger than the settings allow.
+    """Return width and height of an image file, which must not be larger than the settings allow.
 
     Raises:
         FormatError: The file is missing or damaged.
@@ -206,7 +206,7 @@ def picture_size(path: Path, settings: SourceSettings) -> tuple[int, int]:
 
 
 def list_pictures(folder: Path) -> list[Path]:
-    """The images of a folder in natural order: 2 before 10.
+    """Return the images of a folder in natural order: 2 before 10.
 
     Raises:
         SourceError: The folder does not exist or contains no images.
@@ -220,5 +220,5 @@ def list_pictures(folder: Path) -> list[Path]:
 
 
 def is_picture(path: Path) -> bool:
-    """Whether a file is an image by its suffix; hidden files do not count."""
+    """Return whether a file is an image by its suffix; hidden files do not count."""
     return path.suffix.lower() in PICTURES and not path.name.startswith(".")

@@ -78,7 +78,7 @@ def _read_topic(source: BagSource, name: str) -> ReadPrior:
 
 
 def _choose_frames(poses: list[BagPose], where: str) -> tuple[tuple[str, str], list[BagPose]]:
-    """The poses of one frame in another: the only ones, or those in the odometry frame."""
+    """Return the poses of one frame in another: the only ones, or those in the odometry frame."""
     found: dict[tuple[str, str], list[BagPose]] = defaultdict(list)
     for pose in poses:
         found[pose.parent, pose.child].append(pose)
@@ -97,7 +97,7 @@ def _choose_frames(poses: list[BagPose], where: str) -> tuple[tuple[str, str], l
 
 
 def _path_of(poses: list[BagPose], where: str, *, stamped: bool) -> Trajectory:
-    """The poses in order of time, each time once."""
+    """Return the poses in order of time, each time once."""
     stamps = [pose.stamp_ns if stamped else pose.recorded_ns for pose in poses]
     times_ns, first = np.unique(stamps, return_index=True)
     for pose in poses:

@@ -46,7 +46,7 @@ class StereoSource(Protocol):
         ...
 
     def __len__(self) -> int:
-        """Number of pairs."""
+        """Return the number of pairs."""
         ...
 
     def __iter__(self) -> Iterator[StereoPair]:
@@ -103,7 +103,7 @@ class IncompleteSource(Protocol):
         ...
 
     def lines(self, count: int) -> list[int] | None:
-        """The line of each pair in a file of ``count`` lines with one line per frame.
+        """Return the line of each pair in a file of ``count`` lines with one line per frame.
 
         Returns:
             Indices from 0; None = the file has too few lines.

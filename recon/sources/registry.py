@@ -100,7 +100,7 @@ def _recognise_file(path: Path) -> str:
 
 
 def _signs(folder: Path, settings: SourceSettings) -> tuple[tuple[str, bool], ...]:
-    """Kinds and whether a folder looks like them, most distinctive first."""
+    """Return kinds and whether a folder looks like them, most distinctive first."""
     views = range(4)
     return (
         ("bag", bool(find_bags(folder))),

@@ -239,7 +239,7 @@ class Bag:
     def _messages(
         self, topics: Sequence[str], start_ns: int | None = None
     ) -> Iterator[tuple[str, int, bytes]]:
-        """Topic, time of recording and content of each message, in that order."""
+        """Yield topic, time of recording and content of each message, in that order."""
         with self._our_errors(), self._opened() as readers:
             streams = []
             for reader in readers:
@@ -257,7 +257,7 @@ class Bag:
             return self._store.deserialize_cdr(content, kind)
 
     def _stamp_ns(self, content: bytes, topic: str) -> int:
-        """The header stamp: all supported types begin with a header."""
+        """Return the header stamp: all supported types begin with a header."""
         try:
             if self._ros1:
                 _, seconds, nanoseconds = struct.unpack_from("<III", content)
@@ -294,7 +294,7 @@ class Bag:
 
 
 def _pose_of(message: Any, recorded_ns: int) -> BagPose:
-    """The pose in a message; one with a covariance is wrapped once more."""
+    """Return the pose in a message; one with a covariance is wrapped once more."""
     if hasattr(message, "transform"):
         place, turn = message.transform.translation, message.transform.rotation
     else:

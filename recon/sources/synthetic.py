@@ -93,7 +93,7 @@ class SyntheticSource:
         return (self.camera.pair(index) for index in range(start, len(self)))
 
     def frame(self, index: int) -> SyntheticFrame:
-        """One pair with depth, disparity, pose and ground.
+        """Return one pair with depth, disparity, pose and ground.
 
         Raises:
             SettingsError: There is no such frame.
@@ -101,7 +101,7 @@ class SyntheticSource:
         return self.camera.render(index)
 
     def disparity_truth(self, index: int) -> DisparityTruth:
-        """True disparity of one frame; NaN = sky.
+        """Return True disparity of one frame; NaN = sky.
 
         Raises:
             SettingsError: There is no such frame.
@@ -117,7 +117,7 @@ class SyntheticSource:
         least_frames: int = 3,
         T_map_world: Float64 | None = None,
     ) -> OccupancyTruth:
-        """True obstacles, and which of them were seen; see `true_occupancy`."""
+        """Return True obstacles, and which of them were seen; see `true_occupancy`."""
         return true_occupancy(
             self.camera,
             resolution_m=resolution_m,

@@ -16,7 +16,7 @@ from recon.io.trajectory import read_tum
 def truth_at(
     path: Trajectory, stamps_s: Float64, T_body_camera: Float64 | None = None
 ) -> tuple[SequenceTruth | None, str]:
-    """True pose of the left camera in each frame; the first one is the identity.
+    """Return True pose of the left camera in each frame; the first one is the identity.
 
     Args:
         path: ``T_world_body`` at the times of the measuring instrument.
@@ -36,7 +36,7 @@ def truth_at(
 
 
 def read_tum_truth(folder: Path, stamps_s: Float64) -> tuple[SequenceTruth | None, str]:
-    """Ground truth from ``groundtruth.txt`` (TUM format, left camera), if a folder has one.
+    """Return ground truth from ``groundtruth.txt`` (TUM format, left camera), if a folder has one.
 
     Raises:
         FormatError: The file is damaged.

@@ -49,13 +49,13 @@ def open_tum(folder: Path, settings: SourceSettings) -> PictureSource:
 
 
 def list_files(folder: Path) -> list[tuple[str, str]]:
-    """Names (left, right) of the text files in a folder that list images."""
+    """Return names (left, right) of the text files in a folder that list images."""
     names = [path.name for path in folder.iterdir() if path.suffix == ".txt" and _lists(path)]
     return find_partners(names)
 
 
 def _lists(path: Path) -> bool:
-    """Whether a file is a list, by its first entry: a number, then the name of an image."""
+    """Return whether a file is a list, by its first entry: a number, then the name of an image."""
     with path.open(encoding="utf-8", errors="replace") as lines:
         words = next((line.split() for line in lines if line.strip() and line[0] != "#"), [])
     return len(words) >= 2 and is_picture(Path(words[1]))

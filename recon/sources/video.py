@@ -60,7 +60,7 @@ class VideoSource:
         return sum(self.roll.alone)
 
     def lines(self, count: int) -> list[int] | None:
-        """The line of each frame in a file with one line per frame; see `Roll.lines`."""
+        """Return the line of each frame in a file with one line per frame; see `Roll.lines`."""
         return self.roll.lines(count)
 
     def __len__(self) -> int:
@@ -92,7 +92,7 @@ class VideoSource:
             yield StereoPair(left, right, time_s, index, f"frame {number}")
 
     def _views(self, numbers: Sequence[int]) -> Iterator[tuple[float, UInt8, UInt8]]:
-        """The views of some frames, numbered as in the files and evenly spaced."""
+        """Yield the views of some frames, numbered as in the files and evenly spaced."""
         if len(self.videos) == 1:
             for stamp_s, image in self.videos[0].pick(numbers):
                 yield stamp_s, *split_views(image, self.settings)
@@ -160,19 +160,19 @@ def open_videos(files: Sequence[Path]) -> tuple[VideoFile, ...]:
 
 
 def frames_of(videos: Sequence[VideoFile]) -> int:
-    """Number of frames that all the videos have."""
+    """Return the number of frames that all the videos have."""
     return min(video.frames for video in videos)
 
 
 def list_videos(folder: Path) -> list[str]:
-    """Names of the video files in a folder."""
+    """Return names of the video files in a folder."""
     return sorted(
         path.name for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file()
     )
 
 
 def view_size(video: VideoFile, settings: SourceSettings) -> tuple[int, int]:
-    """Width and height of one of the two views in a video.
+    """Return the width and height of one of the two views in a video.
 
     Raises:
         SourceError: The frame size is odd.

@@ -80,7 +80,7 @@ class FrameReconstructor:
         return rectified, disparity
 
     def inspect(self, pair: RectifiedPair) -> tuple[str, ...]:
-        """Warnings about the geometry of a pair; only every so many pairs are inspected.
+        """Return warnings about the geometry of a pair; only every so many pairs are inspected.
 
         Raises:
             CalibrationError: Left and right are swapped.

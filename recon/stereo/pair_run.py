@@ -55,7 +55,7 @@ class PairRun:
 
 
 def disparity_figures(disparity: Disparity) -> dict[str, Any]:
-    """Size, share of pixels for each reason, and median of a disparity, ready for JSON."""
+    """Return size, share of pixels for each reason, and median of a disparity, ready for JSON."""
     found = disparity.values[disparity.valid]
     shares = np.bincount(disparity.reason.ravel(), minlength=len(Reason)) / disparity.reason.size
     return {
@@ -68,7 +68,7 @@ def disparity_figures(disparity: Disparity) -> dict[str, Any]:
 
 
 def cloud_figures(frame: ReconstructedFrame) -> dict[str, Any]:
-    """Number of points, median depth and camera of a frame, ready for JSON."""
+    """Return the number of points, median depth and camera of a frame, ready for JSON."""
     camera, z = frame.pair.camera, frame.cloud.xyz[:, 2]
     return {
         "points": len(frame.cloud),

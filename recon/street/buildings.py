@@ -72,7 +72,7 @@ class HousePlan:
 
 
 def draw_plan(width: float, rng: np.random.Generator) -> HousePlan:
-    """A random house of a given width."""
+    """Return a random house of a given width."""
     brick = rng.random() < 0.4
     colours = _BRICKS if brick else _PLASTERS
     base = np.clip(np.array(colours[rng.integers(len(colours))]) + rng.normal(0, 0.03, 3), 0, 1)
@@ -109,7 +109,7 @@ def _rgb(values: Float64) -> tuple[float, float, float]:
 
 
 def _openings(plan: HousePlan, rng: np.random.Generator) -> tuple[Float64, Float64]:
-    """Windows (N, 4) and the door (1, 4), each as (x0, z0, x1, z1)."""
+    """Return windows (N, 4) and the door (1, 4), each as (x0, z0, x1, z1)."""
     columns = max(2, int(plan.width / rng.uniform(2.2, 3.0)))
     centres = (np.arange(columns) + 0.5) * plan.width / columns
     w, h = plan.window
@@ -127,7 +127,7 @@ def _openings(plan: HousePlan, rng: np.random.Generator) -> tuple[Float64, Float
 
 
 def _facade(plan: HousePlan, holes: Float64) -> TriangleSoup:
-    """The wall y = 0 with rectangular holes, split along the edges of all holes."""
+    """Return the wall y = 0 with rectangular holes, split along the edges of all holes."""
     xs = np.unique(np.concatenate([[0.0, plan.width], holes[:, 0], holes[:, 2]]))
     zs = np.unique(np.concatenate([[0.0, plan.eaves], holes[:, 1], holes[:, 3]]))
     x_mid, z_mid = 0.5 * (xs[:-1] + xs[1:]), 0.5 * (zs[:-1] + zs[1:])
@@ -182,7 +182,7 @@ def _windows(holes: Float64, rng: np.random.Generator) -> TriangleSoup:
 
 
 def _upright(rectangles: Float64, y: float, paint: Paint, parts: NDArray[Any]) -> TriangleSoup:
-    """Rectangles (N, 4) of x, z, width and height, parallel to the facade."""
+    """Return rectangles (N, 4) of x, z, width and height, parallel to the facade."""
     x, z, width, height = rectangles.T
     zero = np.zeros(len(x))
     soup = quads(
@@ -195,7 +195,7 @@ def _upright(rectangles: Float64, y: float, paint: Paint, parts: NDArray[Any]) -
 
 
 def _reveals(holes: Float64, paint: Paint) -> TriangleSoup:
-    """The four inner sides of each hole."""
+    """Return the four inner sides of each hole."""
     x0, z0, x1, z1 = holes.T
     zero = np.zeros(len(holes))
     inwards = [0.0, _REVEAL_M, 0.0]
@@ -207,7 +207,7 @@ def _reveals(holes: Float64, paint: Paint) -> TriangleSoup:
 
 
 def _ledges(plan: HousePlan, holes: Float64) -> TriangleSoup:
-    """A string course per floor, a cornice, and a sill under each opening."""
+    """Return a string course per floor, a cornice, and a sill under each opening."""
     w = plan.width
     levels = 0.4 + plan.storey * np.arange(1, plan.floors)
     bands = [(plan.eaves - 0.25, plan.eaves + 0.1, 0.3)]
@@ -232,7 +232,7 @@ def _blind_walls(plan: HousePlan) -> TriangleSoup:
 
 
 def _gable(plan: HousePlan) -> TriangleSoup:
-    """Two slopes with their ridge along the street, and the triangles below them."""
+    """Return two slopes with their ridge along the street, and the triangles below them."""
     w, d, h, out = plan.width, plan.depth, plan.eaves + 0.05, 0.35
     rise = 0.42 * d
     slope = rise / (d / 2)

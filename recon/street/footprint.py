@@ -22,7 +22,7 @@ def footprint(
     band_m: tuple[float, float],
     raster: tuple[NDArray[np.int64], tuple[int, int], float],
 ) -> OccupancyGrid:
-    """OCCUPIED where a surface lies in the height band, else FREE.
+    """Return OCCUPIED where a surface lies in the height band, else FREE.
 
     Objects taller than the band, such as houses, are hollow.
 
@@ -63,7 +63,7 @@ def _outlines(vertices: Float64, band_m: tuple[float, float], step_m: float) -> 
 
 
 def _level_cut(triangles: Float64, z: float) -> tuple[Float64, Float64]:
-    """Ends (N, 3) of the segments in which triangles cross the plane at height ``z``."""
+    """Return ends (N, 3) of the segments in which triangles cross the plane at height ``z``."""
     above = triangles[..., 2] > z
     # The corner that is alone on its side of the plane; both edges from it cross the plane.
     lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
@@ -78,7 +78,7 @@ def _level_cut(triangles: Float64, z: float) -> tuple[Float64, Float64]:
 
 
 def _sample_segments(start: Float64, end: Float64, step_m: float) -> Float64:
-    """Points (M, 3) on segments, at most ``step_m`` apart, including the ends."""
+    """Return points (M, 3) on segments, at most ``step_m`` apart, including the ends."""
     pieces = np.ceil(np.linalg.norm(end - start, axis=1) / step_m).astype(int) + 1
     segment = np.repeat(np.arange(len(start)), pieces + 1)
     first = np.cumsum(pieces + 1) - (pieces + 1)
@@ -89,7 +89,7 @@ def _sample_segments(start: Float64, end: Float64, step_m: float) -> Float64:
 def _quarter_centres(
     shape: tuple[int, int], origin_m: tuple[float, float], resolution_m: float
 ) -> Float64:
-    """Centres (rows·columns·4, 2) of the quarters of each cell, map axes, cell by cell."""
+    """Return centres (rows·columns·4, 2) of the quarters of each cell, map axes, cell by cell."""
     row, column = np.indices(shape)
     corner = np.stack([column, row], axis=-1).reshape(-1, 1, 2)
     quarters = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
@@ -99,7 +99,7 @@ def _quarter_centres(
 def _covered(
     world: StreetWorld, T_map_street: Float64, xy_map: Float64, band_m: tuple[float, float]
 ) -> Bool:
-    """Whether a vertical line between the two heights hits a surface, for points (N, 2)."""
+    """Return whether a vertical line between the two heights hits a surface, for points (N, 2)."""
     level = np.column_stack([xy_map, np.full(len(xy_map), T_map_street[2, 3])])
     feet = se3.apply(se3.invert(T_map_street), level)
     feet[:, 2] = band_m[1]

@@ -63,7 +63,7 @@ def _expose(light: Float64) -> Float64:
 
 
 def _four_rays(stage: Stage, view: View, pixels: Float64) -> Float64:
-    """Mean radiance (N, 3) over the four quarters of pixels (N, 2)."""
+    """Return the mean radiance (N, 3) over the four quarters of pixels (N, 2)."""
     quarters = (pixels[:, None, :] + np.array(_QUARTERS)).reshape(-1, 2)
     sample = stage.look(view.origin, view.directions(quarters), 0.5 / view.focal_px)
     return np.asarray(_expose(sample.rgb).reshape(-1, 4, 3).mean(axis=1))

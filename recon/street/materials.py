@@ -91,7 +91,7 @@ Recipe = Callable[[Patch], Float64]
 
 
 def albedo(soup: TriangleSoup, faces: Int32, hits: SurfaceHits, seed: int) -> Float64:
-    """Diffuse colour of points.
+    """Return diffuse colour of points.
 
     Args:
         soup: The scene.
@@ -126,7 +126,7 @@ def _blend(rgb: Float64, paint: tuple[float, float, float], share: Float64) -> F
 
 
 def _variation(patch: Patch, channel: int) -> Float64:
-    """One random number in [-1, 1) per object."""
+    """Return one random number in [-1, 1) per object."""
     zero = np.zeros(len(patch.part), dtype=np.int64)
     return lattice_values(patch.part, zero + channel, zero, 11)
 
@@ -153,7 +153,7 @@ def _asphalt(p: Patch) -> Float64:
 
 
 def _paving(p: Patch) -> Float64:
-    """Slabs in running bond, with a row of darker setts along the kerb."""
+    """Return slabs in running bond, with a row of darker setts along the kerb."""
     tile = (0.6, 0.4)
     tone = tile_tone(p.uv, tile, p.spread, np.zeros(len(p.uv), dtype=int), bond=0.5)
     rgb = p.rgb * (1.0 + 0.16 * tone)[:, None]
@@ -161,7 +161,7 @@ def _paving(p: Patch) -> Float64:
 
 
 def _kerb(p: Patch) -> Float64:
-    """Stones one metre long."""
+    """Return stones one metre long."""
     tone = tile_tone(p.uv, (1.0, 1.0), p.spread, np.zeros(len(p.uv), dtype=int))
     rgb = p.rgb * (1.0 + 0.12 * tone)[:, None]
     return _blend(rgb, (0.2, 0.2, 0.2), 0.8 * stripes(p.u, 1.0, 0.02, p.spread[:, 0]))
@@ -181,7 +181,7 @@ def _plaster(p: Patch) -> Float64:
 
 
 def _brick(p: Patch) -> Float64:
-    """Bricks of 24 × 7.5 cm, in areas of slightly different colour."""
+    """Return bricks of 24 × 7.5 cm, in areas of slightly different colour."""
     tile = (0.25, 0.083)
     tone = 0.28 * tile_tone(p.uv, tile, p.spread, p.part, bond=0.5)
     tone += 0.07 * tile_tone(p.uv, (0.9, 0.4), p.spread, p.part + 1)
@@ -190,7 +190,7 @@ def _brick(p: Patch) -> Float64:
 
 
 def _glass(p: Patch) -> Float64:
-    """Dark rooms, painted sky reflections, and some curtains."""
+    """Return the dark rooms, painted sky reflections, and some curtains."""
     rgb = p.rgb * np.clip(1.0 + 0.5 * (p.v - 0.7), 0.5, 2.5)[:, None]
     curtain = (_variation(p, 1) > 0.1) * stripe(p.u % 1.1, 0.0, 0.36, p.spread[:, 0])
     folds = 0.5 + 0.25 * np.sin(p.u * 42.0) * np.exp(-((p.spread[:, 0] / 0.06) ** 2))
@@ -201,7 +201,7 @@ def _glass(p: Patch) -> Float64:
 
 
 def _door(p: Patch) -> Float64:
-    """Two columns of panels and a letter box."""
+    """Return two columns of panels and a letter box."""
     u, v = p.u % 1.1, p.v
     frame = 1.0 - stripe(np.abs(u - 0.55), 0.08, 0.45, p.spread[:, 0]) * (
         1.0 - stripes(v, 0.75, 0.14, p.spread[:, 1])
@@ -212,14 +212,14 @@ def _door(p: Patch) -> Float64:
 
 
 def _roof(p: Patch) -> Float64:
-    """Rows of tiles, each casting a line of shadow."""
+    """Return rows of tiles, each casting a line of shadow."""
     tone = tile_tone(p.uv, (0.3, 0.35), p.spread, p.part, bond=0.5)
     rgb = p.rgb * (1.0 + 0.2 * tone)[:, None]
     return _blend(rgb, (0.1, 0.08, 0.07), 0.6 * stripes(p.v, 0.35, 0.05, p.spread[:, 1]))
 
 
 def _car_paint(p: Patch) -> Float64:
-    """Door gaps, a trim strip, and road dirt at the bottom."""
+    """Return door gaps, a trim strip, and road dirt at the bottom."""
     gaps = both(
         stripe(np.abs(p.u + 0.25), 0.0, 0.012, p.spread[:, 0]),
         stripe(np.abs(p.u - 0.80), 0.0, 0.012, p.spread[:, 0]),
@@ -231,7 +231,7 @@ def _car_paint(p: Patch) -> Float64:
 
 
 def _car_glass(p: Patch) -> Float64:
-    """Dark panes between pillars in the colour of the body."""
+    """Return the dark panes between pillars in the colour of the body."""
     pillars = stripe(np.abs(p.u + 0.25), 0.0, 0.05, p.spread[:, 0])
     pillars = both(pillars, stripe(p.v, 1.36, 9.0, p.spread[:, 1]))
     cover = pillars[:, None]
@@ -241,7 +241,7 @@ def _car_glass(p: Patch) -> Float64:
 
 
 def _leaves(p: Patch) -> Float64:
-    """Leaves; sunlit ones are yellower than those deep in the crown."""
+    """Return leaves; sunlit ones are yellower than those deep in the crown."""
     tint = np.clip(0.5 + 0.6 * p.grain, 0.0, 1.0)[:, None]
     return np.asarray(p.rgb * (tint * [1.25, 1.1, 0.7] + (1.0 - tint) * [0.7, 0.85, 0.9]))
 
@@ -253,7 +253,7 @@ def _metal(p: Patch) -> Float64:
 
 
 def _poster(p: Patch) -> Float64:
-    """Strongly coloured areas within a white border, and lines of text."""
+    """Return strongly coloured areas within a white border, and lines of text."""
     zero = np.zeros(len(p.uv), dtype=np.int64)
     tones = [tile_tone(p.uv, (0.23, 0.31), p.spread, p.part + k) for k in (0, 1, 2)]
     rgb = p.rgb * (1.0 + 0.3 * tones[0][:, None] + 0.3 * np.stack(tones, axis=1))
@@ -281,7 +281,7 @@ RECIPES: Final[dict[Material, Recipe]] = {
 
 
 def sky_colour(directions: Float64, pixel: float, seed: int) -> Float64:
-    """Linear light (N, 3) of the sky: blue above, haze below, clouds.
+    """Return linear light (N, 3) of the sky: blue above, haze below, clouds.
 
     Args:
         directions: (N, 3), z up, any length.

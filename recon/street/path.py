@@ -45,7 +45,7 @@ class CentreLine:
     loop_m: float | None = None
 
     def heading(self, along_m: float) -> float:
-        """Direction of the road at a distance along it."""
+        """Return the direction of the road at a distance along it."""
         return float(np.interp(self._in_lap(along_m), self.along_m, self.heading_rad))
 
     def points(self, along_m: NDArray[np.float64], lateral_m: NDArray[np.float64]) -> Float64:
@@ -57,18 +57,18 @@ class CentreLine:
         return np.stack([x - lateral_m * np.sin(heading), y + lateral_m * np.cos(heading)], axis=-1)
 
     def place(self, along_m: float, lateral_m: float, height_m: float = 0.0) -> Float64:
-        """``T_street_object`` of an object at that position that faces along the road."""
+        """Return ``T_street_object`` of an object at that position that faces along the road."""
         x, y = self.points(np.array([along_m]), np.array([lateral_m]))[0]
         return se3.make_transform(
             se3.exp_so3(np.array([0.0, 0.0, self.heading(along_m)])), np.array([x, y, height_m])
         )
 
     def bends(self, from_m: float, to_m: float) -> bool:
-        """Whether any part of a stretch lies on a corner."""
+        """Return whether any part of a stretch lies on a corner."""
         return abs(self.heading(to_m) - self.heading(from_m)) > 1e-6
 
     def _in_lap(self, along_m: Any) -> Any:
-        """Distances within one lap; the end of the lap does not wrap to its start."""
+        """Return distances within one lap; the end of the lap does not wrap to its start."""
         if self.loop_m is None:
             return along_m
         return np.where(along_m == self.loop_m, along_m, np.mod(along_m, self.loop_m))
@@ -103,7 +103,7 @@ def _heading(along_m: Float64, settings: StreetScene) -> Float64:
 
 
 def _block(length_m: float, width_m: float) -> CentreLine:
-    """One lap around a block, counter-clockwise, from the start of a long side."""
+    """Return one lap around a block, counter-clockwise, from the start of a long side."""
     arc_m = 0.5 * math.pi * CORNER_M
     sides = [length_m - 2 * CORNER_M, width_m - 2 * CORNER_M] * 2
     ends = np.cumsum([[side, arc_m] for side in sides])
@@ -118,13 +118,13 @@ def _block(length_m: float, width_m: float) -> CentreLine:
 
 
 def camera_poses(settings: StreetScene, road: CentreLine) -> Float64:
-    """``T_street_camera`` (frames, 4, 4) of the left camera, street axes."""
+    """Return ``T_street_camera`` (frames, 4, 4) of the left camera, street axes."""
     along = settings.speed_m_per_frame * np.arange(settings.frames)
     return np.stack([_camera_pose(float(s), settings, road) for s in along])
 
 
 def _camera_pose(along_m: float, settings: StreetScene, road: CentreLine) -> Float64:
-    """Position of the car on the road, its small motions, and the mounting of the rig."""
+    """Return position of the car on the road, its small motions, and the mounting of the rig."""
     phase = 0.7 * (settings.seed % 997)
     drift = 0.2 * settings.sway * math.sin(along_m / 11.0 + phase)
     slope = 0.2 * settings.sway / 11.0 * math.cos(along_m / 11.0 + phase)

@@ -35,14 +35,14 @@ def stripes(x: Float64, period: float, width: float, spread: Float64) -> Float64
 
 
 def both(a: Float64, b: Float64) -> Float64:
-    """Fraction covered by at least one of two independent patterns."""
+    """Return the fraction covered by at least one of two independent patterns."""
     return np.asarray(1.0 - (1.0 - a) * (1.0 - b))
 
 
 def tile_tone(
     uv: Float64, tile: tuple[float, float], spread: Float64, seed: NDArray[Any], bond: float = 0.0
 ) -> Float64:
-    """A random tone in [-1, 1) per tile, averaged if a pixel covers several.
+    """Return a random tone in [-1, 1) per tile, averaged if a pixel covers several.
 
     Args:
         uv: float64 (N, 2), metres.
@@ -65,7 +65,7 @@ def tile_tone(
 def tile_joints(
     uv: Float64, tile: tuple[float, float], joint: float, spread: Float64, bond: float = 0.0
 ) -> Float64:
-    """Fraction (N,) of the footprint covered by the joints between tiles."""
+    """Return the fraction (N,) of the footprint covered by the joints between tiles."""
     rows = stripes(uv[:, 1], tile[1], joint, spread[:, 1])
     shift = bond * tile[0] * (np.floor(uv[:, 1] / tile[1]) % 2)
     return both(rows, stripes(uv[:, 0] + shift, tile[0], joint, spread[:, 0]))

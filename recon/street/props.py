@@ -35,7 +35,7 @@ _POSTERS = [(0.62, 0.30, 0.22), (0.25, 0.42, 0.62), (0.66, 0.58, 0.25), (0.35, 0
 
 
 def car(rng: np.random.Generator) -> TriangleSoup:
-    """A parked saloon, hatchback or van, facing along x."""
+    """Return a parked saloon, hatchback or van, facing along x."""
     part = int(rng.integers(1, 2**30))
     colour = _PAINTS[rng.integers(len(_PAINTS))]
     van = rng.random() < 0.18
@@ -51,7 +51,7 @@ def car(rng: np.random.Generator) -> TriangleSoup:
 
 
 def _body(length: float, width: float, paint: Paint, van: bool) -> TriangleSoup:
-    """The lower body with sills, bumpers, bonnet and boot."""
+    """Return the lower body with sills, bumpers, bonnet and boot."""
     a = length / 2
     boot = (
         [(-a + 0.06, 0.92), (-a, 0.6)] if van else [(-a + 0.55, 0.97), (-a + 0.08, 0.9), (-a, 0.6)]
@@ -62,7 +62,7 @@ def _body(length: float, width: float, paint: Paint, van: bool) -> TriangleSoup:
 
 
 def _cabin(length: float, width: float, height: float, paint: Paint, van: bool) -> TriangleSoup:
-    """Windows that slant inwards, and a roof."""
+    """Return windows that slant inwards, and a roof."""
     a, side, front = length / 2, 0.14, 0.75
     back = 0.12 if van else 0.4
     low = np.array([-a + (0.06 if van else 0.35), -width / 2 + 0.03, 0.9])
@@ -102,7 +102,7 @@ def _lamps(length: float, width: float, part: int) -> list[TriangleSoup]:
 
 
 def tree(rng: np.random.Generator) -> TriangleSoup:
-    """A tree: a trunk and a crown of several bumpy balls."""
+    """Return a tree: a trunk and a crown of several bumpy balls."""
     part = int(rng.integers(1, 2**30))
     height = float(rng.uniform(2.1, 2.9))
     bark = Paint(Material.BARK, (0.36, 0.30, 0.24), part)
@@ -121,7 +121,7 @@ def tree(rng: np.random.Generator) -> TriangleSoup:
 
 
 def lamp_post(side: float, rng: np.random.Generator) -> TriangleSoup:
-    """A 6 m post with an arm over the road, which is towards ``-side``."""
+    """Return a 6 m post with an arm over the road, which is towards ``-side``."""
     paint = Paint(Material.METAL, (0.30, 0.33, 0.32), int(rng.integers(1, 2**30)))
     arm = boxes([-0.04, min(0.0, -side * 1.4), 5.9], [0.04, max(0.0, -side * 1.4), 5.98], paint)
     y0, y1 = sorted((-side * 1.0, -side * 1.6))
@@ -131,7 +131,7 @@ def lamp_post(side: float, rng: np.random.Generator) -> TriangleSoup:
 
 
 def sign(rng: np.random.Generator) -> TriangleSoup:
-    """A round or square traffic sign on a thin pole, facing backwards along x."""
+    """Return a round or square traffic sign on a thin pole, facing backwards along x."""
     part = int(rng.integers(1, 2**30))
     pole = cylinder((0.035, 0.035), 2.9, Paint(Material.METAL, (0.55, 0.56, 0.57), part), 8)
     if rng.random() < 0.5:
@@ -147,7 +147,7 @@ def sign(rng: np.random.Generator) -> TriangleSoup:
 
 
 def bollard(rng: np.random.Generator) -> TriangleSoup:
-    """A knee-high post with a lighter head."""
+    """Return a knee-high post with a lighter head."""
     part = int(rng.integers(1, 2**30))
     dark = Paint(Material.METAL, (0.25, 0.22, 0.20), part)
     light = Paint(Material.PLAIN, (0.80, 0.78, 0.72), part + 1)
@@ -156,7 +156,7 @@ def bollard(rng: np.random.Generator) -> TriangleSoup:
 
 
 def advertising_pillar(rng: np.random.Generator) -> TriangleSoup:
-    """A column covered with posters."""
+    """Return a column covered with posters."""
     part = int(rng.integers(1, 2**30))
     posters = Paint(Material.POSTER, _POSTERS[rng.integers(len(_POSTERS))], part)
     stone = Paint(Material.PLAIN, (0.40, 0.42, 0.40), part + 1)
@@ -167,7 +167,7 @@ def advertising_pillar(rng: np.random.Generator) -> TriangleSoup:
 
 
 def bin_(rng: np.random.Generator) -> TriangleSoup:
-    """A wheeled rubbish bin."""
+    """Return a wheeled rubbish bin."""
     part = int(rng.integers(1, 2**30))
     colours = [(0.20, 0.30, 0.22), (0.28, 0.28, 0.30), (0.45, 0.36, 0.18)]
     paint = Paint(Material.PLAIN, colours[rng.integers(3)], part)

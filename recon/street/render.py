@@ -103,7 +103,7 @@ class StreetCamera:
         )
 
     def depth(self, index: int) -> Float32:
-        """True depth of the left image.
+        """Return True depth of the left image.
 
         Returns:
             float32 (H, W), metres; NaN = sky.
@@ -116,7 +116,7 @@ class StreetCamera:
         return depth.reshape(view.height_px, view.width_px).astype(np.float32)
 
     def disparity_truth(self, index: int) -> DisparityTruth:
-        """True disparity of the left image, without rendering the images.
+        """Return True disparity of the left image, without rendering the images.
 
         Raises:
             SettingsError: There is no such frame.
@@ -124,7 +124,7 @@ class StreetCamera:
         return self._truth(index, self.depth(index))
 
     def views(self, index: int) -> tuple[View, View]:
-        """Left and right view of a frame, in street axes.
+        """Return the left and right view of a frame, in street axes.
 
         Raises:
             SettingsError: There is no such frame.
@@ -136,7 +136,7 @@ class StreetCamera:
         return stereo_views(self.world.camera, self.world.T_street_camera[index])
 
     def _truth(self, index: int, depth_m: Float32) -> DisparityTruth:
-        """Disparity, and whether the right camera sees each point."""
+        """Return the disparity, and whether the right camera sees each point."""
         camera = self.world.camera
         left, right = self.views(index)
         known = np.flatnonzero(np.isfinite(depth_m))

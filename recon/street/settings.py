@@ -112,7 +112,7 @@ class StreetScene(StreetSettings):
 
     @classmethod
     def of(cls, settings: StreetSettings) -> StreetScene:
-        """The scene of settings: themselves, or with the other details of a demo."""
+        """Return the scene of settings: themselves, or with the other details of a demo."""
         return settings if isinstance(settings, cls) else cls(**dict(settings))
 
     @model_validator(mode="after")

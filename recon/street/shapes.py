@@ -18,7 +18,7 @@ FAR_UV = 100.0
 def quads(
     origins: Any, edges_u: Any, edges_v: Any, paint: Paint, uv_origins: Any = (0.0, 0.0)
 ) -> TriangleSoup:
-    """Parallelograms in one paint; the array arguments are broadcast.
+    """Return parallelograms in one paint; the array arguments are broadcast.
 
     Args:
         origins: (N, 3) or (3,), one corner of each.
@@ -39,7 +39,7 @@ def quads(
 
 
 def boxes(low: Any, high: Any, paint: Paint) -> TriangleSoup:
-    """Axis-aligned boxes between corners ``low`` and ``high``, each (N, 3) or (3,)."""
+    """Return axis-aligned boxes between corners ``low`` and ``high``, each (N, 3) or (3,)."""
     a, b = np.broadcast_arrays(*np.atleast_2d(low, high))
     x, y, z = (np.eye(3)[k] * (b - a) for k in range(3))
     sides = [(a, x, z), (a, y, z), (a + y, x, z), (a + x, y, z), (a + z, x, y), (a, x, y)]
@@ -48,7 +48,7 @@ def boxes(low: Any, high: Any, paint: Paint) -> TriangleSoup:
 
 
 def frustum(low: Any, high: Any, inset: tuple[float, float, float], paint: Paint) -> TriangleSoup:
-    """The four walls of a box that narrows towards the top.
+    """Return the four walls of a box that narrows towards the top.
 
     Args:
         low: (3,) lower corner.
@@ -93,7 +93,7 @@ def cylinder(
 
 
 def disc(radius_m: float, paint: Paint, sides: int = 14) -> TriangleSoup:
-    """A flat disc around the origin in the x-z plane."""
+    """Return a flat disc around the origin in the x-z plane."""
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
     rim = radius_m * np.stack([np.cos(angle), np.zeros(sides + 1), np.sin(angle)], axis=1)
     corners = np.stack([np.zeros((sides, 3)), rim[:-1], rim[1:]], axis=1)
@@ -123,7 +123,7 @@ def extrusion(profile: Any, width_m: float, paint: Paint) -> TriangleSoup:
 def bumpy_ball(
     radii_m: Any, paint: Paint, *, bump: float, wavelength: float, seed: int, splits: int = 3
 ) -> TriangleSoup:
-    """An ellipsoid with bumps, such as the crown of a tree.
+    """Return an ellipsoid with bumps, such as the crown of a tree.
 
     Args:
         radii_m: (3,) semi-axes.
@@ -142,7 +142,7 @@ def bumpy_ball(
 
 
 def _smooth_normals(corners: Float64, places: NDArray[np.int64]) -> Float64:
-    """Normals (F, 3, 3), the area-weighted mean of all triangles that meet at a corner."""
+    """Return normals (F, 3, 3), the area-weighted mean of all triangles that meet at a corner."""
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     total = np.zeros((int(places.max()) + 1, 3))
     np.add.at(total, places, np.repeat(flat, 3, axis=0))
@@ -157,7 +157,7 @@ def _icosphere_corners(splits: int) -> tuple[Float64, NDArray[np.int64]]:
 
 
 def icosphere(splits: int) -> Float64:
-    """Triangles (20·4^splits, 3, 3) of a unit sphere."""
+    """Return triangles (20·4^splits, 3, 3) of a unit sphere."""
     g = (1.0 + 5.0**0.5) / 2.0
     flat = np.array([[-1, g, 0], [1, g, 0], [-1, -g, 0], [1, -g, 0]])
     # Three golden rectangles, one in each coordinate plane.
@@ -180,5 +180,5 @@ def _unit(v: NDArray[Any]) -> Float64:
 
 
 def _split(a: Float64, b: Float64, c: Float64, d: Float64) -> Float64:
-    """Two triangles per quad a b c d."""
+    """Return two triangles per quad a b c d."""
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])

@@ -82,7 +82,7 @@ class TriangleSoup:
 
 
 def merge(soups: Iterable[TriangleSoup]) -> TriangleSoup:
-    """All triangles of several soups, in order."""
+    """Return all triangles of several soups, in order."""
     parts = list(soups)
     names = ("vertices", "normals", "uv", "rgb", "material", "part")
     return TriangleSoup(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
@@ -98,7 +98,7 @@ def move(soup: TriangleSoup, T_to_from: Float64) -> TriangleSoup:
 def painted(
     vertices: Float64, uv: Float64, paint: Paint, normals: Float64 | None = None
 ) -> TriangleSoup:
-    """Triangles (F, 3, 3) with texture coordinates (F, 3, 2), all in one paint.
+    """Return triangles (F, 3, 3) with texture coordinates (F, 3, 2), all in one paint.
 
     Without ``normals`` they are flat-shaded.
     """

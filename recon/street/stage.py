@@ -59,7 +59,7 @@ class Stage:
     seed: int
 
     def depth(self, origin: Float64, directions: Float64) -> Float64:
-        """float64 (N,), depth along rays of unit depth; NaN where they hit nothing."""
+        """Return float64 (N,), depth along rays of unit depth; NaN where they hit nothing."""
         faces = self.rays.first_hit(origin, directions)
         hit = faces >= 0
         depth = np.full(len(directions), np.nan)
@@ -67,7 +67,7 @@ class Stage:
         return depth
 
     def sees(self, origin: Float64, xyz: Float64) -> Bool:
-        """bool (N,), whether the line of sight from ``origin`` to each point is free."""
+        """Return bool (N,), whether the line of sight from ``origin`` to each point is free."""
         return ~self.rays.blocked(origin, xyz - origin, far=_SIGHT)
 
     def look(self, origin: Float64, directions: Float64, pixel: float) -> Sample:
@@ -94,7 +94,7 @@ class Stage:
         return Sample(rgb, normal, label)
 
     def _light(self, points: SurfaceHits) -> tuple[Float64, Bool]:
-        """Irradiance (N, 3) at points, and whether the sun reaches them."""
+        """Return irradiance (N, 3) at points, and whether the sun reaches them."""
         start = points.xyz + _SKIN_M * points.normal
         facing = points.normal @ self.to_sun
         lit = facing > 0

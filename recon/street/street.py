@@ -74,7 +74,7 @@ class StreetWorld:
         return se3.make_transform(R_map_street @ self.T_street_camera[0][:3, :3], np.zeros(3))
 
     def ground_plane(self, index: int) -> Float64:
-        """The road in the axes of a left camera.
+        """Return the road in the axes of a left camera.
 
         Returns:
             float64 (4,), ``(a, b, c, d)``: ``a·x + b·y + c·z + d`` is the height above the road.
@@ -130,7 +130,7 @@ def rig(settings: StreetSettings) -> RectifiedCamera:
 
 
 def _sun(seed: int) -> Float64:
-    """Direction to the sun: high and to one side of the street, so that one row is lit."""
+    """Return direction to the sun: high and to one side of the street, so that one row is lit."""
     rng = np.random.default_rng([seed, 99])
     azimuth = rng.choice([-1.0, 1.0]) * rng.uniform(1.1, 2.3)
     climb = rng.uniform(0.75, 1.0)
@@ -161,7 +161,7 @@ def _ground(road: CentreLine) -> TriangleSoup:
 
 
 def _strip(road: CentreLine, edges: tuple[tuple[float, float], ...], paint: Paint) -> TriangleSoup:
-    """A band along the road between two edges (lateral, height)."""
+    """Return a band along the road between two edges (lateral, height)."""
     along = _stations(road)
     rims, uvs = [], []
     run = 0.0
@@ -183,7 +183,7 @@ def _stations(road: CentreLine) -> Float64:
 
 
 def _yard(road: CentreLine, lateral_m: float, paint: Paint) -> TriangleSoup:
-    """The ground inside a block: a fan from its centre to the inner edge of the pavement."""
+    """Return the ground inside a block: a fan from its centre to the inner edge of the pavement."""
     along = _stations(road)
     rim = road.points(along, np.full(len(along), lateral_m))
     middle = np.broadcast_to(rim.mean(axis=0), (len(rim) - 1, 2))
@@ -193,19 +193,19 @@ def _yard(road: CentreLine, lateral_m: float, paint: Paint) -> TriangleSoup:
 
 
 def _inside(road: CentreLine, side: float) -> bool:
-    """Whether a side of the road is the inside of a block."""
+    """Return whether a side of the road is the inside of a block."""
     return road.loop_m is not None and side > 0
 
 
 def _band(near: Float64, far: Float64) -> Float64:
-    """Triangles (2·(N-1), 3, C) between two polylines (N, C)."""
+    """Return triangles (2·(N-1), 3, C) between two polylines (N, C)."""
     first = np.stack([near[:-1], near[1:], far[1:]], axis=1)
     second = np.stack([near[:-1], far[1:], far[:-1]], axis=1)
     return np.concatenate([first, second])
 
 
 def _houses(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """A row of houses with setbacks and occasional gaps for side streets."""
+    """Yield a row of houses with setbacks and occasional gaps for side streets."""
     at, end = road.span_m
     while at < end:
         width = float(rng.uniform(8.0, 15.0))
@@ -228,7 +228,7 @@ def _backdrop(road: CentreLine, side: float, rng: np.random.Generator) -> Iterat
 
 
 def _room(road: CentreLine, side: float, at_m: float, width_m: float) -> bool:
-    """Whether a house fits: within the lap or period, and not on the inside of a corner."""
+    """Return whether a house fits: within the lap or period, and not on the inside of a corner."""
     if road.span_m[0] < 0.0:
         return True
     end_m = at_m + width_m
@@ -243,7 +243,7 @@ def _stand(
     width_m: float,
     rng: np.random.Generator,
 ) -> TriangleSoup:
-    """A house on one side, with its facade on a chord of the curve."""
+    """Return a house on one side, with its facade on a chord of the curve."""
     built = house(draw_plan(width_m, rng), rng)
     T = road.place(at_m + width_m / 2, side * (_WALL_M + setback_m), KERB_M)
     half = se3.make_transform(np.eye(3), np.array([-width_m / 2, 0.0, 0.0]))

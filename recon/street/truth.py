@@ -23,7 +23,7 @@ _COMPACT_AT: Final = 4_000_000
 def true_surface(
     camera: StreetCamera, *, range_m: float = 30.0, voxel_m: float = 0.05
 ) -> PointCloud:
-    """Points on the surfaces that the left camera saw.
+    """Return points on the surfaces that the left camera saw.
 
     Args:
         camera: The rig in its street.
@@ -55,7 +55,7 @@ def true_occupancy(
     least_frames: int = 1,
     T_map_world: Float64 | None = None,
 ) -> OccupancyTruth:
-    """True surfaces and obstacles on the part of the street that was seen.
+    """Return True surfaces and obstacles on the part of the street that was seen.
 
     Args:
         camera: The rig in its street.
@@ -111,7 +111,7 @@ def _raster(
 
 
 def _visible_points(camera: StreetCamera, index: int, range_m: float) -> Float64:
-    """Points (N, 3) of one depth map, left camera axes."""
+    """Return points (N, 3) of one depth map, left camera axes."""
     depth = camera.depth(index).astype(np.float64).ravel()
     rig = camera.world.camera
     near = np.flatnonzero(depth <= range_m)
@@ -121,7 +121,7 @@ def _visible_points(camera: StreetCamera, index: int, range_m: float) -> Float64
 
 
 def _thin(xyz: Float32, voxel_m: float) -> Float32:
-    """The first point in each voxel, in the order given."""
+    """Return the first point in each voxel, in the order given."""
     keys = _pack(np.floor(xyz / voxel_m).astype(np.int64))
     first = np.unique(keys, return_index=True)[1]
     return np.asarray(xyz[np.sort(first)])
@@ -148,7 +148,7 @@ class _Counter:
         self._frames = np.bincount(place, weights=frames).astype(np.int64)
 
     def counts(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Cells (N, 3) in order, and the number of frames in which each appeared."""
+        """Return cells (N, 3) in order, and the number of frames in which each appeared."""
         mask = (1 << _KEY_BITS) - 1
         parts = [(self._keys >> shift) & mask for shift in (2 * _KEY_BITS, _KEY_BITS, 0)]
         return np.stack(parts, axis=1) - (1 << (_KEY_BITS - 1)), self._frames

@@ -34,7 +34,7 @@ class View:
         return self.T_scene_camera[:3, 3]
 
     def pixels(self) -> Float64:
-        """float64 (H·W, 2), column and row of each pixel, row by row."""
+        """Return float64 (H·W, 2), column and row of each pixel, row by row."""
         v, u = np.mgrid[0 : self.height_px, 0 : self.width_px]
         return np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
 
@@ -45,13 +45,13 @@ class View:
         return np.asarray(sight @ self.T_scene_camera[:3, :3].T)
 
     def project(self, xyz: Float64) -> Float64:
-        """Pixels (N, 2) of points in the scene; NaN behind the camera."""
+        """Return pixels (N, 2) of points in the scene; NaN behind the camera."""
         local = (xyz - self.origin) @ self.T_scene_camera[:3, :3]
         depth = np.where(local[:, 2:] > 0, local[:, 2:], np.nan)
         return np.asarray(self.focal_px * local[:, :2] / depth + self.centre_px)
 
     def inside(self, pixels: Float64) -> Bool:
-        """bool (N,), True where a position lies within the image."""
+        """Return bool (N,), True where a position lies within the image."""
         u, v = pixels[:, 0], pixels[:, 1]
         with np.errstate(invalid="ignore"):
             in_u = (u >= -0.5) & (u < self.width_px - 0.5)
@@ -59,7 +59,7 @@ class View:
 
 
 def stereo_views(camera: RectifiedCamera, T_scene_left: Float64) -> tuple[View, View]:
-    """The left and right view of a rig with its left camera at ``T_scene_left``."""
+    """Return the left and right view of a rig with its left camera at ``T_scene_left``."""
     T_scene_right = T_scene_left.copy()
     T_scene_right[:3, 3] += camera.baseline_m * T_scene_left[:3, 0]
     size = camera.width_px, camera.height_px

@@ -31,14 +31,14 @@ class Similarity:
         freeze(self, "T_to_from", np.float64, (4, 4))
 
     def move(self, trajectory: Trajectory) -> Trajectory:
-        """The trajectory in the other frame; its timestamps do not change."""
+        """Return the trajectory in the other frame; its timestamps do not change."""
         poses = trajectory.T_world_camera.copy()
         poses[:, :3, 3] *= self.scale
         return Trajectory(self.T_to_from @ poses, trajectory.timestamps_s)
 
 
 def fit_points(from_m: Float64, to_m: Float64, *, scaled: bool = False) -> Similarity:
-    """The least-squares similarity between corresponding points.
+    """Return the least-squares similarity between corresponding points.
 
     A rotation that the points do not determine, such as that about a straight line, is left as
     small as the others allow.
@@ -63,7 +63,7 @@ def fit_points(from_m: Float64, to_m: Float64, *, scaled: bool = False) -> Simil
 
 
 def fit_paths(from_path: Trajectory, to_path: Trajectory) -> Similarity:
-    """The rigid transform that brings a trajectory closest to another, pose by pose.
+    """Return the rigid transform that brings a trajectory closest to another, pose by pose.
 
     Each pose contributes its camera centre and the ends of its axes, whose length is the typical
     distance of mapped points. On a nearly straight street, the centres alone would leave the
@@ -77,7 +77,7 @@ def fit_paths(from_path: Trajectory, to_path: Trajectory) -> Similarity:
 
 
 def _axes_m(path: Trajectory) -> Float64:
-    """float64 (N · 4, 3): centre and axis ends of each camera."""
+    """Return float64 (N · 4, 3): centre and axis ends of each camera."""
     poses = path.T_world_camera
     tips = np.swapaxes(poses[:, :3, :3], 1, 2) * _AXIS_M + poses[:, None, :3, 3]
     return np.concatenate([poses[:, None, :3, 3], tips], axis=1).reshape(-1, 3)

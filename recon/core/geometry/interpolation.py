@@ -10,7 +10,7 @@ from recon.core.values.arrays import Float64
 
 
 def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
-    """Poses at given times, interpolated between the poses before and after each.
+    """Return poses at given times, interpolated between the poses before and after each.
 
     Args:
         trajectory: At least one pose.
@@ -36,7 +36,7 @@ def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
 
 
 def pose_between(first: Float64, second: Float64, share: float) -> Float64:
-    """The pose (4, 4) at a fraction (0 to 1) of the way from one pose to another."""
+    """Return the pose (4, 4) at a fraction (0 to 1) of the way from one pose to another."""
     turn = log_so3(first[:3, :3].T @ second[:3, :3])
     position = (1 - share) * first[:3, 3] + share * second[:3, 3]
     return make_transform(first[:3, :3] @ exp_so3(share * turn), position)

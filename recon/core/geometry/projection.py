@@ -33,7 +33,7 @@ def unproject(
 def project(
     xyz: NDArray[Any], camera: RectifiedCamera
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Columns, rows and left-to-right disparity (N,) of points (N, 3) in camera axes.
+    """Return columns, rows and left-to-right disparity (N,) of points (N, 3) in camera axes.
 
     Points at or behind the camera plane give NaN.
     """
@@ -45,6 +45,6 @@ def project(
 
 
 def map_pixels(H: Float64, pixels: NDArray[Any]) -> Float64:
-    """float64 (N, 2), pixels (N, 2) mapped by a homography (3, 3)."""
+    """Return float64 (N, 2), pixels (N, 2) mapped by a homography (3, 3)."""
     mapped = pixels.astype(np.float64) @ H[:, :2].T + H[:, 2]
     return np.asarray(mapped[:, :2] / mapped[:, 2:])

@@ -11,7 +11,7 @@ from recon.core.values.arrays import Float64
 
 
 def rotation_from_quaternion(xyzw: NDArray[Any]) -> Float64:
-    """Rotation matrix (3, 3) of a quaternion (4,) of any nonzero norm."""
+    """Return the rotation matrix (3, 3) of a quaternion (4,) of any nonzero norm."""
     x, y, z, w = np.asarray(xyzw, dtype=np.float64) / np.linalg.norm(xyzw)
     return np.array(
         [
@@ -23,7 +23,7 @@ def rotation_from_quaternion(xyzw: NDArray[Any]) -> Float64:
 
 
 def quaternion_from_rotation(rotation: NDArray[Any]) -> Float64:
-    """Unit quaternion (4,) of a rotation matrix (3, 3), with ``w ≥ 0``.
+    """Return the unit quaternion (4,) of a rotation matrix (3, 3), with ``w ≥ 0``.
 
     The eigenvector method used is accurate at all angles; the formula based on the trace divides
     by almost zero near 180 degrees.

@@ -12,7 +12,7 @@ from recon.core.values.arrays import Float64
 
 
 def make_transform(rotation: NDArray[Any], translation_m: NDArray[Any]) -> Float64:
-    """A 4×4 transform from a rotation (3, 3) and a translation (3,)."""
+    """Return a 4×4 transform from a rotation (3, 3) and a translation (3,)."""
     T = np.eye(4)
     T[:3, :3] = rotation
     T[:3, 3] = np.asarray(translation_m).reshape(3)
@@ -20,7 +20,7 @@ def make_transform(rotation: NDArray[Any], translation_m: NDArray[Any]) -> Float
 
 
 def invert(T: NDArray[Any]) -> Float64:
-    """Inverse of one rigid transform (4, 4) or of a stack (…, 4, 4)."""
+    """Return the inverse of one rigid transform (4, 4) or of a stack (…, 4, 4)."""
     rotation = np.swapaxes(T[..., :3, :3], -1, -2)
     inverse = np.zeros(T.shape)
     inverse[..., :3, :3] = rotation
@@ -41,7 +41,7 @@ def rotate(T: NDArray[Any], directions: NDArray[Any]) -> NDArray[Any]:
 
 
 def angle_rad(T: NDArray[Any]) -> Float64:
-    """Rotation angle of one transform or of a stack, in [0, π]."""
+    """Return the rotation angle of one transform or of a stack, in [0, π]."""
     # atan2 is accurate near 0 and π, where acos of the trace loses half of the digits.
     R = T[..., :3, :3]
     axis = np.stack(
@@ -54,12 +54,12 @@ def angle_rad(T: NDArray[Any]) -> Float64:
 
 
 def hat(w: NDArray[Any]) -> Float64:
-    """Cross-product matrix of a vector (3,)."""
+    """Return the cross-product matrix of a vector (3,)."""
     return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
 
 
 def exp_so3(w: NDArray[Any]) -> Float64:
-    """Rotation matrix of a rotation vector (3,), radians (Rodrigues)."""
+    """Return the rotation matrix of a rotation vector (3,), radians (Rodrigues)."""
     angle = float(np.linalg.norm(w))
     K = hat(np.asarray(w, dtype=np.float64))
     if angle < 1e-8:
@@ -91,12 +91,12 @@ def as_step(T: NDArray[Any]) -> Float64:
 
 
 def as_transform(step: NDArray[Any]) -> Float64:
-    """The rigid transform (4, 4) of a step; inverse of `as_step`."""
+    """Return the rigid transform (4, 4) of a step; inverse of `as_step`."""
     return make_transform(exp_so3(step[3:]), step[:3])
 
 
 def step_jacobian(xyz: NDArray[Any]) -> Float64:
-    """Jacobian (N, 3, 6) of points (N, 3) for a step of their frame: ``[I | -hat(xyz)]``."""
+    """Return Jacobian (N, 3, 6) of points (N, 3) for a step of their frame: ``[I | -hat(xyz)]``."""
     J = np.zeros((len(xyz), 3, 6))
     J[:, [0, 1, 2], [0, 1, 2]] = 1.0
     x, y, z = xyz.T
@@ -107,7 +107,7 @@ def step_jacobian(xyz: NDArray[Any]) -> Float64:
 
 
 def orthonormalise(T: NDArray[Any]) -> Float64:
-    """The rigid transform nearest to ``T``: its rotation part is made orthonormal by SVD."""
+    """Return the rigid transform nearest to ``T``: its rotation part is made orthonormal by SVD."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     U[:, -1] *= np.sign(np.linalg.det(U @ Vt))
     return make_transform(U @ Vt, T[:3, 3])

@@ -12,7 +12,7 @@ from recon.core.values.camera import RectifiedCamera
 
 
 def depth_from_disparity(disparity_px: NDArray[Any], camera: RectifiedCamera) -> Float32:
-    """Depth along the optical axis, ``Z = f·b / (d + doffs)``.
+    """Return the depth along the optical axis, ``Z = f·b / (d + doffs)``.
 
     Args:
         disparity_px: Any shape, pixels; NaN = unknown.
@@ -29,7 +29,7 @@ def depth_from_disparity(disparity_px: NDArray[Any], camera: RectifiedCamera) ->
 
 
 def disparity_from_depth(depth_m: NDArray[Any], camera: RectifiedCamera) -> Float32:
-    """Inverse of `depth_from_disparity`; NaN where the depth is unknown or not positive."""
+    """Return inverse of `depth_from_disparity`; NaN where the depth is unknown or not positive."""
     depth = np.asarray(depth_m, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         disparity = camera.focal_px * camera.baseline_m / depth - camera.doffs_px
@@ -39,7 +39,7 @@ def disparity_from_depth(depth_m: NDArray[Any], camera: RectifiedCamera) -> Floa
 def depth_sigma(
     depth_m: NDArray[Any], sigma_px: NDArray[Any] | float, camera: RectifiedCamera
 ) -> Float32:
-    """Standard deviation of the depth, ``sigma_z = Z²·sigma_d / (f·b)`` (first order).
+    """Return the standard deviation of the depth, ``sigma_z = Z²·sigma_d / (f·b)`` (first order).
 
     Args:
         depth_m: Any shape, metres.

@@ -72,7 +72,7 @@ class VoxelPoints(NamedTuple):
 
 
 def make_table(rows: int) -> NDArray[np.int64]:
-    """An empty hash for up to ``rows`` entries.
+    """Return an empty hash for up to ``rows`` entries.
 
     Returns:
         int64 (C, 2), C a power of two: packed cell and row of each entry; a cell of `EMPTY` marks
@@ -123,34 +123,34 @@ def reserve(store: Store, rows: int, make: Callable[[int], Store]) -> Store:
 
 
 def unpack_keys(keys: NDArray[np.int64]) -> NDArray[np.int32]:
-    """int32 (N, 3) cell indices of packed cells (N,)."""
+    """Return int32 (N, 3) cell indices of packed cells (N,)."""
     parts = [(keys >> shift) & _MASK for shift in (2 * KEY_BITS, KEY_BITS, 0)]
     return np.asarray(np.stack(parts, axis=1) - KEY_LIMIT, dtype=np.int32)
 
 
 def pack_keys(cells: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-    """int64 (N,) packed cells of cell indices (N, 3)."""
+    """Return int64 (N,) packed cells of cell indices (N, 3)."""
     i, j, k = cells.astype(np.int64).T + KEY_LIMIT
     return np.asarray((i << (2 * KEY_BITS)) | (j << KEY_BITS) | k)
 
 
 @kernel
 def pack_key(i: int, j: int, k: int) -> int:
-    """One int64 of three cell indices in ``[-KEY_LIMIT, KEY_LIMIT)``; never negative."""
+    """Return one int64 of three cell indices in ``[-KEY_LIMIT, KEY_LIMIT)``; never negative."""
     high = (i + KEY_LIMIT) << (2 * KEY_BITS)
     return high | ((j + KEY_LIMIT) << KEY_BITS) | (k + KEY_LIMIT)
 
 
 @kernel
 def unpack_key(key: int) -> tuple[int, int, int]:
-    """The three cell indices of a packed cell."""
+    """Return the three cell indices of a packed cell."""
     i, j, k = key >> (2 * KEY_BITS), (key >> KEY_BITS) & _MASK, key & _MASK
     return i - KEY_LIMIT, j - KEY_LIMIT, k - KEY_LIMIT
 
 
 @kernel
 def _place(key: int, mask: int) -> int:
-    """Where the search for a packed cell begins."""
+    """Return where the search for a packed cell begins."""
     # Two rounds of multiplicative hashing; 32-bit factors keep the products inside an int64.
     mixed = ((key >> 32) * 0x9E3779B1 ^ key) & 0x7FFFFFFF
     return ((mixed * 0x85EBCA6B) >> 22) & mask
@@ -158,7 +158,7 @@ def _place(key: int, mask: int) -> int:
 
 @kernel
 def find_or_add(table: NDArray[np.int64], key: int, next_row: int) -> int:
-    """Row of a packed cell; where it is new it is entered with ``next_row``.
+    """Return the row of a packed cell; where it is new it is entered with ``next_row``.
 
     The hash must have an unused place.
     """
@@ -175,7 +175,7 @@ def find_or_add(table: NDArray[np.int64], key: int, next_row: int) -> int:
 
 @kernel
 def find(table: NDArray[np.int64], key: int) -> int:
-    """Row of a packed cell, or `EMPTY` where it is not in the hash."""
+    """Return the row of a packed cell, or `EMPTY` where it is not in the hash."""
     mask = len(table) - 1
     place = _place(key, mask)
     while table[place, 0] != EMPTY:
@@ -189,7 +189,7 @@ def find(table: NDArray[np.int64], key: int) -> int:
 def find_or_append(
     table: NDArray[np.int64], keys: NDArray[np.int64], used: NDArray[np.int64], key: int
 ) -> int:
-    """Row of a packed cell; where it is new it gets the next row, which must exist."""
+    """Return the row of a packed cell; where it is new it gets the next row, which must exist."""
     row: int = find_or_add(table, key, used[0])
     if row == used[0]:
         keys[row] = key

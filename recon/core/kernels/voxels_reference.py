@@ -11,7 +11,7 @@ Cell = tuple[int, int, int]
 
 
 def cell_of(point: NDArray[Any], edge: float) -> Cell:
-    """The cell that a point (3,) lies in."""
+    """Return the cell that a point (3,) lies in."""
     i, j, k = np.floor(np.asarray(point) / edge).astype(int).tolist()
     return i, j, k
 

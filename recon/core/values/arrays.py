@@ -86,12 +86,12 @@ def float_map(name: str, values: ArrayLike, shape: tuple[int, ...] | None = None
 
 
 def size_text(image: NDArray[Any]) -> str:
-    """The size of an image or map as it is read aloud: width x height."""
+    """Return the size of an image or map as it is read aloud: width x height."""
     return f"{image.shape[1]}x{image.shape[0]}"
 
 
 def map_text(values: Float32, unit: str = "px") -> str:
-    """Range and share of the finite values of a map, for a ``repr``."""
+    """Return the range and share of the finite values of a map, for a ``repr``."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return "0 %"
@@ -100,7 +100,7 @@ def map_text(values: Float32, unit: str = "px") -> str:
 
 
 def extent_text(xyz: NDArray[Any]) -> str:
-    """Range of points (N, 3) along each axis in metres, for a ``repr``."""
+    """Return the range of points (N, 3) along each axis in metres, for a ``repr``."""
     if not len(xyz):
         return "empty"
     ends = zip("xyz", xyz.min(axis=0), xyz.max(axis=0), strict=True)

@@ -153,7 +153,7 @@ class RectifiedCamera:
         return np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
 
     def resized(self, width_px: int, height_px: int) -> RectifiedCamera:
-        """The camera of the same view at another image size; the baseline does not change.
+        """Return the camera of the same view at another image size; the baseline does not change.
 
         Pixel centres are at integers, so a principal point scales as ``(c + 0.5)·s - 0.5``.
         Middlebury multiplies ``c`` and ``doffs`` by ``s``: the same for ``doffs``, but up to half
@@ -197,7 +197,7 @@ def check_size(
 def other_size(
     width_px: int, height_px: int, expected: str, where: str | PathLike[str] | None
 ) -> CalibrationError:
-    """The error for images that have another size than their calibration."""
+    """Return the error for images that have another size than their calibration."""
     return CalibrationError(
         "images have another size than the calibration",
         where=where,

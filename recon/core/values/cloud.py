@@ -57,7 +57,7 @@ class PointCloud:
         return len(self.xyz)
 
     def select(self, which: NDArray[Any]) -> PointCloud:
-        """The points of a boolean mask (N,) or of an index array, in that order."""
+        """Return the points of a boolean mask (N,) or of an index array, in that order."""
         # Indexing by position is several times faster than by mask.
         index = np.flatnonzero(which) if which.dtype == np.bool_ else which
         arrays = {

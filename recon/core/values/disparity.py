@@ -118,7 +118,7 @@ class Disparity:
 
 
 def _where(mask: Bool, inside: Float32, outside: float) -> Float32:
-    """float32 (H, W): ``inside`` (N,) where the mask is True, else a constant."""
+    """Return float32 (H, W): ``inside`` (N,) where the mask is True, else a constant."""
     filled = np.full(mask.shape, outside, dtype=np.float32)
     filled[mask] = inside
     return filled

@@ -60,7 +60,7 @@ class RayCloud:
         return len(self.places)
 
     def cloud(self) -> PointCloud:
-        """The end points as a cloud; ``count`` is the number of averaged points."""
+        """Return the end points as a cloud; ``count`` is the number of averaged points."""
         return PointCloud(
             self.places * np.float32(self.unit_m),
             sigma_m=self.sigma_m.astype(np.float32),

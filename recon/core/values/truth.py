@@ -68,7 +68,7 @@ class DisparityTruth:
 
 
 def _seen_by_both(mask: ArrayLike, shape: tuple[int, ...]) -> Bool:
-    """bool (H, W), from truth values or from Middlebury's levels (128 = occluded)."""
+    """Return bool (H, W), from truth values or from Middlebury's levels (128 = occluded)."""
     levels = np.asarray(mask)
     seen = levels if levels.dtype == np.bool_ else levels == _SEEN_BY_BOTH
     if levels.shape != shape or (levels.dtype != np.bool_ and not seen.any()):

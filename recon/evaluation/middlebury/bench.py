@@ -48,7 +48,7 @@ class SceneResult:
     file: Path | None = None
 
     def error_px(self) -> Float32:
-        """float32 (H, W), dense absolute error in full-size pixels; NaN = truth unknown."""
+        """Return float32 (H, W), dense absolute error in full-size pixels; NaN = truth unknown."""
         truth, rules = self.scene.truth.values, self.scene.rules
         error = values_compared(dense_map(self.values), truth.shape, rules) - truth
         return np.asarray(np.abs(error) * np.float32(rules.full_size_factor), dtype=np.float32)
@@ -83,7 +83,7 @@ class Bench:
         self._own = threading.local()
 
     def results(self, scene: ScoredScene) -> Iterator[SceneResult]:
-        """One result for each matcher, in the order given.
+        """Yield one result for each matcher, in the order given.
 
         Raises:
             ReconError: A matcher cannot match the scene; the message names it.
@@ -118,7 +118,7 @@ def _rates(disparity: Disparity) -> bool:
 
 
 def _upper_rows(pair: RectifiedPair) -> RectifiedPair:
-    """The top rows of a pair, for a quick warm-up on images of the same kind."""
+    """Return the top rows of a pair, for a quick warm-up on images of the same kind."""
     rows = min(_WARM_UP_ROWS, pair.camera.height_px)
     return RectifiedPair(
         left=np.ascontiguousarray(pair.left[:rows]),

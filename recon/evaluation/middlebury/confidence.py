@@ -29,7 +29,7 @@ _MEANS: Final = ("ece", "ause", "within_1_sigma", "within_2_sigma")
 
 
 def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | None:
-    """How well the confidence and the standard deviation of a result predict its errors.
+    """Return how well the confidence and the standard deviation of a result predict its errors.
 
     Counts all pixels with a value and known ground truth, occluded ones included.
 
@@ -51,7 +51,7 @@ def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | 
 
 
 def curve_figures(estimate: Disparity, truth: DisparityTruth, limit_px: float) -> Figures:
-    """The same for the confidence alone, of maps of equal size.
+    """Return the same for the confidence alone, of maps of equal size.
 
     Args:
         estimate: The result; its ``sigma_px`` is not read.
@@ -72,7 +72,7 @@ def curve_figures(estimate: Disparity, truth: DisparityTruth, limit_px: float) -
 
 
 def weighted_confidence(scenes: Mapping[str, Figures | None]) -> Figures | None:
-    """The mean over scenes with the benchmark's weights; None if no scene has figures.
+    """Return the mean over scenes with the benchmark's weights; None if no scene has figures.
 
     Args:
         scenes: Figures by scene name; scenes with None are skipped.
@@ -91,7 +91,7 @@ def weighted_confidence(scenes: Mapping[str, Figures | None]) -> Figures | None:
 
 
 def _of_bins(reliability: Reliability) -> Figures:
-    """Equal bins of confidence from 0 to 1; None in an empty bin."""
+    """Return equal bins of confidence from 0 to 1; None in an empty bin."""
     return {
         "confidence": _rounded(reliability.confidence),
         "right": _rounded(reliability.right),
@@ -125,5 +125,5 @@ def _mean_steps(steps: Sequence[Figures], weights: Any) -> Figures:
 
 
 def _rounded(values: Any) -> list[float | None]:
-    """Values for JSON: six decimals, None for NaN."""
+    """Return values for JSON: six decimals, None for NaN."""
     return [None if np.isnan(value) else round(float(value), 6) for value in values]

@@ -108,7 +108,7 @@ def _file_of(folder: Path, scene: str, path: Path) -> Path | None:
 
 
 def _submitted(folder: Path) -> Path | None:
-    """The dense result in the folder of one scene; not its ground truth."""
+    """Return the dense result in the folder of one scene; not its ground truth."""
     truth = {"disp0GT.pfm"} if find_image(folder, "im0") is None else {"disp0GT.pfm", "disp0.pfm"}
     files = {file.stem: file for file in folder.glob(f"{_DISPARITY}*.pfm")}
     found = [
@@ -128,7 +128,7 @@ def _submitted(folder: Path) -> Path | None:
 
 
 def _seconds(file: Path) -> float | None:
-    """What ``timeX.txt`` beside ``disp0X.pfm`` says, if there is one."""
+    """Return what ``timeX.txt`` beside ``disp0X.pfm`` says, if there is one."""
     beside = file.with_name(f"{_TIME}{file.stem.removeprefix(_DISPARITY)}.txt")
     if not file.stem.startswith(_DISPARITY) or not beside.is_file():
         return None

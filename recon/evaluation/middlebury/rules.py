@@ -38,7 +38,7 @@ class MiddleburyRules:
 
 
 def scene_weight(name: str) -> float:
-    """Weight of a scene in the table's mean: 8, or 4 for the scenes of `HALF_WEIGHT`.
+    """Return the weight of a scene in the table's mean: 8, or 4 for the scenes of `HALF_WEIGHT`.
 
     Args:
         name: Name of the scene's folder, or a path that ends in it.
@@ -132,7 +132,7 @@ def evaluate_middlebury(
 
 
 def weighted_mean(figures: Mapping[str, float]) -> float:
-    """The mean over scenes, weighted as in the table; NaN if any value is NaN.
+    """Return the mean over scenes, weighted as in the table; NaN if any value is NaN.
 
     Args:
         figures: One value for each scene, by the scene's name.
@@ -147,7 +147,7 @@ def weighted_mean(figures: Mapping[str, float]) -> float:
 
 
 def _step(shape: tuple[int, ...], truth_shape: tuple[int, ...]) -> float:
-    """Pixels of a result for each pixel of the truth, along a row: 4, 2, 1, 0.5 or 0.25."""
+    """Return pixels of a result for each pixel of the truth, along a row: 4, 2, 1, 0.5 or 0.25."""
     for factor in (1, 2, 4):
         if _fits(truth_shape, shape, factor):
             return 1 / factor
@@ -165,7 +165,7 @@ def _fits(large: tuple[int, ...], small: tuple[int, ...], factor: int) -> bool:
 
 
 def _taken(values: NDArray[Any], shape: tuple[int, ...], step: float) -> NDArray[Any]:
-    """The pixels at ``step`` times row and column, rounded down."""
+    """Return the pixels at ``step`` times row and column, rounded down."""
     rows, columns = (
         np.minimum((np.arange(n) * step).astype(np.intp), limit - 1)
         for n, limit in zip(shape, values.shape, strict=True)

@@ -40,7 +40,7 @@ class ScoredScene:
 
 
 def find_scenes(folder: Path) -> dict[str, Path]:
-    """Folders of all scenes at or below a folder, by scene name.
+    """Return folders of all scenes at or below a folder, by scene name.
 
     Raises:
         SourceError: The folder is missing or contains no scene.

@@ -22,7 +22,7 @@ Figures = dict[str, Any]
 
 
 def dense_map(values: Float32) -> Float32:
-    """A map without holes: float32 (H, W).
+    """Return a map without holes: float32 (H, W).
 
     Holes that cannot be filled get disparity 0, which is wrong nearly everywhere, so that no
     matcher gains by leaving pixels out.
@@ -32,7 +32,7 @@ def dense_map(values: Float32) -> Float32:
 
 
 def score_result(scene: ScoredScene, values: Float32) -> Figures:
-    """The figures of a result, by mask.
+    """Return the figures of a result, by mask.
 
     Args:
         scene: The scene.
@@ -46,7 +46,7 @@ def score_result(scene: ScoredScene, values: Float32) -> Figures:
 
 
 def weighted_figures(scenes: Mapping[str, Figures]) -> Figures:
-    """The mean of each figure over scenes, with the benchmark's weights.
+    """Return the mean of each figure over scenes, with the benchmark's weights.
 
     Args:
         scenes: Nested figures by scene name. A figure that any scene lacks is left out.
@@ -57,7 +57,7 @@ def weighted_figures(scenes: Mapping[str, Figures]) -> Figures:
 
 
 def named_figures(metrics: DisparityMetrics) -> Figures:
-    """Figures named as in the benchmark's table, in pixels and per cent."""
+    """Return figures named as in the benchmark's table, in pixels and per cent."""
     return {
         "bad": {f"{limit:g}": share for limit, share in metrics.bad.items()},
         "avgerr": metrics.avgerr_px,
@@ -83,7 +83,7 @@ def _of_mask(scene: ScoredScene, maps: Mapping[str, Float32], *, occluded: bool)
 
 
 def _depth(scene: ScoredScene, values: Float32, *, occluded: bool) -> Figures:
-    """Errors in metres, where the scene has a calibration."""
+    """Return errors in metres, where the scene has a calibration."""
     if scene.truth_camera is None:
         return {}
     compared = values_compared(values, scene.truth.values.shape, scene.rules)

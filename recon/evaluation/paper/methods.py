@@ -104,7 +104,7 @@ class PatchFigure:
 
 
 def methods_of(config: PaperConfig) -> tuple[str, ...]:
-    """The methods that a configuration selects."""
+    """Return the methods that a configuration selects."""
     return tuple(TITLES) if config.paper.as_printed else (CORRECTED,)
 
 
@@ -192,7 +192,7 @@ def _result(
 
 
 def _matcher(method: str, patch_px: int, config: PaperConfig, threads: int | None) -> Matcher:
-    """The matcher of a method with the given patch size."""
+    """Return the matcher of a method with the given patch size."""
     if method != CORRECTED:
         return PrintedMatcher(PrintedSettings(patch_px=patch_px, signed=method == AS_PRINTED))
     settings = {**config.matching.sad.model_dump(), "window_px": patch_px}
@@ -206,7 +206,7 @@ def _grey_pair(method: str, experiment: Experiment, config: PaperConfig) -> Rect
 
 
 def _printed_pair(experiment: Experiment) -> RectifiedPair:
-    """The images converted to grey by Eq. 6."""
+    """Return the images converted to grey by Eq. 6."""
     settings = RectificationSettings(grey="paper")
     return Rectifier(experiment.camera, settings).rectify(experiment.pair)
 

@@ -76,7 +76,7 @@ class PrintedMatcher:
         return _undoubted(values)
 
     def _smallest_sums(self, pair: RectifiedPair) -> Float32:
-        """float32, the disparity of each pixel whose patch lies within the left image."""
+        """Return float32, the disparity of each pixel whose patch lies within the left image."""
         left, right = pair.left.astype(np.int32), pair.right.astype(np.int32)
         outside = self._settings.patch_px - 1
         size = (left.shape[0] - outside, left.shape[1] - outside)
@@ -102,7 +102,7 @@ class PrintedMatcher:
 
 
 def _undoubted(values: Float32) -> Disparity:
-    """A disparity without any check: where there is a value, it is believed."""
+    """Return a disparity without any check: where there is a value, it is believed."""
     known = np.isfinite(values)
     return Disparity(
         values=values,

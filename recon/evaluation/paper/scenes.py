@@ -73,7 +73,7 @@ class Experiment:
 
 
 def default_scenes_folder() -> Path:
-    """MiddEval3's quarter-size training scenes in ``RECON_DATA``.
+    """Return MiddEval3's quarter-size training scenes in ``RECON_DATA``.
 
     Raises:
         SourceError: The environment variable is not set.
@@ -108,7 +108,7 @@ def read_experiments(folder: Path) -> list[Experiment]:
 
 
 def camera_of_table_1(camera: RectifiedCamera) -> RectifiedCamera:
-    """The camera of Table 1: ``doffs`` taken as the focal length, and no offset added to d.
+    """Return the camera of Table 1: ``doffs`` taken as the focal length, and no offset added to d.
 
     Raises:
         CalibrationError: ``doffs`` is not positive, so it cannot be used as a focal length.
@@ -138,7 +138,7 @@ def _read_experiment(number: int, folder: Path) -> Experiment:
 
 
 def _table_1_row(number: int, folder: Path) -> Table1Row:
-    """The row of Table 1 for an experiment, from the scene's own calibration file."""
+    """Return the row of Table 1 for an experiment, from the scene's own calibration file."""
     calib = read_middlebury_calib(folder / "calib.txt")
     camera = calib.camera
     return Table1Row(

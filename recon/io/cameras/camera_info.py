@@ -64,7 +64,7 @@ def rig_of_camera_infos(
     P_right: Float64,
     where: StrPath,
 ) -> StereoCalibration:
-    """The rig described by two CameraInfos, from files or messages.
+    """Return the rig described by two CameraInfos, from files or messages.
 
     Args:
         left: The left camera and its rectifying rotation, float64 (3, 3).

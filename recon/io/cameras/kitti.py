@@ -70,7 +70,7 @@ def read_kitti_calib(
 
 @reader
 def read_kitti_offset(path: StrPath, camera: int) -> Float64:
-    """Pose of a camera: float64 (4, 4), ``T_camera_camera0``, a translation in metres.
+    """Return the pose of a camera: float64 (4, 4), ``T_camera_camera0``, a translation in metres.
 
     KITTI's trajectories are those of camera 0.
 
@@ -93,7 +93,7 @@ def kitti_cameras_of(left: Path) -> tuple[int, int] | None:
 
 @reader
 def list_kitti_cameras(path: StrPath) -> frozenset[int]:
-    """Numbers of the cameras that have a matrix in a calibration file.
+    """Return numbers of the cameras that have a matrix in a calibration file.
 
     Raises:
         FormatError: The file is missing or not text.
@@ -131,5 +131,5 @@ def _projection(path: StrPath, camera: int) -> Float64:
 
 
 def _centre_m(projection: Float64) -> Float64:
-    """``t`` of ``P = K·[I | t]``, float64 (3,)."""
+    """Return ``t`` of ``P = K·[I | t]``, float64 (3,)."""
     return np.asarray(np.linalg.solve(projection[:, :3], projection[:, 3]), dtype=np.float64)

@@ -64,7 +64,7 @@ def _camera(
 
 
 def _pose(rows: dict[str, str], camera: int, path: StrPath) -> Float64:
-    """``T_camera_camera0``."""
+    """Return ``T_camera_camera0``."""
     rotation = _numbers(rows, "R", camera, path).reshape(3, 3)
     return make_transform(rotation, _numbers(rows, "T", camera, path))
 

@@ -29,14 +29,14 @@ KALIBR_MODELS: Final[Models] = {
 
 
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Float64:
-    """float64 (3, 3) camera matrix, pixels."""
+    """Return float64 (3, 3) camera matrix, pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def lens_of(
     models: Models, name: str, coefficients: Float64, path: StrPath
 ) -> tuple[LensModel, Float64]:
-    """Our lens model for a format's name, and its coefficients.
+    """Return our lens model for a format's name, and its coefficients.
 
     Raises:
         FormatError: The model is not supported, or the number of coefficients is wrong.

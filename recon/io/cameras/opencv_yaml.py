@@ -123,7 +123,7 @@ def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> N
 
 
 def _model(nodes: Nodes) -> LensModel | None:
-    """The lens model named in a file, if any."""
+    """Return the lens model named in a file, if any."""
     named = {str(nodes[name]).lower() for name in _MODEL if name in nodes}
     if not named:
         return None
@@ -143,7 +143,7 @@ def _check_model(camera: CameraIntrinsics, path: StrPath) -> None:
 
 
 def _find(nodes: Nodes, names: Sequence[str]) -> Float64 | None:
-    """The numbers under the first of some names that has any."""
+    """Return the numbers under the first of some names that has any."""
     found = (nodes.get(name) for name in names)
     return next((value for value in found if isinstance(value, np.ndarray)), None)
 
@@ -186,7 +186,7 @@ def _camera(
 
 
 def _size(nodes: Nodes) -> tuple[int, int] | None:
-    """Image width and height, if the file states them."""
+    """Return image width and height, if the file states them."""
     width, height, both = (_find(nodes, names) for names in (_WIDTH, _HEIGHT, _SIZE))
     if width is not None and height is not None:
         return int(width), int(height)
@@ -196,7 +196,7 @@ def _size(nodes: Nodes) -> tuple[int, int] | None:
 
 
 def _find_extrinsics(intrinsics: StrPath, extrinsics: StrPath | None, nodes: Nodes) -> StrPath:
-    """The file with ``R`` and ``T``."""
+    """Return the file with ``R`` and ``T``."""
     if extrinsics is not None:
         return extrinsics
     path = Path(intrinsics)

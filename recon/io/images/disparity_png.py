@@ -15,7 +15,7 @@ from recon.io.images.pfm import read_pfm
 
 
 def read_disparity(path: StrPath) -> Float32:
-    """A disparity map, PFM or 16-bit PNG by its suffix: float32 (H, W), NaN = unknown.
+    """Return a disparity map, PFM or 16-bit PNG by its suffix: float32 (H, W), NaN = unknown.
 
     Raises:
         FormatError: The file is missing or damaged.
@@ -77,6 +77,6 @@ def write_disparity_png(path: StrPath, values: Float32, *, scale: float = 256.0)
 
 
 def fitting_scale(values: Float32) -> float:
-    """The largest power of two, at most KITTI's 256, for which ``values`` fit 16 bits."""
+    """Return the largest power of two, at most KITTI's 256, for which ``values`` fit 16 bits."""
     highest = max(1.0, float(np.nanmax(values, initial=1.0)))
     return min(256.0, 2.0 ** math.floor(math.log2(65535 / highest)))

@@ -64,7 +64,7 @@ def eight_bits(levels: NDArray[Any], white: int = FULL_WHITE) -> UInt8:
 
 
 def find_white(images: Iterable[NDArray[Any]]) -> int:
-    """The largest value that the sensor of some images can give: 2^n - 1, 8 to 16 bits.
+    """Return the largest value that the sensor of some images can give: 2^n - 1, 8 to 16 bits.
 
     Cameras of 10, 12 or 14 bits often store their values unscaled in 16 bits.
     """

@@ -50,7 +50,7 @@ def check_image_bytes(content: bytes, path: StrPath) -> None:
 
 
 def is_tiff(content: bytes) -> bool:
-    """Whether the content starts like a TIFF."""
+    """Return whether the content starts like a TIFF."""
     return content.startswith(_TIFF_STARTS)
 
 

@@ -104,7 +104,7 @@ def _unpack(
     big_endian: bool,
     where: str,
 ) -> NDArray[Any]:
-    """Pixels (H, W) or (H, W, channels), without the padding of rows."""
+    """Return pixels (H, W) or (H, W, channels), without the padding of rows."""
     height_px, width_px = shape
     channels, bits = _LAYOUT[name]
     row = width_px * channels * bits // 8

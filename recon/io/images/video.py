@@ -105,7 +105,7 @@ def open_video(path: StrPath) -> VideoFile:
 
 
 def _count(path: Path) -> int:
-    """Number of packets; a video stream has one per frame."""
+    """Return the number of packets; a video stream has one per frame."""
     with _opened(path) as capture:
         capture.set(cv2.CAP_PROP_FORMAT, -1)  # raw packets, not decoded
         count = 0

@@ -45,7 +45,7 @@ class Leaves(NamedTuple):
 
 
 def begin_walk(depth: int) -> TreeWalk:
-    """A walk before the root of a tree whose deepest leaves are on the level ``depth``."""
+    """Return a walk before the root of a tree whose deepest leaves are on the level ``depth``."""
     return TreeWalk(
         np.zeros(1, np.int64), np.zeros(depth, np.uint8), np.zeros((depth, 3), np.int32)
     )

@@ -8,7 +8,7 @@ Leaf = tuple[int, int, tuple[int, int, int]]
 
 
 def find_leaves_reference(children: Sequence[int]) -> list[Leaf]:
-    """Number, level and place of each leaf of a whole tree.
+    """Return the number, level and place of each leaf of a whole tree.
 
     Args:
         children: For each node, depth first, a bit for each of its children.

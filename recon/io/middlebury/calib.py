@@ -72,7 +72,7 @@ def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
 def nominal_camera_2005(
     width_px: int, height_px: int, dmin_px: float, factor: float
 ) -> RectifiedCamera:
-    """The camera of a 2005 or 2006 scene, from the nominal values that are published.
+    """Return the camera of a 2005 or 2006 scene, from the nominal values that are published.
 
     The images are cropped so that disparities are too small by ``dmin``. The principal point is
     unknown and assumed at the image centre.

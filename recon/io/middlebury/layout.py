@@ -88,13 +88,13 @@ def find_layout(folder: Path) -> Layout | None:
 
 
 def find_image(folder: Path, stem: str) -> Path | None:
-    """The image file with that stem and any image suffix, or None."""
+    """Return the image file with that stem and any image suffix, or None."""
     paths = (folder / f"{stem}{suffix}" for suffix in _IMAGES)
     return next((path for path in paths if path.is_file()), None)
 
 
 def generation_of(layout: Layout, width_px: int) -> Generation:
-    """The year; scenes of 2001 and 2003 have the same file names and differ in width."""
+    """Return the year; scenes of 2001 and 2003 have the same file names and differ in width."""
     if layout.calibrated:
         return "2014"
     if layout == _2005:
@@ -113,14 +113,14 @@ def levels_per_pixel(layout: Layout, width_px: int, height_px: int) -> float | N
 
 
 def scene_root(folder: Path) -> Path:
-    """The folder of the scene itself, above any subfolders by lighting and exposure."""
+    """Return the folder of the scene itself, above any subfolders by lighting and exposure."""
     while _VARIANT.fullmatch(folder.name):
         folder = folder.parent
     return folder
 
 
 def full_size_factor(layout: Layout, width_px: int, height_px: int, folder: Path) -> float:
-    """Full-size pixels per pixel of these images.
+    """Return full-size pixels per pixel of these images.
 
     MiddEval3 gives the size by the last letter of the collection (``trainingQ``); in other
     folders its scenes are recognised by name.

@@ -91,7 +91,7 @@ def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
 
 
 def stand_in_camera(width_px: int, height_px: int, ndisp: int | None = None) -> RectifiedCamera:
-    """A placeholder camera for uncalibrated images: valid for matching, not for depth.
+    """Return a placeholder camera for uncalibrated images: valid for matching, not for depth.
 
     The focal length is set to the image width and the baseline to 1, so depth has an unknown
     scale.

@@ -54,7 +54,7 @@ def read_middlebury_truth(
 
 
 def cross_check(left: Float32, right: Float32, tolerance_px: float) -> Bool:
-    """Where the left and the right disparity describe the same point.
+    """Return where the left and the right disparity describe the same point.
 
     Args:
         left: float32 (H, W), disparity of the left image; NaN = unknown.

@@ -63,7 +63,7 @@ def srgb_from_linear(rgb: UInt8) -> UInt8:
 
 
 def _linear(rgb: UInt8) -> NDArray[np.uint16]:
-    """uint16 (V, 4): linear red, green, blue and full opacity (IEC 61966-2-1)."""
+    """Return uint16 (V, 4): linear red, green, blue and full opacity (IEC 61966-2-1)."""
     share = rgb / 255
     curve = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     opaque = np.ones((len(rgb), 1))
@@ -74,7 +74,7 @@ def _linear(rgb: UInt8) -> NDArray[np.uint16]:
 def _document(
     mesh: TriangleMesh, attributes: dict[str, tuple[NDArray[Any], int]]
 ) -> tuple[dict[str, Any], bytes]:
-    """The JSON part, and the arrays it describes as one block of bytes."""
+    """Return the JSON part, and the arrays it describes as one block of bytes."""
     arrays = [*attributes.values(), (mesh.faces.astype(np.uint32).reshape(-1, 1), _UINT)]
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
@@ -112,7 +112,7 @@ def _document(
 
 
 def _accessor(values: NDArray[Any], component: int, view: int) -> dict[str, Any]:
-    """The description of one array."""
+    """Return the description of one array."""
     kind = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]]
     return {
         "bufferView": view,
@@ -124,6 +124,6 @@ def _accessor(values: NDArray[Any], component: int, view: int) -> dict[str, Any]
 
 
 def _chunk(kind: bytes, content: bytes, filler: bytes) -> bytes:
-    """One chunk of the container, padded to a multiple of four bytes."""
+    """Return one chunk of the container, padded to a multiple of four bytes."""
     content += filler * (-len(content) % 4)
     return struct.pack("<I4s", len(content), kind) + content

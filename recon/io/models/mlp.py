@@ -98,12 +98,12 @@ def _add_photo(group: ET.Element, photo: Photo, project: Path) -> None:
 
 
 def _rows(T: Float64) -> str:
-    """A matrix as MeshLab writes it, one row per line."""
+    """Return a matrix as MeshLab writes it, one row per line."""
     return "\n" + "".join(" ".join(f"{x:g}" for x in row) + " \n" for row in T)
 
 
 def _relative(file: str | PathLike[str], project: Path) -> str:
-    """Path of a layer's file relative to the project's folder."""
+    """Return the path of a layer's file relative to the project's folder."""
     if not Path(file).is_file():
         raise OutputError(
             "a layer of the MeshLab project does not exist", where=file, hint="write it first"

@@ -152,7 +152,7 @@ def read_ply_pieces(
 
 
 def vertex_dtype(*, normals: bool, colours: bool) -> list[tuple[str, str]]:
-    """Fields of a vertex table: position, and optionally normal and colour."""
+    """Return fields of a vertex table: position, and optionally normal and colour."""
     fields = [(name, "<f4") for name in _XYZ + (_NORMAL if normals else ())]
     return fields + [(name, "u1") for name in (_COLOUR if colours else ())]
 
@@ -168,12 +168,12 @@ def fill_vertices(
 
 
 def normals_of(vertex: Table) -> NDArray[np.float32] | None:
-    """float32 (N, 3), the normals of a vertex table, or None."""
+    """Return float32 (N, 3), the normals of a vertex table, or None."""
     return _stacked(vertex, _NORMAL, np.float32) if _has(vertex, _NORMAL) else None
 
 
 def colours_of(vertex: Table) -> UInt8 | None:
-    """uint8 (N, 3), the colours of a vertex table, or None; float colours are in [0, 1]."""
+    """Return uint8 (N, 3), the colours of a vertex table, or None; float colours are in [0, 1]."""
     if not _has(vertex, _COLOUR):
         return None
     if vertex.dtype["red"].kind == "f":
@@ -220,7 +220,7 @@ def _check_precision(vertex: Table, path: str | PathLike[str]) -> None:
 
 
 def _shape(vertex: Table, header: PlyHeader) -> PointCloud:
-    """Positions, normals and colours of vertices."""
+    """Return positions, normals and colours of vertices."""
     return PointCloud(
         xyz=_stacked(vertex, _XYZ, np.float32),
         rgb=colours_of(vertex),

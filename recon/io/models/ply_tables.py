@@ -49,7 +49,7 @@ class PlyHeader:
 
 
 def list_length(name: str) -> str:
-    """Name of the field with the length of the list property ``name``."""
+    """Return the name of the field with the length of the list property ``name``."""
     return f"{name} length"
 
 
@@ -177,7 +177,7 @@ class TableStream:
         self._stream.write(self._header())
 
     def _header(self) -> bytes:
-        """The header, padded with a comment to the same length for every number of rows."""
+        """Return the header, padded with a comment to the same length for every number of rows."""
         number = str(self.rows)
         lines = [
             "ply",
@@ -202,7 +202,7 @@ def _property_lines(dtype: np.dtype[Any]) -> list[str]:
 
 
 def _fields(dtype: np.dtype[Any]) -> list[tuple[str, np.dtype[Any]]]:
-    """Names and dtypes of the fields of a table."""
+    """Return names and dtypes of the fields of a table."""
     return [(name, dtype[name]) for name in dtype.names or ()]
 
 
@@ -255,7 +255,7 @@ def _is_property(words: list[str]) -> bool:
 
 
 def _property_fields(words: list[str], order: str) -> list[tuple[Any, ...]]:
-    """The fields of one property line."""
+    """Return the fields of one property line."""
     name = words[-1]
     if words[0] == "list":
         length, entry = (order + _TYPES[word] for word in words[1:-1])
@@ -284,7 +284,7 @@ def _pieces(
     rows_each: int,
     path: str | PathLike[str],
 ) -> Iterator[Table]:
-    """The rows of an element in pieces; at least one table."""
+    """Yield the rows of an element in pieces; at least one table."""
     name, count, dtype = element
     read = _read_text if header.encoding == "ascii" else _read_binary
     rows = 0

@@ -89,7 +89,7 @@ def _grey(cells: NDArray[np.int8]) -> UInt8:
 
 
 def _describe(grid: OccupancyGrid, image: str) -> dict[str, Any]:
-    """The content of the YAML file."""
+    """Return the content of the YAML file."""
     return {
         "image": image,
         "mode": "trinary",

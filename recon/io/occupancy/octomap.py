@@ -101,7 +101,7 @@ class _Node:
 
 
 def _nodes(voxels: OccupancyVoxels, depth: int, pieces: IO[bytes]) -> list[_Node]:
-    """Nodes for the cubes of a tile; their bytes are appended to ``pieces``."""
+    """Return nodes for the cubes of a tile; their bytes are appended to ``pieces``."""
     _check(voxels)
     if len(voxels) == 0:
         return []

@@ -61,7 +61,7 @@ def _pieces(file: IO[bytes], path: Path, nodes_each: int) -> Iterator[OccupancyV
 
 
 def _cells(nodes: NDArray[np.void], walk: TreeWalk, resolution_m: float) -> OccupancyVoxels | None:
-    """The cells of the next nodes; None if they do not fit the tree."""
+    """Return the cells of the next nodes; None if they do not fit the tree."""
     seen, leaves = find_leaves(np.ascontiguousarray(nodes["children"]), walk)
     log_odds = nodes["log_odds"][leaves.nodes]
     coarse = (leaves.levels < _COARSEST).any()

@@ -136,7 +136,7 @@ def _encode_binary(
 
 
 def _places(written: list[Bool], begins: list[_Index], size: int) -> list[_Index]:
-    """Byte offset of each node, per level; nodes that are not written take no bytes."""
+    """Return the byte offset of each node, per level; nodes that are not written take no bytes."""
     sizes = [size * written[0].astype(np.int64)]
     for up, begin in enumerate(begins, 1):
         below = np.add.reduceat(sizes[-1], begin)
@@ -152,7 +152,7 @@ def _places(written: list[Bool], begins: list[_Index], size: int) -> list[_Index
 
 
 def _morton(cells: NDArray[np.int64], depth: int) -> _Index:
-    """Morton codes of cells (N, 3) in ``[0, 2^depth)``; x is the lowest bit."""
+    """Return Morton codes of cells (N, 3) in ``[0, 2^depth)``; x is the lowest bit."""
     code = np.zeros(len(cells), np.int64)
     for bit in range(depth):
         for axis in range(3):
@@ -161,7 +161,7 @@ def _morton(cells: NDArray[np.int64], depth: int) -> _Index:
 
 
 def file_header(*, binary: bool, nodes: int, resolution_m: float) -> bytes:
-    """The header of a file."""
+    """Return the header of a file."""
     kind = "# Octomap OcTree binary file" if binary else "# Octomap OcTree file"
     lines = [
         kind,

@@ -63,7 +63,7 @@ class NormalEquations(NamedTuple):
 def linearise(
     T_camera_world: Float64, uvd: Float64, xyz_world: Float64, model: BundleModel
 ) -> NormalEquations:
-    """Normal equations of all observations, with Cauchy weights.
+    """Return the normal equations of all observations, with Cauchy weights.
 
     Args:
         T_camera_world: float64 (W, 4, 4).

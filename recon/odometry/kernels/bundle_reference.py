@@ -31,7 +31,7 @@ def linearise_reference(
 
 
 def solve_step_reference(normal: NormalEquations, damping: float) -> tuple[Float64, Float64]:
-    """The reference of `bundle.solve_step`: the whole system, not reduced."""
+    """Return the reference of `bundle.solve_step`: the whole system, not reduced."""
     H, g = whole_system(normal, damping)
     step = np.zeros(len(g))
     step[6:] = np.linalg.solve(H[6:, 6:], g[6:])
@@ -85,7 +85,7 @@ def _white(
 
 
 def _projection_jacobian(xyz: Float64, model: BundleModel) -> Float64:
-    """Whitened derivative (W, N, 3, 3) of column, row and disparity by the point."""
+    """Return whitened derivative (W, N, 3, 3) of column, row and disparity by the point."""
     z = np.maximum(xyz[:, :, 2], MIN_DEPTH_M)
     J = np.zeros((*xyz.shape, 3))
     J[:, :, 0, 0] = J[:, :, 1, 1] = model.focal / z / model.sigma_uv

@@ -52,7 +52,7 @@ class RowAlignment:
         return exp_so3(np.array([self.pitch_rad, 0.0, self.roll_rad]))
 
     def turned_rows(self, right_uv: Float32, camera: RectifiedCamera) -> Float64:
-        """float64 (N,): rows of features of the right image after correction."""
+        """Return float64 (N,): rows of features of the right image after correction."""
         turn = np.array([self.pitch_rad, self.roll_rad])
         return np.asarray(turn_features(right_uv, camera, turn)[:, 1])
 
@@ -99,7 +99,7 @@ def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> 
 
 
 def turn_features(right_uv: Float32, camera: RectifiedCamera, turn: Float64) -> Float64:
-    """Positions of features of the right image after a rotation of the right camera.
+    """Return positions of features of the right image after a rotation of the right camera.
 
     Args:
         right_uv: float32 (N, 2).
@@ -116,7 +116,7 @@ def turn_features(right_uv: Float32, camera: RectifiedCamera, turn: Float64) -> 
 
 
 def count_aligned(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> int:
-    """Number of features that agree with one rotation of the right camera, however large."""
+    """Return number of features that agree with one rotation of the right camera, however large."""
     if len(left_uv) < 2:
         return 0
     return int(_consensus(*_linear(left_uv, right_uv, camera), camera.focal_px).sum())
@@ -125,7 +125,7 @@ def count_aligned(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) 
 def mend_rig(
     rig: RectifiedCamera | StereoCalibration, alignment: RowAlignment, R_rect_left: Float64
 ) -> StereoCalibration:
-    """The calibration with the right camera rotated in place so that rows are aligned.
+    """Return the calibration with the right camera rotated in place so that rows are aligned.
 
     Args:
         rig: The calibration that the images were rectified with.
@@ -157,7 +157,7 @@ def _as_raw(rig: RectifiedCamera | StereoCalibration) -> StereoCalibration:
 def _linear(
     left_uv: Float32, right_uv: Float32 | Float64, camera: RectifiedCamera
 ) -> tuple[Float64, Float64]:
-    """Basis (N, 2) and target (N,) of ``rows = basis @ (pitch, roll)``, in focal lengths.
+    """Return basis (N, 2) and target (N,) of ``rows = basis @ (pitch, roll)``, in focal lengths.
 
     A small rotation w moves a ray p by w × p; its row becomes y - w_x·(1 + y²) + w_z·x.
     """
@@ -168,7 +168,7 @@ def _linear(
 
 
 def _solve(basis: Float64, rows: Float64) -> Float64:
-    """float64 (2,): least-squares pitch and roll."""
+    """Return float64 (2,): least-squares pitch and roll."""
     return np.asarray(np.linalg.lstsq(basis, rows, rcond=None)[0], dtype=np.float64)
 
 

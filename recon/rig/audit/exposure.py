@@ -16,7 +16,7 @@ _BRIGHT: Final = 243.0
 
 
 def measure_gain(left: UInt8, right: UInt8, left_uv: Float32, right_uv: Float32) -> Float64:
-    """Brightness of the right image relative to the left, around matched features.
+    """Return the brightness of the right image relative to the left, around matched features.
 
     Args:
         left: uint8 (H, W).
@@ -34,7 +34,7 @@ def measure_gain(left: UInt8, right: UInt8, left_uv: Float32, right_uv: Float32)
 
 
 def _medians(image: UInt8, uv: Float32) -> Float64:
-    """Median brightness around each feature."""
+    """Return the median brightness around each feature."""
     smooth = cv2.medianBlur(np.ascontiguousarray(image), _AROUND_PX)
     height, width = image.shape
     column = np.clip(np.rint(uv[:, 0]).astype(int), 0, width - 1)

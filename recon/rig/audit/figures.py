@@ -26,7 +26,7 @@ _LEAST_SIGMA_PX: Final = 0.05
 def audit_figures(
     source: StereoSource, sample: Sample, geometry: Geometry, gaps: Gaps, camera: RectifiedCamera
 ) -> dict[str, Any]:
-    """All measures of the audit; None if unknown."""
+    """Return all measures of the audit; None if unknown."""
     sharpness = np.median(sample.sharpness, axis=0).tolist() if sample.sharpness else [None, None]
     gains = np.concatenate([np.zeros(0), *sample.gains])
     return {
@@ -73,7 +73,7 @@ def _row_figures(alignment: RowAlignment | None) -> dict[str, Any]:
 def _depth_figures(
     alignment: RowAlignment | None, disparity_px: Float64, camera: RectifiedCamera
 ) -> dict[str, Any]:
-    """Observed disparities, and the depth error if columns are as accurate as rows."""
+    """Return observed disparities, and the depth error if columns are as accurate as rows."""
     if alignment is None or not len(disparity_px):
         return {}
     sigma_px = np.float32(max(alignment.residual_px, _LEAST_SIGMA_PX))

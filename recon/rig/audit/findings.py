@@ -25,7 +25,7 @@ class Finding:
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
-    """Good without findings, not usable with a fatal one, else usable."""
+    """Return good without findings, not usable with a fatal one, else usable."""
     found = list(findings)
     if any(finding.fatal for finding in found):
         return "not usable"

@@ -9,7 +9,7 @@ from recon.core.values.arrays import UInt8
 
 
 def measure_sharpness(image: UInt8) -> float:
-    """Share of the finest detail in all detail of an image, in [0, 1].
+    """Return the share of the finest detail in all detail of an image, in [0, 1].
 
     Compares Laplacians at full and at quarter size: blur reduces the first, but not the second.
     Sensor noise is subtracted from both.
@@ -25,7 +25,7 @@ def measure_sharpness(image: UInt8) -> float:
 
 
 def _detail(image: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> float:
-    """Mean of the strongest 5 % of absolute Laplacians, minus twice the median of all."""
+    """Return mean of the strongest 5 % of absolute Laplacians, minus twice the median of all."""
     size = np.abs(cv2.Laplacian(image, cv2.CV_32F))
     noise, strong = np.quantile(size, [0.5, 0.95])
     return float(max(0.0, size[size >= strong].mean() - 2.0 * noise))

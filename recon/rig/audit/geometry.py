@@ -92,7 +92,7 @@ def _align(features: PairFeatures, camera: RectifiedCamera) -> RowAlignment | No
 def _disparities(
     features: PairFeatures, alignment: RowAlignment | None, camera: RectifiedCamera
 ) -> Float64:
-    """float64 (M,), pixels; matches with a large row error are left out."""
+    """Return float64 (M,), pixels; matches with a large row error are left out."""
     if alignment is None:
         return np.zeros(0)
     rows = alignment.turned_rows(features.right_uv, camera) - features.left_uv[:, 1]
@@ -101,7 +101,7 @@ def _disparities(
 
 
 def _best_lag(sample: Sample, skew: tuple[float, float] | None) -> int:
-    """The lag that fits best, if it fits clearly better than none.
+    """Return the lag that fits best, if it fits clearly better than none.
 
     A delay of half a frame fits both neighbours badly and is reported as skew, not as lag.
     """
@@ -119,7 +119,7 @@ def _best_lag(sample: Sample, skew: tuple[float, float] | None) -> int:
 def _time_skew(
     sample: Sample, camera: RectifiedCamera, alignment: RowAlignment | None
 ) -> tuple[float, float] | None:
-    """Skew in frames with its standard error, from all pairs."""
+    """Return the skew in frames with its standard error, from all pairs."""
     if alignment is None:
         return None
     errors, flows = [np.zeros(0)], [np.zeros(0)]

@@ -63,7 +63,7 @@ class _OnePair:
 def find_pair_faults(
     given: PairInput, config: AuditedSettings, *, metric: bool
 ) -> tuple[Finding, ...]:
-    """Findings of a quick audit; none if it is switched off.
+    """Return findings of a quick audit; none if it is switched off.
 
     Args:
         given: The pair.
@@ -83,7 +83,7 @@ def find_pair_faults(
 def check_found(
     disparity: Disparity, pair: StereoPair, faults: tuple[Finding, ...] = ()
 ) -> tuple[str, ...]:
-    """Warnings about the share of pixels with a disparity.
+    """Return warnings about the share of pixels with a disparity.
 
     Args:
         disparity: The disparity map.
@@ -114,7 +114,7 @@ def check_found(
 
 
 def _reasons(disparity: Disparity) -> str:
-    """The two most common reasons for having no disparity."""
+    """Return the two most common reasons for having no disparity."""
     count = np.bincount(disparity.reason.ravel(), minlength=len(Reason))
     percent = 100 * count / disparity.reason.size
     most = sorted((r for r in Reason if r and percent[r] >= 1), key=lambda r: -percent[r])[:2]

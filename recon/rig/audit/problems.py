@@ -76,7 +76,7 @@ class Gaps:
 
 
 def find_picture_faults(sample: Sample, matcher: str | Matcher) -> Iterator[Finding]:
-    """Problems of single images: unreadable, black, blurred, of unequal brightness.
+    """Yield problems of single images: unreadable, black, blurred, of unequal brightness.
 
     Args:
         sample: The sampled images.
@@ -110,7 +110,7 @@ def find_picture_faults(sample: Sample, matcher: str | Matcher) -> Iterator[Find
 
 
 def _blank_sides(sample: Sample) -> list[int]:
-    """Cameras whose images are uniform in most pairs."""
+    """Return cameras whose images are uniform in most pairs."""
     blank = np.array(sample.contrast_dn).reshape(-1, 2) < BLANK_DN
     return [side for side in range(2) if len(blank) and blank[:, side].mean() >= 0.5]
 
@@ -137,7 +137,7 @@ def _find_blur(sample: Sample) -> Iterator[Finding]:
 
 
 def find_series_faults(sample: Sample, gaps: Gaps) -> Iterator[Finding]:
-    """Problems of the sequence: repeated frames, frozen cameras, gaps."""
+    """Yield problems of the sequence: repeated frames, frozen cameras, gaps."""
     repeats = sample.repeats
     if repeats.steps and repeats.both > _REPEATED_SHARE * repeats.steps:
         yield Finding(
@@ -177,7 +177,7 @@ def find_gaps(source: StereoSource) -> Gaps:
 
 
 def find_geometry_faults(geometry: Geometry) -> Iterator[Finding]:
-    """Problems of the geometry: swapped cameras, delays, row errors."""
+    """Yield problems of the geometry: swapped cameras, delays, row errors."""
     swapped, lag, skew = geometry.swapped_share, geometry.lag, geometry.skew
     if swapped >= _SWAPPED_SHARE:
         yield Finding(
@@ -230,7 +230,7 @@ def _find_row_faults(geometry: Geometry) -> Iterator[Finding]:
 def find_range_faults(
     geometry: Geometry, reach_px: int | None, camera: RectifiedCamera
 ) -> Iterator[Finding]:
-    """Scenes that are too near or too far for the rig.
+    """Yield scenes that are too near or too far for the rig.
 
     Args:
         geometry: Measures of the matched features.
@@ -270,7 +270,7 @@ def find_calibration_faults(
     camera: RectifiedCamera,
     baseline_m: tuple[float, float],
 ) -> Iterator[Finding]:
-    """Implausible calibration: image size, baseline outside of the plausible ones."""
+    """Yield implausible calibration: image size, baseline outside of the plausible ones."""
     for name, centre, size in _centres(rig):
         off = np.abs(np.array(centre) / size - 0.5)
         if off.max() > LARGEST_CENTRE_OFFSET:

@@ -94,7 +94,7 @@ def run_audit(source: StereoSource, config: AuditedSettings, *, quick: bool = Fa
 
 
 def quick_warnings(source: StereoSource, config: AuditedSettings) -> tuple[str, ...]:
-    """Findings of a quick audit, one line each; none if it is switched off.
+    """Return findings of a quick audit, one line each; none if it is switched off.
 
     A calibration that cannot rectify is reported by the run itself, not here.
     """
@@ -141,7 +141,7 @@ def mend_calibration(
 
 
 def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None:
-    """The largest disparity that is searched; None if the range adapts to each pair."""
+    """Return the largest disparity that is searched; None if the range adapts to each pair."""
     own = settings_of(matching.matcher, matching)
     if not isinstance(own, SearchSettings):
         return None

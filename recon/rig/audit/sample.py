@@ -155,7 +155,7 @@ def plan_stretches(frames: int, read: int, *, quick: bool) -> list[tuple[int, in
 
 
 def plan_centres(stretches: list[tuple[int, int]], *, quick: bool) -> list[int]:
-    """Frames whose features are matched, evenly spread, with a margin for the lags."""
+    """Return frames whose features are matched, evenly spread, with a margin for the lags."""
     pairs, lag = (_QUICK_RUNS, _QUICK_LAG) if quick else (_PAIRS, _MAX_LAG)
     each = max(1, pairs // len(stretches))
     chosen: list[int] = []

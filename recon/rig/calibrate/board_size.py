@@ -105,7 +105,7 @@ def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBo
 
 
 def grown_size(grey: UInt8, pixels: Float64, inner: Inner) -> Inner:
-    """Columns and rows of a grid of inner corners, extended as far as corners are found.
+    """Return columns and rows of a grid of inner corners, extended as far as corners are found.
 
     Args:
         grey: uint8 (H, W).
@@ -128,7 +128,7 @@ def grown_size(grey: UInt8, pixels: Float64, inner: Inner) -> Inner:
 
 
 def probe_size(grey: UInt8) -> Inner | None:
-    """Inner columns and rows of any chessboard in an image, or None."""
+    """Return inner columns and rows of any chessboard in an image, or None."""
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(
         grey, (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     )
@@ -150,12 +150,12 @@ def _spread(numbers: Sequence[int], count: int) -> list[int]:
 
 
 def _sorted(size: Inner) -> Inner:
-    """The size independent of orientation: a board may be held upright or sideways."""
+    """Return the size independent of orientation: a board may be held upright or sideways."""
     return min(size), max(size)
 
 
 def _continue(grey: UInt8, grid: Float64, axis: int, usual: float) -> Float64 | None:
-    """The grid with one more line at the end of an axis, or None if there are no corners."""
+    """Return the grid with one more line at the end of an axis, or None if there are no corners."""
     lines = np.moveaxis(grid, axis, 0)
     if len(lines) < 3 or len(lines) >= _LARGEST:
         return None
@@ -196,7 +196,7 @@ def _sample(grey: UInt8, places: Float64) -> Float64:
 
 
 def _marker_votes(images: Sequence[UInt8]) -> tuple[str, Counter[str]]:
-    """The dictionary with the most markers found, and the number found of each."""
+    """Return the dictionary with the most markers found, and the number found of each."""
     votes = Counter(
         {
             name: sum(len(find_markers(image, name)) for image in images)

@@ -32,7 +32,7 @@ _MOST: Final = 120
 
 
 def is_video(where: str) -> bool:
-    """Whether an argument names a video file."""
+    """Return whether an argument names a video file."""
     return Path(where).suffix.lower() in VIDEOS and Path(where).is_file()
 
 
@@ -76,7 +76,7 @@ def pick_views(
 def _frames(
     videos: Sequence[VideoFile], numbers: Iterable[int], settings: SourceSettings
 ) -> Iterator[tuple[UInt8, UInt8]]:
-    """Both views of frames of increasing numbers."""
+    """Yield both views of frames of increasing numbers."""
     wanted = list(numbers)
     if len(videos) == 1:
         for _, image in videos[0].pick(wanted):
@@ -87,7 +87,7 @@ def _frames(
 
 
 def _shrunk(both: tuple[UInt8, UInt8]) -> Float32:
-    """float32 (H, W), both views side by side, small."""
+    """Return float32 (H, W), both views side by side, small."""
     height, width = both[0].shape[:2]
     size = (_SMALL_PX, max(1, round(_SMALL_PX * height / width)))
     small = [cv2.resize(to_grey(view), size, interpolation=cv2.INTER_AREA) for view in both]
@@ -95,7 +95,7 @@ def _shrunk(both: tuple[UInt8, UInt8]) -> Float32:
 
 
 def _choose(small: Float32) -> list[int]:
-    """Indices of still frames, each as different as can be from those chosen before it."""
+    """Return indices of still frames, each as different as can be from those chosen before it."""
     steps = _apart(small[1:], small[:-1])
     limit = max(_NOISE_DN, _STILL * float(np.quantile(steps, _STILL_SHARE))) if len(steps) else 0.0
     still = np.flatnonzero(_still_frames(steps, limit))
@@ -111,7 +111,7 @@ def _choose(small: Float32) -> list[int]:
 
 
 def _apart(first: Float32, second: Float32) -> Float64:
-    """float64 (N,), rms difference of N images from others, or from one; grey levels."""
+    """Return float64 (N,), rms difference of N images from others, or from one; grey levels."""
     return np.asarray(np.sqrt(((first - second) ** 2).mean(axis=(1, 2), dtype=np.float64)))
 
 

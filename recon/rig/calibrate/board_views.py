@@ -91,7 +91,7 @@ def find_views(images: ImagePairs, board: CalibrationBoard, threads: int) -> Boa
 def _look_at_all(
     files: Sequence[Path], board: CalibrationBoard, threads: int
 ) -> tuple[CalibrationBoard, list[_Look]]:
-    """Detections in all images, and the board, which may have OpenCV's legacy pattern."""
+    """Return detections in all images, and the board, which may have OpenCV's legacy pattern."""
     with ThreadPoolExecutor(threads) as pool:
         looks = list(pool.map(lambda path: _look(path, board), files))
         if board.kind == "chess" or any(look.seen for look in looks):

@@ -75,7 +75,7 @@ class Spread:
 
 
 def resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibration]:
-    """Rigs calibrated from bootstrap resamples of the views; failed resamples are left out.
+    """Return rigs calibrated from bootstrap resamples of the views; failed resamples are left out.
 
     Raises:
         CalibrationError: More than half of the resamples fail.
@@ -102,7 +102,7 @@ def resample(fit: StereoFit, settings: CalibrationSettings) -> list[StereoCalibr
 
 
 def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
-    """Bootstrap intervals of focal length, baseline, rotation and depth.
+    """Return bootstrap intervals of focal length, baseline, rotation and depth.
 
     Raises:
         CalibrationError: The views do not determine the rig.
@@ -120,7 +120,7 @@ def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
 
 
 def working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> float:
-    """The distance at which depth matters, in metres.
+    """Return the distance at which depth matters, in metres.
 
     It is `CalibrationSettings.working_m`, or else as far as the rig itself allows 2 % of error: an
     error of calibration and of matching both grow with its square, so it is the same to ask there
@@ -161,7 +161,7 @@ def _jackknife_vectors(fit: StereoFit) -> Float64:
 
 
 def _try_rig(state: RigState, step: Float64) -> StereoCalibration | None:
-    """The rig after a step, or None if the resample does not determine one."""
+    """Return the rig after a step, or None if the resample does not determine one."""
     try:
         return stereo_of(moved(state, step))
     except CalibrationError:

@@ -76,7 +76,7 @@ class RigState:
     T_rig_board: tuple[Float64, ...]
 
     def residuals(self, view: View, number: int) -> tuple[Float64, ...]:
-        """float64 (N, 2) for each camera: observed minus predicted, pixels."""
+        """Return float64 (N, 2) for each camera: observed minus predicted, pixels."""
         return tuple(
             seen.pixels - project(camera, apply(T @ self.T_rig_board[number], seen.board_m))
             for camera, T, seen in zip(self.cameras, self.T_camera_rig, view.seen, strict=True)
@@ -145,7 +145,7 @@ def solve(
 
 
 def shared_size(state: RigState) -> int:
-    """Number of shared parameters, P."""
+    """Return the number of shared parameters, P."""
     return sum(_camera_size(camera) for camera in state.cameras) + _POSE * (len(state.cameras) - 1)
 
 
@@ -185,7 +185,7 @@ def _linearise(views: Sequence[View], state: RigState) -> list[_Blocks]:
 
 
 def _view_blocks(view: View, state: RigState, number: int) -> _Blocks:
-    """Normal equations of one view."""
+    """Return the normal equations of one view."""
     size, at = shared_size(state), 0
     J_shared, J_own, errors = [], [], []
     xyz_rig_of = state.T_rig_board[number]
@@ -228,7 +228,7 @@ def _prior(state: RigState) -> Float64:
 
 
 def _shared_numbers(state: RigState) -> Float64:
-    """float64 (P,), the distortion at its place; 0 elsewhere, where the prior is zero."""
+    """Return float64 (P,), the distortion at its place; 0 elsewhere, where the prior is zero."""
     numbers = [np.concatenate([np.zeros(4), camera.distortion]) for camera in state.cameras]
     return np.concatenate([*numbers, np.zeros(_POSE * (len(state.cameras) - 1))])
 
@@ -245,7 +245,7 @@ def _cost(views: Sequence[View], state: RigState, weights: Float64) -> float:
 def _step(
     blocks: Sequence[_Blocks], state: RigState, weights: Float64, damping: float
 ) -> RigState | None:
-    """The state after one damped step; None if a focal length would not be positive."""
+    """Return the state after one damped step; None if a focal length would not be positive."""
     prior = _prior(state)
     A, a = prior.copy(), -prior @ _shared_numbers(state)
     own = []

@@ -56,7 +56,7 @@ def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
 
 
 def find_chessboard(grey: UInt8, inner: tuple[int, int]) -> Float64 | None:
-    """float64 (N, 2), approximate inner corners row by row, or None."""
+    """Return float64 (N, 2), approximate inner corners row by row, or None."""
     scale = min(1.0, _SEARCH_WIDTH_PX / grey.shape[1])
     small = (
         grey
@@ -77,7 +77,7 @@ def find_chessboard(grey: UInt8, inner: tuple[int, int]) -> Float64 | None:
 def refine_corners(
     grey: UInt8, pixels: Float64, spacing_px: float, window: float = _WINDOW
 ) -> Float64:
-    """float64 (N, 2), corners refined to subpixel accuracy.
+    """Return float64 (N, 2), corners refined to subpixel accuracy.
 
     Args:
         grey: uint8 (H, W).
@@ -126,7 +126,7 @@ def _enough(numbers: Int32, board: CalibrationBoard) -> bool:
 
 
 def _spacing(numbers: Int32, pixels: Float64, board: CalibrationBoard) -> float:
-    """Smallest distance between neighbouring corners of the board, pixels."""
+    """Return the smallest distance between neighbouring corners of the board, pixels."""
     place = np.full(len(board.corners_m) + board.inner[0], -1)
     place[numbers] = np.arange(len(numbers))
     columns = board.inner[0]

@@ -30,7 +30,7 @@ _REWEIGHTED: Final = 4
 def calibrate_one(
     sightings: Sequence[Sighting], size: Size, settings: CalibrationSettings
 ) -> RigState:
-    """Lens and board poses of one camera, with views that do not fit down-weighted.
+    """Return the lens and board poses of one camera, with views that do not fit down-weighted.
 
     Raises:
         CalibrationError: The views do not determine a camera.
@@ -59,7 +59,7 @@ def solve_robustly(views: Sequence[View], start: RigState) -> RigState:
 
 
 def view_errors(views: Sequence[View], state: RigState) -> Float64:
-    """float64 (V,), rms reprojection error of each view, pixels."""
+    """Return float64 (V,), rms reprojection error of each view, pixels."""
     errors = []
     for number, view in enumerate(views):
         apart = np.concatenate(state.residuals(view, number))
@@ -68,7 +68,7 @@ def view_errors(views: Sequence[View], state: RigState) -> Float64:
 
 
 def join_cameras(left: RigState, right: RigState) -> RigState:
-    """Both cameras in one rig, with the median pose of the right camera over all views."""
+    """Return both cameras in one rig, with the median pose of the right camera over all views."""
     T_right_left = [
         T_right @ invert(T_left)
         for T_left, T_right in zip(left.T_rig_board, right.T_rig_board, strict=True)
@@ -81,7 +81,7 @@ def join_cameras(left: RigState, right: RigState) -> RigState:
 
 
 def locate_board(camera: CameraIntrinsics, seen: Sighting) -> Float64:
-    """float64 (4, 4), T_camera_board of one sighting.
+    """Return float64 (4, 4), T_camera_board of one sighting.
 
     Raises:
         CalibrationError: The corners are collinear, or no pose fits.
@@ -105,7 +105,7 @@ def _with_poses(camera: CameraIntrinsics, sightings: Sequence[Sighting]) -> RigS
 
 
 def _guess_pinhole(sightings: Sequence[Sighting], size: Size) -> CameraIntrinsics:
-    """OpenCV's calibration: Zhang's closed form, refined with two radial terms."""
+    """Return OpenCV's calibration: Zhang's closed form, refined with two radial terms."""
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     try:
         _, matrix, distortion, *_ = cv2.calibrateCamera(
@@ -122,7 +122,7 @@ def _guess_pinhole(sightings: Sequence[Sighting], size: Size) -> CameraIntrinsic
 
 
 def _guess_fisheye(sightings: Sequence[Sighting], size: Size) -> RigState:
-    """The undistorted fisheye lens, of several fields of view, that fits the board best."""
+    """Return the undistorted fisheye lens, of several fields of view, that fits the board best."""
     radius = math.hypot(*size) / 2
     guesses: list[tuple[float, int, RigState]] = []
     for angle in _HALF_ANGLES:

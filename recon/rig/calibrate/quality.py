@@ -24,7 +24,7 @@ def shared_pixels(view: View) -> tuple[Float64, Float64]:
 
 
 def coverage(pixels: Sequence[Float64], camera: CameraIntrinsics) -> float:
-    """Share of the 8 by 6 image cells in which a corner was seen, in [0, 1].
+    """Return the share of the 8 by 6 image cells in which a corner was seen, in [0, 1].
 
     Args:
         pixels: float64 (N, 2) for each view.
@@ -37,13 +37,13 @@ def coverage(pixels: Sequence[Float64], camera: CameraIntrinsics) -> float:
 
 
 def tilt_deg(fit: StereoFit) -> Float64:
-    """float64 (V,), angle between the board's normal and the left camera's optical axis."""
+    """Return float64 (V,), angle between the board's normal and the left camera's optical axis."""
     normals = np.array([T[2, 2] for T in fit.state.T_rig_board])
     return np.asarray(np.degrees(np.arccos(np.clip(np.abs(normals), 0.0, 1.0))))
 
 
 def distances_m(fit: StereoFit) -> Float64:
-    """float64 (V,), distance of the middle of the board from the left camera."""
+    """Return float64 (V,), distance of the middle of the board from the left camera."""
     middles = [
         (T @ [*view.seen[0].board_m.mean(axis=0), 1.0])[:3]
         for T, view in zip(fit.state.T_rig_board, fit.views, strict=True)

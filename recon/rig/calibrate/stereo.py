@@ -111,7 +111,7 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
 
 
 def stereo_of(state: RigState) -> StereoCalibration:
-    """The rig of a state.
+    """Return the rig of a state.
 
     Raises:
         CalibrationError: Its parameters are invalid, such as a zero baseline.

@@ -21,7 +21,7 @@ from recon.run.summary import plain
 
 
 def summarise(seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64) -> dict[str, Any]:
-    """The figures of ``summary.json``, without time and memory of the run."""
+    """Return the figures of ``summary.json``, without time and memory of the run."""
     rig, tilts_deg, away_m = fit.calibration, tilt_deg(fit), distances_m(fit)
     return {
         "board": str(seen.board),
@@ -65,7 +65,7 @@ def summarise(seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64
 
 
 def tell_depths(summary: dict[str, Any]) -> dict[str, str]:
-    """The depth errors of a summary as text, one line per distance."""
+    """Return the depth errors of a summary as text, one line per distance."""
     working = summary["working_error"]
     share = working["calibration_share"]
     text = "unknown" if share is None else f"{100 * share:.1f} %"
@@ -80,7 +80,7 @@ def tell_depths(summary: dict[str, Any]) -> dict[str, str]:
 
 
 def _short(value: float) -> str:
-    """Two significant digits, without an exponent."""
+    """Return two significant digits, without an exponent."""
     return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
 
 

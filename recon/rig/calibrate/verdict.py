@@ -60,7 +60,7 @@ def verdict_of_calibration(findings: Sequence[CalibrationFinding]) -> Verdict:
 def judge_calibration(
     board: CalibrationBoard, images: ImagePairs, summary: dict[str, Any]
 ) -> list[CalibrationFinding]:
-    """All findings of a calibration, the gravest first."""
+    """Return all findings of a calibration, the gravest first."""
     found = [
         *_find_depth_faults(board, summary),
         *_find_fit_faults(board, summary),
@@ -77,7 +77,7 @@ def judge_calibration(
 def _find_depth_faults(
     board: CalibrationBoard, summary: dict[str, Any]
 ) -> Iterator[CalibrationFinding]:
-    """What the calibration does to depth at the working distance."""
+    """Yield what the calibration does to depth at the working distance."""
     expected = summary["working_error"]
     at = f"at {_length(expected['distance_m'], board)}"
     share = expected["calibration_share"]
@@ -97,7 +97,7 @@ def _find_depth_faults(
 def _find_fit_faults(
     board: CalibrationBoard, summary: dict[str, Any]
 ) -> Iterator[CalibrationFinding]:
-    """Reasons for which depth may be worse than expected."""
+    """Yield reasons for which depth may be worse than expected."""
     used = summary["views_used"]
     if used < _FEW_VIEWS:
         text = f"only {used} different views: the expected error is unsure; take {_ENOUGH_VIEWS}"
@@ -132,7 +132,7 @@ def _find_fit_faults(
 def _find_left_out(
     board: CalibrationBoard, images: ImagePairs, summary: dict[str, Any]
 ) -> Iterator[CalibrationFinding]:
-    """What was left out or is not known; none of it makes the depth of this rig worse."""
+    """Yield what was left out or is not known; none of it makes the depth of this rig worse."""
     if not board.metric:
         text = "size of a square not given: every length is in squares; add it, as in :25mm"
         yield CalibrationFinding("square", "note", text)
@@ -158,7 +158,7 @@ def _find_left_out(
 
 
 def _advise(summary: dict[str, Any]) -> Iterator[CalibrationFinding]:
-    """What the views lack for a better calibration."""
+    """Yield what the views lack for a better calibration."""
     side, share = min((summary[f"coverage_{side}"], side) for side in ("left", "right"))[::-1]
     if _SMALL_COVERAGE <= share < _COVERED:
         yield CalibrationFinding(

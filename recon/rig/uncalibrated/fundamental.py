@@ -75,7 +75,7 @@ def _fit_agreeing(
 
 
 def line_distances(F: Float64, left_px: Float64, right_px: Float64) -> Float64:
-    """float64 (N,), signed Sampson distances: the error of each match to first order.
+    """Return float64 (N,), signed Sampson distances: the error of each match to first order.
 
     Ref: Hartley and Zisserman 2004, equation 11.9.
     """
@@ -146,13 +146,13 @@ def _fit_weighted(apart: Callable[[Float64], Float64], start: Float64, weights: 
 
 
 def epipoles(F: Float64) -> tuple[Float64, Float64]:
-    """float64 (3,) twice, homogeneous: the epipoles in the left and in the right image."""
+    """Return float64 (3,) twice, homogeneous: the epipoles in the left and in the right image."""
     U, _, Vt = np.linalg.svd(F)
     return Vt[2], U[:, 2]
 
 
 def level_homographies(F: Float64, size: tuple[int, int]) -> tuple[Float64, Float64]:
-    """Homographies that bring matching pixels of both images onto the same row.
+    """Return homographies that bring matching pixels of both images onto the same row.
 
     Never divides by the last coordinate of an epipole, which is almost zero if the rows are nearly
     aligned already.
@@ -186,7 +186,7 @@ def level_homographies(F: Float64, size: tuple[int, int]) -> tuple[Float64, Floa
 
 
 def _facing(H: Float64, size: tuple[int, int]) -> Float64:
-    """The homography scaled so that the image centre maps to a last coordinate of 1."""
+    """Return the homography scaled so that the image centre maps to a last coordinate of 1."""
     return np.asarray(H / (H[2] @ [(size[0] - 1) / 2, (size[1] - 1) / 2, 1.0]))
 
 

@@ -149,7 +149,7 @@ def _some(features: PairFeatures, which: Bool) -> PairFeatures:
 def _fit(
     features: PairFeatures, size: Size, min_features: int
 ) -> tuple[Float64, Float64, Float64, PairFeatures]:
-    """Homographies, the fundamental matrix, and the matches that agree with it."""
+    """Return homographies, the fundamental matrix, and the matches that agree with it."""
     F, agreeing = _fundamental(features, min_features)
     _check_depth(agreeing)
     _check_epipoles(F, size)
@@ -200,7 +200,7 @@ def _seen(side: str, got: str) -> CalibrationError:
 
 
 def _held_out(homographies: tuple[Float64, Float64], features: PairFeatures) -> float:
-    """Mean absolute row error of held-out matches, without outliers; NaN = none."""
+    """Return the mean absolute row error of held-out matches, without outliers; NaN = none."""
     H_left, H_right = homographies
     left, right = map_pixels(H_left, features.left_uv), map_pixels(H_right, features.right_uv)
     rows = np.abs(left[:, 1] - right[:, 1])

@@ -70,13 +70,13 @@ def _corners(size: Size) -> Float64:
 
 
 def _middles(size: Size) -> Float64:
-    """float64 (4, 2), the midpoints of the left, right, top and bottom border."""
+    """Return float64 (4, 2), the midpoints of the left, right, top and bottom border."""
     w, h = size[0] - 1.0, size[1] - 1.0
     return np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]])
 
 
 def _upright(H: Float64, size: Size) -> float:
-    """Positive if the bottom border stays below the top border."""
+    """Return a positive number if the bottom border stays below the top border."""
     _, _, top, bottom = map_pixels(H, _middles(size))
     return float(bottom[1] - top[1])
 
@@ -97,7 +97,7 @@ def _straight(H: Float64, size: Size) -> Float64:
 
 
 def _extent(H: Float64, size: Size) -> Float64:
-    """Width and height of the mapped centre lines."""
+    """Return the width and height of the mapped centre lines."""
     left, right, top, bottom = map_pixels(H, _middles(size))
     return np.array([np.linalg.norm(right - left), abs(bottom[1] - top[1])])
 

@@ -58,7 +58,7 @@ class CloudSettings(Settings):
 def back_project(
     disparity: Disparity, pair: RectifiedPair, settings: CloudSettings, *, normals: bool = True
 ) -> PointCloud:
-    """Points of the pixels that have a disparity, ``Z = f·b / (d + doffs)``.
+    """Return points of the pixels that have a disparity, ``Z = f·b / (d + doffs)``.
 
     Args:
         disparity: The disparity of ``pair``.

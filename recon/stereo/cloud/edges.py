@@ -63,6 +63,6 @@ def _support(values: Float32) -> UInt8:
 
 
 def _half_window(radius_px: int) -> list[tuple[int, int]]:
-    """Offsets (dy, dx) of one half of a window; the other half is its negative."""
+    """Return offsets (dy, dx) of one half of a window; the other half is its negative."""
     r = range(-radius_px, radius_px + 1)
     return [(dy, dx) for dy in r for dx in r if dy > 0 or (dy == 0 and dx > 0)]

@@ -79,7 +79,7 @@ def filter_cloud(cloud: PointCloud, settings: FilterSettings) -> PointCloud:
 
 
 def voxel_downsample(cloud: PointCloud, voxel_m: float) -> PointCloud:
-    """One point per voxel, the mean of its points in every attribute.
+    """Return one point per voxel, the mean of its points in every attribute.
 
     Raises:
         SettingsError: The voxel is too small for the extent of the cloud.
@@ -106,7 +106,7 @@ _ATTRIBUTES = {
 
 
 def _restored(name: str, mean: Float32) -> NDArray[Any]:
-    """The mean of an attribute, converted to the dtype and shape used in a cloud."""
+    """Return the mean of an attribute, converted to the dtype and shape used in a cloud."""
     if name == "normals":
         length = np.linalg.norm(mean, axis=1, keepdims=True)
         return np.asarray(mean / np.maximum(length, np.float32(1e-12)), dtype=np.float32)

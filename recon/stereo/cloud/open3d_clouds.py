@@ -20,7 +20,7 @@ _SEARCHABLE_M: Final = 1e18
 def voxel_downsample(
     xyz: NDArray[Any], attributes: NDArray[Any], voxel_m: float
 ) -> tuple[Float32, Float32]:
-    """One point per occupied voxel: the mean of its points and of their attributes.
+    """Return one point per occupied voxel: the mean of its points and of their attributes.
 
     Args:
         xyz: (N, 3), metres, finite.
@@ -51,7 +51,7 @@ def voxel_downsample(
 
 
 def statistical_inliers(xyz: NDArray[Any], neighbours: int, sigmas: float) -> Bool:
-    """Points whose mean distance to their neighbours is not unusually large.
+    """Return points whose mean distance to their neighbours is not unusually large.
 
     Args:
         xyz: (N, 3), metres, finite.
@@ -69,7 +69,7 @@ def statistical_inliers(xyz: NDArray[Any], neighbours: int, sigmas: float) -> Bo
 
 
 def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float) -> Bool:
-    """Points that have at least ``neighbours`` others within ``radius_m``.
+    """Return points that have at least ``neighbours`` others within ``radius_m``.
 
     Args:
         xyz: (N, 3), metres, finite.
@@ -132,7 +132,7 @@ def _orient(cloud: Any, normals: NDArray[Any], neighbours: int) -> Float32:
 
 
 def _joggled(xyz: NDArray[Any]) -> Float64:
-    """The points, moved by up to a millionth of their extent, the same way each time."""
+    """Return the points, moved by up to a millionth of their extent, the same way each time."""
     points = _finite(xyz)
     reach = 1e-6 * float(np.ptp(points, axis=0).max())
     return points + np.random.default_rng(0).uniform(-reach, reach, points.shape)
@@ -141,7 +141,7 @@ def _joggled(xyz: NDArray[Any]) -> Float64:
 def nearest(
     query: NDArray[Any], reference: NDArray[Any], neighbours: int = 1
 ) -> tuple[Int32, Float32]:
-    """The nearest reference points of each query point.
+    """Return the nearest reference points of each query point.
 
     Args:
         query: (N, 3), metres, finite.
@@ -198,7 +198,7 @@ def _legacy(xyz: NDArray[Any]) -> Any:
 
 
 def _finite(xyz: NDArray[Any]) -> Float64:
-    """The points as float64, checked to be finite."""
+    """Return the points as float64, checked to be finite."""
     points = np.asarray(xyz, dtype=np.float64)
     if not np.isfinite(points).all():
         raise ShapeError("a point of the cloud is not finite")

@@ -119,7 +119,7 @@ class Halves(NamedTuple):
 
 
 def empty_views(search: Search, block: int, height: int, width: int) -> Views:
-    """Memory for `lay_out` to write to, where ``block`` columns are done at a time."""
+    """Return memory for `lay_out` to write to, where ``block`` columns are done at a time."""
     columns = width + _stride(search, block)
     right = np.empty((height, columns + _places(search) - 1), np.uint8)
     return Views(np.empty((height, columns), np.uint8), right, width)
@@ -150,7 +150,7 @@ def lay_out(
 
 
 def empty_scratch(search: Search, block: int) -> Scratch:
-    """Memory for one thread's search, ``block`` columns at a time."""
+    """Return memory for one thread's search, ``block`` columns at a time."""
     places, stride = _places(search), _stride(search, block)
     rows = search.rows_radius + 1
     narrow = [np.uint8 if n * rows * search.cost_cap <= 255 else np.uint16 for n in (1, 2)]
@@ -182,7 +182,7 @@ def _places(search: Search) -> int:
 
 
 def _stride(search: Search, block: int) -> int:
-    """Columns of a block including those that only its windows reach, a multiple of 32."""
+    """Return columns of a block including those that only its windows reach, a multiple of 32."""
     return -(-(block + 2 * search.radius) // 32) * 32
 
 

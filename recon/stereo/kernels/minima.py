@@ -32,7 +32,7 @@ class Minima(NamedTuple):
 
 
 def empty_minima(height: int, width: int) -> Minima:
-    """Arrays for a search to write to."""
+    """Return arrays for a search to write to."""
     # One block, so that the system uses large pages: faulting in small ones outlasts a search.
     block = np.empty((6, height, width), np.uint16)
     return Minima(winner=block[0], costs=block[1:5], right_winner=block[5])

@@ -24,7 +24,7 @@ def average_opposite_reference(
 
 
 def _square(values: NDArray[np.float32], y: int, x: int, radius: int) -> NDArray[np.float64]:
-    """The square around a pixel; NaN beyond the image."""
+    """Return the square around a pixel; NaN beyond the image."""
     padded = np.pad(values.astype(float), radius, constant_values=np.nan)
     width = 2 * radius + 1
     return np.array(padded[y : y + width, x : x + width])

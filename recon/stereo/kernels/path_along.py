@@ -63,7 +63,7 @@ class RowScratch(NamedTuple):
 
 
 def empty_row_scratch(columns: int, paths: Paths) -> RowScratch:
-    """Memory for `follow_row`; columns is a multiple of `LANES`."""
+    """Return memory for `follow_row`; columns is a multiple of `LANES`."""
     candidates = padded(paths.ndisp)
     closed = np.uint8(255 - paths.p1)
     now, least = aligned((2, LANES + candidates + LANES)), aligned((candidates,))

@@ -97,12 +97,12 @@ class CostRows(NamedTuple):
 
 
 def padded(number: int) -> int:
-    """The number, rounded up to whole vectors."""
+    """Return the number, rounded up to whole vectors."""
     return -(-number // LANES) * LANES
 
 
 def aligned(shape: tuple[int, ...], kind: type[np.uint8 | np.uint16] = np.uint8) -> NDArray[Any]:
-    """Zeros that start at a cache line, so that loads of whole vectors cross none."""
+    """Return zeros that start at a cache line, so that loads of whole vectors cross none."""
     size = int(np.prod(shape)) * np.dtype(kind).itemsize
     memory = np.zeros(size + ALIGNMENT, np.uint8)
     start = -memory.ctypes.data % ALIGNMENT
@@ -112,7 +112,7 @@ def aligned(shape: tuple[int, ...], kind: type[np.uint8 | np.uint16] = np.uint8)
 def scaled_window(
     radius: int, rows_radius: int, gradient_cap: int, largest: int, levels: float
 ) -> Window:
-    """A window whose costs are about ``levels`` times the mean cost of its pixels.
+    """Return a window whose costs are about ``levels`` times the mean cost of its pixels.
 
     Args:
         radius: As in `Window`.
@@ -136,7 +136,7 @@ def scaled_window(
 def empty_planes(
     height: int, width: int, planes: int, radius: int, ndisp: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Memory for `Views.left` and `Views.right`, with so many planes each."""
+    """Return memory for `Views.left` and `Views.right`, with so many planes each."""
     # A band may start at any column, and its last vector reads beyond its end.
     reach = padded(width + 2 * radius) + LANES
     left, right = (height, planes, reach), (height, planes, reach + ndisp - 1)
@@ -164,7 +164,7 @@ def write_views(
 
 
 def column_offsets(window: Window, ndisp: int, minimum: int) -> tuple[int, int]:
-    """Column of the planes that holds column 0 of the image, of the left and the right one.
+    """Return column of the planes that holds column 0 of the image, of the left and the right one.
 
     Column ``x`` of the left planes is compared, as candidate ``k``, with column ``x - k + P - 1``
     of the right ones.
@@ -173,7 +173,7 @@ def column_offsets(window: Window, ndisp: int, minimum: int) -> tuple[int, int]:
 
 
 def empty_cost_rows(columns: int, window: Window) -> CostRows:
-    """Memory for `write_costs`; columns is a multiple of `LANES`."""
+    """Return memory for `write_costs`; columns is a multiple of `LANES`."""
     return CostRows(
         aligned((BLOCK, padded(columns + 2 * window.radius) + LANES)),
         aligned((2 * window.rows_radius + 1, BLOCK, columns)),
@@ -305,7 +305,7 @@ def _sum_across(pixels: NDArray[np.uint8], n: int, x: int, radius: int) -> Vecto
 def _sum_across_wide(
     pixels: NDArray[np.uint8], n: int, x: int, window: Window, sums: NDArray[np.uint16]
 ) -> Vector:
-    """The same in uint16, shifted to fit into uint8."""
+    """Return the same in uint16, shifted to fit into uint8."""
     total = widen(load_row(pixels, n, x), sums)
     for d in range(x + 1, x + 2 * window.radius + 1):
         total = total + widen(load_row(pixels, n, d), sums)

@@ -170,7 +170,7 @@ def next_cost(
     low: Vector,
     cost: Vector,
 ) -> Vector:
-    """The path cost of a candidate at the next pixel: Hirschmüller 2008, equation 13.
+    """Return the path cost of a candidate at the next pixel: Hirschmüller 2008, equation 13.
 
     Args:
         same: Path costs of the candidate at the pixel before.

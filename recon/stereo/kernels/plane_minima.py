@@ -80,7 +80,7 @@ class Best(NamedTuple):
 
 
 def empty_best(columns: int, width: int, rows: int) -> Best:
-    """Memory for `choose_row`, for so many rows."""
+    """Return memory for `choose_row`, for so many rows."""
     right_lowest = aligned((rows, padded(width)))
     right_lowest[:] = NONE
     return Best(

@@ -94,7 +94,7 @@ class Points(NamedTuple):
 
 
 def make_points(maps: Maps, rules: PointRules) -> Points:
-    """Points of all pixels that the rules let through."""
+    """Return points of all pixels that the rules let through."""
     step = rules.stride
     capacity = int(np.count_nonzero(np.isfinite(maps.values[::step, ::step])))
     points = Points(
@@ -152,7 +152,7 @@ def _make_points(maps: tuple[Any, ...], rules: tuple[Any, ...], points: tuple[An
 
 @kernel
 def _with_frame(values: Float32, radius: int) -> tuple[Float32, Float32]:
-    """Ones where a value is known, and the values with 0 elsewhere, in a frame of zeros."""
+    """Return ones where a value is known, and the values with 0 elsewhere, in a frame of zeros."""
     height, width = values.shape
     known = np.zeros((height + 2 * radius, width + 2 * radius), np.float32)
     masked = np.zeros((height + 2 * radius, width + 2 * radius), np.float32)

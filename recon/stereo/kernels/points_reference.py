@@ -41,7 +41,7 @@ def make_points_reference(maps: Maps, rules: PointRules) -> Points:
 
 
 def _candidates(maps: Maps, rules: PointRules) -> NDArray[np.bool_]:
-    """bool (H, W), pixels on the raster that have a disparity and are sure enough."""
+    """Return bool (H, W), pixels on the raster that have a disparity and are sure enough."""
     with np.errstate(invalid="ignore"):
         candidates = maps.values.astype(np.float64) + rules.doffs > 0
     candidates &= maps.confidence >= rules.confidence

@@ -26,7 +26,7 @@ from recon.stereo.kernels.refine import (
 
 
 def refine_minima_reference(minima: Minima, texture: NDArray[np.float32], rules: Rules) -> Refined:
-    """All rows of `recon.stereo.kernels.refine.refine_minima`."""
+    """Return all rows of `recon.stereo.kernels.refine.refine_minima`."""
     reason = _reasons(minima, texture, rules)
     keep = reason == VALID
     best, before, after, second = minima.costs.astype(np.float64)

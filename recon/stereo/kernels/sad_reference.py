@@ -14,7 +14,7 @@ from recon.stereo.kernels.tiles_reference import offered_reference
 def sad_minima_reference(
     left: NDArray[np.uint8], right: NDArray[np.uint8], search: Search, tiles: Tiles
 ) -> Minima:
-    """All rows of `recon.stereo.kernels.sad.sad_minima`, from images (H, W)."""
+    """Return all rows of `recon.stereo.kernels.sad.sad_minima`, from images (H, W)."""
     upright = window_costs_reference(left, right, search._replace(slant=0))
     slanted = window_costs_reference(left, right, search)
     lowest = np.minimum(upright, slanted)
@@ -65,7 +65,7 @@ def right_winners_reference(minima: Minima, search: Search) -> NDArray[np.uint16
 
 
 def minima_reference(costs: NDArray[np.int64], minimum: int) -> Minima:
-    """The minima of costs (H, W, ndisp) in both views; `NO_COST` = not offered."""
+    """Return the minima of costs (H, W, ndisp) in both views; `NO_COST` = not offered."""
     width, ndisp = costs.shape[1:]
     k = np.arange(ndisp)
     x = np.arange(width)[:, None]
@@ -89,7 +89,7 @@ def minima_reference(costs: NDArray[np.int64], minimum: int) -> Minima:
 
 
 def _cost_at(costs: NDArray[np.int64], k: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Costs (H, W) of one candidate of each pixel; `NO_COST` outside the range."""
+    """Return costs (H, W) of one candidate of each pixel; `NO_COST` outside the range."""
     ndisp = costs.shape[2]
     there = np.clip(k, 0, ndisp - 1)[:, :, None]
     cost = np.take_along_axis(costs, there, axis=2)[:, :, 0]

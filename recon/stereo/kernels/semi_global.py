@@ -80,13 +80,13 @@ class BandScratch(NamedTuple):
 
 
 def empty_scratch(width: int, paths: Paths) -> Scratch:
-    """Memory for strips of images of a width."""
+    """Return memory for strips of images of a width."""
     columns = band_columns(width, paths)
     return Scratch(aligned((scratch_bytes(columns, paths),)), columns)
 
 
 def band_columns(width: int, paths: Paths) -> int:
-    """Columns of the bands of an image."""
+    """Return columns of the bands of an image."""
     most = SCRATCH_BYTES // (paths.ndisp * (2 * ROWS + paths.overlap)) // LANES * LANES
     # A band should keep more columns than it shares with its neighbours.
     least = padded(4 * paths.side_overlap + 1)
@@ -94,12 +94,12 @@ def band_columns(width: int, paths: Paths) -> int:
 
 
 def scratch_bytes(columns: int, paths: Paths) -> int:
-    """Memory that a band of so many columns takes."""
+    """Return memory that a band of so many columns takes."""
     return sum(int(np.prod(shape)) for shape in _shapes(columns, paths))
 
 
 def _shapes(columns: int, paths: Paths) -> list[tuple[int, ...]]:
-    """Shapes of the arrays of a `BandScratch` that share the memory of a `Scratch`."""
+    """Return shapes of the arrays of a `BandScratch` that share the memory of a `Scratch`."""
     wide = MARGIN + columns + MARGIN
     row = [(3, paths.ndisp + 2, wide), (2, 3, wide), (3, columns), (3, columns)]
     costs, means = (ROWS + paths.overlap, paths.ndisp, columns), (ROWS, paths.ndisp, wide)

@@ -17,7 +17,7 @@ Int64 = NDArray[np.int64]
 def semi_global_minima_reference(
     views: Views, window: Window, paths: Paths, bands: list[Band] | None = None
 ) -> Minima:
-    """All rows of `recon.stereo.kernels.semi_global.semi_global_minima`, as one block.
+    """Return all rows of `recon.stereo.kernels.semi_global.semi_global_minima`, as one block.
 
     Args:
         views: As there.
@@ -36,7 +36,7 @@ def semi_global_minima_reference(
 
 
 def _path_means(grey: NDArray[np.uint8], costs: Int64, paths: Paths) -> Int64:
-    """int64 (H, W, P), mean costs of the paths to each pixel."""
+    """Return int64 (H, W, P), mean costs of the paths to each pixel."""
 
     def along(dy: int, dx: int) -> Int64:
         return path_reference(grey, costs, paths, dy, dx)
@@ -50,7 +50,7 @@ def _mean(a: Int64, b: Int64) -> Int64:
 
 
 def path_costs_reference(views: Views, window: Window, ndisp: int) -> Int64:
-    """int64 (H, W, P), the cost of each candidate at each pixel."""
+    """Return int64 (H, W, P), the cost of each candidate at each pixel."""
     height, width = views.grey.shape
     x, k = np.arange(views.left.shape[2])[:, None], np.arange(ndisp)
     left, right = views.left[..., None], views.right[:, :, x - k + ndisp - 1]
@@ -66,7 +66,7 @@ def path_costs_reference(views: Views, window: Window, ndisp: int) -> Int64:
 
 
 def path_reference(grey: NDArray[np.uint8], costs: Int64, paths: Paths, dy: int, dx: int) -> Int64:
-    """int64 (H, W, P), costs of the paths that step by ``(dy, dx)`` to each pixel."""
+    """Return int64 (H, W, P), costs of the paths that step by ``(dy, dx)`` to each pixel."""
     height, width, candidates = costs.shape
     closed = np.full(candidates + 2, 255 - paths.p1)
     result: Int64 = costs.copy()

@@ -156,7 +156,7 @@ def _join(parents: NDArray[np.int32], one: int, other: int) -> None:
 
 @kernel
 def _root(parents: NDArray[np.int32], node: int) -> int:
-    """The root of a node's region; every step halves the path for the next call."""
+    """Return the root of a node's region; every step halves the path for the next call."""
     while parents[node] != node:
         parents[node] = parents[parents[node]]
         node = parents[node]

@@ -55,7 +55,7 @@ class Support(NamedTuple):
 
 
 def make_tiles(shape: tuple[int, int], size: tuple[int, int], ndisp: int) -> Tiles:
-    """Tiles that are offered every candidate.
+    """Return tiles that are offered every candidate.
 
     Args:
         shape: Rows and columns of the image.

@@ -11,7 +11,7 @@ from recon.stereo.kernels.tiles import GROUP, Support, Tiles
 def offer_supported_reference(
     halved: NDArray[np.float32], minimum: int, ndisp: int, support: Support, tiles: Tiles
 ) -> NDArray[np.bool_]:
-    """What `recon.stereo.kernels.tiles.offer_supported` writes to ``offered``."""
+    """Return what `recon.stereo.kernels.tiles.offer_supported` writes to ``offered``."""
     y = 2 * np.arange(halved.shape[0])[:, None]
     x = 2 * np.arange(halved.shape[1])[None, :]
     k = np.clip(np.rint(2 * halved) - minimum, 0, ndisp - 1)
@@ -30,6 +30,6 @@ def offer_supported_reference(
 
 
 def offered_reference(tiles: Tiles, shape: tuple[int, int], ndisp: int) -> NDArray[np.bool_]:
-    """bool (H, W, ndisp), which candidates are offered to which pixel."""
+    """Return bool (H, W, ndisp), which candidates are offered to which pixel."""
     y, x = np.arange(shape[0]) // tiles.height, np.arange(shape[1]) // tiles.width
     return tiles.offered[y[:, None, None], x[:, None], np.arange(ndisp) // GROUP]

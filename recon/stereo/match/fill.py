@@ -35,7 +35,7 @@ def fill_holes(values: Float32) -> Float32:
 
 
 def _last_known(known: Bool) -> Int32:
-    """int32 (H, W): column of the nearest known pixel at or left of each; -1 = none."""
+    """Return int32 (H, W): column of the nearest known pixel at or left of each; -1 = none."""
     columns = np.arange(known.shape[1], dtype=np.int32)
     return np.asarray(np.maximum.accumulate(np.where(known, columns, np.int32(-1)), axis=1))
 
@@ -46,7 +46,7 @@ def _gather(values: Float32, columns: Int32) -> Float32:
 
 
 def _nearest_of(rows: Bool) -> Int32:
-    """int32 (H,): for each row the nearest one that is True."""
+    """Return int32 (H,): for each row the nearest one that is True."""
     found = np.flatnonzero(rows)
     number = np.arange(len(rows))
     after = np.searchsorted(found, number).clip(0, len(found) - 1)

@@ -75,7 +75,7 @@ def name_of(matcher: str | Matcher) -> str:
 
 
 def registered_names() -> set[str]:
-    """Names of the matchers that installed packages register."""
+    """Return names of the matchers that installed packages register."""
     return set(entry_points(group=GROUP).names)
 
 
@@ -136,7 +136,7 @@ def _checked(found: Any, pair: RectifiedPair, name: str) -> Disparity:
 
 
 def _problem(found: Disparity, pair: RectifiedPair) -> tuple[str, str, str] | None:
-    """What is wrong with a disparity, what was found, and what is expected."""
+    """Return what is wrong with a disparity, what was found, and what is expected."""
     if found.values.shape != pair.left.shape:
         got, expected = str(found.values.shape), str(pair.left.shape)
         return "the disparity does not have the size of the images", got, expected

@@ -16,7 +16,7 @@ _GAIN_OF_SOBEL: Final = 8.0
 
 
 def clipped_gradients(image: UInt8, cap: int, rows: range) -> UInt8:
-    """Horizontal gradients of some rows in Sobel units, clipped to plus or minus ``cap``.
+    """Return horizontal gradients of some rows in Sobel units, clipped to plus or minus ``cap``.
 
     Args:
         image: uint8 (H, W).
@@ -33,7 +33,7 @@ def clipped_gradients(image: UInt8, cap: int, rows: range) -> UInt8:
 
 
 def texture(pair: RectifiedPair, window: tuple[int, int], least: float, rows: range) -> Float32:
-    """Mean size of the horizontal gradient in the window around each pixel of the left view.
+    """Return mean size of the horizontal gradient in the window around each pixel of the left view.
 
     Args:
         pair: The images.
@@ -64,7 +64,7 @@ def texture(pair: RectifiedPair, window: tuple[int, int], least: float, rows: ra
 
 
 def _around(rows: range, reach: int, height: int) -> range:
-    """Rows, and those around them that the image has."""
+    """Return rows, and those around them that the image has."""
     return range(max(rows.start - reach, 0), min(rows.stop + reach, height))
 
 

@@ -50,14 +50,14 @@ def zero_texture(width: int, valid: Bool | None, rows: range) -> Float32:
 
 
 def half_search(search: Search) -> Search:
-    """What to search at half size."""
+    """Return what to search at half size."""
     minimum = search.minimum // 2
     ndisp = -(-(search.minimum + search.ndisp) // 2) - minimum
     return Search(ndisp, minimum, RADIUS_PX, RADIUS_PX, search.cost_cap, slant=0)
 
 
 def half_rules(search: Search) -> Rules:
-    """What makes a match at half size reliable.
+    """Return what makes a match at half size reliable.
 
     Args:
         search: That at half size.
@@ -75,17 +75,17 @@ def half_rules(search: Search) -> Rules:
 
 
 def undivided(search: Search, shape: tuple[int, int]) -> Tiles:
-    """One tile from top to bottom, offered everything, as wide as is fast."""
+    """Return one tile from top to bottom, offered everything, as wide as is fast."""
     return make_tiles(shape, (shape[0], widest_block(search, shape[1])), search.ndisp)
 
 
 def divided(search: Search, shape: tuple[int, int]) -> Tiles:
-    """The tiles that are offered what half size supports."""
+    """Return the tiles that are offered what half size supports."""
     height = max(TILE_HEIGHT_PX, search.rows_radius)
     width = min(_TILE_COLUMNS - 2 * search.radius, shape[1])
     return make_tiles(shape, (height, width), search.ndisp)
 
 
 def support(share: float) -> Support:
-    """How much support offers candidates to a tile; ``share`` as in `Support`."""
+    """Return how much support offers candidates to a tile; ``share`` as in `Support`."""
     return Support(margin_x=8, margin_y=8, margin=3, matched=0.15, share=share, least=4)

@@ -110,7 +110,7 @@ class OnnxMatcher:
         return self._network
 
     def _disparity_of(self, outputs: list[Float32]) -> Float32:
-        """float32 (h, w), pixels of what was put in, NaN = none."""
+        """Return float32 (h, w), pixels of what was put in, NaN = none."""
         number = self._settings.output
         if not -len(outputs) <= number < len(outputs):
             raise MatchingError("the network has no such output", got=number, expected=len(outputs))
@@ -126,7 +126,7 @@ class OnnxMatcher:
 
 
 def _channels(declared: tuple[int | None, ...], stacked: bool) -> int:
-    """The channels of one image by the shape of an input; where that leaves them free, 3."""
+    """Return the channels of one image by the shape of an input; where that leaves them free, 3."""
     channels = declared[1] if len(declared) == 4 else None
     if channels is None:
         return 3
@@ -134,7 +134,7 @@ def _channels(declared: tuple[int | None, ...], stacked: bool) -> int:
 
 
 def _size(declared: tuple[int | None, ...], s: OnnxSettings) -> tuple[int, int] | None:
-    """Width and height that images are resized to; None = they keep theirs."""
+    """Return the width and height that images are resized to; None = they keep theirs."""
     if s.width_px is not None and s.height_px is not None:
         return s.width_px, s.height_px
     height, width = declared[2:] if len(declared) == 4 else (None, None)
@@ -142,7 +142,7 @@ def _size(declared: tuple[int | None, ...], s: OnnxSettings) -> tuple[int, int] 
 
 
 def _fitted(image: UInt8, size: tuple[int, int] | None) -> UInt8:
-    """The image at the size that the network takes."""
+    """Return the image at the size that the network takes."""
     if size is not None:
         way = cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR
         return np.asarray(cv2.resize(image, size, interpolation=way))
@@ -151,7 +151,7 @@ def _fitted(image: UInt8, size: tuple[int, int] | None) -> UInt8:
 
 
 def _unfitted(values: Float32, shape: tuple[int, ...], size: tuple[int, int] | None) -> Float32:
-    """The disparity at the size of the image, in its pixels."""
+    """Return the disparity at the size of the image, in its pixels."""
     height, width = shape
     inner = (height, width) if size else tuple(n + -n % _MULTIPLE_PX for n in shape)
     if values.shape != inner:
@@ -162,7 +162,7 @@ def _unfitted(values: Float32, shape: tuple[int, ...], size: tuple[int, int] | N
 
 
 def _tensor(image: UInt8, channels: int, s: OnnxSettings) -> Float32:
-    """float32 (1, C, H, W), normalised.
+    """Return float32 (1, C, H, W), normalised.
 
     Raises:
         SettingsError: Mean or std have more numbers than the network has channels.

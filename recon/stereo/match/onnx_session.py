@@ -85,7 +85,7 @@ class OnnxNetwork:
 
 
 def _errors_of(runtime: Any) -> tuple[type[Exception], ...]:
-    """Exceptions that onnxruntime raises: its own have no common base class."""
+    """Return exceptions that onnxruntime raises: its own have no common base class."""
     state = vars(runtime.capi.onnxruntime_pybind11_state).values()
     own = [kind for kind in state if isinstance(kind, type) and issubclass(kind, Exception)]
     return (*own, RuntimeError, ValueError, TypeError)

@@ -159,12 +159,12 @@ class _Margins:
         return cls(margin, margin + max(0, high), margin + max(0, -low))
 
     def widen(self, image: UInt8) -> UInt8:
-        """The image with its edges repeated."""
+        """Return the image with its edges repeated."""
         sides = (self.rows, self.rows, self.left, self.right)
         return np.asarray(cv2.copyMakeBorder(image, *sides, cv2.BORDER_REPLICATE))
 
     def crop(self, image: NDArray[Any], shape: tuple[int, int]) -> NDArray[Any]:
-        """What `widen` made of an image of that shape, without the edges."""
+        """Return what `widen` made of an image of that shape, without the edges."""
         height, width = shape
         rows, columns = slice(self.rows, self.rows + height), slice(self.left, self.left + width)
         return image[rows, columns]
@@ -194,7 +194,7 @@ def _match(pair: RectifiedPair, engine: Any, s: OpencvSettings, margins: _Margin
 
 
 def _range(settings: OpencvSettings, camera: RectifiedCamera) -> int:
-    """Number of disparities, a multiple of 16."""
+    """Return the number of disparities, a multiple of 16."""
     ndisp = settings.ndisp_for(camera)
     ndisp = _STEPS * -(-ndisp // _STEPS)
     first, last = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1

@@ -54,7 +54,7 @@ class AutoRangeMatcher:
 
 
 def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
-    """Number of disparities that a pair needs, from matching it at a small size.
+    """Return the number of disparities that a pair needs, from matching it at a small size.
 
     The small pair is searched up to half its width. Its trusted disparities show how near the scene
     is; a tenth and one pixel of the small pair are added, because small objects may be nearer.
@@ -94,7 +94,7 @@ def _shrunk(image: UInt8, factor: int, size: tuple[int, int]) -> UInt8:
 
 
 def _trusted_disparities(small: RectifiedPair) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
-    """float32 (N,), disparities in pixels of the small pair."""
+    """Return float32 (N,), disparities in pixels of the small pair."""
     settings = SadSettings(window_px=7, uniqueness_percent=10, average_px=1)
     found = SadMatcher(settings, threads=1).match(small)
     return found.values[found.valid & (found.confidence >= _CONFIDENCE)]

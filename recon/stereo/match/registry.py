@@ -100,7 +100,7 @@ def check_matcher(matcher: str | Matcher) -> None:
 
 
 def settings_of(matcher: str | Matcher, settings: MatchingSettings) -> Settings | None:
-    """The settings of one matcher; None of a matcher that is not ours."""
+    """Return the settings of one matcher; None of a matcher that is not ours."""
     if not isinstance(matcher, str) or matcher not in MATCHERS:
         return None
     own: Settings = getattr(settings, field_of(matcher))
@@ -110,7 +110,7 @@ def settings_of(matcher: str | Matcher, settings: MatchingSettings) -> Settings 
 def searched_ndisp(
     matcher: str | Matcher, settings: MatchingSettings, pair: RectifiedPair
 ) -> int | None:
-    """How many disparities a matcher searches in a pair, before it rounds them.
+    """Return how many disparities a matcher searches in a pair, before it rounds them.
 
     Args:
         matcher: The matcher, or its name.
@@ -129,5 +129,5 @@ def searched_ndisp(
 
 
 def field_of(name: str) -> str:
-    """The field of `MatchingSettings` that a matcher's settings have."""
+    """Return the field of `MatchingSettings` that a matcher's settings have."""
     return name.replace("-", "_")

@@ -111,7 +111,7 @@ class SadMatcher:
             return finish(refined, s, pool, self._threads)
 
     def _tiles(self, pool: Executor, pair: RectifiedPair, search: Search) -> Tiles:
-        """Which candidates are offered where."""
+        """Return which candidates are offered where."""
         if not self._settings.half_size_first or search.ndisp < LEAST_NDISP:
             return undivided(search, pair.left.shape)
         halved = half_search(search)
@@ -141,5 +141,5 @@ class SadMatcher:
 
 
 def _prefiltered(image: UInt8, rows: range) -> UInt8:
-    """What the windows compare in N rows: uint8 (N, W)."""
+    """Return what the windows compare in N rows: uint8 (N, W)."""
     return clipped_gradients(image, _GRADIENT_CAP, rows)

@@ -59,7 +59,7 @@ class ResultPool:
         self._free: deque[UInt8] = deque(maxlen=most)
 
     def lend(self, size_bytes: int) -> UInt8:
-        """uint8 (size_bytes,), lent as long as it or a view of it is referenced."""
+        """Return uint8 (size_bytes,), lent as long as it or a view of it is referenced."""
         try:
             block = self._free.pop()
         except IndexError:

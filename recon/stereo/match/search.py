@@ -73,11 +73,11 @@ class SearchSettings(Settings):
     )
 
     def ndisp_for(self, camera: RectifiedCamera) -> int:
-        """Number of disparities to search in the images of a camera."""
+        """Return the number of disparities to search in the images of a camera."""
         return self.ndisp or camera.ndisp or usual_ndisp(camera.width_px)
 
     def ndisp_within(self, camera: RectifiedCamera) -> int:
-        """Number of disparities to search, some of which lie within the image.
+        """Return the number of disparities to search, some of which lie within the image.
 
         Raises:
             MatchingError: None does.
@@ -122,7 +122,7 @@ def rules_of(
     min_texture: float = 0.0,
     odds: float = ODDS,
 ) -> Rules:
-    """What the checks ask for, by the settings.
+    """Return what the checks ask for, by the settings.
 
     Args:
         settings: Of the matcher.
@@ -145,7 +145,7 @@ def rules_of(
 
 
 def finish(refined: Refined, settings: MeasuredSettings, pool: Executor, threads: int) -> Disparity:
-    """The disparity of what was refined: no small regions (reason SPECKLE), averaged.
+    """Return the disparity of what was refined: no small regions (reason SPECKLE), averaged.
 
     Args:
         refined: Overwritten; a copy of each array would cost more than the search for speckles.
@@ -174,5 +174,5 @@ def _averaged(values: Float32, settings: MeasuredSettings, pool: Executor, threa
 
 
 def usual_ndisp(width_px: int) -> int:
-    """A number of disparities that suits most rigs: a tenth of the width, in steps of 16."""
+    """Return a number of disparities that suits most rigs: a tenth of the width, in steps of 16."""
     return 16 * max(1, -(-width_px // 160))

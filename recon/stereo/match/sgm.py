@@ -159,7 +159,7 @@ class SgmMatcher:
             return finish(refined, s, pool, at_once)
 
     def _strips(self, camera: RectifiedCamera, paths: Paths) -> tuple[list[range], int]:
-        """The strips of an image, and how many may be worked on at once."""
+        """Return the strips of an image, and how many may be worked on at once."""
         height = camera.height_px
         # An even number of strips keeps two cores busy to the end.
         rows = -(-height // (2 * -(-height // (2 * _STRIP_ROWS))))

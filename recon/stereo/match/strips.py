@@ -42,7 +42,7 @@ class StripSearch:
         rules: Rules,
         texture: Callable[[range], Float32],
     ) -> Refined:
-        """Search, check and refine.
+        """Return search, check and refine.
 
         Args:
             pool: Where to work.

@@ -18,7 +18,7 @@ _DEPTHS: Final = np.geomspace(0.5, 1e4, 400)
 def epipolar_curves(
     calibration: StereoCalibration, left_px: Float64, right_px: Float64
 ) -> tuple[list[Float64], list[Float64]]:
-    """Epipolar curves in the raw images (straight lines bent by the lenses).
+    """Return epipolar curves in the raw images (straight lines bent by the lenses).
 
     Args:
         calibration: The raw rig.
@@ -39,7 +39,7 @@ def epipolar_curves(
 def epipolar_lines(
     fundamental: Float64, left_px: Float64, right_px: Float64, size: tuple[int, int]
 ) -> tuple[list[Float64], list[Float64]]:
-    """Epipolar lines of undistorted pinhole cameras; returned as by `epipolar_curves`.
+    """Return epipolar lines of undistorted pinhole cameras; returned as by `epipolar_curves`.
 
     Args:
         fundamental: float64 (3, 3), the fundamental matrix, ``right.T @ F @ left = 0``.
@@ -60,7 +60,7 @@ def _curve(
 
 
 def _line(line: Float64, size: tuple[int, int]) -> Float64:
-    """float64 (M, 2), points on the line a·x + b·y + c = 0; NaN outside the image."""
+    """Return float64 (M, 2), points on the line a·x + b·y + c = 0; NaN outside the image."""
     a, b, c = line
     if abs(b) >= abs(a):
         x = np.linspace(0, size[0] - 1, 50)

@@ -23,7 +23,7 @@ MOST_FEATURES: Final = 8000
 
 
 def match_exactly(left: UInt8, right: UInt8, count: int = MOST_FEATURES) -> PairFeatures:
-    """Mutual best matches of SIFT features that pass the ratio test.
+    """Return mutual best matches of SIFT features that pass the ratio test.
 
     Slower than `match_features`, but subpixel accurate and robust to rotation, scale and slant
     between the images.
@@ -77,7 +77,7 @@ def match_again(
 
 
 def _mutual_best(left: Float32, right: Float32) -> Int32:
-    """int32 (N, 2), pairs that are each other's best match and pass the ratio test."""
+    """Return int32 (N, 2), pairs that are each other's best match and pass the ratio test."""
     # SIFT descriptors are whole numbers: float32 sums of products are exact in any order.
     right_sizes = (right**2).sum(axis=1)
     best, second_best = np.empty(len(left), np.int32), np.empty(len(left), np.float32)

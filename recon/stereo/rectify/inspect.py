@@ -120,7 +120,7 @@ def inspect_features(
 
 
 def check_inspection(inspection: PairInspection, where: str | None = None) -> tuple[str, ...]:
-    """Warnings about a pair; none if it is good or has too few features.
+    """Return warnings about a pair; none if it is good or has too few features.
 
     Args:
         inspection: Result of `inspect_pair`.
@@ -154,7 +154,7 @@ def _side(row_error_px: float) -> str:
 
 
 def _agreeing(row_shift: Float32) -> Bool:
-    """bool (N,), features whose row error is close to the most common one."""
+    """Return bool (N,), features whose row error is close to the most common one."""
     if not len(row_shift):
         return np.zeros(0, np.bool_)
     ordered = np.sort(row_shift)

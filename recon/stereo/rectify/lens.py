@@ -20,7 +20,7 @@ _EXACT: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
 
 
 def project(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
-    """float64 (N, 2), pixels of points (N, 3) in camera axes; NaN at or behind its plane."""
+    """Return float64 (N, 2), pixels of points (N, 3) in camera axes; NaN at or behind its plane."""
     return project_with_jacobian(camera, xyz)[0]
 
 
@@ -54,7 +54,7 @@ def project_with_jacobian(
 
 
 def project_into_image(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
-    """float64 (N, 2), pixels of points (N, 3) inside the image; NaN for all others.
+    """Return float64 (N, 2), pixels of points (N, 3) inside the image; NaN for all others.
 
     Far outside the field of view, the distortion polynomial may fold points back into the image;
     the ray of such a pixel does not lead to the point, and it is NaN too.
@@ -69,7 +69,7 @@ def project_into_image(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
 
 
 def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
-    """float64 (N, 3), the rays of pixels (N, 2) in camera axes, with z = 1.
+    """Return float64 (N, 3), the rays of pixels (N, 2) in camera axes, with z = 1.
 
     A ray is NaN where the lens model cannot be inverted (outside the image), or at 90 degrees or
     more from the optical axis.
@@ -93,7 +93,7 @@ def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
 
 
 def sees_all(camera: CameraIntrinsics) -> bool:
-    """Whether the lens model can be inverted along the whole border of the image.
+    """Return whether the lens model can be inverted along the whole border of the image.
 
     Distortion polynomials are fitted where points were seen; farther out they may fold back.
     """

@@ -60,7 +60,7 @@ def match_features(
 
 
 def exposed_as(model: UInt8, image: UInt8) -> UInt8:
-    """An image with the brightness and contrast of another, since tracking needs them equal.
+    """Return an image with the brightness and contrast of another, since tracking needs them equal.
 
     Args:
         model: uint8 (H, W), reference for mean and standard deviation.
@@ -72,14 +72,14 @@ def exposed_as(model: UInt8, image: UInt8) -> UInt8:
 
 
 def _describe(detector: cv2.Feature2D, image: UInt8) -> tuple[Float32, NDArray[Any]]:
-    """Positions (N, 2) and descriptors (N, C) of the features of an image."""
+    """Return positions (N, 2) and descriptors (N, C) of the features of an image."""
     keypoints, bits = detector.detectAndCompute(image, None)
     uv = np.array([point.pt for point in keypoints], dtype=np.float32).reshape(-1, 2)
     return uv, np.zeros((0, 1), np.uint8) if bits is None else np.asarray(bits)
 
 
 def _distinct(candidates: Sequence[Sequence[cv2.DMatch]]) -> dict[int, int]:
-    """Best matches that pass the ratio test."""
+    """Return best matches that pass the ratio test."""
     return {
         best.queryIdx: best.trainIdx
         for best, second in candidates

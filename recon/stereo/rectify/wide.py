@@ -22,7 +22,7 @@ Box = tuple[Float64, Float64]
 def plan_wide_view(
     calibration: StereoCalibration, alpha: float | None
 ) -> tuple[Float64, Float64, Float64, Float64]:
-    """Rotations and projections of the rectified views, like ``stereoRectify`` for pinholes.
+    """Return rotations and projections of the rectified views, like ``stereoRectify`` for pinholes.
 
     The centre of the views keeps the resolution of the lens, so they show less than a wide lens
     sees; along their shorter side they reach at most 60 degrees from the optical axis.
@@ -57,7 +57,7 @@ def plan_wide_view(
 
 
 def _boxes(camera: CameraIntrinsics, rotation: Float64) -> tuple[Box, Box]:
-    """The largest box inside the rotated image border, and the smallest box around it."""
+    """Return the largest box inside the rotated image border, and the smallest box around it."""
     w, h = camera.width_px - 1.0, camera.height_px - 1.0
     t, zero = np.linspace(0, 1, _BORDER_POINTS), np.zeros(_BORDER_POINTS)
     sides = {

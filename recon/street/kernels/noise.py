@@ -33,7 +33,7 @@ def _mix(h: Any) -> Any:
 
 @kernel
 def _value_noise(x: float, y: float, z: float, seed: Any) -> Any:
-    """Random values on the integer lattice, interpolated with quintic weights."""
+    """Return random values on the integer lattice, interpolated with quintic weights."""
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
     tx, ty, tz = x - fx, y - fy, z - fz
     tx = tx * tx * tx * (tx * (tx * 6.0 - 15.0) + 10.0)
@@ -91,7 +91,7 @@ def fractal_noise(
     gain: float,
     seed: int,
 ) -> NDArray[np.float64]:
-    """Fractal value noise, averaged over the footprint of a pixel.
+    """Return fractal value noise, averaged over the footprint of a pixel.
 
     A pixel that looks along a surface covers a long strip of it. Blurring by the long side would
     wipe the texture off every road, so the strip is sampled along its length and each sample is
@@ -139,7 +139,7 @@ def fractal_noise(
 def lattice_values(
     ix: NDArray[Any], iy: NDArray[Any], iz: NDArray[Any], seed: int
 ) -> NDArray[np.float64]:
-    """Random values in [-1, 1) of integer lattice points, plain numpy.
+    """Return random values in [-1, 1) of integer lattice points, plain numpy.
 
     Args:
         ix: Integers, any shape.
@@ -156,7 +156,7 @@ def lattice_values(
 
 
 def value_noise_reference(xyz: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
-    """One octave of `fractal_noise` with spacing 1 and no blur, in plain numpy."""
+    """Return one octave of `fractal_noise` with spacing 1 and no blur, in plain numpy."""
     base = np.floor(xyz)
     t = xyz - base
     weight = t * t * t * (t * (t * 6.0 - 15.0) + 10.0)
@@ -178,7 +178,7 @@ def fractal_noise_reference(
     gain: float,
     seed: int,
 ) -> NDArray[np.float64]:
-    """The plain-numpy twin of `fractal_noise`, one point at a time."""
+    """Return the plain-numpy twin of `fractal_noise`, one point at a time."""
     turn = np.array([[2.0, 3.0, 6.0], [6.0, 2.0, -3.0], [3.0, -6.0, 2.0]]) / 7.0
     amplitudes = gain ** np.arange(octaves)
     out = np.empty(len(width))

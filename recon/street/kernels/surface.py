@@ -128,7 +128,7 @@ def describe_hits_reference(
     directions: Float64,
     pixel: float,
 ) -> SurfaceHits:
-    """The plain-numpy twin of `describe_hits`, all points at once."""
+    """Return the plain-numpy twin of `describe_hits`, all points at once."""
     plane = table.normal[faces]
     along = (directions * plane).sum(axis=1)
     depth = ((table.anchor[faces] - origin) * plane).sum(axis=1) / along

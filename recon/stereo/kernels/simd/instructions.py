@@ -58,7 +58,7 @@ class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
 
 
 def llvm_type(bits: int, lanes: int = LANES) -> ir.VectorType:
-    """LLVM's type of a vector of so many bits a lane."""
+    """Return LLVM's type of a vector of so many bits a lane."""
     return ir.VectorType(ir.IntType(bits), lanes)
 
 
@@ -134,7 +134,7 @@ def _write_splat(builder: Any, value: Any, lanes: int) -> Any:
 
 
 def _address(context: Any, builder: Any, signature: Any, arguments: Any, kind: Any) -> Any:
-    """Address, as of some type, of an element: arguments are the array and the index."""
+    """Return address, as of some type, of an element: arguments are the array and the index."""
     array = context.make_array(signature.args[0])(context, builder, arguments[0])
     return builder.bitcast(builder.gep(array.data, [arguments[1]]), kind.as_pointer())
 
@@ -151,7 +151,7 @@ def address_in_row(context: Any, builder: Any, signature: Any, arguments: Any, k
 
 
 def type_in_row(rows: Any, n: Any, at: Any) -> Any:
-    """The type of a vector in an array of rows; None = the array does not fit."""
+    """Return the type of a vector in an array of rows; None = the array does not fit."""
     # The address is computed for a C-ordered array.
     fits = isinstance(rows, types.Array) and rows.ndim == 1 + 1 and rows.layout == "C"
     return _Vector(rows.dtype) if fits else None
@@ -239,7 +239,7 @@ def _broadcast_smallest(context: Any, builder: Any, signature: Any, arguments: A
 
 
 def shuffle(builder: Any, a: Any, b: Any, order: list[int]) -> Any:
-    """Lanes of two vectors in some order; ``LANES`` is the first lane of the second one."""
+    """Return lanes of two vectors in some order; ``LANES`` is the first lane of the second one."""
     return builder.shuffle_vector(a, b, ir.Constant(llvm_type(32), order))
 
 

@@ -42,7 +42,7 @@ class _Part(NamedTuple):
     types: Any
 
     def address(self, context: Any, builder: Any, row: int, kind: Any) -> Any:
-        """Where a row of the block begins."""
+        """Return where a row of the block begins."""
         array, n, at = self.arguments
         first = context.cast(builder, n, self.types[1], types.intp)
         place = builder.add(first, first.type(row))

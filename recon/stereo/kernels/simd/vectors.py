@@ -19,7 +19,7 @@ Vector: TypeAlias = NDArray[Any]
 
 
 def load(array: NDArray[Any], at: int) -> Vector:
-    """Values ``at`` to ``at + LANES - 1`` of a uint8 or uint16 array (n,)."""
+    """Return values ``at`` to ``at + LANES - 1`` of a uint8 or uint16 array (n,)."""
     vector: Vector = array[at : at + LANES].copy()
     return vector
 
@@ -30,7 +30,7 @@ def store(array: NDArray[Any], at: int, vector: Vector) -> None:
 
 
 def load_row(rows: NDArray[Any], n: int, at: int) -> Vector:
-    """`load` from row ``n`` of a C-ordered array of rows."""
+    """Return `load` from row ``n`` of a C-ordered array of rows."""
     vector: Vector = rows[n, at : at + LANES].copy()
     return vector
 
@@ -41,22 +41,22 @@ def store_row(rows: NDArray[Any], n: int, at: int, vector: Vector) -> None:
 
 
 def splat(value: np.uint8 | np.uint16) -> Vector:
-    """The same value in each lane."""
+    """Return the same value in each lane."""
     return np.full(LANES, value)
 
 
 def ramp(first: np.uint16) -> Vector:
-    """``first``, ``first + 1`` and so on."""
+    """Return ``first``, ``first + 1`` and so on."""
     return np.arange(LANES, dtype=np.uint16) + first
 
 
 def smaller(a: Vector, b: Vector) -> Vector:
-    """The smaller value of each lane."""
+    """Return the smaller value of each lane."""
     return np.minimum(a, b)
 
 
 def larger(a: Vector, b: Vector) -> Vector:
-    """The larger value of each lane."""
+    """Return the larger value of each lane."""
     return np.maximum(a, b)
 
 
@@ -66,23 +66,23 @@ def absolute_difference(a: Vector, b: Vector) -> Vector:
 
 
 def mean(a: Vector, b: Vector) -> Vector:
-    """Mean of two bytes, rounded up."""
+    """Return the mean of two bytes, rounded up."""
     return ((a.astype(np.uint16) + b + 1) >> 1).astype(np.uint8)
 
 
 def differing_bits(a: Vector, b: Vector) -> Vector:
-    """How many bits of two bytes differ."""
+    """Return how many bits of two bytes differ."""
     bits = np.unpackbits(np.bitwise_xor(a, b)).reshape(-1, 8)
     return np.asarray(bits.sum(axis=1, dtype=np.uint8))
 
 
 def where_equal(a: Vector, b: Vector, then: Vector, otherwise: Vector) -> Vector:
-    """``then`` in the lanes where ``a == b``."""
+    """Return ``then`` in the lanes where ``a == b``."""
     return np.where(a == b, then, otherwise)
 
 
 def where_less(a: Vector, b: Vector, then: Vector, otherwise: Vector) -> Vector:
-    """``then`` in the lanes where ``a < b``."""
+    """Return ``then`` in the lanes where ``a < b``."""
     return np.where(a < b, then, otherwise)
 
 
@@ -92,22 +92,22 @@ def widen(vector: Vector, array: NDArray[Any]) -> Vector:
 
 
 def narrow(vector: Vector) -> Vector:
-    """The lower bytes of uint16."""
+    """Return the lower bytes of uint16."""
     return vector.astype(np.uint8)
 
 
 def put_before(vector: Vector, before: Vector) -> Vector:
-    """Each lane's neighbour below; that of the first lane is the last of ``before``."""
+    """Return each lane's neighbour below; that of the first lane is the last of ``before``."""
     return np.concatenate((before[-1:], vector[:-1]))
 
 
 def put_after(vector: Vector, after: Vector) -> Vector:
-    """Each lane's neighbour above; that of the last lane is the first of ``after``."""
+    """Return each lane's neighbour above; that of the last lane is the first of ``after``."""
     return np.concatenate((vector[1:], after[:1]))
 
 
 def broadcast_smallest(vector: Vector) -> Vector:
-    """The smallest value, in each lane."""
+    """Return the smallest value, in each lane."""
     return np.full_like(vector, vector.min())
 
 
