@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from recon.io.models.mesh import read_mesh, write_mesh
     from recon.io.models.ply import read_ply, write_ply
     from recon.io.trajectory import read_trajectory
+    from recon.map.persistent import Map
     from recon.map.sequence import MappedSequence, map_sequence
     from recon.rig.audit.run import Audit, run_audit
     from recon.sources import SourceSettings, StereoSource, open_source
@@ -90,6 +91,7 @@ _HOMES = {
     "recon.commands.occupancy": ("OccupancyRequest", "run_occupancy"),
     "recon.commands.pair": ("run_disparity", "run_pair"),
     "recon.sources.pair_input": ("PairInput",),
+    "recon.map.persistent": ("Map",),
     "recon.map.sequence": ("MappedSequence", "map_sequence"),
     "recon.sources": ("SourceSettings", "StereoSource", "open_source"),
     "recon.sources.synthetic": ("SyntheticSource",),
@@ -118,6 +120,7 @@ __all__ = [
     "Disparity",
     "DisparityMetrics",
     "DisparityTruth",
+    "Map",
     "MapOptions",
     "MappedSequence",
     "Matcher",

@@ -37,7 +37,7 @@ def occupancy(
 ) -> None:
     """Make another Nav2 grid and OctoMap of a run: cell size, height band, range.
 
-    Uses the rays that the run has kept in map/rays.bin, so that nothing is
+    Uses the rays that the run has kept in map/map.recon, so that nothing is
     matched again.
 
     Examples:

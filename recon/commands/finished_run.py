@@ -22,7 +22,6 @@ RECORD_BYTES: Final = 1 << 26
 CONFIG: Final = "config.yaml"
 GRID: Final = "map/grid.yaml"
 OCTOMAP: Final = "map/octomap.ot"
-RAYS_FILE: Final = "map/rays.bin"
 CLOUD: Final = "map/cloud.ply"
 PAIR_CLOUD: Final = "clouds/cloud.ply"
 SUMMARY: Final = "summary.json"

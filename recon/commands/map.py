@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, dump_config
-from recon.commands.finished_run import RAYS_FILE, UNTRUSTED
+from recon.commands.finished_run import UNTRUSTED
 from recon.commands.resume import begin_or_resume, identity_of, tell_how_to_resume
 from recon.core.errors import EvaluationError, MeshingError
 from recon.core.geometry.se3 import invert
@@ -32,8 +33,10 @@ from recon.io.atomic import write_text
 from recon.io.trajectory import write_kitti_poses, write_tum
 from recon.map import base_axes
 from recon.map.empty import check_map
+from recon.map.finished import keep_map
+from recon.map.persistent import MAP_FILE
 from recon.map.sequence import MappedSequence, map_sequence
-from recon.map.workspace import RAYS, Workspace
+from recon.map.workspace import Workspace
 from recon.odometry.health import health_warnings
 from recon.run.directory import RunDirectory
 from recon.run.machine import use_threads
@@ -132,19 +135,22 @@ def run_map(source: StereoSource, config: ReconConfig, options: MapOptions) -> M
     watch = Stopwatch()
     identity = identity_of(source, config, options.known_poses, options.prior)
     target = RunDirectory.for_command(options.command, options.out, resume=options.resume)
-    with target as directory, tell_how_to_resume(directory):
-        begin_or_resume(directory, identity, options.arguments)
+    with target as directory, tell_how_to_resume(directory), ExitStack() as made:
+        map_ = made.enter_context(
+            begin_or_resume(directory, source, config, identity, options.arguments)
+        )
         mapped = map_sequence(
             source,
             config,
             known_poses=options.known_poses,
             prior=options.prior,
             progress=options.progress,
-            workspace=Workspace(watch, directory.state(""), resume=options.resume, threads=threads),
+            workspace=Workspace(map_, watch, threads),
         )
         run = _finish(source, config, mapped, options, directory, watch)
         with watch.stage("write"):
             _write(run, directory)
+            keep_map(map_, directory.path(MAP_FILE), config)
         run.summary.update(cost(watch, time.perf_counter() - start))
         if options.present is not None:
             options.progress.on_stage("report")
@@ -317,8 +323,6 @@ def _write(run: MapRun, directory: RunDirectory) -> None:
     if run.mapped.loops is not None and run.mapped.loops.closure.closed:
         write_tum(path("trajectory_odometry_tum.txt"), run.mapped.loops.odometry)
         directory.write_json("loops.json", run.mapped.loops.edges())
-    if run.config.occupancy.keep_rays:
-        directory.keep(RAYS, RAYS_FILE)
     write_text(path("config.yaml"), dump_config(run.config, "map"))
 
 

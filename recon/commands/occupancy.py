@@ -17,8 +17,6 @@ from recon.commands.config import ReconConfig, dump_config, load_config
 from recon.commands.finished_run import (
     CLOUD,
     MAPPED_BY,
-    RAYS_FILE,
-    TRAJECTORY,
     UNTRUSTED,
     FinishedRun,
     open_run,
@@ -26,15 +24,16 @@ from recon.commands.finished_run import (
 )
 from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.se3 import apply
-from recon.core.values import FREE, OCCUPIED, OccupancyGrid, PointCloud, Trajectory
+from recon.core.values import FREE, OCCUPIED, OccupancyGrid, PointCloud
 from recon.export.occupancy import OccupancyWriter
 from recon.io.atomic import write_text
 from recon.io.models.ply import read_ply_pieces
-from recon.io.rays import RayFile
-from recon.io.trajectory import read_kitti_poses
-from recon.map import SubmapBuilder, base_axes
+from recon.map import base_axes
 from recon.map.drive_map import DriveMap, Tile
-from recon.map.submap_store import SubmapStore
+from recon.map.finished import with_occupancy
+from recon.map.persistent import MAP_FILE, Map
+from recon.map.session import Session
+from recon.map.submap_records import Submaps
 from recon.run.directory import RunDirectory
 from recon.run.machine import use_threads
 from recon.run.record import fingerprint, write_record
@@ -80,9 +79,9 @@ def run_occupancy(request: OccupancyRequest) -> dict[str, Any]:
     drive = _Drive(request)
     with RunDirectory.for_command("occupancy", request.out) as directory:
         with watch.stage("map"):
-            store = drive.submaps(directory)
+            store = drive.submaps()
         path_m = apply(drive.run.T_map_world, drive.trajectory.positions_m)
-        tiles = DriveMap(store, drive.config, drive.run.T_map_world)
+        tiles = DriveMap(store, drive.config, drive.run.T_map_world, drive.session.corrections())
         trusted = ~np.isin(np.arange(len(path_m)), drive.run.untrusted)
         writer = OccupancyWriter(tiles, drive.config, path_m, trusted, directory)
         with watch.stage("octomap"):
@@ -110,7 +109,7 @@ def run_occupancy(request: OccupancyRequest) -> dict[str, Any]:
         record = {
             "source": str(request.run),
             MAPPED_BY: drive.run.mapped_by,
-            "inputs": fingerprint([request.run / n for n in (RAYS_FILE, CLOUD, TRAJECTORY)]),
+            "inputs": fingerprint([request.run / n for n in (MAP_FILE, CLOUD)]),
             "T_map_world": T_map_world.tolist(),
             UNTRUSTED: list(drive.run.untrusted),
             "timings": watch.seconds,
@@ -127,31 +126,13 @@ class _Drive:
         self.run = open_run(request.run)
         refuse_as_target(request.run, request.out)
         self.config = _configure(self.run, request)
-        self._rays = _open_rays(self.run.folder / RAYS_FILE)
-        self.trajectory: Trajectory = read_kitti_poses(self.run.folder / TRAJECTORY)
-        _check_grain(self._rays, self.config)
-        if len(self._rays) != len(self.trajectory):
-            raise FormatError(
-                "the run has different numbers of ray frames and poses",
-                where=self.run.folder,
-                got=f"{len(self._rays)} and {len(self.trajectory)}",
-            )
+        self.session: Session = Map.open(self.run.folder).session()
+        self.trajectory = self.session.trajectory
+        _check_grain(self.session, self.config)
 
-    def submaps(self, directory: RunDirectory) -> SubmapStore:
-        """The occupancy, in submaps on disk."""
-        config = self.config
-        store = SubmapStore(directory.state("submaps"))
-        builder = SubmapBuilder(
-            config.submaps, config.fusion, config.occupancy, self.run.T_map_world
-        )
-        unfused = PointCloud(np.zeros((0, 3), np.float32), frame="world")
-        for rays, T_world_camera in zip(self._rays, self.trajectory.T_world_camera, strict=True):
-            builder.integrate(unfused, rays.cloud(), T_world_camera)
-            if builder.full:
-                store.add(builder.close())
-        if builder.frames:
-            store.add(builder.close())
-        return store
+    def submaps(self) -> Submaps:
+        """The submaps with occupancy."""
+        return with_occupancy(self.session, self.config)
 
     def clouds(self, edge_m: float) -> Iterator[tuple[Tile, PointCloud]]:
         """The fused cloud in map axes, in parts that each lie in one tile."""
@@ -178,19 +159,21 @@ def _configure(run: FinishedRun, request: OccupancyRequest) -> ReconConfig:
     return config
 
 
-def _open_rays(path: Path) -> RayFile:
-    if not path.is_file():
+def _check_grain(session: Session, config: ReconConfig) -> None:
+    """Refuse a cell size or range that the stored rays do not support."""
+    if not session.ray_frames:
         raise FormatError(
             "the run kept no rays to build occupancy from",
-            where=path,
+            where=session.where,
             hint="map the drive again with --set occupancy.keep_rays=true",
         )
-    return RayFile(path)
-
-
-def _check_grain(rays: RayFile, config: ReconConfig) -> None:
-    """Refuse a cell size or range that the stored rays do not support."""
-    grain, wanted = rays.grain, config.occupancy
+    if session.ray_frames != len(session):
+        raise FormatError(
+            "the run has different numbers of ray frames and poses",
+            where=session.where,
+            got=f"{session.ray_frames} and {len(session)}",
+        )
+    grain, wanted = session.rays(0)[1], config.occupancy
     # The 0.05 % tolerance is for rounded input, such as 0.3333 for a third.
     if wanted.resolution_m < grain.cell_m * 0.9995:
         raise SettingsError(

@@ -5,20 +5,25 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import os
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.finished_run import RECORD_BYTES
-from recon.core.errors import FormatError, MemoryLimitError, OutputError, SettingsError
+from recon.core.errors import (
+    FormatError,
+    MemoryLimitError,
+    OutputError,
+    ReconError,
+    SettingsError,
+)
 from recon.core.values import Trajectory
-from recon.io.atomic import write_text
-from recon.io.files import read_text
-from recon.map.checkpoint import quick_fingerprint
+from recon.map.persistent import Map
+from recon.map.workspace import ANEW, resuming, session_info
 from recon.run.directory import RECORD, STARTED, RunDirectory, state_folder
 from recon.run.machine import versions
 from recon.run.memory import memory_overrides
@@ -32,6 +37,7 @@ _OTHER: Final = {
     "versions": "other versions",
 }
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_HEAD_BYTES: Final = 4096
 _MEMORY: Final = "memory"
 _NOTHING: Final = "there is no unfinished run to resume"
 _START_ANEW: Final = "start it without --resume"
@@ -147,11 +153,26 @@ def identity_of(
     """Everything that must be unchanged for a resumed run to give the same result."""
     return {
         "config": config.model_dump(mode="json"),
-        "source": {"frames": len(source), **quick_fingerprint(source.files)},
+        "source": {"frames": len(source), **_quick_fingerprint(source.files)},
         "poses": _digest(known_poses),
         "prior": _digest(prior),
         "versions": versions(),
     }
+
+
+def _quick_fingerprint(files: Iterable[Path]) -> dict[str, Any]:
+    """Number, total size, and a hash of names and first bytes of files, to tell sources apart.
+
+    Hashing whole files, as at the end of a run, would delay the start of a large drive.
+    """
+    digest, count, size = hashlib.sha256(), 0, 0
+    for path in files:
+        length = path.stat().st_size
+        digest.update(os.fsencode(path.name) + b"\0" + length.to_bytes(8, "little"))
+        with path.open("rb") as content:
+            digest.update(content.read(_HEAD_BYTES))
+        count, size = count + 1, size + length
+    return {"files": count, "bytes": size, "sha256": digest.hexdigest()}
 
 
 def _digest(path: Trajectory | None) -> str | None:
@@ -162,20 +183,29 @@ def _digest(path: Trajectory | None) -> str | None:
 
 
 def begin_or_resume(
-    directory: RunDirectory, identity: Mapping[str, Any], arguments: Mapping[str, Any]
-) -> None:
-    """Store what a run is started with; for a resumed run, first check that it is unchanged.
+    directory: RunDirectory,
+    source: StereoSource,
+    config: ReconConfig,
+    identity: Mapping[str, Any],
+    arguments: Mapping[str, Any],
+) -> Map:
+    """Begin the map of a run; for a resumed one, check that nothing has changed, and open it.
 
     Raises:
         SettingsError: The run was started with other inputs or settings.
-        OutputError: The state cannot be written, or there is no run to resume.
+        FormatError: The map is damaged.
+        OutputError: The map cannot be written, or there is no run to resume.
     """
+    path, memory = directory.state(STARTED), config.memory.cache_bytes
     if directory.resumes:
-        started = read_started(directory.folder)
-        _refuse_others(identity, started["identity"], directory.folder)
-        arguments = arguments or started["arguments"]
-    content = {"identity": dict(identity), "arguments": dict(arguments)}
-    write_text(directory.state(STARTED), json.dumps(content, ensure_ascii=False))
+        _refuse_others(identity, read_started(directory.folder)["identity"], directory.folder)
+        with resuming(path):
+            return Map.open(path, read_only=False, cache_bytes=memory)
+    map_ = Map.create(path, cache_bytes=memory)
+    start = {"identity": dict(identity), "arguments": dict(arguments)}
+    map_.begin(session_info(source, config, start))
+    map_.commit()
+    return map_
 
 
 @contextmanager
@@ -222,8 +252,13 @@ def read_started(folder: Path) -> dict[str, Any]:
     """
     path = state_folder(folder) / STARTED
     try:
-        return _checked(json.loads(read_text(path, RECORD_BYTES)))
-    except (FormatError, ValueError, LookupError, TypeError, RecursionError) as error:
+        with Map.open(path) as map_:
+            return _checked(map_.session().info.start)
+    except (ReconError, LookupError, TypeError) as error:
+        if path.is_file():
+            raise FormatError(
+                "the unfinished map cannot be read", where=path, got=error, hint=ANEW
+            ) from error
         finished = (folder / RECORD).is_file()
         hint = "it is finished; without --resume it runs again" if finished else _START_ANEW
         raise OutputError(_NOTHING, where=folder, hint=hint) from error

@@ -39,7 +39,7 @@ def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, bytes]:
         TypeError: The tree holds something else than mappings with names, sequences, arrays of
             numbers, numbers, texts and None.
     """
-    content: list[bytes] = []
+    content: list[bytes | memoryview] = []
     size = 0
 
     def plain(value: Any) -> Any:
@@ -61,7 +61,7 @@ def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, bytes]:
 
 
 def from_bytes(text: str, content: bytes) -> dict[str, Any]:
-    """The tree of `to_bytes`, with read-only arrays. Tuples are lists now.
+    """The tree of `to_bytes`. Tuples are lists now.
 
     Raises:
         FormatError: The bytes are no such arrays; other exceptions where the text is no tree.
@@ -74,16 +74,17 @@ def from_bytes(text: str, content: bytes) -> dict[str, Any]:
             return value
         if _ARRAY in value:
             *head, begin, end = value[_ARRAY]
-            return _unpack(head, content[begin:end])
+            return _unpack(head, view[begin:end])
         return {name: restored(item) for name, item in value[_TREE].items()}
 
+    view = memoryview(content)
     tree = restored(json.loads(text))
     if not isinstance(tree, dict):
         raise FormatError("a record of the map is no tree")
     return tree
 
 
-def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes]:
+def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | memoryview]:
     """Dtype, shape, layout and codec of an array, and its bytes."""
     # Products of matrices round differently in another order of axes.
     layout = "F" if array.flags.f_contiguous and not array.flags.c_contiguous else "C"
@@ -91,7 +92,8 @@ def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes]:
     if little.dtype.kind not in _KINDS:
         raise TypeError(f"an array of {array.dtype} cannot be stored")
     flat = np.ascontiguousarray(little.T if layout == "F" else little)
-    content, codec = flat.tobytes(), _RAW
+    content: bytes | memoryview = flat.reshape(-1).view(np.uint8).data
+    codec = _RAW
     if compress and array.size:
         # Runs and single bytes: as small as with a search for repeats, in half the time.
         packer = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, 9, zlib.Z_RLE)
@@ -101,7 +103,7 @@ def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes]:
     return [little.dtype.str, list(array.shape), layout, codec], content
 
 
-def _unpack(head: Sequence[Any], packed: bytes) -> NDArray[Any]:
+def _unpack(head: Sequence[Any], packed: memoryview) -> NDArray[Any]:
     """The array of these bytes.
 
     Raises:
@@ -112,16 +114,20 @@ def _unpack(head: Sequence[Any], packed: bytes) -> NDArray[Any]:
         raise FormatError("an array of the map has an impossible type or shape")
     axes = shape[::-1] if layout == "F" else shape
     wanted = math.prod(shape) * dtype.itemsize
+    content: bytes | bytearray
     if codec == _ZLIB:
         if wanted > _MOST_INFLATED * (len(packed) + 1):
             raise FormatError("an array of the map is truncated")
-        packed = zlib.decompressobj().decompress(packed, wanted + 1)
-    if len(packed) != wanted:
+        content = zlib.decompressobj().decompress(packed, wanted + 1)
+    else:
+        content = bytearray(packed)  # compiled kernels take only arrays that can be written
+    if len(content) != wanted:
         raise FormatError("an array of the map is truncated")
+    numbers: NDArray[Any] = np.frombuffer(content, np.uint8)
     if codec == _ZLIB:
-        planes = np.frombuffer(packed, np.uint8).reshape(_columns(axes), dtype.itemsize, -1)
-        packed = np.ascontiguousarray(planes.transpose(2, 0, 1)).tobytes()
-    array: NDArray[Any] = np.frombuffer(packed, dtype).reshape(axes)
+        planes = numbers.reshape(_columns(axes), dtype.itemsize, -1).transpose(2, 0, 1)
+        numbers = np.array(planes, order="C").reshape(-1)
+    array: NDArray[Any] = numbers.view(dtype).reshape(axes)
     return array.T if layout == "F" else array
 
 

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from recon.core.errors import FormatError
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.io.tree_file import read_tree, write_tree
-from recon.map.submap_store import SubmapEntry
+from recon.map.keyframes import Keyframes
+from recon.map.submap_records import SubmapEntry
 from recon.places import LoopSettings
-from recon.places.detector import CONTRADICTED, KeyframeMemory, LoopDetector, StoredKeyframe
+from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.places.drift import path_lengths
 from recon.places.graph import Closure, close_loops
-from recon.places.keyframe import Keyframe
-from recon.places.verify import Loop
 from recon.run.stopwatch import Stopwatch
 from recon.stereo.frame import ReconstructedFrame
 
-_CACHED: Final = 64
 _TELLING: Final = 3  # implausible place recognitions from which a warning is given
 _BEHIND: Final = 4  # frames by which loop detection may lag behind
 
@@ -92,6 +87,15 @@ class DriveLoops:
             for name, loops in (("closed", self.closure.closed), ("refused", self.closure.refused))
         }
 
+    def record(self) -> dict[str, Any]:
+        """What a map keeps of it: the loops, and the path after closure if one was closed."""
+        closed, refused = self.closure.closed, self.closure.refused
+        return {
+            "closed": [asdict(loop) for loop in closed],
+            "refused": [asdict(loop) for loop in refused],
+            "T_world_camera": self.closure.trajectory.T_world_camera if closed else None,
+        }
+
     def warnings(self) -> list[str]:
         """Warnings about loops that were not closed."""
         closed, refused = len(self.closure.closed), len(self.closure.refused)
@@ -112,22 +116,22 @@ class LoopWatch:
 
     Args:
         settings: Settings of loop detection and closure.
-        folder: Folder for keyframes; None = they stay in memory.
+        keyframes: Where keyframes are kept; those in it are of the frames before.
         stopwatch: Records the time spent.
     """
 
     def __init__(
         self,
         settings: LoopSettings,
-        folder: Path | None = None,
+        keyframes: Keyframes,
         stopwatch: Stopwatch | None = None,
     ) -> None:
         self._drift = settings.drift
         self._stage = (stopwatch or Stopwatch()).stage
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
         self._waiting: deque[Future[None]] = deque()
-        self._store = KeyframeMemory() if folder is None else KeyframeFiles(folder)
-        self._detector = LoopDetector(settings.drift, self._store)
+        self._keyframes = keyframes
+        self._detector = LoopDetector(settings.drift, keyframes)
         self._path_m: list[float] = []
         self._last: Float64 = np.eye(4)
 
@@ -166,17 +170,15 @@ class LoopWatch:
         self._pool.shutdown(cancel_futures=True)
 
     def restore(self, T_world_camera: Iterable[Float64], measured: Iterable[bool]) -> None:
-        """Resume after frames with these poses; their keyframes are in the store.
+        """Resume after frames with these poses, whose keyframes are kept.
 
         Raises:
-            FormatError: A keyframe's file is damaged.
+            FormatError: A keyframe is damaged.
         """
         for T, good in zip(T_world_camera, measured, strict=True):
             self._advance(T, measured=good)
-        for stored in self._store:
-            # A killed run may have written keyframes after its last checkpoint.
-            if stored.keyframe.frame < len(self._path_m):
-                self._detector.restore(stored)
+        for stored in self._keyframes:
+            self._detector.restore(stored)
 
     def close(self, trajectory: Trajectory) -> DriveLoops:
         """Close the loops of a path.
@@ -207,67 +209,3 @@ class LoopWatch:
         self._path_m.append((self._path_m[-1] if self._path_m else 0.0) + float(step[1]))
         self._last = T_world_camera
         return self._path_m[-1]
-
-
-class KeyframeFiles:
-    """Keeps each keyframe in a file, and those read last in memory.
-
-    Args:
-        folder: The folder of the files; created if missing.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._held: OrderedDict[int, StoredKeyframe] = OrderedDict()
-
-    def put(self, stored: StoredKeyframe) -> None:
-        """Store a keyframe.
-
-        Raises:
-            OutputError: It cannot be written.
-        """
-        write_tree(self._path(stored.keyframe.frame), _to_tree(stored))
-
-    def get(self, frame: int) -> StoredKeyframe:
-        """The keyframe of a frame.
-
-        Raises:
-            FormatError: Its file is missing or damaged.
-        """
-        if frame not in self._held:
-            self._held[frame] = _read(self._path(frame))
-            while len(self._held) > _CACHED:
-                self._held.popitem(last=False)
-        self._held.move_to_end(frame)
-        return self._held[frame]
-
-    def __iter__(self) -> Iterator[StoredKeyframe]:
-        """All stored keyframes, in frame order."""
-        return (_read(path) for path in sorted(self._folder.glob("keyframe_*.zip")))
-
-    def _path(self, frame: int) -> Path:
-        return self._folder / f"keyframe_{frame:09d}.zip"
-
-
-def _read(path: Path) -> StoredKeyframe:
-    tree = read_tree(path)
-    try:
-        return StoredKeyframe(
-            Keyframe(**tree["keyframe"]),
-            tree["T_world_camera"],
-            tree["path_m"],
-            tuple(Loop(**loop) for loop in tree["loops"]),
-            tuple(tree["refused"]),
-        )
-    except (KeyError, TypeError) as error:
-        raise FormatError("the file holds no keyframe", where=path) from error
-
-
-def _to_tree(stored: StoredKeyframe) -> dict[str, Any]:
-    return {
-        "keyframe": asdict(stored.keyframe),
-        "T_world_camera": stored.T_world_camera,
-        "path_m": stored.path_m,
-        "loops": [asdict(loop) for loop in stored.loops],
-        "refused": list(stored.refused),
-    }

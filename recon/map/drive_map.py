@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -20,7 +20,7 @@ from recon.map.grid import JOINED_CELLS
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
 from recon.map.occupancy_part import OccupancyPart, join_occupancy
 from recon.map.settings import DriveSettings
-from recon.map.submap_store import SubmapStore
+from recon.map.submap_records import Submaps
 from recon.stereo.cloud import filter_cloud
 
 Tile = tuple[int, int]
@@ -66,7 +66,7 @@ class DriveMap:
 
     def __init__(
         self,
-        store: SubmapStore,
+        store: Submaps,
         config: DriveSettings,
         T_map_world: Float64,
         T_corrected_world: Float64 | None = None,
@@ -75,7 +75,6 @@ class DriveMap:
         self._config = config
         self._T_map_world = T_map_world
         self._T_corrected_world = T_corrected_world
-        self._moved: OrderedDict[int, Submap] = OrderedDict()
         self._frames = sum(entry.frames for entry in store.entries)
         tile_m = config.submaps.tile_m
         self._voxels_per_tile = max(1, round(tile_m / config.fusion.voxel_m))
@@ -247,18 +246,14 @@ class DriveMap:
             self._T_corrected_world[index], np.eye(4)
         ):
             return self._store.get(index)
-        if index not in self._moved:
-            motion = SubmapMotion(
-                self._T_corrected_world[index],
-                self._T_map_world,
-                self._config.fusion.voxel_m,
-                self._config.occupancy.resolution_m,
-            )
-            self._moved[index] = self._store.get(index).moved(motion)
-            while len(self._moved) > self._config.memory.cached_submaps:
-                self._moved.popitem(last=False)
-        self._moved.move_to_end(index)
-        return self._moved[index]
+        motion = SubmapMotion(
+            self._T_corrected_world[index],
+            self._T_map_world,
+            self._config.fusion.voxel_m,
+            self._config.occupancy.resolution_m,
+        )
+        key = ("moved submap", id(self), index)
+        return self._store.store.cache.get(key, lambda: self._store.get(index).moved(motion))
 
 
 def join_clouds(clouds: Sequence[PointCloud]) -> PointCloud | None:

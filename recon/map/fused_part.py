@@ -69,14 +69,17 @@ class FusedPart:
         """
         if not len(self):
             return self
-        weight = self.sums[:, :1]
-        points = (self.cells + 0.5) * voxel_m + self.sums[:, _OFFSET] / weight
-        points = apply(T_new_world, points)
+        points = self._moved_points(T_new_world, voxel_m)
         cells = np.floor(points / voxel_m).astype(np.int64)
         sums = self.sums.copy()
-        sums[:, _OFFSET] = weight * (points - (cells + 0.5) * voxel_m)
+        sums[:, _OFFSET] = self.sums[:, :1] * (points - (cells + 0.5) * voxel_m)
         sums[:, _TURNED] = rotate(T_new_world, sums[:, _TURNED])
         return _merged(replace(self, keys=voxels.pack_keys(cells), sums=sums))
+
+    def moved_keys(self, T_new_world: Float64, voxel_m: float) -> NDArray[np.int64]:
+        """int64 (N,), packed cell of each row after a rigid motion, several rows in one or not."""
+        points = self._moved_points(T_new_world, voxel_m)
+        return voxels.pack_keys(np.floor(points / voxel_m).astype(np.int64))
 
     def cloud(self, voxel_m: float, least: int, precise_m: float | None = None) -> PointCloud:
         """One point per voxel that enough frames saw.
@@ -106,6 +109,11 @@ class FusedPart:
             count=part.frames,
             frame="world",
         )
+
+    def _moved_points(self, T_new_world: Float64, voxel_m: float) -> Float64:
+        """float64 (N, 3), the mean point of each voxel after a rigid motion."""
+        points = (self.cells + 0.5) * voxel_m + self.sums[:, _OFFSET] / self.sums[:, :1]
+        return apply(T_new_world, points)
 
     def _needed(self, least: int, precise_m: float | None) -> Int32:
         """int32 (N,), frames that must have seen each voxel."""

@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 
 from recon.core.geometry.transform import transform_cloud
-from recon.core.values import PointCloud, RayCloud, RectifiedCamera, Trajectory
+from recon.core.values import PointCloud, RayCloud, RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.map import SubmapBuilder, estimate_ground, fusion_range_m, map_axes, thin_rays
-from recon.map.axes import check_rigid
-from recon.map.frame_log import FrameLog
+from recon.map.axes import estimate_ground, map_axes
 from recon.map.frame_result import FrameResult
-from recon.map.ray_log import RayLog
+from recon.map.fused import fusion_range_m
+from recon.map.rays import ray_grain, thin_rays
+from recon.map.session import Session
 from recon.map.settings import DriveSettings
-from recon.map.submap_store import SubmapStore
-from recon.map.workspace import Workspace
-from recon.odometry import Odometry, OdometryFrame, OdometryHealth
+from recon.map.submaps import SubmapBuilder
+from recon.odometry import Odometry, OdometryFrame
 from recon.run.lookahead import OneBehind
+from recon.run.stopwatch import Stopwatch
 from recon.stereo.frame import ReconstructedFrame
 
 
@@ -31,7 +31,8 @@ class Mapper:
         config: The configuration.
         camera: The rectified camera.
         odometry: Estimates the poses.
-        workspace: Storage for closed submaps, and the stopwatch.
+        session: Where it is kept; its frames, submaps and rays are those before.
+        stopwatch: Times each stage.
     """
 
     def __init__(
@@ -39,37 +40,26 @@ class Mapper:
         config: DriveSettings,
         camera: RectifiedCamera,
         odometry: Odometry,
-        workspace: Workspace,
+        session: Session,
+        stopwatch: Stopwatch,
     ) -> None:
         self._config = config
         self._odometry = odometry
-        self._workspace = workspace
+        self._camera = camera
+        self.session = session
+        self._stage = stopwatch.stage
         self._fusion_range_m = fusion_range_m(camera, config.fusion)
         self._behind = OneBehind()
         self._builder: SubmapBuilder | None = None
-        self._frames = FrameLog(workspace.frames)
-        self._rays = RayLog(workspace.rays, config.occupancy)
-        self.submaps = SubmapStore(workspace.submaps, config.memory.cached_submaps)
-        self.T_map_world: Float64 = np.eye(4)
+        self._grain = ray_grain(config.occupancy) if config.occupancy.keep_rays else None
 
     def __len__(self) -> int:
         """Number of frames so far."""
-        return len(self._frames)
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """The poses so far; at least one frame must have been added."""
-        return self._frames.trajectory
-
-    @property
-    def health(self) -> tuple[OdometryHealth, ...]:
-        """Health of each pose."""
-        return self._frames.health
+        return len(self.session)
 
     def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
         """Register the next frame and start its integration."""
-        stage = self._workspace.stopwatch.stage
-        with stage("odometry"):
+        with self._stage("odometry"):
             registered = self._odometry.register(OdometryFrame(frame.pair, frame.disparity))
         T_world_camera = registered.T_world_camera
         health = replace(registered.health, warnings=(*frame.warnings, *registered.health.warnings))
@@ -77,8 +67,9 @@ class Mapper:
         cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))
         rays = frame.rays if health.ok else None
         builder = self._builder_from(frame)
-        self._behind.begin(partial(self._integrate, builder, cloud, rays, T_world_camera))
-        self._frames.add(T_world_camera, frame.pair.timestamp_s, health)
+        work = (builder, len(self), cloud, rays, T_world_camera)
+        self._behind.begin(partial(self._integrate, *work))
+        self.session.add_frame(T_world_camera, frame.pair.timestamp_s, health)
         valid_share = float(np.mean(frame.disparity.valid))
         return FrameResult(
             len(self) - 1, total, 0.0, valid_share, len(frame.cloud), T_world_camera, health
@@ -87,21 +78,22 @@ class Mapper:
     def _integrate(
         self,
         builder: SubmapBuilder,
+        frame: int,
         cloud: PointCloud,
         rays: RayCloud | None,
         T_world_camera: Float64,
     ) -> None:
         """Integrate a frame into the maps; runs while the next one is registered."""
-        stage = self._workspace.stopwatch.stage
-        with stage("map"):
+        with self._stage("map"):
             rays = thin_rays(cloud, self._config.occupancy) if rays is None else rays
             near = cloud.select(cloud.xyz[:, 2] <= self._fusion_range_m)
             cloud_world = transform_cloud(near, T_world_camera, frame="world")
             builder.integrate(cloud_world, rays.cloud(), T_world_camera)
-        with stage("store"):
-            self._rays.add(rays)
+        with self._stage("store"):
+            if self._grain is not None:
+                self.session.add_rays(frame, rays, self._grain)
             if builder.full:
-                self.submaps.add(builder.close())
+                self.session.submaps.add(builder.close())
 
     def settle(self) -> None:
         """Wait until all frames are integrated.
@@ -119,29 +111,19 @@ class Mapper:
         """Close the current submap after the last frame."""
         self._behind.settle()
         if self._builder is not None and self._builder.frames:
-            self.submaps.add(self._builder.close())
-        self._rays.close()
+            self.session.submaps.add(self._builder.close())
 
     def state(self) -> dict[str, Any]:
-        """Everything that later results depend on, as a tree of arrays and plain values."""
+        """What later results depend on beside the session, as a tree of arrays and plain values."""
         self._behind.settle()
         return {
             "odometry": self._odometry.state(),
             "builder": None if self._builder is None else self._builder.state(),
-            "submaps": self.submaps.state(),
-            "rays": self._rays.state(),
-            "T_map_world": self.T_map_world,
-            "frames": self._frames.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a `state`."""
         self._odometry.restore(state["odometry"])
-        self.submaps.restore(state["submaps"])
-        self._rays.restore(state["rays"])
-        check_rigid("T_map_world", state["T_map_world"])
-        self.T_map_world = state["T_map_world"]
-        self._frames.restore(state["frames"])
         if state["builder"] is not None:
             self._builder = self._new_builder()
             self._builder.restore(state["builder"])
@@ -151,7 +133,8 @@ class Mapper:
         if self._builder is None:
             ground = estimate_ground(frame.cloud)
             height_m = self._config.ground.camera_height_m
-            self.T_map_world = map_axes(ground, self._config.axes, height_m)
+            T_map_world = map_axes(ground, self._config.axes, height_m)
+            self.session.set_axes(T_map_world, self._camera)
             self._builder = self._new_builder()
         return self._builder
 
@@ -161,6 +144,6 @@ class Mapper:
             config.submaps,
             config.fusion,
             config.occupancy,
-            self.T_map_world,
+            self.session.T_map_world,
             config.memory.submap_bytes,
         )

@@ -19,8 +19,8 @@ from recon.map.frame_result import FrameResult
 from recon.map.mapper import Mapper
 from recon.map.rays import thin_rays
 from recon.map.settings import DriveSettings
-from recon.map.submap_store import SubmapStore
-from recon.map.workspace import Workspace
+from recon.map.submap_records import Submaps
+from recon.map.workspace import Workspace, resuming
 from recon.odometry import (
     KnownPoses,
     MotionPrior,
@@ -82,7 +82,7 @@ class MappedSequence:
 
     trajectory: Trajectory
     health: tuple[OdometryHealth, ...]
-    submaps: SubmapStore
+    submaps: Submaps
     config: DriveSettings
     T_map_world: Float64
     camera: RectifiedCamera
@@ -158,7 +158,7 @@ def map_sequence(
         prior: Motion of the left camera from wheel odometry, an IMU or GNSS, in the time base of
             the source; only relative motions are used.
         progress: Shown each frame.
-        workspace: Disk storage, threads and stopwatch of the run; None = in memory, all cores,
+        workspace: Map, threads and stopwatch of the run; None = a temporary map, all cores,
             not timed.
 
     Raises:
@@ -179,9 +179,10 @@ def map_sequence(
         used = _axes_of(prior, source, reconstructor, config.odometry.prior)
     odometry = _odometry(config, source, known_poses, prior, used)
     looking = config.loops.enabled and known_poses is None
-    loops = LoopWatch(config.loops, work.loops, work.stopwatch) if looking else None
-    mapper = Mapper(config, reconstructor.camera, odometry, work)
-    drive = _Drive(mapper, loops, config, work)
+    session = work.session(source, config)
+    watch = LoopWatch(config.loops, session.keyframes, work.stopwatch) if looking else None
+    mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch)
+    drive = _Drive(mapper, watch, config, work)
     progress.on_start(source.name, len(source))
     try:
         with serial_algebra():
@@ -196,9 +197,9 @@ def map_sequence(
 
 
 class _Drive:
-    """Couples the mapper with the search for loops, checkpoints and timing.
+    """Couples the mapper with the search for loops, commits and timing.
 
-    Resumes from a checkpoint if there is one; the time spent before it is included.
+    Goes on from the last commit if there is one; the time spent before it is included.
     """
 
     def __init__(
@@ -207,13 +208,16 @@ class _Drive:
         self.mapper = mapper
         self._loops = loops
         self._config = config
-        self._checkpoint = workspace.checkpoint
+        self._map = workspace.map
+        self._session = mapper.session
         self._stage = workspace.stopwatch.stage
         self._sample: ReconstructedFrame | None = None
         self._saved = 0
         self._start = self._last = time.perf_counter()
-        if workspace.resume and self._checkpoint is not None and self._checkpoint.exists():
-            self._checkpoint.restore(self._restore)
+        with resuming(self._map.store.name):
+            state = self._session.state()
+            if state is not None:
+                self._restore(state)
 
     def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
         result = self.mapper.add(frame, total=total)
@@ -248,11 +252,11 @@ class _Drive:
             self._save()
         self.mapper.close()
         mapped = MappedSequence(
-            trajectory=self.mapper.trajectory,
-            health=self.mapper.health,
-            submaps=self.mapper.submaps,
+            trajectory=self._session.odometry,
+            health=self._session.health,
+            submaps=self._session.submaps,
             config=self._config,
-            T_map_world=self.mapper.T_map_world,
+            T_map_world=self._session.T_map_world,
             camera=reconstructor.camera,
             sample=self._sample or self._sample_again(source, reconstructor),
             seconds=self._last - self._start,
@@ -260,24 +264,27 @@ class _Drive:
         if self._loops is None:
             return mapped
         with self._stage("close_loops"):
-            return mapped.closed(self._loops.close(mapped.trajectory))
+            loops = self._loops.close(mapped.trajectory)
+            self._session.set_loops(loops.record())
+            return mapped.closed(loops)
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.mapper.restore(state["mapper"])
         if self._loops is not None:
-            path, health = self.mapper.trajectory, self.mapper.health
+            path, health = self._session.odometry, self._session.health
             self._loops.restore(path.T_world_camera, [record.ok for record in health])
         self._saved = len(self.mapper)
         self._last = time.perf_counter()
         self._start = self._last - state["seconds"]
 
     def _save(self) -> None:
-        if self._checkpoint is None:
+        if self._map.store.path is None:
             return
         self.settle()  # else keyframes that a resumed run needs might be missing
         with self._stage("checkpoint"):
             seconds = time.perf_counter() - self._start
-            self._checkpoint.save({"mapper": self.mapper.state(), "seconds": seconds})
+            self._session.set_state({"mapper": self.mapper.state(), "seconds": seconds})
+            self._map.commit()
         self._saved = len(self.mapper)
 
     def _sample_again(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from recon.core.settings import Settings
 from recon.map.axes import AxesSettings
-from recon.map.checkpoint import CheckpointSettings
 from recon.map.fused import FusionSettings
 from recon.map.grid import GridSettings
 from recon.map.ground import GroundSettings
@@ -16,6 +16,14 @@ from recon.places import LoopSettings
 from recon.run.memory import MemorySettings
 from recon.stereo.cloud import FilterSettings
 from recon.stereo.settings import StereoSettings
+
+
+class CheckpointSettings(Settings):
+    """How often the map is committed while a drive is mapped; does not change results."""
+
+    every_frames: int = Field(
+        50, ge=1, le=1_000_000, description="Number of frames between two checkpoints."
+    )
 
 
 class DriveSettings(StereoSettings):

@@ -29,7 +29,7 @@ from recon.map.database import (
 )
 
 Key = int | tuple[int, ...]
-_CACHE_BYTES: Final = 100_000_000
+CACHE_BYTES: Final = 100_000_000
 
 
 class Store:
@@ -54,7 +54,7 @@ class Store:
         self.cache = Cache(cache_bytes)
 
     @classmethod
-    def create(cls, path: Path, *, cache_bytes: int = _CACHE_BYTES) -> Self:
+    def create(cls, path: Path, *, cache_bytes: int = CACHE_BYTES) -> Self:
         """Begin a store; a file at ``path`` is replaced.
 
         Raises:
@@ -70,7 +70,7 @@ class Store:
         return cls(database, path, cache_bytes)
 
     @classmethod
-    def open(cls, path: Path, *, read_only: bool = False, cache_bytes: int = _CACHE_BYTES) -> Self:
+    def open(cls, path: Path, *, read_only: bool = False, cache_bytes: int = CACHE_BYTES) -> Self:
         """Open a store at its last commit.
 
         Raises:
@@ -92,13 +92,18 @@ class Store:
         return cls(database, path, cache_bytes)
 
     @classmethod
-    def temporary(cls, *, cache_bytes: int = _CACHE_BYTES) -> Self:
+    def temporary(cls, *, cache_bytes: int = CACHE_BYTES) -> Self:
         """Begin a store in a temporary file, which is gone when the store is closed."""
         with writing(None), closed_on_error(connect(None)) as database:
             database.execute("PRAGMA journal_mode = OFF")
             make_tables(database)
             database.execute("BEGIN")
         return cls(database, None, cache_bytes)
+
+    @property
+    def name(self) -> str:
+        """The file, for messages."""
+        return "temporary map" if self.path is None else str(self.path)
 
     def put(self, kind: str, key: Key, tree: Mapping[str, Any], *, compress: bool = False) -> None:
         """Store a record, in place of an earlier one of that kind and key.
@@ -117,7 +122,7 @@ class Store:
         self._insert(kind, _name(key), text, content)
 
     def get(self, kind: str, key: Key) -> dict[str, Any]:
-        """A record. Its arrays are read-only; it may be shared, so copy before changing it.
+        """A record, which others may hold as well: copy it before changing it.
 
         Raises:
             FormatError: It is missing or damaged.
@@ -159,6 +164,15 @@ class Store:
             rows = self._database.execute("SELECT key FROM record WHERE kind = ?", (kind,))
             found = [_key(name) for (name,) in rows]
         return sorted(found, key=lambda key: key if isinstance(key, tuple) else (key,))
+
+    def numbers(self, kind: str, session: int) -> list[int]:
+        """The second numbers of the keys of a kind that begin with the number of a session.
+
+        Raises:
+            FormatError: The file is damaged.
+        """
+        keys = (key for key in self.keys(kind) if isinstance(key, tuple))
+        return [key[1] for key in keys if key[0] == session]
 
     def kinds(self) -> list[str]:
         """The kinds of which there are records, in order.
@@ -260,7 +274,7 @@ class Store:
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
-        with reading("temporary map" if self.path is None else self.path):
+        with reading(self.name):
             yield
 
 

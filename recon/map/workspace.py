@@ -1,56 +1,75 @@
-"""The workspace of a run: its state on disk, threads and stopwatch."""
+"""What a drive is mapped with: its map, threads and stopwatch."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from recon.map.checkpoint import Checkpoint
+from recon.core.errors import FormatError, ReconError
+from recon.io.files import reading
+from recon.map.persistent import Map
+from recon.map.session import Session, SessionInfo
+from recon.map.settings import DriveSettings
+from recon.run.machine import versions
 from recon.run.stopwatch import Stopwatch
+from recon.sources import StereoSource
 
-RAYS: Final = "rays.bin"
+ANEW: Final = "start the run anew, without --resume"
 
 
 @dataclass(frozen=True)
 class Workspace:
-    """Resources of a run, none of which affect the result.
+    """What a drive is mapped with, none of which affects the result.
 
     Attributes:
+        map: The map whose last session the drive goes on with, or which it becomes a session of;
+            it must stay open as long as the result is used.
         stopwatch: Times each stage.
-        folder: Folder for closed submaps, keyframes and the checkpoint, so that memory does not
-            grow with the drive and an interrupted run can be resumed; it must exist as long as the
-            result is used. None = everything stays in memory.
-        resume: Resume from the checkpoint in the folder, if there is one.
         threads: Threads of the matcher; None = all cores.
     """
 
+    map: Map = field(default_factory=Map.temporary)
     stopwatch: Stopwatch = field(default_factory=Stopwatch)
-    folder: Path | None = None
-    resume: bool = False
     threads: int | None = None
 
-    @property
-    def submaps(self) -> Path | None:
-        """Folder of the submaps."""
-        return None if self.folder is None else self.folder / "submaps"
+    def session(self, source: StereoSource, config: DriveSettings) -> Session:
+        """The session of a drive: the last one of the map, or a new one."""
+        last = self.map.sessions[-1] if self.map.sessions else None
+        return self.map.begin(session_info(source, config)) if last is None else last
 
-    @property
-    def loops(self) -> Path | None:
-        """Folder of the keyframes."""
-        return None if self.folder is None else self.folder / "loops"
 
-    @property
-    def rays(self) -> Path | None:
-        """File of the rays of all frames."""
-        return None if self.folder is None else self.folder / RAYS
+@contextmanager
+def resuming(where: str | Path) -> Iterator[None]:
+    """Say in errors about an unfinished map that the run has to start anew.
 
-    @property
-    def frames(self) -> Path | None:
-        """File of the poses and health of all frames."""
-        return None if self.folder is None else self.folder / "frames.jsonl"
+    Raises:
+        FormatError: The map is damaged.
+    """
+    try:
+        with reading(where):
+            yield
+    except ReconError as error:
+        raise FormatError(error.what, where=where, got=error.got, hint=ANEW) from error
 
-    @property
-    def checkpoint(self) -> Checkpoint | None:
-        """The checkpoint that the run resumes from."""
-        return None if self.folder is None else Checkpoint(self.folder / "checkpoint.zip")
+
+def session_info(
+    source: StereoSource, config: DriveSettings, start: Mapping[str, Any] | None = None
+) -> SessionInfo:
+    """What a session is a drive of.
+
+    Args:
+        source: The source.
+        config: The settings.
+        start: What a run is started with, to resume it.
+    """
+    return SessionInfo(
+        source.name,
+        source.description,
+        len(source),
+        config.model_dump(mode="json"),
+        versions(),
+        start or {},
+    )

@@ -24,8 +24,8 @@ from recon.core.errors import MemoryLimitError, OutputError
 from recon.io.atomic import write_text
 
 RECORD: Final = "run.json"
-STARTED: Final = "started.json"
-"""State file that records what a resumable run was started with."""
+STARTED: Final = "map.recon"
+"""State file of a run that can be resumed: the map that it makes."""
 _PARTIAL: Final = ".partial"
 _STATE: Final = ".state"
 _LOCK: Final = ".lock"
@@ -85,14 +85,6 @@ class RunDirectory:
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
 
-    def keep(self, state: str, name: str) -> None:
-        """Publish a state file as a result: hard-linked where links are supported, else copied."""
-        source, target = self.state(state), self.path(name)
-        try:
-            os.link(source, target)
-        except OSError:
-            shutil.copyfile(source, target)
-
     def files(self) -> list[str]:
         """Return sorted names of the files written so far, without those of the state."""
         written = (p.relative_to(self._partial) for p in self._partial.rglob("*") if p.is_file())
@@ -133,7 +125,7 @@ class RunDirectory:
 
     @property
     def resumable(self) -> bool:
-        """Whether the run has recorded what it was started with."""
+        """Whether the run has begun a map."""
         return (state_folder(self.folder) / STARTED).is_file()
 
     def _take_lock(self) -> int:

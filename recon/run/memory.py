@@ -13,13 +13,14 @@ from recon.run.machine import peak_memory_mb
 
 _UNITS_MB: Final = {"": 1, "M": 1, "MB": 1, "G": 1000, "GB": 1000}
 _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*")
-#: Shares of the limit for an open submap and for the cells of one tile. Stores grow by doubling
+#: Shares of the limit for an open submap, the cells of one tile, and what was read from the map.
+#: Sums grow by doubling
 #: and are copied when closed, so each briefly costs several times its size; most of the limit is
 #: left to the libraries, the images and the matcher.
 _SUBMAP_SHARE: Final = 1 / 40
 _TILE_SHARE: Final = 1 / 24
-_CACHED: Final = 6
-_FEW_CACHED: Final = 2
+_CACHE_SHARE: Final = 1 / 10
+_CACHE_BYTES: Final = 100_000_000
 
 
 class MemorySettings(Settings):
@@ -43,9 +44,9 @@ class MemorySettings(Settings):
         return None if self.limit_mb is None else int(1e6 * self.limit_mb * _TILE_SHARE)
 
     @property
-    def cached_submaps(self) -> int:
-        """Number of submaps kept in memory after being read."""
-        return _CACHED if self.limit_mb is None else _FEW_CACHED
+    def cache_bytes(self) -> int:
+        """Most that is kept in memory of what was read from a map."""
+        return _CACHE_BYTES if self.limit_mb is None else int(1e6 * self.limit_mb * _CACHE_SHARE)
 
     def check(self, where: str) -> None:
         """Stop a run that exceeds the limit.

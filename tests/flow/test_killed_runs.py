@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recon.core.errors import FormatError
+from recon.map.persistent import Map
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetSettings
 from tests.scenery.kitti import write_kitti
@@ -43,7 +45,7 @@ class Runs:
 
     def arguments(self, out: Path) -> list[str]:
         """Start the run, or resume it if it has begun."""
-        if (out / ".partial" / ".state" / "started.json").exists():
+        if begun(out):
             return ["map", "--quiet", "--resume", str(out)]
         settings = [part for text in SETTINGS for part in ("--set", text)]
         return ["map", "--quiet", str(self.drive), "--out", str(out), "--no-mesh", *settings]
@@ -59,6 +61,15 @@ class Runs:
             subprocess.run(command, check=True, capture_output=True)
         assert content(out) == self.content
         assert not list(out.rglob(".*-*")), "a temporary file was left"
+
+
+def begun(out: Path) -> bool:
+    """Whether a run has committed what it was started with."""
+    try:
+        with Map.open(out / ".partial" / ".state" / "map.recon") as unfinished:
+            return len(unfinished.sessions) > 0
+    except FormatError:
+        return False
 
 
 def content(folder: Path) -> dict[str, bytes]:

@@ -12,9 +12,10 @@ import pytest
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map import MapOptions, MapRun, run_map
-from recon.core.errors import FormatError, OutputError, SettingsError
-from recon.io.tree_file import write_tree
+from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
+from recon.map import Store
 from recon.map.frame_result import FrameResult
+from recon.map.persistent import Map
 from recon.run.progress import SILENT, Silent
 from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource
@@ -32,7 +33,7 @@ FILES = [
     "map/grid.yaml",
     "map/octomap.ot",
     "map/octomap.bt",
-    "map/rays.bin",
+    "map/map.recon",
     "config.yaml",
 ]
 
@@ -166,40 +167,41 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "empty", "another"])
-def test_a_damaged_checkpoint_is_one_line_and_stays(
-    drive: Path, tmp_path: Path, damage: str
-) -> None:
+def test_a_damaged_map_is_one_line_and_stays(drive: Path, tmp_path: Path, damage: str) -> None:
     with pytest.raises(KeyboardInterrupt):
         _run(drive, tmp_path, _Breaks(12, KeyboardInterrupt()))
-    checkpoint = tmp_path / ".partial" / ".state" / "checkpoint.zip"
-    content = bytearray(checkpoint.read_bytes())
-    content[len(content) // 2] ^= 0xFF
+    path = tmp_path / ".partial" / ".state" / "map.recon"
+    content = bytearray(path.read_bytes())
+    for place in range(100, len(content), 3000):
+        content[place] ^= 0xFF
     damaged = {"cut": content[: len(content) // 2], "changed": content, "empty": b""}
     if damage == "another":
-        write_tree(checkpoint, {"a": 1})
+        with Map.create(path) as other:
+            other.store.put("state", 0, {"a": 1})
+            other.commit()
     else:
-        checkpoint.write_bytes(damaged[damage])
-    with pytest.raises(FormatError, match=r"checkpoint.zip: .*without --resume") as told:
+        path.write_bytes(damaged[damage])
+    with pytest.raises(ReconError, match=r"without --resume") as caught:
         _run(drive, tmp_path, resume=True)
-    assert "\n" not in str(told.value)
-    assert checkpoint.exists()
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path) in str(caught.value)
+    assert path.exists()
 
 
-@pytest.mark.parametrize("damage", ["cut", "changed", "missing"])
-def test_damaged_frames_are_one_line(drive: Path, tmp_path: Path, damage: str) -> None:
+@pytest.mark.parametrize("kind", ["frames", "state", "submap_entry", "session", "axes"])
+def test_a_missing_or_changed_record_is_one_line(drive: Path, tmp_path: Path, kind: str) -> None:
     with pytest.raises(KeyboardInterrupt):
         _run(drive, tmp_path, _Breaks(12, KeyboardInterrupt()))
-    frames = tmp_path / ".partial" / ".state" / "frames.jsonl"
-    content = frames.read_bytes()
-    last = content.rstrip(b"}]\n")
-    if damage == "missing":
-        frames.unlink()
-    else:
-        # Still a pose, but another one.
-        frames.write_bytes(last if damage == "cut" else content.replace(b"1", b"2", 1))
-    with pytest.raises(FormatError, match=r"frames.jsonl: .*without --resume") as told:
+    with Store.open(tmp_path / ".partial" / ".state" / "map.recon") as store:
+        first = store.keys(kind)[0]
+        if kind in ("state", "axes", "session"):
+            store.put(kind, first, {"a": 1})
+        else:
+            store.delete(kind, first)
+        store.commit()
+    with pytest.raises(ReconError, match=r"map.recon: .*without --resume") as caught:
         _run(drive, tmp_path, resume=True)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(caught.value)
 
 
 @contextmanager

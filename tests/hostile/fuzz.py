@@ -34,11 +34,12 @@ from recon.io.models.mesh import read_mesh, write_mesh
 from recon.io.models.ply import read_ply, read_ply_pieces, write_ply
 from recon.io.occupancy.nav2 import read_nav2, write_nav2
 from recon.io.occupancy.octomap import read_octomap, write_octomap
-from recon.io.rays import RayFile, RayWriter
 from recon.io.trajectory import read_trajectory
-from recon.io.tree_file import read_tree, write_tree
 from recon.io.yaml_file import read_yaml
 from recon.map import OccupancySettings, ray_grain
+from recon.map.persistent import Map
+from recon.map.session import SessionInfo
+from recon.odometry import OdometryHealth
 from recon.sources import open_source
 from recon.sources.times import read_dates, read_stamped_names
 from tests.hostile.calibrations import CAMERA_INFO, VALID
@@ -98,13 +99,25 @@ def _grid(path: Path) -> None:
     write_nav2(path.with_suffix(""), OccupancyGrid(cells, 0.1, (0.0, 0.0)))
 
 
-def _rays(path: Path) -> None:
-    writer = RayWriter(path, ray_grain(OccupancySettings()))
-    for count in (3, 0, 5):
-        ones = np.ones(count, np.uint8)
-        places = np.ones((count, 3), np.int16)
-        writer.append(RayCloud(places, ones.astype(np.float16), ones, ones, 0.001))
-    writer.close()
+def _map(path: Path) -> None:
+    grain = ray_grain(OccupancySettings())
+    with Map.create(path) as map_:
+        session = map_.begin(SessionInfo("drive", "of a test", 3))
+        session.set_axes(np.eye(4), RectifiedCamera(100.0, 9.0, 5.0, 9.0, 0.5, 20, 12))
+        for frame, count in enumerate((3, 0, 5)):
+            ones = np.ones(count, np.uint8)
+            places = np.ones((count, 3), np.int16)
+            rays = RayCloud(places, ones.astype(np.float16), ones, ones, grain.unit_m)
+            session.add_frame(np.eye(4), float(frame), OdometryHealth())
+            session.add_rays(frame, rays, grain)
+        map_.commit()
+
+
+def _read_map(path: Path) -> object:
+    with Map.open(path) as map_:
+        session = map_.session()
+        rays = [session.rays(frame) for frame in range(session.ray_frames)]
+        return rays, session.trajectory, session.health, session.T_map_world, session.camera
 
 
 def _video(path: Path) -> None:
@@ -196,10 +209,7 @@ KINDS: Final[dict[str, Kind]] = {
     "octomap ot": Kind("o.ot", _octomap(".ot"), read_octomap),
     "nav2": Kind("g.yaml", _grid, read_nav2),
     "nav2 image": Kind("g.pgm", _grid, lambda p: read_nav2(p.with_suffix(".yaml"))),
-    "rays": Kind("rays.bin", _rays, lambda p: [len(RayFile(p)), list(RayFile(p))]),
-    "checkpoint": Kind(
-        "s.zip", lambda p: write_tree(p, {"a": np.ones((2, 3)), "b": [1, None, "x"]}), read_tree
-    ),
+    "map": Kind("map.recon", _map, _read_map),
     "video": Kind("v.avi", _video, _read_video),
 }
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import pytest
 
-from recon.io.tree_file import read_tree, write_tree
+from recon.map import Store
 from recon.run.directory import STARTED
 from tests.hostile.calibrations import deep
 from tests.hostile.refusals import assert_refused, run
@@ -132,115 +132,19 @@ def flipped(at: float) -> Alter:
     return alter
 
 
-def frame_of(count: int) -> Alter:
-    """Let the first frame of a ray file claim a number of rays."""
+def record(kind: str, change: Callable[[dict[str, Any]], None] | None) -> Alter:
+    """Change the first record of a kind in a map, which stays a valid file; None = delete it."""
 
     def alter(path: Path) -> None:
-        content = path.read_bytes()
-        replaced(content[:40] + count.to_bytes(4, "little") + content[44:])(path)
-
-    return alter
-
-
-def grain_of(*numbers: float) -> Alter:
-    """Replace cell, unit and range in the header of a ray file."""
-    packed = np.array(numbers, "<f8").tobytes()
-    return lambda path: replaced(path.read_bytes()[:16] + packed + path.read_bytes()[40:])(path)
-
-
-RAYS: Final[dict[str, Alter]] = {
-    "empty": replaced(b""),
-    "cut in the header": cut(0.00001),
-    "cut": cut(0.6),
-    "another kind": replaced(b"ply\n"),
-    "flipped": flipped(0.5),
-    "no ray counted": frame_of(0),
-    "too many rays counted": frame_of(2**32 - 1),
-    "NaN as grain": grain_of(float("nan"), float("nan"), float("nan")),
-    "infinite grain": grain_of(0.05, float("inf"), 30.0),
-    "unit of 1e30 m": grain_of(0.05, 1e30, 30.0),
-    "unit of 1e300 m": grain_of(0.05, 1e300, 30.0),
-    "negative unit": grain_of(0.05, -1.0, 30.0),
-    "unit of 0": grain_of(0.05, 0.0, 30.0),
-    "missing": Path.unlink,
-}
-
-
-@pytest.mark.parametrize("change", RAYS)
-def test_altered_rays_are_refused(change: str, finished: Path) -> None:
-    RAYS[change](finished / "map" / "rays.bin")
-    assert_refused(run(*COMMANDS["occupancy"]), "rays.bin")
-    assert not Path("out").exists()
-
-
-PATHS: Final[dict[str, Alter]] = {
-    "empty": replaced(b""),
-    "cut": cut(0.5),
-    "words": replaced(b"one two\n"),
-    "NaN": replaced(b"nan 0 0 0 0 1 0 0 0 0 1 0\n" * 5),
-    "far": replaced(b"1 0 0 1e30 0 1 0 0 0 0 1 0\n" * 5),
-    "no rotation": replaced(b"1 1 1 0 1 1 1 0 1 1 1 0\n" * 5),
-    "5000 digits": replaced(b"9" * 5000 + b" 0 0 0 0 1 0 0 0 0 1 0\n"),
-    "a pose too many": replaced(b"1 0 0 0 0 1 0 0 0 0 1 0\n" * 7),
-    "missing": Path.unlink,
-}
-
-
-@pytest.mark.parametrize("change", PATHS)
-def test_an_altered_path_is_refused(change: str, finished: Path) -> None:
-    PATHS[change](finished / "trajectory_kitti.txt")
-    assert_refused(run(*COMMANDS["occupancy"]))
-    assert not Path("out").exists()
-
-
-def identity(part: str, value: Any) -> Alter:
-    """Replace a part of what a run was started with."""
-
-    def alter(path: Path) -> None:
-        started = json.loads(path.read_text())
-        path.write_text(json.dumps({**started, part: value}))
-
-    return alter
-
-
-STARTS: Final[dict[str, Alter]] = {
-    "empty": replaced(b""),
-    "cut": cut(0.5),
-    "a list": replaced(b"[]"),
-    "a number": replaced(b"7"),
-    "nothing": replaced(b"{}"),
-    "5000 digits": replaced(b"9" * 5000),
-    "nested": replaced(b"[" * 100_000),
-    "not UTF-8": replaced(b"\xff"),
-    "identity is a list": identity("identity", []),
-    "identity is empty": identity("identity", {}),
-    "configuration is a list": identity("identity", {"config": []}),
-    "configuration is of another program": identity("identity", {"config": {"a": 1}}),
-    "arguments are a list": identity("arguments", []),
-    "arguments are null": identity("arguments", None),
-    "source is a number": identity("arguments", {"source": 7}),
-    "source is a list": identity("arguments", {"source": ["a"]}),
-    "source is missing": identity("arguments", {}),
-    "source does not exist": identity("arguments", {"source": "/nonexistent"}),
-    "kind is a number": identity("arguments", {"source": "/", "kind": 7}),
-    "prior is a list": identity("arguments", {"source": "/", "prior": []}),
-}
-
-
-@pytest.mark.parametrize("change", STARTS)
-def test_an_altered_start_is_refused(change: str, interrupted: Path) -> None:
-    STARTS[change](interrupted / STATE / STARTED)
-    assert_refused(run("map", "--resume", interrupted, "--quiet"))
-    assert not (interrupted / "run.json").exists()
-
-
-def tree(change: Callable[[dict[str, Any]], None]) -> Alter:
-    """Change the state in a checkpoint, which stays a valid file."""
-
-    def alter(path: Path) -> None:
-        state = read_tree(path)
-        change(state)
-        write_tree(path, state)
+        with Store.open(path) as store:
+            first = store.keys(kind)[0]
+            content = store.read(kind, first)
+            if change is None:
+                store.delete(kind, first)
+            else:
+                change(content)
+                store.put(kind, first, content)
+            store.commit()
 
     return alter
 
@@ -272,56 +176,129 @@ def spoil(*names: str, value: Any) -> Callable[[dict[str, Any]], None]:
 
 
 NAN_POSE: Final = np.full((4, 4), np.nan)
+FILES: Final[dict[str, Alter]] = {
+    "empty": replaced(b""),
+    "cut in the header": cut(0.0001),
+    "cut": cut(0.6),
+    "another kind": replaced(b"ply\n"),
+    "another database": replaced(b"SQLite format 3\0" + bytes(4000)),
+    "missing": Path.unlink,
+}
+MAPS: Final[dict[str, Alter]] = {
+    **FILES,
+    "rays missing": record("rays", None),
+    "rays empty": record("rays", dict.clear),
+    "NaN as grain": record("rays", spoil("grain", "cell_m", value=float("nan"))),
+    "unit of 1e300 m": record("rays", spoil("grain", "unit_m", value=1e300)),
+    "negative unit": record("rays", spoil("grain", "unit_m", value=-1.0)),
+    "infinite range": record("rays", spoil("grain", "max_range_m", value=float("inf"))),
+    "rays of another type": record("rays", every_array(lambda a: a.astype(np.float64))),
+    "fewer rays than counts": record("rays", spoil("count", value=np.zeros(1, np.uint8))),
+    "path of words": record("frames", spoil("T_world_camera", value="eye")),
+    "path of NaN": record("frames", every_array(lambda a: a * np.nan)),
+    "path far off": record("frames", every_array(lambda a: a * 1e30)),
+    "path no rotation": record("frames", every_array(np.ones_like)),
+    "health missing": record("frames", spoil("health", value={})),
+    "path missing": record("frames", None),
+    "axes missing": record("axes", None),
+    "axes NaN": record("axes", spoil("T_map_world", value=NAN_POSE)),
+    "axes far off": record("axes", spoil("T_map_world", value=np.array(moved(1e30)))),
+    "session missing": record("session", None),
+    "session a word": record("session", spoil("frames", value={})),
+    "submap missing": record("submap", None),
+    "submap empty": record("submap", dict.clear),
+    "entry missing": record("submap_entry", None),
+    "entry beyond the frames": record("submap_entry", spoil("frames", value=10**6)),
+    "entry of words": record("submap_entry", spoil("frames", value="many")),
+}
+
+
+@pytest.mark.parametrize("change", MAPS)
+def test_an_altered_map_is_refused(change: str, finished: Path) -> None:
+    MAPS[change](finished / "map" / "map.recon")
+    assert_refused(run(*COMMANDS["occupancy"]), "map.recon")
+    assert not Path("out").exists()
+
+
+def start(part: str, value: Any) -> Alter:
+    """Replace a part of what a run was started with."""
+    return record("session", spoil("start", part, value=value))
+
+
+STARTS: Final[dict[str, Alter]] = {
+    **{name: change for name, change in FILES.items() if name != "missing"},
+    "nothing": record("session", spoil("start", value={})),
+    "a list": record("session", spoil("start", value=[])),
+    "identity is a list": start("identity", []),
+    "identity is empty": start("identity", {}),
+    "configuration is a list": start("identity", {"config": []}),
+    "configuration is of another program": start("identity", {"config": {"a": 1}}),
+    "arguments are a list": start("arguments", []),
+    "arguments are null": start("arguments", None),
+    "source is a number": start("arguments", {"source": 7}),
+    "source is a list": start("arguments", {"source": ["a"]}),
+    "source is missing": start("arguments", {}),
+    "source does not exist": start("arguments", {"source": "/nonexistent"}),
+    "kind is a number": start("arguments", {"source": "/", "kind": 7}),
+    "prior is a list": start("arguments", {"source": "/", "prior": []}),
+}
+
+
+@pytest.mark.parametrize("change", STARTS)
+def test_an_altered_start_is_refused(change: str, interrupted: Path) -> None:
+    STARTS[change](interrupted / STATE / STARTED)
+    assert_refused(run("map", "--resume", interrupted, "--quiet"))
+    assert not (interrupted / "run.json").exists()
+
+
 MAPPER: Final = ("mapper",)
 FUSED: Final = ("mapper", "odometry", "odometry")
+
+
+def state(change: Callable[[dict[str, Any]], None]) -> Alter:
+    """Change the state from which a run goes on."""
+    return record("state", change)
+
+
 CHECKPOINTS: Final[dict[str, Alter]] = {
-    "empty": replaced(b""),
-    "cut": cut(0.5),
-    "flipped": flipped(0.5),
-    "another kind": replaced(b"PK\x03\x04" + bytes(40)),
-    "an empty tree": tree(dict.clear),
-    "no mapper": tree(spoil("mapper", value=None)),
-    "mapper is a list": tree(spoil("mapper", value=[1, 2])),
-    "seconds are a word": tree(spoil("seconds", value="many")),
-    "all arrays NaN": tree(every_array(lambda a: a * np.nan if a.dtype.kind == "f" else a)),
-    "all arrays infinite": tree(every_array(lambda a: a + np.inf if a.dtype.kind == "f" else a)),
-    "all arrays empty": tree(every_array(lambda a: a.ravel()[:0])),
-    "all arrays flat": tree(every_array(np.ravel)),
-    "all arrays double": tree(every_array(lambda a: a.astype(np.float64) * 1.0 + 0.5)),
-    "all arrays integers": tree(every_array(lambda a: np.zeros(a.shape, np.int64))),
-    "all arrays words": tree(every_array(lambda a: np.full(a.shape, "x"))),
-    "all arrays lists": tree(every_array(lambda a: [1, 2])),
-    "map pose NaN": tree(spoil(*MAPPER, "T_map_world", value=NAN_POSE)),
-    "map pose scaled": tree(spoil(*MAPPER, "T_map_world", value=2 * np.eye(4))),
-    "map pose far": tree(spoil(*MAPPER, "T_map_world", value=np.array(moved(1e30)))),
-    "map pose a word": tree(spoil(*MAPPER, "T_map_world", value="eye")),
-    "odometry null": tree(spoil(*MAPPER, "odometry", value=None)),
-    "odometry of bytes": tree(spoil(*MAPPER, "odometry", value=np.zeros(9, np.uint8))),
-    "odometry pose NaN": tree(spoil(*FUSED, "T_world_camera", value=NAN_POSE)),
-    "odometry covariance 3x3": tree(spoil(*FUSED, "icp_covariance", value=np.eye(3))),
-    "odometry counts of words": tree(spoil(*FUSED, "counts", value=["a", "b", "c"])),
-    "ICP threshold negative": tree(spoil(*FUSED, "icp", "threshold", value=[-1.0, 0])),
-    "ICP points NaN": tree(spoil(*FUSED, "icp", "points", value=np.full((5, 3), np.nan))),
-    "ICP points flat": tree(spoil(*FUSED, "icp", "points", value=np.zeros(5))),
-    "ICP pose NaN": tree(spoil(*FUSED, "icp", "last_pose", value=NAN_POSE)),
-    "submaps null": tree(spoil(*MAPPER, "submaps", value=None)),
-    "submaps of words": tree(spoil(*MAPPER, "submaps", value=[["a"]])),
-    "rays negative": tree(spoil(*MAPPER, "rays", value=-5)),
-    "rays a word": tree(spoil(*MAPPER, "rays", value="many")),
-    "rays beyond the file": tree(spoil(*MAPPER, "rays", value=2**60)),
-    "frames a word": tree(spoil(*MAPPER, "frames", value="many")),
-    "frames beyond the file": tree(spoil(*MAPPER, "frames", value=[9, 2**60, 0])),
-    "builder a list": tree(spoil(*MAPPER, "builder", value=[])),
-    "builder empty": tree(spoil(*MAPPER, "builder", value={})),
+    "an empty tree": state(dict.clear),
+    "no mapper": state(spoil("mapper", value=None)),
+    "mapper is a list": state(spoil("mapper", value=[1, 2])),
+    "seconds are a word": state(spoil("seconds", value="many")),
+    "all arrays NaN": state(every_array(lambda a: a * np.nan if a.dtype.kind == "f" else a)),
+    "all arrays infinite": state(every_array(lambda a: a + np.inf if a.dtype.kind == "f" else a)),
+    "all arrays empty": state(every_array(lambda a: a.ravel()[:0])),
+    "all arrays flat": state(every_array(np.ravel)),
+    "all arrays double": state(every_array(lambda a: a.astype(np.float64) * 1.0 + 0.5)),
+    "all arrays integers": state(every_array(lambda a: np.zeros(a.shape, np.int64))),
+    "all arrays lists": state(every_array(lambda a: [1, 2])),
+    "map pose NaN": record("axes", spoil("T_map_world", value=NAN_POSE)),
+    "map pose scaled": record("axes", spoil("T_map_world", value=2 * np.eye(4))),
+    "map pose far": record("axes", spoil("T_map_world", value=np.array(moved(1e30)))),
+    "map pose a word": record("axes", spoil("T_map_world", value="eye")),
+    "odometry null": state(spoil(*MAPPER, "odometry", value=None)),
+    "odometry of bytes": state(spoil(*MAPPER, "odometry", value=np.zeros(9, np.uint8))),
+    "odometry pose NaN": state(spoil(*FUSED, "T_world_camera", value=NAN_POSE)),
+    "odometry covariance 3x3": state(spoil(*FUSED, "icp_covariance", value=np.eye(3))),
+    "odometry counts of words": state(spoil(*FUSED, "counts", value=["a", "b", "c"])),
+    "ICP threshold negative": state(spoil(*FUSED, "icp", "threshold", value=[-1.0, 0])),
+    "ICP points NaN": state(spoil(*FUSED, "icp", "points", value=np.full((5, 3), np.nan))),
+    "ICP points flat": state(spoil(*FUSED, "icp", "points", value=np.zeros(5))),
+    "ICP pose NaN": state(spoil(*FUSED, "icp", "last_pose", value=NAN_POSE)),
+    "frames of words": record("frames", spoil("times_s", value="many")),
+    "frames missing": record("frames", None),
+    "a submap missing in between": record("submap_entry", None),
+    "builder a list": state(spoil(*MAPPER, "builder", value=[])),
+    "builder empty": state(spoil(*MAPPER, "builder", value={})),
 }
 
 
 @pytest.mark.parametrize("change", CHECKPOINTS)
 def test_an_altered_checkpoint_is_refused(change: str, interrupted: Path) -> None:
-    CHECKPOINTS[change](interrupted / STATE / "checkpoint.zip")
+    CHECKPOINTS[change](interrupted / STATE / STARTED)
     assert_refused(run("map", "--resume", interrupted, "--quiet"), "--resume")
     assert not (interrupted / "run.json").exists()
-    assert (interrupted / STATE / "checkpoint.zip").exists()
+    assert (interrupted / STATE / STARTED).exists()
 
 
 def test_the_interrupted_run_can_be_resumed(interrupted: Path) -> None:

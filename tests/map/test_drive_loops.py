@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import time
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,8 +22,10 @@ from recon.core.values import (
     Trajectory,
 )
 from recon.map import drive_loops
-from recon.map.drive_loops import DriveLoops, KeyframeFiles, LoopWatch
-from recon.map.submap_store import SubmapEntry
+from recon.map.drive_loops import DriveLoops, LoopWatch
+from recon.map.keyframes import Keyframes
+from recon.map.store import Store
+from recon.map.submap_records import SubmapEntry
 from recon.places import LoopSettings
 from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
 from recon.places.graph import close_loops
@@ -72,9 +73,15 @@ def frames() -> list[ReconstructedFrame]:
     return [_frame(k) for k in range(FRAMES)]
 
 
-def _watch(frames, path: Trajectory, folder: Path | None = None, upto: int = FRAMES) -> LoopWatch:
-    watch = LoopWatch(LoopSettings(), folder)
-    for frame, T in zip(frames[:upto], path.T_world_camera, strict=False):
+def _watch(
+    frames, path: Trajectory, store: Store | None = None, upto: int = FRAMES, committed: int = 0
+) -> LoopWatch:
+    store = store or Store.temporary()
+    watch = LoopWatch(LoopSettings(), Keyframes(store))
+    for number, (frame, T) in enumerate(zip(frames[:upto], path.T_world_camera, strict=False)):
+        if number == committed:
+            watch.settle()
+            store.commit()
         watch.add(frame, T, measured=True)
     watch.settle()
     return watch
@@ -135,18 +142,14 @@ def test_a_drive_without_loops_stays_as_it_is(frames):
     assert loops.submap_corrections([SubmapEntry(0, 0, 40, 0, 0)]) is None
 
 
-def test_files_give_the_same_loops_as_memory(frames, closed, tmp_path):
-    loops = _watch(frames, closed.odometry, tmp_path).close(closed.odometry)
-
-    assert _pairs(loops) == _pairs(closed)
-    assert len(list(tmp_path.glob("keyframe_*.zip"))) == FRAMES
-
-
 @pytest.mark.parametrize(("checkpoint", "killed"), [(30, 30), (30, 35), (64, 67)])
 def test_an_interrupted_drive_gives_the_same_loops(frames, closed, tmp_path, checkpoint, killed):
     path = closed.odometry
-    _watch(frames, path, tmp_path, upto=killed)
-    resumed = LoopWatch(LoopSettings(), tmp_path)
+    with Store.create(tmp_path / "map.recon") as store:
+        _watch(frames, path, store, upto=killed + 1, committed=checkpoint)
+    keyframes = Keyframes(Store.open(tmp_path / "map.recon"))
+    assert len(list(keyframes)) == checkpoint
+    resumed = LoopWatch(LoopSettings(), keyframes)
     resumed.restore(path.T_world_camera[:checkpoint], ALL_MEASURED[:checkpoint])
     for frame, T in zip(frames[checkpoint:], path.T_world_camera[checkpoint:], strict=True):
         resumed.add(frame, T, measured=True)
@@ -160,12 +163,12 @@ def test_an_interrupted_drive_gives_the_same_loops(frames, closed, tmp_path, che
 
 
 def test_a_full_disk_is_told_although_another_thread_met_it(frames, tmp_path, monkeypatch):
-    def full(self: KeyframeFiles, stored: StoredKeyframe) -> None:
+    def full(self: Keyframes, stored: StoredKeyframe) -> None:
         raise OutputError("the disk is full")
 
-    monkeypatch.setattr(KeyframeFiles, "put", full)
+    monkeypatch.setattr(Keyframes, "put", full)
     with pytest.raises(OutputError, match="full"):
-        _watch(frames, _circle(), tmp_path, upto=1)
+        _watch(frames, _circle(), upto=1)
 
 
 def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):
@@ -178,7 +181,7 @@ def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):
 
     monkeypatch.setattr(LoopDetector, "add", slow)
     monkeypatch.setattr(drive_loops, "ThreadPoolExecutor", pool)
-    watch = LoopWatch(LoopSettings())
+    watch = LoopWatch(LoopSettings(), Keyframes(Store.temporary()))
     for frame in frames[:4]:
         watch.add(frame, np.eye(4), measured=True)
     while not looked:
@@ -187,12 +190,13 @@ def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):
     assert looked == [0]
 
 
-def test_a_damaged_keyframe_is_told(frames, tmp_path):
-    _watch(frames, _circle(), tmp_path, upto=3)
-    (tmp_path / "keyframe_000000001.zip").write_bytes(b"not a keyframe")
+def test_a_foreign_keyframe_is_told(frames):
+    store = Store.temporary()
+    _watch(frames, _circle(), store, upto=3)
+    store.put("keyframe", (0, 1), {"a": 1})
 
-    with pytest.raises(FormatError, match="keyframe_000000001"):
-        list(KeyframeFiles(tmp_path))
+    with pytest.raises(FormatError, match="map"):
+        list(Keyframes(store))
 
 
 def test_loops_that_contradict_odometry_are_a_warning(closed):

@@ -135,7 +135,7 @@ def test_large_arrays_shrink_and_keep_their_order_of_axes() -> None:
         back = store.get("any", 1)
     assert np.array_equal(back["smooth"], smooth)
     assert back["turned"].flags.f_contiguous
-    assert not back["smooth"].flags.writeable
+    assert back["smooth"].flags.writeable  # compiled kernels take no others
 
 
 @pytest.mark.parametrize(

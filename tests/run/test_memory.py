@@ -16,7 +16,8 @@ from recon.core.values import PointCloud
 from recon.map import SubmapBuilder
 from recon.map.axes import AXES_MAP_WORLD
 from recon.map.drive_map import DriveMap
-from recon.map.submap_store import SubmapStore
+from recon.map.store import Store
+from recon.map.submap_records import Submaps
 from recon.run import memory
 from recon.run.memory import MemorySettings, memory_overrides, parse_size_mb
 from recon.sources import open_source
@@ -60,10 +61,10 @@ def test_what_takes_more_than_the_limit_is_one_line(monkeypatch: pytest.MonkeyPa
     assert "\n" not in str(told.value)
 
 
-def _along_a_wall(config: ReconConfig) -> SubmapStore:
+def _along_a_wall(config: ReconConfig) -> Submaps:
     """Twelve frames along a wall, 1 m apart."""
     rng = np.random.default_rng(1)
-    store = SubmapStore()
+    store = Submaps(Store.temporary())
     builder = SubmapBuilder(
         config.submaps, config.fusion, config.occupancy, T_MAP_WORLD, config.memory.submap_bytes
     )

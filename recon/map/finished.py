@@ -1,0 +1,150 @@
+"""What a finished map keeps: rays exactly, fused sums rounded, nothing that resuming needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.errors import FormatError
+from recon.core.kernels import voxels
+from recon.core.values import PointCloud
+from recon.core.values.arrays import Bool, Float32, Int32
+from recon.map.kernels import clamped
+from recon.map.keyframes import KEYFRAME
+from recon.map.occupancy_part import OccupancyPart
+from recon.map.persistent import Map
+from recon.map.session import AXES, LOOPS, RAYS, Session
+from recon.map.settings import DriveSettings
+from recon.map.store import Store
+from recon.map.submap_records import Submaps
+from recon.map.submaps import Submap, SubmapBuilder
+
+_PLACED: Final = slice(0, 4)
+_PLACE_BITS: Final = 12
+"""Of weights and offsets: the mean of a voxel of 0.1 m moves by some µm at most."""
+_VALUE_BITS: Final = 8
+"""Of colours, normals and the rest: half a level of 255, a tenth of a degree."""
+_INFORMATION_BITS: Final = 16
+"""It decides which voxels are precise enough to be exported."""
+
+
+def keep_map(mapped: Map, path: Path, settings: DriveSettings) -> None:
+    """Write the map of finished drives: path, rays, keyframes, loops, and compact submaps.
+
+    The fused sums are rounded, and lack voxels that too few frames saw to be exported; occupancy is
+    left out, since `with_occupancy` makes it from the rays again.
+
+    Args:
+        mapped: The map as it was made.
+        path: The new file.
+        settings: What decides which voxels are exported.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with Map.create(path) as kept:
+        for session in mapped.sessions:
+            new = kept.begin(replace(session.info, start={}))
+            for number, T_world_camera in enumerate(session.odometry.T_world_camera):
+                time_s = float(session.odometry.timestamps_s[number])
+                new.add_frame(T_world_camera, time_s, session.health[number])
+            for submap in _compact(session, settings):
+                new.submaps.add(submap, compress=True)
+        for kind in (AXES, LOOPS, KEYFRAME, RAYS):
+            mapped.store.copy(kind, kept.store)
+        kept.commit()
+
+
+def with_occupancy(session: Session, settings: DriveSettings) -> Submaps:
+    """The submaps of a finished map, with occupancy made from its rays, in a temporary store.
+
+    Raises:
+        FormatError: The map is damaged.
+        MappingError: A ray would spoil the map.
+    """
+    if session.submaps.frames != len(session):
+        raise FormatError("the map lacks submaps", where=session.where)
+    made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
+    T_map_world = session.T_map_world
+    builder = SubmapBuilder(settings.submaps, settings.fusion, settings.occupancy, T_map_world)
+    unfused = PointCloud(np.zeros((0, 3), np.float32), frame="world")
+    poses = session.odometry.T_world_camera
+    for kept in session.submaps:
+        for frame in range(kept.first_frame, kept.first_frame + kept.frames):
+            builder.integrate(unfused, session.rays(frame)[0].cloud(), poses[frame])
+        made.add(replace(kept, occupancy=builder.close().occupancy))
+    return made
+
+
+def _compact(session: Session, settings: DriveSettings) -> Iterator[Submap]:
+    """The submaps of a session as they are kept."""
+    fusion = settings.fusion
+    least = min(fusion.min_count, len(session)) - (fusion.precise_sigma_m is not None)
+    where = _Places(session, fusion.voxel_m)
+    for index, submap in enumerate(session.submaps):
+        few = submap.fused.frames < least
+        fused = submap.fused.select(~few | where.seen_elsewhere(index))
+        sums = fused.sums.copy()
+        sums[:, _PLACED] = _rounded(sums[:, _PLACED], _PLACE_BITS)
+        sums[:, _PLACED.stop :] = _rounded(sums[:, _PLACED.stop :], _VALUE_BITS)
+        information = _rounded(fused.information, _INFORMATION_BITS)
+        fused = replace(fused, sums=sums, information=information)
+        yield replace(submap, fused=fused, occupancy=_nothing())
+
+
+class _Places:
+    """Where the voxels of the submaps of a session are after loop closure."""
+
+    def __init__(self, session: Session, voxel_m: float) -> None:
+        self._submaps, self._voxel_m = session.submaps, voxel_m
+        self._corrections = session.corrections()
+        self._boxes = [self._box(index) for index in range(len(self._submaps))]
+
+    def seen_elsewhere(self, index: int) -> Bool:
+        """Which voxels of a submap other submaps saw as well."""
+        keys = self._keys(index)
+        found = np.zeros(len(keys), np.bool_)
+        for other, (low, high) in enumerate(self._boxes):
+            ours_low, ours_high = self._boxes[index]
+            if other != index and (low <= ours_high).all() and (ours_low <= high).all():
+                found |= np.isin(keys, self._keys(other))
+        return found
+
+    def _keys(self, index: int) -> NDArray[np.int64]:
+        """int64 (N,), packed cell of each voxel of a submap."""
+        return self._submaps.store.cache.get(
+            ("moved keys", id(self), index), lambda: self._moved(index)
+        )
+
+    def _moved(self, index: int) -> NDArray[np.int64]:
+        fused = self._submaps.get(index).fused
+        if self._corrections is None or np.array_equal(self._corrections[index], np.eye(4)):
+            return fused.keys
+        return fused.moved_keys(self._corrections[index], self._voxel_m)
+
+    def _box(self, index: int) -> tuple[Int32, Int32]:
+        """Smallest and largest cell of a submap."""
+        cells = voxels.unpack_keys(self._keys(index))
+        nowhere = np.full(3, np.iinfo(np.int32).max)
+        if not len(cells):
+            return nowhere, -nowhere
+        return cells.min(axis=0), cells.max(axis=0)
+
+
+def _rounded(values: Float32, bits: int) -> Float32:
+    """Numbers with fewer bits behind the point of their mantissa; the rest is zero."""
+    drop = 23 - bits
+    half = np.int32(1 << (drop - 1))
+    whole = np.ascontiguousarray(values).view(np.int32) + half
+    return np.asarray((whole >> drop << drop).view(np.float32))
+
+
+def _nothing() -> OccupancyPart:
+    """Occupancy without a cell."""
+    blocks, starts, cells = np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(0, np.uint16)
+    return OccupancyPart(clamped.CellRows(blocks, starts, cells, np.zeros((0, 3), np.float32)))

@@ -1,0 +1,68 @@
+"""The keyframes of a session, as records of a map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any, Final
+
+from recon.io.files import reading
+from recon.map.store import Store
+from recon.places.detector import StoredKeyframe
+from recon.places.keyframe import Keyframe
+from recon.places.verify import Loop
+
+KEYFRAME: Final = "keyframe"
+
+
+class Keyframes:
+    """Keyframes of one drive, by the number of their frame.
+
+    Args:
+        store: The records of the map.
+        session: Number of the session.
+    """
+
+    def __init__(self, store: Store, session: int = 0) -> None:
+        self._store = store
+        self._session = session
+
+    def put(self, stored: StoredKeyframe) -> None:
+        """Keep a keyframe.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        content = {
+            "keyframe": asdict(stored.keyframe),
+            "T_world_camera": stored.T_world_camera,
+            "path_m": stored.path_m,
+            "loops": [asdict(loop) for loop in stored.loops],
+            "refused": list(stored.refused),
+        }
+        key = (self._session, stored.keyframe.frame)
+        self._store.put(KEYFRAME, key, content, compress=True)
+
+    def get(self, frame: int) -> StoredKeyframe:
+        """The keyframe of a frame, read unless it was read lately.
+
+        Raises:
+            FormatError: It is missing or damaged.
+        """
+        key = (KEYFRAME, self._session, frame, "keyframe")
+        return self._store.cache.get(key, lambda: self._read(frame))
+
+    def __iter__(self) -> Iterator[StoredKeyframe]:
+        """All keyframes, in the order of their frames."""
+        return map(self._read, self._store.numbers(KEYFRAME, self._session))
+
+    def _read(self, frame: int) -> StoredKeyframe:
+        with reading(self._store.name):
+            content: dict[str, Any] = self._store.read(KEYFRAME, (self._session, frame))
+            return StoredKeyframe(
+                Keyframe(**content["keyframe"]),
+                content["T_world_camera"],
+                content["path_m"],
+                tuple(Loop(**loop) for loop in content["loops"]),
+                tuple(content["refused"]),
+            )

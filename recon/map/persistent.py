@@ -1,0 +1,118 @@
+"""The map: drives in one file that is opened, appended to, committed and closed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Final
+
+from typing_extensions import Self
+
+from recon.core.errors import FormatError
+from recon.map.session import Session, SessionInfo
+from recon.map.store import CACHE_BYTES, Store
+
+MAP_FILE: Final = "map/map.recon"
+"""Where a finished run keeps its map."""
+_SESSION: Final = "session"
+
+
+class Map:
+    """What is known of one or several drives, on disk; memory holds the poses and a cache.
+
+    Open one with `create`, `open` or `temporary`.
+
+    Attributes:
+        store: The records.
+        sessions: The drives in it, in the order in which they were begun.
+
+    Raises:
+        FormatError: The records are damaged.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self.store = store
+        numbers = [key for key in store.keys(_SESSION) if isinstance(key, int)]
+        self.sessions = [Session(store, number) for number in numbers]
+
+    @classmethod
+    def create(cls, path: Path, *, cache_bytes: int = CACHE_BYTES) -> Self:
+        """Begin an empty map; a file at ``path`` is replaced.
+
+        Raises:
+            OutputError: The file cannot be written.
+        """
+        return cls(Store.create(path, cache_bytes=cache_bytes))
+
+    @classmethod
+    def open(cls, path: Path, *, read_only: bool = True, cache_bytes: int = CACHE_BYTES) -> Self:
+        """Open a map as it was committed last, or the map in the folder of a finished run.
+
+        Raises:
+            FormatError: The file is missing, no map, of a newer format, or damaged.
+            OutputError: It is to be changed, and another program uses it or it cannot be written.
+        """
+        file = path / MAP_FILE if path.is_dir() else path
+        store = Store.open(file, read_only=read_only, cache_bytes=cache_bytes)
+        try:
+            return cls(store)
+        except BaseException:
+            store.close()
+            raise
+
+    @classmethod
+    def temporary(cls) -> Self:
+        """Begin an empty map that is gone when it is closed."""
+        return cls(Store.temporary())
+
+    def __repr__(self) -> str:
+        return f"Map({self.store.name!r}, {len(self.sessions)} sessions)"
+
+    def session(self, number: int = 0) -> Session:
+        """A drive in the map.
+
+        Raises:
+            FormatError: There is none of this number.
+        """
+        for session in self.sessions:
+            if session.number == number:
+                return session
+        known = ", ".join(str(session.number) for session in self.sessions) or "none"
+        raise FormatError(
+            "the map has no such session", where=self.store.name, got=number, expected=known
+        )
+
+    def begin(self, info: SessionInfo) -> Session:
+        """Add a drive.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        number = max((session.number for session in self.sessions), default=-1) + 1
+        self.sessions.append(Session.begin(self.store, number, info))
+        return self.sessions[-1]
+
+    def commit(self) -> None:
+        """Make everything so far permanent: all of it or, after an error, nothing.
+
+        Raises:
+            OutputError: The disk is full or cannot be written; the file keeps the last commit.
+        """
+        for session in self.sessions:
+            session.flush()
+        self.store.commit()
+
+    def close(self) -> None:
+        """Close the file; what was not committed is lost."""
+        self.store.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

@@ -1,0 +1,334 @@
+"""A session of a map: what one drive put into it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.errors import FormatError
+from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
+from recon.core.values.arrays import Float64, frozen_array
+from recon.io.files import reading
+from recon.map.axes import check_rigid
+from recon.map.keyframes import Keyframes
+from recon.map.store import Store
+from recon.map.submap_records import Submaps
+from recon.odometry import OdometryHealth
+from recon.places.graph import Closure
+
+FRAMES: Final = "frames"
+RAYS: Final = "rays"
+_SESSION: Final = "session"
+AXES: Final = "axes"
+LOOPS: Final = "loops"
+_STATE: Final = "state"
+_FARTHEST_M: Final = 1e5
+"""From the start: farther than any drive, or ray."""
+_SKEW: Final = 1e-3
+"""Of poses that were written with few digits."""
+_HEALTH: Final = tuple(f.name for f in fields(OdometryHealth))
+
+
+@dataclass(frozen=True)
+class SessionInfo:
+    """What a session is a drive of.
+
+    Attributes:
+        source: Display name of the source.
+        description: What kind of source it is.
+        frames: Number of its frames.
+        config: The settings of the drive, as plain values.
+        versions: Versions of recon and its libraries.
+        start: What the run was started with, to resume it; empty in a finished map.
+    """
+
+    source: str = ""
+    description: str = ""
+    frames: int = 0
+    config: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    start: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        texts, trees = (self.source, self.description), (self.config, self.versions, self.start)
+        if not (
+            all(isinstance(text, str) for text in texts)
+            and all(isinstance(tree, Mapping) for tree in trees)
+            and isinstance(self.frames, int)
+        ):
+            raise FormatError("the map does not describe its session")
+
+
+class Session:
+    """One drive in a map. What is added is kept by the next commit of the map.
+
+    Args:
+        store: The records of the map.
+        number: Number of the session in the map.
+
+    Raises:
+        FormatError: The map has no such session, or its records are damaged.
+
+    Attributes:
+        info: What it is a drive of.
+        submaps: Its submaps.
+        keyframes: Its keyframes, for place recognition.
+    """
+
+    def __init__(self, store: Store, number: int) -> None:
+        self._store = store
+        self.number = number
+        self._poses: list[Float64] = []
+        self._times_s: list[float] = []
+        self._health: list[OdometryHealth] = []
+        self._flushed = 0
+        with reading(store.name):
+            self.info = SessionInfo(**store.read(_SESSION, number))
+            self._read_frames()
+        self.submaps = Submaps(store, number)
+        if self.submaps.frames > len(self):
+            raise FormatError("the map has submaps of frames without a pose", where=store.name)
+        self.keyframes = Keyframes(store, number)
+
+    @staticmethod
+    def begin(store: Store, number: int, info: SessionInfo) -> Session:
+        """Add a session to a map.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        store.put(_SESSION, number, asdict(info))
+        return Session(store, number)
+
+    def __len__(self) -> int:
+        """Number of frames so far."""
+        return len(self._poses)
+
+    def __repr__(self) -> str:
+        return f"Session({self.info.source!r}, {len(self)} of {self.info.frames} frames)"
+
+    @property
+    def where(self) -> str:
+        """The file of the map, for messages."""
+        return self._store.name
+
+    @property
+    def odometry(self) -> Trajectory:
+        """The path by odometry.
+
+        Raises:
+            FormatError: There is no frame yet.
+        """
+        if not self._poses:
+            raise FormatError("the session has no frame", where=self._store.name)
+        return Trajectory(np.stack(self._poses), np.array(self._times_s))
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The path after loop closure; that of odometry if no loop was closed."""
+        closed = self.loops.get("T_world_camera")
+        return self.odometry if closed is None else Trajectory(closed, np.array(self._times_s))
+
+    @property
+    def health(self) -> tuple[OdometryHealth, ...]:
+        """How far each pose can be trusted."""
+        return tuple(self._health)
+
+    @property
+    def T_map_world(self) -> Float64:
+        """float64 (4, 4), from the world of the session to map axes; known after the first frame.
+
+        Raises:
+            FormatError: It is not known, or none.
+        """
+        with reading(self._store.name):
+            T = np.array(self._axes["T_map_world"])
+            check_rigid("T_map_world", T)
+        return T
+
+    @property
+    def camera(self) -> RectifiedCamera:
+        """The rectified camera; known after the first frame.
+
+        Raises:
+            FormatError: It is not known, or none.
+        """
+        with reading(self._store.name):
+            return RectifiedCamera(**self._axes["camera"])
+
+    @property
+    def loops(self) -> dict[str, Any]:
+        """Result of loop closure: ``closed`` and ``refused`` loops, ``T_world_camera`` after it."""
+        if not self._store.has(LOOPS, self.number):
+            return {}
+        return self._store.get(LOOPS, self.number)
+
+    def corrections(self) -> Float64 | None:
+        """float64 (S, 4, 4), what loop closure moves each submap by; None = nothing moves.
+
+        Raises:
+            FormatError: The record of the loops is damaged.
+        """
+        with reading(self._store.name):
+            closure, odometry = Closure(self.trajectory, (), ()), self.odometry
+            if self.loops.get("T_world_camera") is None:
+                return None
+            middles = (entry.first_frame + entry.frames // 2 for entry in self.submaps.entries)
+            return np.stack([closure.correction(odometry, frame) for frame in middles])
+
+    @property
+    def ray_frames(self) -> int:
+        """Number of frames whose rays are kept."""
+        return len(self._store.numbers(RAYS, self.number))
+
+    def set_axes(self, T_map_world: Float64, camera: RectifiedCamera) -> None:
+        """Keep the axes of the map, and the camera.
+
+        Raises:
+            OutputError: They cannot be written.
+        """
+        content = {"T_map_world": T_map_world, "camera": asdict(camera)}
+        self._store.put(AXES, self.number, content)
+
+    def add_frame(self, T_world_camera: Float64, time_s: float, health: OdometryHealth) -> None:
+        """Add the pose of the next frame."""
+        self._poses.append(T_world_camera)
+        self._times_s.append(time_s)
+        self._health.append(health)
+
+    def add_rays(self, frame: int, rays: RayCloud, grain: RayGrain) -> None:
+        """Keep the rays of a frame.
+
+        Raises:
+            OutputError: They cannot be written.
+        """
+        content = {
+            # Of neighbours in the image: small numbers, which compress.
+            "steps": _zigzag(np.diff(rays.places, axis=0, prepend=np.zeros((1, 3), np.int16))),
+            "sigma_m": rays.sigma_m,
+            "confidence": rays.confidence,
+            "count": rays.count,
+            "grain": asdict(grain),
+        }
+        self._store.put(RAYS, (self.number, frame), content, compress=True)
+
+    def rays(self, frame: int) -> tuple[RayCloud, RayGrain]:
+        """The rays of a frame, as they were kept.
+
+        Raises:
+            FormatError: They are missing or damaged.
+        """
+        with reading(self._store.name):
+            content = self._store.read(RAYS, (self.number, frame))
+            grain = _checked(RayGrain(**content["grain"]))
+            steps = frozen_array("steps", content["steps"], np.uint16, (None, 3))
+            places = np.cumsum(_unzigzag(steps), axis=0, dtype=np.int16)
+            return RayCloud(
+                places, content["sigma_m"], content["confidence"], content["count"], grain.unit_m
+            ), grain
+
+    def set_loops(self, content: Mapping[str, Any]) -> None:
+        """Keep the result of loop closure.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        self._store.put(LOOPS, self.number, content)
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Keep what the rest of the drive depends on, beside all that was added.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        self._store.put(_STATE, self.number, state)
+
+    def state(self) -> dict[str, Any] | None:
+        """The state of an unfinished drive, to go on from; None = nothing is known.
+
+        Raises:
+            FormatError: It is damaged.
+        """
+        if not self._store.has(_STATE, self.number):
+            return None
+        return self._store.read(_STATE, self.number)
+
+    def flush(self) -> None:
+        """Write the frames since the last time, so that a commit keeps them.
+
+        Raises:
+            OutputError: They cannot be written.
+        """
+        first, self._flushed = self._flushed, len(self)
+        if first == len(self):
+            return
+        content = {
+            "T_world_camera": np.stack(self._poses[first:]),
+            "times_s": np.array(self._times_s[first:]),
+            "health": {
+                name: [getattr(health, name) for health in self._health[first:]] for name in _HEALTH
+            },
+        }
+        self._store.put(FRAMES, (self.number, first), content, compress=True)
+
+    @property
+    def _axes(self) -> dict[str, Any]:
+        return self._store.get(AXES, self.number)
+
+    def _read_frames(self) -> None:
+        for first in self._store.numbers(FRAMES, self.number):
+            if first != len(self):
+                raise FormatError("frames of the drive are missing", got=f"{len(self)} to {first}")
+            for T, time_s, health in _frames_of(self._store.read(FRAMES, (self.number, first))):
+                self.add_frame(T, time_s, health)
+        self._flushed = len(self)
+
+
+def _frames_of(content: dict[str, Any]) -> Iterator[tuple[Float64, float, OdometryHealth]]:
+    path, columns = Trajectory(content["T_world_camera"], content["times_s"]), content["health"]
+    _check_rotations(path)
+    times_s = path.timestamps_s.tolist()
+    for number, (T, time_s) in enumerate(zip(path.T_world_camera, times_s, strict=True)):
+        values = {name: columns[name][number] for name in columns}
+        values.update({name: tuple(values[name]) for name in ("notes", "warnings")})
+        yield T, time_s, OdometryHealth(**values)
+
+
+def _check_rotations(path: Trajectory) -> None:
+    """Check poses, which may come from a file with few digits, or be far off.
+
+    Raises:
+        FormatError: One is no pose of a drive.
+    """
+    R = path.T_world_camera[:, :3, :3]
+    skew = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    far_m = np.abs(path.positions_m).max(axis=1)
+    wrong = (skew > _SKEW) | (far_m > _FARTHEST_M) | (np.linalg.det(R) <= 0)
+    if wrong.any():
+        raise FormatError("the path of the map has an impossible pose", got=int(np.argmax(wrong)))
+
+
+def _checked(grain: RayGrain) -> RayGrain:
+    """The resolution of rays.
+
+    Raises:
+        FormatError: It is impossible.
+    """
+    sizes_m = (grain.cell_m, grain.unit_m, grain.max_range_m)
+    # Not above the range; this is false for NaN as well.
+    if not (min(sizes_m) > 0 and max(sizes_m) <= grain.max_range_m <= _FARTHEST_M):
+        raise FormatError("sizes of the rays are impossible", got=sizes_m)
+    return grain
+
+
+def _zigzag(steps: NDArray[np.int16]) -> NDArray[np.uint16]:
+    """Steps of either sign as small positive numbers: 0, −1, 1, −2 become 0, 1, 2, 3."""
+    return ((steps << 1) ^ (steps >> 15)).view(np.uint16)
+
+
+def _unzigzag(codes: NDArray[np.uint16]) -> NDArray[np.int16]:
+    return ((codes >> 1) ^ -(codes & 1)).view(np.int16)

@@ -1,0 +1,106 @@
+"""The submaps of a session, as records of a map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Final
+
+from recon.core.errors import FormatError
+from recon.io.files import reading
+from recon.map.store import Store
+from recon.map.submaps import Submap
+
+SUBMAP: Final = "submap"
+ENTRY: Final = "submap_entry"
+
+
+@dataclass(frozen=True)
+class SubmapEntry:
+    """What is known about a closed submap without reading it.
+
+    Attributes:
+        index: Index of the submap.
+        first_frame: Index of its first frame.
+        frames: Number of its frames.
+        voxels: Voxels of its part of the fused cloud.
+        cells: Cells of its part of the occupancy.
+    """
+
+    index: int
+    first_frame: int
+    frames: int
+    voxels: int
+    cells: int
+
+
+class Submaps:
+    """Closed submaps of one drive, in order.
+
+    Args:
+        store: The records of the map.
+        session: Number of the session.
+
+    Raises:
+        FormatError: The records are damaged.
+    """
+
+    def __init__(self, store: Store, session: int = 0) -> None:
+        self._session = session
+        self.store = store
+        with reading(store.name):
+            found = store.numbers(ENTRY, session)
+            self._entries = [SubmapEntry(**store.read(ENTRY, (session, n))) for n in found]
+            frames = 0
+            for index, entry in enumerate(self._entries):
+                if (entry.index, entry.first_frame) != (index, frames) or entry.frames < 1:
+                    raise FormatError("submaps of the drive are missing", got=f"{entry}")
+                frames += entry.frames
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    @property
+    def entries(self) -> Sequence[SubmapEntry]:
+        """One for each submap."""
+        return tuple(self._entries)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames in all submaps."""
+        return sum(entry.frames for entry in self._entries)
+
+    def add(self, submap: Submap, *, compress: bool = False) -> None:
+        """Store the next submap.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        entry = SubmapEntry(
+            submap.index,
+            submap.first_frame,
+            submap.frames,
+            len(submap.fused),
+            len(submap.occupancy),
+        )
+        key = (self._session, submap.index)
+        self.store.put(SUBMAP, key, submap.to_tree(), compress=compress)
+        self.store.put(ENTRY, key, asdict(entry))
+        self._entries.append(entry)
+
+    def get(self, index: int) -> Submap:
+        """A submap, read unless it was read lately.
+
+        Raises:
+            FormatError: It is missing or damaged.
+        """
+        key = (SUBMAP, self._session, index, "submap")
+        return self.store.cache.get(key, lambda: self._read(index))
+
+    def __iter__(self) -> Iterator[Submap]:
+        """The submaps in order, read one at a time."""
+        return (self._read(index) for index in range(len(self)))
+
+    def _read(self, index: int) -> Submap:
+        with reading(self.store.name):
+            return Submap.from_tree(self.store.read(SUBMAP, (self._session, index)))
