@@ -10,7 +10,7 @@ from recon.commands.paper import ExperimentResult, PaperRun
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import apply
 from recon.core.values import PointCloud, RectifiedCamera
-from recon.evaluation.paper.methods import AS_PRINTED, CORRECTED, TITLES, MethodResult
+from recon.evaluation.paper.methods import AS_PRINTED, BAD_PX, CORRECTED, TITLES, MethodResult
 from recon.evaluation.paper.scenes import camera_of_table_1
 from recon.io.images.image import write_image
 from recon.report.colour import colour_disparity
@@ -47,8 +47,9 @@ def write_paper_page(run: PaperRun, directory: RunDirectory) -> None:
         directory,
         run=run,
         titles=TITLES,
-        drawn=[_drawn(result, run.config.paper.bad_px) for result in run.experiments],
+        drawn=[_drawn(result) for result in run.experiments],
         limit_px=_ERROR_LIMIT_PX,
+        bad_px=BAD_PX,
         # Experiments have their own sections.
         of_the_run={k: v for k, v in run.summary.items() if k not in {"experiments", "table_1"}},
         warnings=run.warnings,
@@ -63,13 +64,13 @@ def believed_camera(camera: RectifiedCamera) -> RectifiedCamera | None:
         return None
 
 
-def _drawn(result: ExperimentResult, bad_px: float) -> dict[str, Any]:
+def _drawn(result: ExperimentResult) -> dict[str, Any]:
     """The figures of an experiment."""
     camera, first = result.experiment.camera, result.methods[0]
     return {
         "pair": pair_figure(first.pair),
         "methods": [_drawn_method(result, one) for one in result.methods],
-        "patches": patches_figure(result.patches, bad_px),
+        "patches": patches_figure(result.patches, BAD_PX),
         "curve": depth_curve_figure(camera, believed_camera(camera), first.disparity.values),
     }
 

@@ -38,6 +38,9 @@ TITLES: Final[Mapping[str, str]] = MappingProxyType(
         AS_PRINTED: "as printed",
     }
 )
+BAD_PX: Final = 1.0
+"""Disparity error above which a pixel counts as wrong."""
+
 # Keeps every point of the printed method, regardless of range and uncertainty.
 _EVERY_POINT: Final = CloudSettings(min_range_m=0.0, max_range_m=None, max_relative_sigma=None)
 
@@ -143,7 +146,7 @@ def try_patches(
     for patch_px in config.paper.patches_px:
         if patch_px <= min(pair.left.shape):
             found = _matcher(method, patch_px, config, threads).match(pair)
-            figures.append(_patch_figure(patch_px, found, experiment.truth, config.paper.bad_px))
+            figures.append(_patch_figure(patch_px, found, experiment.truth))
     return figures
 
 
@@ -211,12 +214,10 @@ def _printed_pair(experiment: Experiment) -> RectifiedPair:
     return Rectifier(experiment.camera, settings).rectify(experiment.pair)
 
 
-def _patch_figure(
-    patch_px: int, found: Disparity, truth: DisparityTruth | None, bad_px: float
-) -> PatchFigure:
+def _patch_figure(patch_px: int, found: Disparity, truth: DisparityTruth | None) -> PatchFigure:
     valid_percent = 100 * float(found.valid.mean())
     if truth is None:
         return PatchFigure(patch_px, valid_percent, None, None, None)
-    metrics = evaluate_disparity(found, truth, (bad_px,))
-    bad = metrics.bad[bad_px]
+    metrics = evaluate_disparity(found, truth, (BAD_PX,))
+    bad = metrics.bad[BAD_PX]
     return PatchFigure(patch_px, valid_percent, bad, 100 - bad - metrics.invalid, metrics.avgerr_px)

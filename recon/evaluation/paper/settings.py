@@ -18,15 +18,13 @@ class PaperSettings(Settings):
         default=11,
         ge=3,
         le=61,
-        description="Patch size of the printed method, odd. The paper does not give one.",
+        description="Patch size of the printed method, odd. The paper does not give one: try "
+        "others.",
     )
     patches_px: tuple[int, ...] = Field(
         default=tuple(range(3, 22, 2)),
         min_length=1,
         description="Patch sizes, and window sizes of the matcher `sad`, to compare; odd.",
-    )
-    bad_px: float = Field(
-        default=1.0, gt=0, description="Disparity error above which a pixel counts as wrong."
     )
 
     @field_validator("patch_px", "patches_px")

@@ -49,8 +49,13 @@ _SPECKLE_PX: Final = 50
 _SPECKLE_STEP_PX: Final = 1
 
 
+_BM_BLOCK_PX: Final = 9
+_SGBM_BLOCK_PX: Final = 3
+"""Windows where the settings name none: a single one of SGBM smooths by its paths instead."""
+
+
 class OpencvSettings(SearchSettings):
-    """What both of OpenCV's matchers have."""
+    """Settings of `opencv-bm` (``cv2.StereoBM``) and `opencv-sgbm` (``cv2.StereoSGBM``)."""
 
     pad: bool = Field(
         default=False,
@@ -58,21 +63,17 @@ class OpencvSettings(SearchSettings):
         "as far as the right image reaches. false = OpenCV as it comes, without a strip at the "
         "left as wide as the range, which scoring then fills by a guess.",
     )
-
-
-class OpencvBmSettings(OpencvSettings):
-    """Settings of ``cv2.StereoBM``."""
-
-    block_px: OddInt = Field(default=9, ge=5, le=255, description="Width of the window; odd.")
-
-
-class OpencvSgbmSettings(OpencvSettings):
-    """Settings of ``cv2.StereoSGBM``."""
-
-    block_px: OddInt = Field(default=3, ge=1, le=51, description="Width of the window; odd.")
+    block_px: OddInt | None = Field(
+        default=None,
+        ge=1,
+        le=255,
+        description="Width of the window; odd. none = 9 for `opencv-bm` (at least 5), 3 for "
+        "`opencv-sgbm`.",
+    )
     mode: Literal["hh", "3way", "sgbm"] = Field(
         default="hh",
-        description="8 paths over the whole image, 3 paths in strips (fastest), or 5 paths.",
+        description="Of `opencv-sgbm`: 8 paths over the whole image, 3 paths in strips (fastest), "
+        "or 5 paths.",
     )
 
 
@@ -85,7 +86,7 @@ class OpencvBmMatcher:
             commands set (``--threads``).
     """
 
-    def __init__(self, settings: OpencvBmSettings, threads: int | None = None) -> None:
+    def __init__(self, settings: OpencvSettings, threads: int | None = None) -> None:
         del threads
         self._settings = settings
 
@@ -97,14 +98,15 @@ class OpencvBmMatcher:
         """
         s = self._settings
         ndisp = _range(s, pair.camera)
-        engine = cv2.StereoBM.create(ndisp, s.block_px)
+        block_px = s.block_px or _BM_BLOCK_PX
+        engine = cv2.StereoBM.create(ndisp, block_px)
         engine.setMinDisparity(s.min_disparity_px)
         engine.setPreFilterType(cv2.STEREO_BM_PREFILTER_XSOBEL)
         engine.setPreFilterCap(_BM_PREFILTER_CAP)
         engine.setTextureThreshold(_BM_TEXTURE_THRESHOLD)
         engine.setUniquenessRatio(_UNIQUENESS_PERCENT)
         engine.setDisp12MaxDiff(LEFT_RIGHT_PX)
-        return _match(pair, engine, s, _Margins.around(s, ndisp))
+        return _match(pair, engine, s, _Margins.around(s, block_px, ndisp))
 
 
 class OpencvSgbmMatcher:
@@ -115,7 +117,7 @@ class OpencvSgbmMatcher:
         threads: Not used, as in `OpencvBmMatcher`.
     """
 
-    def __init__(self, settings: OpencvSgbmSettings, threads: int | None = None) -> None:
+    def __init__(self, settings: OpencvSettings, threads: int | None = None) -> None:
         del threads
         self._settings = settings
 
@@ -126,19 +128,19 @@ class OpencvSgbmMatcher:
             MatchingError: OpenCV refuses the pair or the settings.
         """
         s = self._settings
-        ndisp, pixels = _range(s, pair.camera), s.block_px**2
+        ndisp, block_px = _range(s, pair.camera), s.block_px or _SGBM_BLOCK_PX
         engine = cv2.StereoSGBM.create(
             minDisparity=s.min_disparity_px,
             numDisparities=ndisp,
-            blockSize=s.block_px,
-            P1=_P1 * pixels,
-            P2=_P2 * pixels,
+            blockSize=block_px,
+            P1=_P1 * block_px**2,
+            P2=_P2 * block_px**2,
             disp12MaxDiff=LEFT_RIGHT_PX,
             preFilterCap=_SGBM_PREFILTER_CAP,
             uniquenessRatio=_UNIQUENESS_PERCENT,
             mode=_MODES[s.mode],
         )
-        return _match(pair, engine, s, _Margins.around(s, ndisp))
+        return _match(pair, engine, s, _Margins.around(s, block_px, ndisp))
 
 
 @dataclass(frozen=True)
@@ -150,11 +152,11 @@ class _Margins:
     right: int
 
     @classmethod
-    def around(cls, settings: OpencvBmSettings | OpencvSgbmSettings, ndisp: int) -> _Margins:
+    def around(cls, settings: OpencvSettings, block_px: int, ndisp: int) -> _Margins:
         """As many as OpenCV leaves out, half a window and the range, or none."""
         if not settings.pad:
             return cls(0, 0, 0)
-        margin = settings.block_px // 2 + 1
+        margin = block_px // 2 + 1
         low, high = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1
         return cls(margin, margin + max(0, high), margin + max(0, -low))
 

@@ -95,6 +95,6 @@ def _shrunk(image: UInt8, factor: int, size: tuple[int, int]) -> UInt8:
 
 def _trusted_disparities(small: RectifiedPair) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
     """Return float32 (N,), disparities in pixels of the small pair."""
-    settings = SadSettings(window_px=7, uniqueness_percent=10, average_px=1)
-    found = SadMatcher(settings, threads=1).match(small)
+    settings = SadSettings(window_px=7, uniqueness_percent=10)
+    found = SadMatcher(settings, threads=1, average=False).match(small)
     return found.values[found.valid & (found.confidence >= _CONFIDENCE)]

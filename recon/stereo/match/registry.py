@@ -20,9 +20,8 @@ from recon.stereo.match.foreign import (
 from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
 from recon.stereo.match.opencv import (
     OpencvBmMatcher,
-    OpencvBmSettings,
+    OpencvSettings,
     OpencvSgbmMatcher,
-    OpencvSgbmSettings,
 )
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.range import AutoRangeMatcher, estimate_ndisp
@@ -49,8 +48,7 @@ class MatchingSettings(Settings):
     )
     sad: SadSettings = SadSettings()
     sgm: SgmSettings = SgmSettings()
-    opencv_bm: OpencvBmSettings = OpencvBmSettings()
-    opencv_sgbm: OpencvSgbmSettings = OpencvSgbmSettings()
+    opencv: OpencvSettings = OpencvSettings()
     onnx: OnnxSettings = OnnxSettings()
 
     @field_serializer("matcher")
@@ -130,4 +128,4 @@ def searched_ndisp(
 
 def field_of(name: str) -> str:
     """Return the field of `MatchingSettings` that a matcher's settings have."""
-    return name.replace("-", "_")
+    return name.partition("-")[0]

@@ -88,10 +88,14 @@ class SadMatcher:
         settings: What to search and what to believe.
         threads: Strips of rows worked on at once, all cores by default. The result does not
             depend on it.
+        average: Whether disparities are averaged with their neighbours.
     """
 
-    def __init__(self, settings: SadSettings, threads: int | None = None) -> None:
+    def __init__(
+        self, settings: SadSettings, threads: int | None = None, *, average: bool = True
+    ) -> None:
         self._settings = settings
+        self._average = average
         self._threads = max(1, threads or os.cpu_count() or 1)
         self._full = StripSearch(_prefiltered, self._threads)
         self._half = StripSearch(_prefiltered, self._threads)
@@ -108,7 +112,7 @@ class SadMatcher:
             enough = partial(texture, pair, (s.window_px, s.window_px), s.min_texture)
             tiles = self._tiles(pool, pair, search)
             refined = self._full.find(pool, (pair.left, pair.right), search, tiles, rules, enough)
-            return finish(refined, s, pool, self._threads)
+            return finish(refined, s, pool, self._threads, average=self._average)
 
     def _tiles(self, pool: Executor, pair: RectifiedPair, search: Search) -> Tiles:
         """Return which candidates are offered where."""

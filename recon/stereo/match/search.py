@@ -30,6 +30,10 @@ _SIGMA_FLOOR_PX: Final = 0.1
 _SPECKLE_STEP_PX: Final = 1.0
 """Largest step of disparity between neighbours of one region."""
 
+_AVERAGE_PX: Final = 7
+"""Each disparity becomes the mean of the pairs of opposite neighbours, in a square of this width,
+that lie on its surface."""
+
 _SAME_SURFACE_PX: Final = 1.0
 """Neighbours that differ by more are not averaged: between them may be a step of depth."""
 
@@ -104,14 +108,6 @@ class MeasuredSettings(SearchSettings):
         description="Regions of fewer pixels are removed; 0 = keep all. Grows with the square of "
         "the image width.",
     )
-    average_px: OddInt = Field(
-        default=7,
-        ge=1,
-        le=31,
-        description="Each disparity becomes the mean of the pairs of opposite neighbours, in a "
-        "square of this width, that lie on its surface; odd. 1 = as measured: noisier, for "
-        "comparisons.",
-    )
 
 
 def rules_of(
@@ -144,27 +140,35 @@ def rules_of(
     )
 
 
-def finish(refined: Refined, settings: MeasuredSettings, pool: Executor, threads: int) -> Disparity:
+def finish(
+    refined: Refined,
+    settings: MeasuredSettings,
+    pool: Executor,
+    threads: int,
+    *,
+    average: bool = True,
+) -> Disparity:
     """Return the disparity of what was refined: no small regions (reason SPECKLE), averaged.
 
     Args:
         refined: Overwritten; a copy of each array would cost more than the search for speckles.
-        settings: Says what a speckle is, and what is averaged.
+        settings: Says what a speckle is.
         pool: Where to average.
         threads: Strips of rows averaged at once. The result does not depend on it.
+        average: Whether to average; else the disparities stay as measured.
     """
     if settings.speckle_size_px >= 2:
         small = find_speckles(refined.values, _SPECKLE_STEP_PX, settings.speckle_size_px)
         # A plain number: to look up what an enumeration is takes numba 0.2 ms.
         reject(small, int(Reason.SPECKLE), refined)
-    if settings.average_px > 1:
-        refined = refined._replace(values=_averaged(refined.values, settings, pool, threads))
+    if average:
+        refined = refined._replace(values=_averaged(refined.values, pool, threads))
     return Disparity(*refined)
 
 
-def _averaged(values: Float32, settings: MeasuredSettings, pool: Executor, threads: int) -> Float32:
+def _averaged(values: Float32, pool: Executor, threads: int) -> Float32:
     """float32 (H, W), the values without the noise that they do not share with neighbours."""
-    averages, radius = np.empty_like(values), settings.average_px // 2
+    averages, radius = np.empty_like(values), _AVERAGE_PX // 2
 
     def average(rows: range) -> None:
         average_opposite(values, radius, _SAME_SURFACE_PX, rows.start, rows.stop, averages)

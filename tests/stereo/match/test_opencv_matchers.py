@@ -11,13 +11,11 @@ from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury.scene import stand_in_camera
 from recon.stereo.match.opencv import (
     OpencvBmMatcher,
-    OpencvBmSettings,
+    OpencvSettings,
     OpencvSgbmMatcher,
-    OpencvSgbmSettings,
 )
 
 NAMES = ("opencv-bm", "opencv-sgbm")
-SETTINGS = {"opencv-bm": OpencvBmSettings, "opencv-sgbm": OpencvSgbmSettings}
 MATCHERS = {"opencv-bm": OpencvBmMatcher, "opencv-sgbm": OpencvSgbmMatcher}
 
 
@@ -31,7 +29,7 @@ def shifted_pair(shift_px: int, shape: tuple[int, int] = (60, 160)) -> Rectified
 
 
 def match(name: str, pair: RectifiedPair, *, pad: bool = True, **settings: object) -> Disparity:
-    return MATCHERS[name](SETTINGS[name](pad=pad, **settings)).match(pair)
+    return MATCHERS[name](OpencvSettings(pad=pad, **settings)).match(pair)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -48,7 +46,7 @@ def test_a_shift_is_found_in_pixels_wherever_the_right_image_reaches(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_without_padding_a_strip_as_wide_as_the_range_is_unknown(name: str) -> None:
-    assert not SETTINGS[name]().pad  # the baseline is OpenCV as it comes
+    assert not OpencvSettings().pad  # the baseline is OpenCV as it comes
     assert np.isnan(match(name, shifted_pair(7), pad=False).values[:, :31]).all()
     assert np.isfinite(match(name, shifted_pair(7)).values[5:-5, 12:31]).mean() > 0.95
 
@@ -117,4 +115,4 @@ def test_the_modes_of_the_semi_global_matcher_differ() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_an_even_window_is_refused(name: str) -> None:
     with pytest.raises(SettingsError, match="odd"):
-        SETTINGS[name].parse({"block_px": 6})
+        OpencvSettings.parse({"block_px": 6})

@@ -67,7 +67,7 @@ def near_share(found: Disparity, disparity_px: int) -> float:
 
 @pytest.mark.parametrize("name", ["sad", "sgm", "opencv-bm", "opencv-sgbm"])
 def test_near_plane_is_found_only_with_the_automatic_range(name: str) -> None:
-    padded = {key: {"pad": True} for key in ("opencv_bm", "opencv_sgbm")}
+    padded = {"opencv": {"pad": True}}
     settings, pair = MatchingSettings.parse(padded), plane(100)
     auto = make_matcher(name, settings, 1)
     usual = MATCHERS[name](settings_of(name, settings), 1)
