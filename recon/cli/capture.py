@@ -48,9 +48,11 @@ def capture(
         from recon.cli.interrupt import until_interrupted
         from recon.commands.capture import run_capture
         from recon.commands.config import capture_overrides, load_config
+        from recon.rig.capture import Recording
 
-        asked = capture_overrides(size, rate, frames, seconds, preview)
-        settings = load_config(config, [*(set_ or ()), *asked]).capture
+        known = load_config(config, [*(set_ or ()), *capture_overrides(size, rate)]).capture
+        limits = {"frames": frames, "seconds": seconds, "preview_every": preview}
+        settings = Recording.parse({**dict(known), **limits})
         devices = [left] if right is None else [left, right]
         with until_interrupted() as stopped:
             summary = run_capture(devices, out, settings, calibration=calib, stopped=stopped)

@@ -17,7 +17,7 @@ import numpy as np
 
 from recon.core.errors import FormatError, ReconError
 from recon.io.atomic import write_text
-from recon.rig.capture import CapturedPair, CaptureSettings, capture_pairs, warm_up
+from recon.rig.capture import CapturedPair, Recording, capture_pairs, warm_up
 from recon.rig.capture_folder import CaptureFolder
 from recon.sources.opencv_camera import Camera, OpenCvCamera
 
@@ -42,7 +42,7 @@ class _Log:
 def run_capture(
     devices: Iterable[str],
     folder: Path,
-    settings: CaptureSettings,
+    settings: Recording,
     *,
     calibration: Path | None = None,
     stopped: Callable[[], bool] = lambda: False,
@@ -79,7 +79,7 @@ def run_capture(
 def record(
     cameras: tuple[Camera, ...],
     folder: Path,
-    settings: CaptureSettings,
+    settings: Recording,
     calibration: Path | None,
     stopped: Callable[[], bool],
 ) -> dict[str, Any]:
@@ -108,7 +108,7 @@ def record(
 
 
 def _write_all(
-    pairs: Iterable[CapturedPair], target: CaptureFolder, settings: CaptureSettings, log: _Log
+    pairs: Iterable[CapturedPair], target: CaptureFolder, settings: Recording, log: _Log
 ) -> None:
     """Write in a second thread, so that the disk does not block the cameras."""
     waiting: queue.Queue[CapturedPair | None] = queue.Queue(_WAITING)

@@ -185,13 +185,7 @@ def source_overrides(
     ]
 
 
-def capture_overrides(
-    size: str | None,
-    rate_hz: float | None,
-    frames: int | None,
-    seconds: float | None,
-    preview_every: int | None,
-) -> list[str]:
+def capture_overrides(size: str | None, rate_hz: float | None) -> list[str]:
     """Overrides for a recording; None = unchanged.
 
     Raises:
@@ -204,9 +198,6 @@ def capture_overrides(
         "width_px": width or None,
         "height_px": height or None,
         "rate_hz": rate_hz,
-        "frames": frames,
-        "seconds": seconds,
-        "preview_every": preview_every,
     }
     return [f"capture.{key}={value}" for key, value in given.items() if value is not None]
 

@@ -41,12 +41,6 @@ class CaptureSettings(Settings):
     rate_hz: float | None = Field(
         default=None, gt=0, description="Requested frame rate. none = the driver's default."
     )
-    frames: int | None = Field(
-        default=None, ge=1, description="Stop after this many pairs. none = at Ctrl-C."
-    )
-    seconds: float | None = Field(
-        default=None, gt=0, description="Stop after this many seconds. none = at Ctrl-C."
-    )
     lock_exposure: bool = Field(
         default=True,
         description="Lock exposure and white balance if the driver supports it. Turn it off where "
@@ -58,8 +52,15 @@ class CaptureSettings(Settings):
     suffix: Literal["png", "jpg"] = Field(
         default="png", description="File format: png = lossless, jpg = for a slow disk."
     )
+
+
+class Recording(CaptureSettings):
+    """The settings of one recording, and when it ends."""
+
+    frames: int | None = Field(default=None, ge=1, description="Stop after this many pairs.")
+    seconds: float | None = Field(default=None, gt=0, description="Stop after this many seconds.")
     preview_every: int | None = Field(
-        default=None, ge=1, description="Update preview.jpg every N pairs. none = no preview."
+        default=None, ge=1, description="Update preview.jpg every N pairs. None = no preview."
     )
 
 
@@ -81,7 +82,7 @@ class CapturedPair:
 
 
 def capture_pairs(
-    cameras: tuple[Camera, ...], settings: CaptureSettings, stopped: Callable[[], bool]
+    cameras: tuple[Camera, ...], settings: Recording, stopped: Callable[[], bool]
 ) -> Iterator[CapturedPair]:
     """Yield pairs until the limit is reached, a file ends, or ``stopped`` returns True.
 

@@ -25,11 +25,6 @@ class CalibrationSettings(Settings):
         description="Number of radial coefficients of radtan: k1 k2, or k1 k2 k3. 2 where the "
         "corners of the images hold no board, or for programs that know no k3.",
     )
-    max_rms_px: float = Field(
-        default=2.0,
-        gt=0,
-        description="Largest rms error of an accepted calibration, in pixels.",
-    )
     bootstrap: int = Field(
         default=500,
         ge=50,

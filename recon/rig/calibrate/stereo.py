@@ -34,6 +34,9 @@ _OUTLIER_RATIO: Final = 3.0
 _OUTLIER_PX: Final = 0.3
 """… but never those with an rms error below this."""
 
+_MAX_RMS_PX: Final = 2.0
+"""Largest rms error of an accepted calibration."""
+
 _MIN_VIEWS: Final = 5
 """Minimum number of views with the board."""
 
@@ -106,7 +109,7 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
         state, information = solve(kept, state)
         if good.all():
             break
-    fit = _finish(kept, state, information, (_rms(alone[0]), _rms(alone[1])), settings)
+    fit = _finish(kept, state, information, (_rms(alone[0]), _rms(alone[1])))
     return replace(fit, dropped=dropped, repeated=repeated)
 
 
@@ -125,13 +128,12 @@ def _finish(
     state: RigState,
     information: Information,
     alone_px: tuple[float, float],
-    settings: CalibrationSettings,
 ) -> StereoFit:
     apart = [state.residuals(view, number) for number, view in enumerate(views)]
     errors = np.array([[_length_rms(side) for side in both] for both in apart])
     rms_px = _length_rms(np.concatenate([side for both in apart for side in both]))
-    if rms_px > settings.max_rms_px:
-        raise _no_fit(rms_px, alone_px, settings)
+    if rms_px > _MAX_RMS_PX:
+        raise _no_fit(rms_px, alone_px)
     return StereoFit(
         stereo_of(state), state, information, tuple(views), (), {}, errors, alone_px, rms_px
     )
@@ -168,9 +170,7 @@ def _check_count(
     )
 
 
-def _no_fit(
-    rms_px: float, alone_px: tuple[float, float], settings: CalibrationSettings
-) -> CalibrationError:
+def _no_fit(rms_px: float, alone_px: tuple[float, float]) -> CalibrationError:
     if rms_px > _MISMATCH * max(alone_px):
         what = "each camera fits alone, but not both together"
         hint = "were left and right taken at the same time, and do their names pair them correctly?"
@@ -180,6 +180,6 @@ def _no_fit(
     return CalibrationError(
         what,
         got=f"{rms_px:.1f} px rms (alone: left {alone_px[0]:.1f}, right {alone_px[1]:.1f})",
-        expected=f"at most {settings.max_rms_px:g} px",
+        expected=f"at most {_MAX_RMS_PX:g} px",
         hint=hint,
     )
