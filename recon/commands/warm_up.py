@@ -31,7 +31,7 @@ _SMALL: Final = (
     "street.width_px=192",
     "street.height_px=96",
     "street.focal_px=120",
-    "submaps.max_frames=3",
+    "submaps.length_m=2",
 )
 
 
