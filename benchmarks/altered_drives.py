@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from recon.commands.config import load_config
-from recon.commands.demo_source import demo_source
+from recon.commands.demo import demo_source
 from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8

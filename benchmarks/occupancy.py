@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import load_config
-from recon.commands.demo_source import demo_source
-from recon.commands.evaluate_occupancy import compare_occupancy
+from recon.commands.demo import demo_source
+from recon.commands.evaluate_occupancy import run_evaluate_occupancy
 from recon.commands.map import MapOptions, run_map
 from recon.run.summary import plain
 
@@ -66,7 +66,7 @@ def figures(seed: int, options: argparse.Namespace, runs: Path) -> dict[str, Any
     config = load_config(None, [*street, *options.set])
     out = runs / f"seed_{seed}"
     run_map(demo_source(config), config, MapOptions(command="demo", out=out, mesh=False))
-    found = plain(compare_occupancy(out).metrics)
+    found = plain(run_evaluate_occupancy(out).metrics)
     flat = {
         f"{part}.{name}": value
         for part, values in found.items()

@@ -18,8 +18,9 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from recon.commands.api import match, reconstruct
+    from recon.commands.audit import run_audit
     from recon.commands.config import ReconConfig, load_config
-    from recon.commands.evaluate_middlebury import MiddleburyOptions, run_middlebury
+    from recon.commands.evaluate_middlebury import run_middlebury
     from recon.commands.map import MapOptions, run_map
     from recon.commands.occupancy import OccupancyRequest, run_occupancy
     from recon.commands.pair import run_disparity, run_pair
@@ -58,7 +59,7 @@ if TYPE_CHECKING:
     from recon.io.trajectory import read_trajectory
     from recon.map.persistent import Map
     from recon.map.sequence import MappedSequence, map_sequence
-    from recon.rig.audit.run import Audit, run_audit
+    from recon.rig.audit import Audit
     from recon.sources import SourceSettings, StereoSource, open_source
     from recon.sources.pair_input import PairInput
     from recon.sources.synthetic import SyntheticSource
@@ -84,10 +85,11 @@ _HOMES = {
     "recon.stereo.match": ("Matcher",),
     "recon.export.mesh": ("reconstruct_mesh",),
     "recon.commands.api": ("match", "reconstruct"),
-    "recon.rig.audit.run": ("Audit", "run_audit"),
+    "recon.rig.audit": ("Audit",),
+    "recon.commands.audit": ("run_audit",),
     "recon.commands.config": ("ReconConfig", "load_config"),
     "recon.commands.map": ("MapOptions", "run_map"),
-    "recon.commands.evaluate_middlebury": ("MiddleburyOptions", "run_middlebury"),
+    "recon.commands.evaluate_middlebury": ("run_middlebury",),
     "recon.commands.occupancy": ("OccupancyRequest", "run_occupancy"),
     "recon.commands.pair": ("run_disparity", "run_pair"),
     "recon.sources.pair_input": ("PairInput",),
@@ -124,7 +126,6 @@ __all__ = [
     "MapOptions",
     "MappedSequence",
     "Matcher",
-    "MiddleburyOptions",
     "MiddleburyRules",
     "MiddleburyScene",
     "OccupancyGrid",

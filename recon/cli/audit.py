@@ -23,7 +23,8 @@ from recon.cli.options import (
     Tolerance,
     Verbose,
 )
-from recon.cli.session import print_figures, print_json, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_figures, print_json
 
 
 def audit(
@@ -62,27 +63,21 @@ def audit(
       recon audit rides/today --out audited
     """
     with session(quiet=quiet):
-        from recon.cli.show import announce
-        from recon.commands.audit import write_audit
+        from recon.cli.show.announce import announce
+        from recon.commands.audit import run_audit
         from recon.commands.config import load_config, source_overrides
         from recon.report.audit_table import audit_lines
-        from recon.rig.audit.run import mend_calibration, run_audit
         from recon.sources import open_source
 
         asked = source_overrides(calib, left, right, tolerance, (start, end, stride))
         settings = load_config(config, [*(set_ or ()), *asked])
         drive = open_source(source, kind, settings.source)
         announce(drive, quiet=quiet, verbose=verbose)
-        found = run_audit(drive, settings)
-        summary = found.summary
-        if mend is not None:
-            summary["mended"] = mend_calibration(drive, settings, found, mend)
-        if out is not None:
-            write_audit(found, drive, settings, out)
+        found = run_audit(drive, settings, mend=mend, out=out)
     if json:
-        print_json(summary)
+        print_json(found.summary)
         return
-    print_figures("", audit_lines(summary))
+    print_figures("", audit_lines(found.summary))
     for finding in found.findings:
         typer.echo(f"{'fatal' if finding.fatal else 'warning'}: {finding.text}")
     typer.echo(f"verdict: {found.verdict}")

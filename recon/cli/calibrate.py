@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from recon.cli.options import Config, Json, Quiet, Set, Threads, Verbose
-from recon.cli.session import print_json, print_run, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_json, print_run
 
 
 class Model(str, Enum):

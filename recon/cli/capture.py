@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from recon.cli.options import Config, Json, Quiet, Set
-from recon.cli.session import print_figures, print_json, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_figures, print_json
 
 
 def capture(

@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 
 from recon.cli.options import Config, Json, Mesh, Out, Quiet, Set, Threads, Verbose
-from recon.cli.session import print_json, print_run, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_json, print_run
 
 
 def demo(
@@ -35,22 +36,13 @@ def demo(
       recon demo --frames 60 --seed 3 --out outputs/street
     """
     with session(quiet=quiet):
-        from recon.cli.show import choose_viewer
+        from recon.cli.show.progress import choose_viewer
         from recon.commands.config import load_config
-        from recon.commands.demo_source import demo_source
-        from recon.commands.map import MapOptions, run_map
-        from recon.report.map_page import write_map_page
+        from recon.commands.demo import run_demo
 
         given = {"frames": frames, "seed": seed}
         overrides = [f"street.{key}={value}" for key, value in given.items() if value is not None]
         settings = load_config(config, [*(set_ or ()), *overrides])
-        options = MapOptions(
-            command="demo",
-            out=out,
-            threads=threads,
-            mesh=mesh,
-            progress=choose_viewer(quiet=quiet, verbose=verbose),
-            present=write_map_page,
-        )
-        run = run_map(demo_source(settings), settings, options)
+        viewer = choose_viewer(quiet=quiet, verbose=verbose)
+        run = run_demo(settings, out=out, mesh=mesh, threads=threads, progress=viewer)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 
 from recon.cli.options import Json, Quiet
-from recon.cli.session import print_json, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_json
 
 
 def doctor(
@@ -34,14 +35,14 @@ def doctor(
     with session(quiet=quiet):
         from dataclasses import asdict
 
-        from recon.commands.doctor import Check, examine
+        from recon.commands.doctor import examine
 
-        checks: list[Check] = examine()
+        checks = examine()
     missing = [check for check in checks if check.needed and not check.ok]
     if json:
         print_json({"ok": not missing, "checks": [asdict(check) for check in checks]})
     else:
-        from recon.cli.show.checks import print_checks
+        from recon.cli.show.tables import print_checks
 
         print_checks(checks)
     if missing:
@@ -50,7 +51,7 @@ def doctor(
 
 def _compile(*, json: bool, quiet: bool) -> None:
     with session(quiet=quiet):
-        from recon.commands.warm_up import compile_kernels
+        from recon.commands.doctor import compile_kernels
 
         done = compile_kernels()
     if json:

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from recon.cli.options import Json, Quiet
-from recon.cli.session import print_figures, print_json, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_figures, print_json
 
 
 def disparity(
@@ -42,9 +43,9 @@ def disparity(
       recon evaluate disparity disparity.pfm disp0GT.pfm --mask mask0nocc.png
     """
     with session(quiet=quiet):
-        from recon.commands.evaluate_disparity import compare_disparities
+        from recon.commands.evaluate_disparity import run_evaluate_disparity
 
-        figures = compare_disparities(estimate, truth, mask, scale=scale, confidence=confidence)
+        figures = run_evaluate_disparity(estimate, truth, mask, scale=scale, confidence=confidence)
     if json:
         print_json(figures)
         return

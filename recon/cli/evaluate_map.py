@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from recon.cli.options import Json, Quiet, parse_numbers
-from recon.cli.session import print_evaluation, print_json, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_evaluation, print_json
 
 
 class ReferenceFrame(str, Enum):

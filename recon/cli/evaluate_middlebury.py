@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
-from recon.cli.session import print_json, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_json
 
 _NONE = "none"
 Matchers = Annotated[
@@ -86,14 +87,15 @@ def middlebury(
     if json and latex:
         raise typer.BadParameter("--json and --latex exclude each other")
     with session(quiet=quiet):
-        from recon.cli.show import choose_viewer
+        from recon.cli.show.progress import choose_viewer
         from recon.commands.config import load_config
-        from recon.commands.evaluate_middlebury import MiddleburyOptions, run_middlebury
-        from recon.report.middlebury_page import draw_result, write_middlebury_page
+        from recon.commands.evaluate_middlebury import run_middlebury
         from recon.report.middlebury_tables import middlebury_tables
         from recon.report.table import Table, join
 
-        options = MiddleburyOptions(
+        summary = run_middlebury(
+            folder,
+            load_config(config, set_ or ()),
             matchers=_names(matcher),
             results=results or (),
             truth=truth,
@@ -102,10 +104,7 @@ def middlebury(
             parallel=parallel,
             auto_range=range_ is Range.auto,
             progress=choose_viewer(quiet=quiet, verbose=verbose),
-            draw=draw_result,
-            present=write_middlebury_page,
         )
-        summary = run_middlebury(folder, load_config(config, set_ or ()), options)
         form = Table.latex if latex else Table.text
         tables = join(map(form, middlebury_tables(summary)))
     for warning in summary["warnings"]:

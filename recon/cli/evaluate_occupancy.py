@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from recon.cli.options import Json, Quiet
-from recon.cli.session import print_figures, print_json, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_figures, print_json
 
 
 def occupancy(
@@ -31,14 +32,10 @@ def occupancy(
       recon evaluate occupancy outputs/demo/latest --picture compared.png
     """
     with session(quiet=quiet):
-        from recon.commands.evaluate_occupancy import compare_occupancy
-        from recon.io.images.image import write_image
-        from recon.report.colour import colour_grid_errors
+        from recon.commands.evaluate_occupancy import run_evaluate_occupancy
         from recon.run.summary import plain
 
-        compared = compare_occupancy(run, least_frames)
-        if picture is not None:
-            write_image(picture, colour_grid_errors(compared.grid, compared.truth))
+        compared = run_evaluate_occupancy(run, least_frames, image=picture)
         figures = plain(compared.metrics)
     if json:
         print_json(figures)

@@ -29,7 +29,8 @@ from recon.cli.options import (
     Tolerance,
     Verbose,
 )
-from recon.cli.session import print_json, print_run, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_json, print_run
 
 
 class OdometryName(str, Enum):
@@ -102,13 +103,14 @@ def map_(
     if poses is not None and prior is not None:
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
     with session(quiet=quiet):
-        from recon.cli.show import announce, choose_viewer, warn
+        from recon.cli.show.announce import announce, warn
+        from recon.cli.show.progress import choose_viewer
         from recon.commands.config import matching_overrides, source_overrides
         from recon.commands.map import MapOptions, run_map
         from recon.commands.resume import MapRequest, open_requested, plan_map
         from recon.io.trajectory import read_trajectory
         from recon.report.map_page import write_map_page
-        from recon.rig.audit.run import quick_warnings
+        from recon.rig.audit import quick_warnings
         from recon.sources import read_prior
 
         method = [] if odometry is None else [f"odometry.method={odometry.value}"]

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from recon.cli.options import Config, Formats, Json, Matcher, Out, Quiet, Set, Threads, Verbose
-from recon.cli.session import print_json, print_run, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_json, print_run
 
 Left = Annotated[Path, typer.Argument(help="Left image.")]
 Right = Annotated[Path, typer.Argument(help="Right image.")]
@@ -92,7 +93,7 @@ def pair(
       recon pair left.png right.png --focal 721.5 --baseline 0.54
     """
     with session(quiet=quiet):
-        from recon.cli.show import choose_viewer
+        from recon.cli.show.progress import choose_viewer
         from recon.commands.config import pair_config
         from recon.commands.pair import run_pair
         from recon.sources.pair_input import KnownCamera, read_pair_input, with_truth
@@ -143,7 +144,7 @@ def disparity(
       recon disparity raw_left.png raw_right.png --calib rig.yaml --matcher sgm
     """
     with session(quiet=quiet):
-        from recon.cli.show import choose_viewer
+        from recon.cli.show.progress import choose_viewer
         from recon.commands.config import pair_config
         from recon.commands.pair import run_disparity
         from recon.sources.pair_input import read_pair_input

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
-from recon.cli.session import print_json, print_run, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_json, print_run
 
 
 def paper(
@@ -42,14 +43,11 @@ def paper(
     """
     with session(quiet=quiet):
         from recon.commands.config import PAIR_DEFAULTS, load_config
-        from recon.commands.paper import PaperOptions, headline, run_paper
-        from recon.evaluation.paper.scenes import default_scenes_folder
-        from recon.report.paper_page import write_paper_page
+        from recon.commands.paper import headline, run_paper
 
         overrides = [*(set_ or ()), *(["paper.as_printed=true"] if as_printed else ())]
         settings = load_config(config, overrides, PAIR_DEFAULTS)
-        folder = scenes or default_scenes_folder()
-        run = run_paper(folder, settings, PaperOptions(out, threads, write_paper_page))
+        run = run_paper(scenes, settings, out=out, threads=threads)
     if json:
         print_json(run.summary)
     else:

@@ -7,14 +7,13 @@ one line, 130 = interrupted.
 from __future__ import annotations
 
 import io
-import json
 import os
 import sys
 import tempfile
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NoReturn, TextIO
+from typing import NoReturn, TextIO
 
 import typer
 
@@ -93,57 +92,6 @@ class _CompilingNotice:
             typer.echo(
                 "compiling kernels, once after an installation: about two minutes …", err=True
             )
-
-
-def print_json(content: Mapping[str, Any]) -> None:
-    """Print the machine-readable summary, the only thing on standard output."""
-    typer.echo(json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False))
-
-
-def print_figures(title: str, figures: Mapping[str, Any]) -> None:
-    """Print a two-column table of figures; nested values appear only in ``--json``."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(show_header=False)
-    for name, value in figures.items():
-        if isinstance(value, str | int | float) and value is not None:
-            table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
-    if title:
-        typer.echo(title)
-    Console().print(table)
-
-
-def print_evaluation(title: str, figures: Mapping[str, Any]) -> None:
-    """Print the figures of a comparison and of each part, its warnings and its folder."""
-    shown = {key: value for key, value in figures.items() if key != "out"}
-    limits = figures.get("by_threshold", ())
-    if len(limits) > 1:
-        shown = {key: value for key, value in shown.items() if key not in limits[0]}
-    for part in (*figures.get("by_length", ()), *(limits if len(limits) > 1 else ())):
-        (_, name), *values = part.items()
-        shown |= {f"{key} at {name:g} m": value for key, value in values}
-    print_figures(title, shown)
-    for warning in figures["warnings"]:
-        typer.echo(f"warning: {warning}", err=True)
-    if "out" in figures:
-        typer.echo(f"results: {figures['out']}")
-
-
-def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
-    """Print a run's figures, its warnings and its folder."""
-    shown = {key: value for key, value in summary.items() if key != "out"}
-    for group in ("prior", "loops", "trajectory", "map", "disparity"):
-        shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
-    for part in ("voxels", "grid"):
-        figures = summary.get("occupancy", {}).get(part, {})
-        shown |= {f"occupancy.{part}.{key}": value for key, value in figures.items()}
-    if stages:
-        shown |= {f"seconds.{key}": value for key, value in summary["stages"].items()}
-    print_figures("", shown)
-    for warning in summary["warnings"]:
-        typer.echo(f"warning: {warning}", err=True)
-    typer.echo(f"results: {summary['out']}")
 
 
 @contextmanager

@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 
 from recon.cli.options import Json, Quiet
-from recon.cli.session import print_json, session
+from recon.cli.session import session
+from recon.cli.show.tables import print_json
 
 
 def settings(
@@ -35,7 +36,8 @@ def settings(
     with session(quiet=quiet):
         from dataclasses import asdict
 
-        from recon.commands.settings_list import list_settings, settings_page
+        from recon.commands.settings import list_settings
+        from recon.core.settings_list import settings_page
 
         groups = list_settings(name)
     if json:
@@ -43,6 +45,6 @@ def settings(
     elif markdown:
         typer.echo(settings_page(groups), nl=False)
     else:
-        from recon.cli.show.settings_table import print_settings
+        from recon.cli.show.tables import print_settings
 
         print_settings(groups)

@@ -1,27 +1,53 @@
-"""`recon audit --out`: the report of an audit."""
+"""`recon audit`: is a recording good enough for a long run?"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from recon.commands.config import ReconConfig
 from recon.report.audit_page import write_audit_page
-from recon.rig.audit.run import Audit
+from recon.rig.audit import Audit, audit_source, mend_calibration
 from recon.run import Run
 from recon.sources import StereoSource
 from recon.stereo.match import make_matcher
 
 
-def write_audit(audit: Audit, source: StereoSource, config: ReconConfig, out: Path) -> None:
-    """Write ``report.html``, ``config.yaml``, ``summary.json`` and ``run.json`` of an audit.
+def run_audit(
+    source: StereoSource,
+    config: ReconConfig,
+    *,
+    quick: bool = False,
+    mend: Path | None = None,
+    out: Path | None = None,
+) -> Audit:
+    """Check a recording before a long run: what `recon audit` does.
+
+    Some stretches of the recording are read, and features are matched in some of their pairs. What
+    they say of rows, time, exposure, focus and calibration gives findings and a verdict.
+
+    Args:
+        source: The recording.
+        config: The configuration; its ``audit``, ``rectification`` and ``matching`` are used.
+        quick: A short check of a second or two, as `recon map` makes it.
+        mend: File for a calibration with corrected row alignment; None = none is written.
+        out: Folder for a report with images; None = none is written.
 
     Raises:
-        OutputError: A file cannot be written; then the folder is left as it was.
+        CalibrationError: The calibration cannot rectify anything, or there are too few features to
+            correct it.
+        ReconError: The calibration or the report cannot be written.
     """
-    summary = audit.summary
-    summary["warnings"] = [finding.text for finding in audit.findings]
-    with Run("audit", out, config) as run:
+    audit = audit_source(source, config, quick=quick)
+    if mend is not None:
+        audit = replace(audit, corrected=mend_calibration(source, config, audit, mend))
+    if out is not None:
         matcher = make_matcher(config.matching.matcher, config.matching, None)
-        with run.report(summary):
-            write_audit_page(audit, source, matcher, run)
-        run.finish(summary, source=source.name, inputs=source.files)
+        with Run("audit", out, config) as run:
+            summary = audit.summary
+            with run.report(summary):
+                write_audit_page(audit, source, matcher, run)
+            warnings = [finding.text for finding in audit.findings]
+            record = {"warnings": warnings}
+            run.finish(summary, source=source.name, inputs=source.files, record=record)
+    return audit

@@ -1,42 +1,21 @@
-"""`recon capture` without its command line: record cameras into a folder of pairs."""
+"""`recon capture`: record cameras into a folder of pairs."""
 
 from __future__ import annotations
 
 import json
-import queue
 import shutil
-import threading
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-import numpy as np
-
-from recon.core.errors import FormatError, ReconError
+from recon.core.errors import FormatError
 from recon.io.atomic import write_text
-from recon.rig.capture import CapturedPair, Recording, capture_pairs, warm_up
+from recon.rig.capture import Recording, capture_pairs, warm_up
 from recon.rig.capture_folder import CaptureFolder
+from recon.rig.capture_writer import CaptureLog, write_pairs
 from recon.sources.opencv_camera import Camera, OpenCvCamera
-
-# Length of the write queue: a longer one would only hide that the disk is too slow.
-_WAITING: Final = 32
-# A time step longer than this many periods means that a frame was lost.
-_GAP_PERIODS: Final = 1.5
-
-
-@dataclass(eq=False)
-class _Log:
-    """Timestamps of the pairs that were written."""
-
-    left_s: list[float] = field(default_factory=list)
-    right_s: list[float] = field(default_factory=list)
-
-    def add(self, pair: CapturedPair) -> None:
-        self.left_s.append(pair.left_s)
-        self.right_s.append(pair.right_s)
 
 
 def run_capture(
@@ -85,19 +64,19 @@ def record(
 ) -> dict[str, Any]:
     """Record from opened cameras; see `run_capture`."""
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    log = _Log()
+    log = CaptureLog()
     with CaptureFolder(folder, settings.suffix) as target:
         if calibration is not None:
             shutil.copyfile(calibration, folder / f"calibration{calibration.suffix}")
         locked = warm_up(cameras, settings)
         try:
-            _write_all(capture_pairs(cameras, settings, stopped), target, settings, log)
+            write_pairs(capture_pairs(cameras, settings, stopped), target, settings, log)
         finally:
             summary = {
                 "started_utc": started,
                 "devices": [camera.name for camera in cameras],
                 "exposure_locked": locked,
-                **_figures(log),
+                **log.figures,
                 "calibration": calibration is not None,
                 "out": str(folder),
             }
@@ -105,54 +84,6 @@ def record(
             if target.frames:
                 _write_summary(folder, summary)
     return summary
-
-
-def _write_all(
-    pairs: Iterable[CapturedPair], target: CaptureFolder, settings: Recording, log: _Log
-) -> None:
-    """Write in a second thread, so that the disk does not block the cameras."""
-    waiting: queue.Queue[CapturedPair | None] = queue.Queue(_WAITING)
-    failed: list[Exception] = []
-
-    def work() -> None:
-        while (pair := waiting.get()) is not None:
-            if failed:
-                continue  # keep draining the queue, so that the other thread does not block
-            try:
-                target.add(pair)
-                log.add(pair)
-                if settings.preview_every and (target.frames - 1) % settings.preview_every == 0:
-                    target.preview(pair)
-            except (ReconError, OSError, MemoryError) as error:
-                failed.append(error)
-
-    writer = threading.Thread(target=work, name="capture-writer")
-    writer.start()
-    try:
-        for pair in pairs:
-            if failed:
-                break
-            waiting.put(pair)
-    finally:
-        waiting.put(None)
-        writer.join()
-    if failed:
-        raise failed[0]
-
-
-def _figures(log: _Log) -> dict[str, Any]:
-    left_s, right_s = np.array(log.left_s), np.array(log.right_s)
-    frames = len(left_s)
-    steps_s, skew_s = np.diff(left_s), np.abs(right_s - left_s)
-    period_s = float(np.median(steps_s)) if frames > 1 else None
-    return {
-        "frames": frames,
-        "seconds": float(left_s[-1] - left_s[0]) if frames else 0.0,
-        "rate_hz": 1 / period_s if period_s else None,
-        "gaps": int((steps_s > _GAP_PERIODS * period_s).sum()) if period_s else 0,
-        "skew_mean_ms": 1000 * float(skew_s.mean()) if frames else None,
-        "skew_max_ms": 1000 * float(skew_s.max()) if frames else None,
-    }
 
 
 def _write_summary(folder: Path, summary: dict[str, Any]) -> None:

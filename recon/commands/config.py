@@ -87,7 +87,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "rectify": ("rectification",),
     "calibrate": ("source", "rectification", "calibration"),
     "audit": ("source", "rectification", "matching", "audit"),
-    "evaluate": ("rectification", "matching"),
+    "evaluate-middlebury": ("rectification", "matching"),
     "paper": (*_FRAME, "mesh", "paper"),
 }
 """The groups of settings that determine the result of each command."""

@@ -1,76 +1,67 @@
-"""Checks of the installation and the machine."""
+"""`recon doctor`: check the installation, or compile the kernels before they are needed."""
 
 from __future__ import annotations
 
-import ctypes
-import os
-import platform
-import shutil
-import subprocess
-import sys
 import tempfile
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+import time
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
+from itertools import product
 from pathlib import Path
-from types import MappingProxyType
 from typing import Final
 
-from recon.core.kernels.cache import cache_parent
-from recon.run.machine import available_cores
+import numpy as np
 
-MIN_PYTHON: Final = (3, 10)
-MIN_MEMORY_GB: Final = 3.0
-MIN_DISK_GB: Final = 1.0
-_IMPORT_TIMEOUT_S: Final = 120.0
-
-# Package name -> module name.
-PACKAGES: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "numpy": "numpy",
-        "numba": "numba",
-        "opencv-python-headless": "cv2",
-        "open3d": "open3d",
-        "kiss-icp": "kiss_icp",
-        "pymeshlab": "pymeshlab",
-        "matplotlib": "matplotlib",
-        "plotly": "plotly",
-        "pydantic": "pydantic",
-        "typer": "typer",
-        "rich": "rich",
-        "pyyaml": "yaml",
-    }
+from recon.commands.config import PAIR_DEFAULTS, load_config
+from recon.commands.demo import demo_source
+from recon.commands.finished_run import OCTOMAP
+from recon.commands.map import MapOptions, run_map
+from recon.commands.occupancy import OccupancyRequest, run_occupancy
+from recon.commands.pair import run_pair
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.kernels.cache import when_compiling
+from recon.core.values import StereoPair
+from recon.io.occupancy.octomap_leaves import octomap_pieces
+from recon.map.sequence import MappedSequence, map_sequence
+from recon.run.installation import (
+    PACKAGES,
+    SYSTEM_LIBRARIES,
+    Check,
+    check_cores,
+    check_data,
+    check_disk,
+    check_folder,
+    check_kiss_icp_environment,
+    check_memory,
+    check_numba,
+    check_opencv_threads,
+    check_packages,
+    check_python,
+    check_system_libraries,
 )
-# Shared library -> Debian or Ubuntu package that provides it.
-SYSTEM_LIBRARIES: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "libGL.so.1": "libgl1",
-        "libEGL.so.1": "libegl1",
-        "libX11.so.6": "libx11-6",
-        "libusb-1.0.so.0": "libusb-1.0-0",
-        "libOpenGL.so.0": "libopengl0",
-    }
+from recon.sources.pair_input import PairInput
+from recon.stereo.match import MATCHERS
+
+_MATCHERS: Final = tuple(name for name in MATCHERS if name != "onnx")  # it needs a network
+_SMALL: Final = (
+    "street.frames=6",
+    "street.width_px=192",
+    "street.height_px=96",
+    "street.focal_px=120",
+    "submaps.length_m=2",
 )
 
 
 @dataclass(frozen=True)
-class Check:
-    """The result of one check.
+class WarmUp:
+    """What was compiled.
 
     Attributes:
-        name: What was checked.
-        ok: Whether it passed.
-        found: What was found.
-        hint: What to do if it failed, else "".
-        needed: Whether runs fail without it; else it is optional.
+        kernels: Number of kernels that were not in the cache.
+        seconds: Time that all of it took.
     """
 
-    name: str
-    ok: bool
-    found: str
-    hint: str = ""
-    needed: bool = True
+    kernels: int
+    seconds: float
 
 
 def examine(outputs: Path = Path("outputs")) -> list[Check]:
@@ -97,148 +88,40 @@ def examine(outputs: Path = Path("outputs")) -> list[Check]:
     ]
 
 
-def check_python() -> Check:
-    """The version of Python."""
-    least = ".".join(map(str, MIN_PYTHON))
-    ok = sys.version_info >= MIN_PYTHON
-    return Check(
-        "Python", ok, platform.python_version(), "" if ok else f"install Python >= {least}"
-    )
+def compile_kernels() -> WarmUp:
+    """Compile the kernels that pairs, drives and occupancy maps run, for all matchers of ours.
+
+    They run once on small rendered images.
+
+    The real stages run, so that a kernel that is added to one needs no mention here.
+
+    Raises:
+        OutputError: The temporary folder cannot be written.
+    """
+    begun, compiled = time.perf_counter(), set[str]()
+    with when_compiling(compiled.add), tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        config = load_config(None, _SMALL)
+        source = demo_source(config)
+        run_map(source, config, MapOptions(command="demo", out=folder / "drive", mesh=False))
+        run_occupancy(OccupancyRequest(folder / "drive", out=folder / "occupancy"))
+        _read_again(folder / "drive" / OCTOMAP)
+        _move_submaps(map_sequence(source, config))
+        colour = next(iter(source))
+        grey = StereoPair(*(image[:, :, 1].copy() for image in (colour.left, colour.right)))
+        for number, (matcher, pair) in enumerate(product(_MATCHERS, (colour, grey))):
+            config = load_config(None, [f"matching.matcher={matcher}"], PAIR_DEFAULTS)
+            run_pair(PairInput(pair, source.calibration), config, out=folder / str(number))
+    return WarmUp(len(compiled), time.perf_counter() - begun)
 
 
-def check_packages(packages: Mapping[str, str]) -> list[Check]:
-    """Installed version of each package, and whether it can be imported."""
-    with ThreadPoolExecutor(max_workers=available_cores()) as pool:
-        return list(pool.map(check_package, packages, packages.values()))
+def _read_again(octomap: Path) -> None:
+    """As a mesh of a run does, which asks where the cameras saw free space."""
+    for _ in octomap_pieces(octomap):
+        pass
 
 
-def check_package(name: str, module: str) -> Check:
-    """One package, imported in its own process."""
-    try:
-        installed = version(name)
-    except PackageNotFoundError:
-        return Check(name, ok=False, found="not installed", hint=f"run: pip install {name}")
-    done, told = _run_python(f"import {module}")
-    if done:
-        return Check(name, ok=True, found=installed)
-    return Check(name, ok=False, found=f"{installed}, {told}", hint=_import_hint(name, told))
-
-
-def check_system_libraries(libraries: Mapping[str, str]) -> list[Check]:
-    """The shared libraries that the packages load; no checks outside Linux."""
-    if sys.platform != "linux":
-        return []
-    return [_check_library(library, package) for library, package in libraries.items()]
-
-
-def check_cores() -> Check:
-    """CPU cores available to this process."""
-    return Check("cores", ok=True, found=str(available_cores()), needed=False)
-
-
-def check_memory() -> Check:
-    """The memory of the machine."""
-    try:
-        memory_gb = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
-    except (AttributeError, ValueError, OSError):  # not available on this system
-        return Check("memory", ok=True, found="unknown", needed=False)
-    ok = memory_gb >= MIN_MEMORY_GB
-    hint = "" if ok else f"long drives need {MIN_MEMORY_GB:g} GB: map fewer frames"
-    return Check("memory", ok, f"{memory_gb:.1f} GB", hint, needed=False)
-
-
-def check_opencv_threads() -> Check:
-    """Default number of threads of OpenCV."""
-    done, told = _run_python("import cv2; print(cv2.getNumThreads())")
-    found = told if done else "unknown"
-    return Check("OpenCV threads", done, found, "" if done else "see opencv", needed=False)
-
-
-def check_numba() -> Iterator[Check]:
-    """Whether kernels are compiled, and whether the compiled code is cached for the next run."""
-    off = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
-    yield Check(
-        "compiled kernels",
-        ok=not off,
-        found="off: NUMBA_DISABLE_JIT is set" if off else "on",
-        hint="unset NUMBA_DISABLE_JIT; runs take hours with it" if off else "",
-        needed=False,
-    )
-    yield check_folder(
-        "kernels can be cached",
-        cache_parent(),
-        needed=False,
-        hint="set NUMBA_CACHE_DIR to a folder that can be written, or each run compiles anew",
-    )
-
-
-def check_kiss_icp_environment() -> Check:
-    """Environment variables ``kiss_icp_…``, which would silently change kiss-icp's settings."""
-    names = sorted(name for name in os.environ if name.lower().startswith("kiss_icp"))
-    hint = f"unset {' '.join(names)}" if names else ""
-    found = ", ".join(names) or "none set"
-    return Check("kiss-icp variables", not names, found, hint, needed=False)
-
-
-def check_data() -> Check:
-    """The folder of real data that tests and benchmarks use."""
-    name, folder = "real data (RECON_DATA)", os.environ.get("RECON_DATA")
-    if not folder:
-        return Check(name, ok=True, found="not set; only tests and benchmarks use it", needed=False)
-    ok = Path(folder).is_dir()
-    hint = "" if ok else "set RECON_DATA to a folder, or unset it"
-    return Check(name, ok, folder if ok else f"{folder} is no folder", hint, needed=False)
-
-
-def check_folder(name: str, folder: Path, *, needed: bool, hint: str) -> Check:
-    """Whether a folder, or the one that it would be created in, is writable."""
-    nearest = next((p for p in (folder, *folder.absolute().parents) if p.exists()), Path())
-    try:
-        with tempfile.TemporaryFile(dir=nearest):
-            return Check(name, ok=True, found=str(folder.absolute()), needed=needed)
-    except OSError as error:
-        found = f"{nearest.absolute()}: {error.strerror or error}"
-        return Check(name, ok=False, found=found, hint=hint, needed=needed)
-
-
-def check_disk(folder: Path) -> Check:
-    """Free disk space for results."""
-    nearest = next((p for p in (folder, *folder.absolute().parents) if p.exists()), Path())
-    free_gb = shutil.disk_usage(nearest).free / 1e9
-    ok = free_gb >= MIN_DISK_GB
-    hint = "" if ok else "free some space, or use --out on another disk"
-    return Check("free disk space", ok, f"{free_gb:.1f} GB", hint, needed=False)
-
-
-def _check_library(library: str, package: str) -> Check:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return Check(library, ok=False, found="missing", hint=f"run: apt-get install {package}")
-    return Check(library, ok=True, found="loads")
-
-
-def _run_python(code: str) -> tuple[bool, str]:
-    """Whether code runs in a new Python process, and the last line that it printed."""
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=_IMPORT_TIMEOUT_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return False, f"no answer in {_IMPORT_TIMEOUT_S:g} s"
-    if done.returncode < 0:
-        return False, f"crashed with signal {-done.returncode}"
-    lines = (done.stdout if done.returncode == 0 else done.stderr).strip().splitlines()
-    return done.returncode == 0, lines[-1] if lines else ""
-
-
-def _import_hint(name: str, told: str) -> str:
-    for library, package in SYSTEM_LIBRARIES.items():
-        if library in told:
-            return f"run: apt-get install {package}"
-    return f"run: pip install --force-reinstall {name}"
+def _move_submaps(mapped: MappedSequence) -> None:
+    """As closed loops do; so small a drive has none."""
+    turn = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
+    mapped.corrected(np.tile(turn, (len(mapped.submaps.entries), 1, 1))).map.voxels()

@@ -1,4 +1,4 @@
-"""`recon evaluate disparity` without its command line: compare disparity files."""
+"""`recon evaluate disparity`: compare a disparity map with ground truth."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from recon.run.summary import plain
 _COUNTED: Final = 255
 
 
-def compare_disparities(
+def run_evaluate_disparity(
     estimate: Path,
     truth: Path,
     mask: Path | None = None,
@@ -29,7 +29,7 @@ def compare_disparities(
     scale: float = 1.0,
     confidence: Path | None = None,
 ) -> dict[str, Any]:
-    """Figures of one disparity map file (PFM or 16-bit PNG) against another.
+    """Compare one disparity map file (PFM or 16-bit PNG) with another: `recon evaluate disparity`.
 
     Args:
         estimate: The map; holes are filled for the dense figures, KITTI's ``d1`` among them.

@@ -1,18 +1,20 @@
-"""`recon evaluate occupancy` without its command line: compare a run with ground truth."""
+"""`recon evaluate occupancy`: compare the occupancy maps of a run with ground truth."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from recon.commands.demo_source import demo_source
+from recon.commands.demo import demo_source
 from recon.commands.finished_run import GRID, OCTOMAP, FinishedRun, open_run
 from recon.core.errors import EvaluationError
 from recon.core.values import OccupancyGrid, OccupancyMetrics, OccupancyTruth
 from recon.evaluation import evaluate_occupancy
 from recon.evaluation.occupancy_truth import LEAST_FRAMES, known_occupancy
+from recon.io.images.image import write_image
 from recon.io.occupancy.nav2 import read_nav2
 from recon.io.occupancy.octomap import read_octomap
+from recon.report.colour import colour_grid_errors
 from recon.sources import KnowsOccupancy
 
 
@@ -31,21 +33,29 @@ class OccupancyComparison:
     truth: OccupancyTruth
 
 
-def compare_occupancy(folder: Path, least_frames: int = LEAST_FRAMES) -> OccupancyComparison:
-    """Compare ``map/octomap.ot`` and ``map/grid.*`` of a run with ground truth.
+def run_evaluate_occupancy(
+    folder: Path, least_frames: int = LEAST_FRAMES, *, image: Path | None = None
+) -> OccupancyComparison:
+    """Compare ``map/octomap.ot`` and ``map/grid.*`` of a run: `recon evaluate occupancy`.
+
+    The street is rendered again, and what its cameras can have known of each cell is the truth.
 
     Args:
         folder: A run of a rendered street: of ``recon demo``, or of ``recon occupancy`` on one.
         least_frames: Number of frames that must have seen a cell for it to be compared.
+        image: PNG for the grid with its errors in colour; None = none is drawn.
 
     Raises:
         FormatError: The folder does not contain a finished run, or a map is missing or damaged.
         EvaluationError: The run has no ground truth, or no cell was seen often enough.
+        OutputError: The image cannot be written.
     """
     run = open_run(folder)
     source = _source_that_knows(run)
     voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
     truth = known_occupancy(source, run.config, run.T_map_world, least_frames)
+    if image is not None:
+        write_image(image, colour_grid_errors(grid, truth))
     return OccupancyComparison(evaluate_occupancy(voxels, grid, truth), grid, truth)
 
 

@@ -6,11 +6,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.commands.paper import ExperimentResult, PaperRun
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import apply
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.evaluation.paper.methods import AS_PRINTED, BAD_PX, CORRECTED, TITLES, MethodResult
+from recon.evaluation.paper.result import ExperimentResult, PaperRun
 from recon.evaluation.paper.scenes import camera_of_table_1
 from recon.io.images.image import write_image
 from recon.report.colour import colour_disparity

@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from recon.cli.show.checks import print_checks
-from recon.commands import doctor
-from recon.commands.doctor import Check, examine
+from recon.cli.show.tables import print_checks
+from recon.commands.doctor import examine
+from recon.run import installation
+from recon.run.installation import Check
 
 
 def test_this_machine_is_examined_and_ready(tmp_path: Path) -> None:
@@ -22,14 +23,14 @@ def test_this_machine_is_examined_and_ready(tmp_path: Path) -> None:
 
 
 def test_failed_checks_say_what_to_do() -> None:
-    missing = doctor.check_package("no-such-package", "no_such_package")
+    missing = installation.check_package("no-such-package", "no_such_package")
     assert not missing.ok
     assert missing.found == "not installed"
     assert missing.hint == "run: pip install no-such-package"
 
 
 def test_a_package_that_cannot_be_imported_is_told_with_its_last_line() -> None:
-    broken = doctor.check_package("numpy", "no_such_module")
+    broken = installation.check_package("numpy", "no_such_module")
     assert not broken.ok
     assert "ModuleNotFoundError" in broken.found
     assert broken.hint
@@ -39,20 +40,20 @@ def test_a_missing_system_library_names_its_package(monkeypatch: pytest.MonkeyPa
     def fail(_: str) -> tuple[bool, str]:
         return False, "OSError: libGL.so.1: cannot open shared object file"
 
-    monkeypatch.setattr(doctor, "_run_python", fail)
-    assert doctor.check_package("numpy", "numpy").hint == "run: apt-get install libgl1"
+    monkeypatch.setattr(installation, "_run_python", fail)
+    assert installation.check_package("numpy", "numpy").hint == "run: apt-get install libgl1"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="libraries are looked for on Linux alone")
 def test_system_libraries_are_looked_for() -> None:
-    (check,) = doctor.check_system_libraries({"libnothing.so.9": "libnothing9"})
+    (check,) = installation.check_system_libraries({"libnothing.so.9": "libnothing9"})
     assert not check.ok
     assert check.hint == "run: apt-get install libnothing9"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals of this kind")
 def test_a_package_that_crashes_the_process_is_told() -> None:
-    done, told = doctor._run_python("import os; os.abort()")
+    done, told = installation._run_python("import os; os.abort()")
     assert not done
     assert told.startswith("crashed with signal")
 
@@ -62,7 +63,7 @@ def test_an_import_that_never_ends_is_told(monkeypatch: pytest.MonkeyPatch) -> N
         raise subprocess.TimeoutExpired("python", 1)
 
     monkeypatch.setattr(subprocess, "run", late)
-    done, told = doctor._run_python("pass")
+    done, told = installation._run_python("pass")
     assert not done
     assert "no answer" in told
 
@@ -71,32 +72,32 @@ def test_real_data_may_be_missing_but_not_wrong(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.delenv("RECON_DATA", raising=False)
-    assert doctor.check_data().ok
+    assert installation.check_data().ok
     monkeypatch.setenv("RECON_DATA", str(tmp_path))
-    assert doctor.check_data().ok
+    assert installation.check_data().ok
     monkeypatch.setenv("RECON_DATA", str(tmp_path / "nowhere"))
-    assert not doctor.check_data().ok
+    assert not installation.check_data().ok
 
 
 def test_variables_that_change_kiss_icp_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("kiss_icp_mapping", "{}")
-    check = doctor.check_kiss_icp_environment()
+    check = installation.check_kiss_icp_environment()
     assert not check.ok
     assert "unset kiss_icp_mapping" in check.hint
 
 
 def test_kernels_that_are_not_compiled_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
-    assert not next(iter(doctor.check_numba())).ok
+    assert not next(iter(installation.check_numba())).ok
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "0")
-    assert next(iter(doctor.check_numba())).ok
+    assert next(iter(installation.check_numba())).ok
 
 
 def test_a_folder_below_a_file_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     below = tmp_path / "file" / "outputs"
-    assert not doctor.check_folder("x", below, needed=True, hint="use --out").ok
-    assert doctor.check_folder("x", tmp_path / "a" / "b", needed=True, hint="").ok
+    assert not installation.check_folder("x", below, needed=True, hint="use --out").ok
+    assert installation.check_folder("x", tmp_path / "a" / "b", needed=True, hint="").ok
     assert list(tmp_path.iterdir()) == [tmp_path / "file"]
 
 

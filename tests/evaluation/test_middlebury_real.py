@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from recon.commands.config import load_config
-from recon.commands.evaluate_middlebury import MiddleburyOptions, run_middlebury
+from recon.commands.evaluate_middlebury import run_middlebury
 
 pytestmark = pytest.mark.real
 
@@ -16,11 +15,9 @@ SCENES = 8
 
 @pytest.fixture(scope="module")
 def figures(recon_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
-    options = MiddleburyOptions(
-        matchers=("opencv-bm", "opencv-sgbm"), out=tmp_path_factory.mktemp("real") / "run"
-    )
+    matchers, out = ("opencv-bm", "opencv-sgbm"), tmp_path_factory.mktemp("real") / "run"
     folder = recon_data / "middlebury" / "MiddEval3" / "trainingQ"
-    return run_middlebury(folder, load_config(), options)["matchers"]
+    return run_middlebury(folder, matchers=matchers, out=out)["matchers"]
 
 
 # Measured elsewhere with OpenCV 5 on all 15 scenes of the table, of which 8 are here: bad1, bad2,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.commands.evaluate_occupancy import compare_occupancy
+from recon.commands.evaluate_occupancy import run_evaluate_occupancy
 from recon.core.errors import EvaluationError, FormatError
 from recon.io.occupancy.nav2 import read_nav2
 from recon.report.colour import GRID_ERRORS, GRID_NOT_COUNTED
@@ -26,12 +26,12 @@ def run(small_demo: Path) -> Path:
 
 def test_the_files_of_a_run_give_its_own_figures(run: Path) -> None:
     told = json.loads((run / "summary.json").read_text())["occupancy"]
-    assert plain(compare_occupancy(run).metrics) == told
+    assert plain(run_evaluate_occupancy(run).metrics) == told
     assert 0 < told["voxels"]["precision"] < 1
 
 
 def test_more_frames_must_have_seen_what_is_compared(run: Path) -> None:
-    few, many = (compare_occupancy(run, least).metrics for least in (1, 6))
+    few, many = (run_evaluate_occupancy(run, least).metrics for least in (1, 6))
     assert few.voxels.true_voxels > many.voxels.true_voxels > 0
     assert many.least_frames == 6
 
@@ -61,7 +61,7 @@ def test_a_run_whose_truth_is_not_known_is_refused(run: Path, tmp_path: Path) ->
     record = json.loads((copy / "run.json").read_text())
     (copy / "run.json").write_text(json.dumps({**record, "command": "map"}))
     with pytest.raises(EvaluationError, match=r"not known.*recon map.*evaluate map"):
-        compare_occupancy(copy)
+        run_evaluate_occupancy(copy)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_folder_without_its_files_is_refused(
     copy = shutil.copytree(run, tmp_path / "copy")
     (copy / lost).unlink()
     with pytest.raises(FormatError, match=words):
-        compare_occupancy(copy)
+        run_evaluate_occupancy(copy)
 
 
 @pytest.mark.parametrize("record", ["{}", "no json", "[]", '{"T_map_world": [[1], 2]}'])
@@ -87,7 +87,7 @@ def test_a_broken_record_is_refused(run: Path, tmp_path: Path, record: str) -> N
     copy = shutil.copytree(run, tmp_path / "copy")
     (copy / "run.json").write_text(record)
     with pytest.raises(FormatError, match="record"):
-        compare_occupancy(copy)
+        run_evaluate_occupancy(copy)
 
 
 def test_grids_that_other_programs_drew_larger_are_compared_all_the_same(
@@ -104,4 +104,4 @@ def test_grids_that_other_programs_drew_larger_are_compared_all_the_same(
     x = grid.origin_m[0]
     assert f"- {x}" in text
     (copy / "map" / "grid.yaml").write_text(text.replace(f"- {x}", f"- {x - 5 * 0.2}", 1))
-    assert compare_occupancy(copy).metrics == compare_occupancy(run).metrics
+    assert run_evaluate_occupancy(copy).metrics == run_evaluate_occupancy(run).metrics

@@ -198,10 +198,8 @@ class Known:
 
 
 def test_a_matcher_of_ones_own_is_a_column_too(scenes: Path, results: Path, tmp_path: Path) -> None:
-    options = recon.MiddleburyOptions(
-        matchers=[Known()], results=[str(results / "mine")], out=tmp_path / "run"
-    )
-    summary = recon.run_middlebury(str(scenes), recon.load_config(), options)
+    mine, out = [str(results / "mine")], tmp_path / "run"
+    summary = recon.run_middlebury(str(scenes), matchers=[Known()], results=mine, out=out)
     assert list(summary["matchers"]) == ["known", "mine"]
     weighted = summary["matchers"]["known"]["weighted"]
     assert weighted["all"]["invalid"] == 50

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from recon.commands.config import load_config
-from recon.commands.demo_source import demo_source
+from recon.commands.demo import demo_source
 from recon.commands.map import MapOptions, run_map
 from recon.commands.occupancy import OccupancyRequest, run_occupancy
 from recon.core.geometry.se3 import invert

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.commands.evaluate_occupancy import compare_occupancy
+from recon.commands.evaluate_occupancy import run_evaluate_occupancy
 from recon.commands.occupancy import OccupancyRequest, run_occupancy
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.core.values import OCCUPIED
@@ -72,7 +72,7 @@ def test_another_resolution_is_right_too(
     assert summary["resolution_m"] == resolution_m
     grid, voxels = read_nav2(out / "map/grid.yaml"), read_octomap(out / "map/octomap.ot")
     assert grid.resolution_m == voxels.resolution_m == resolution_m
-    found = compare_occupancy(out).metrics
+    found = run_evaluate_occupancy(out).metrics
     assert found.resolution_m == resolution_m
     assert found.voxels.precision > precision
     assert found.voxels.recall > recall

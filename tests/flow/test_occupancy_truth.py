@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.demo_source import demo_source
+from recon.commands.demo import demo_source
 from recon.commands.map import MapOptions, run_map
 from recon.core.values import OccupancyMetrics
 

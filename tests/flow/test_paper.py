@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from recon.commands.config import PAIR_DEFAULTS, load_config
-from recon.commands.paper import PaperOptions, headline, run_paper
+from recon.commands.paper import headline, run_paper
 from recon.core.values import RectifiedCamera
 from recon.io.images.image import write_image
 from recon.io.images.pfm import read_pfm, write_pfm
@@ -162,7 +162,7 @@ def test_its_configuration_gives_the_same_figures(
     scenes: Path, run: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
     config = load_config(run[0] / "config.yaml")
-    again = run_paper(scenes, config, PaperOptions(out=tmp_path / "again", threads=1))
+    again = run_paper(scenes, config, out=tmp_path / "again", threads=1)
     assert json.loads(json.dumps(again.summary["experiments"])) == run[1]["experiments"]
 
 
@@ -170,7 +170,7 @@ def test_without_the_option_only_the_corrected_method_is_tried(
     scenes: Path, tmp_path: Path
 ) -> None:
     config = load_config(None, ["paper.patches_px=[5]"], PAIR_DEFAULTS)
-    run = run_paper(scenes, config, PaperOptions(out=tmp_path / "out"))
+    run = run_paper(scenes, config, out=tmp_path / "out")
     assert [one.method for result in run.experiments for one in result.methods] == ["corrected"] * 3
     assert next(iter(headline(run.summary))) == "2 ArtL, corrected"
     assert not (tmp_path / "out/experiment_2_ArtL/as_printed").exists()

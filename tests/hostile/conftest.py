@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.demo_source import demo_source
+from recon.commands.demo import demo_source
 from recon.commands.map import MapOptions, run_map
 from recon.io.images.image import write_image
 from recon.sources.synthetic import SyntheticSource

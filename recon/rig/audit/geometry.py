@@ -9,7 +9,8 @@ import numpy as np
 
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.rig.audit import RowAlignment, align_rows, measure_time_skew
+from recon.rig.audit.alignment import RowAlignment, align_rows
+from recon.rig.audit.measures import measure_time_skew
 from recon.rig.audit.sample import Sample
 from recon.stereo.rectify import PairFeatures, inspect_features
 

@@ -18,8 +18,8 @@ from recon.core.values import (
     StereoCalibration,
     StereoPair,
 )
-from recon.rig.audit import Finding
-from recon.rig.audit.run import run_audit
+from recon.rig.audit.audit import audit_source
+from recon.rig.audit.findings import Finding
 from recon.rig.audit.settings import AuditedSettings
 from recon.sources.pair_input import PairInput
 
@@ -74,7 +74,7 @@ def find_pair_faults(
         return ()
     codes = _BY_PICTURES | _BY_CALIBRATION if metric else _BY_PICTURES
     try:
-        audit = run_audit(_OnePair(given.pair, given.calibration), config, quick=True)
+        audit = audit_source(_OnePair(given.pair, given.calibration), config, quick=True)
     except CalibrationError:
         return ()  # the run itself reports this later
     return tuple(finding for finding in audit.findings if finding.code in codes)

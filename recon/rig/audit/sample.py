@@ -12,15 +12,15 @@ import numpy as np
 from recon.core.errors import ReconError
 from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Float64
-from recon.rig.audit import (
-    AuditSettings,
+from recon.rig.audit.alignment import count_aligned
+from recon.rig.audit.measures import (
     RepeatCounter,
-    count_aligned,
     measure_gain,
     measure_sharpness,
     measure_speed,
     track,
 )
+from recon.rig.audit.settings import AuditSettings
 from recon.sources import StereoSource
 from recon.stereo.rectify import PairFeatures, Rectifier, match_features
 

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from recon.cli.show import announce, warn
+from recon.cli.show.announce import announce, warn
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetSettings
 

@@ -11,7 +11,7 @@ import pytest
 from recon.commands.config import load_config
 from recon.core.values import StereoCalibration, StereoPair
 from recon.io.cameras.calibration import read_calibration
-from recon.rig.audit.run import mend_calibration, run_audit
+from recon.rig.audit import audit_source, mend_calibration
 from recon.sources import StereoSource, open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetScene
@@ -34,24 +34,24 @@ def street() -> faults.Spoiled:
 
 
 def codes(source: StereoSource, *, quick: bool = False) -> set[str]:
-    return {finding.code for finding in run_audit(source, CONFIG, quick=quick).findings}
+    return {finding.code for finding in audit_source(source, CONFIG, quick=quick).findings}
 
 
 def test_a_clean_drive_is_good_and_its_figures_are_right(street: faults.Spoiled) -> None:
-    audit = run_audit(street, CONFIG)
+    audit = audit_source(street, CONFIG)
     assert (audit.verdict, audit.findings) == ("good", ())
     assert audit.figures["gain"] == pytest.approx(1, abs=0.02)
     assert audit.figures["row_error_rms_px"] < 0.1
     # 1 m a frame, ten frames a second.
     assert audit.figures["speed_m_per_s"] == pytest.approx(10, rel=0.05)
     assert audit.figures["frames_read"] == FRAMES
-    assert run_audit(street, CONFIG, quick=True).verdict == "good"
+    assert audit_source(street, CONFIG, quick=True).verdict == "good"
 
 
 @pytest.mark.parametrize("fault", faults.FAULTS)
 def test_each_planted_fault_is_found_and_no_other(street: faults.Spoiled, fault: str) -> None:
     code, plant = faults.FAULTS[fault]
-    audit = run_audit(plant(street), CONFIG)
+    audit = audit_source(plant(street), CONFIG)
     assert [finding.code for finding in audit.findings] == [code]
     assert audit.verdict != "good"
     assert all("\n" not in finding.text for finding in audit.findings)
@@ -60,7 +60,7 @@ def test_each_planted_fault_is_found_and_no_other(street: faults.Spoiled, fault:
 @pytest.mark.parametrize("matcher", ["sad", "sgm"])
 def test_sgm_is_not_advised_to_those_who_use_it(street: faults.Spoiled, matcher: str) -> None:
     config = load_config(None, [f"matching.matcher={matcher}"])
-    (finding,) = run_audit(faults.gain(street, 1.4), config).findings
+    (finding,) = audit_source(faults.gain(street, 1.4), config).findings
     assert ("match with sgm" in finding.text) == (matcher != "sgm")
 
 
@@ -78,7 +78,7 @@ def test_mending_brings_a_pitch_back_under_a_third_of_a_pixel(
 
 
 def assert_mended(spoiled: faults.Spoiled, folder: Path) -> None:
-    before = run_audit(spoiled, CONFIG)
+    before = audit_source(spoiled, CONFIG)
     assert "rows" in {finding.code for finding in before.findings}
     path = folder / "mended.yaml"
     mend_calibration(spoiled, CONFIG, before, path)
@@ -86,7 +86,7 @@ def assert_mended(spoiled: faults.Spoiled, folder: Path) -> None:
     mended = read_calibration(path, width_px, height_px)
     assert isinstance(mended, StereoCalibration)
     assert mended.baseline_m == pytest.approx(spoiled.camera.baseline_m, rel=1e-9)
-    after = run_audit(replace(spoiled, camera=mended), CONFIG)
+    after = audit_source(replace(spoiled, camera=mended), CONFIG)
     assert "rows" not in {finding.code for finding in after.findings}
     assert abs(after.figures["row_error_mean_px"]) < 0.3
     assert after.figures["row_error_rms_px"] < 0.3
@@ -108,7 +108,7 @@ def test_half_a_frame_of_skew_is_measured(street: faults.Spoiled) -> None:
     def take(index: int) -> StereoPair:
         return replace(street.take(2 * index), right=street.take(2 * index + 1).right)
 
-    audit = run_audit(faults.Spoiled(street.camera, FRAMES // 2, take), CONFIG)
+    audit = audit_source(faults.Spoiled(street.camera, FRAMES // 2, take), CONFIG)
     assert audit.figures["time_skew_frames"] == pytest.approx(0.5, abs=0.1)
     assert "skew" in {finding.code for finding in audit.findings}
 
@@ -117,7 +117,7 @@ def test_a_frozen_camera_is_found(street: faults.Spoiled) -> None:
     def take(index: int) -> StereoPair:
         return replace(street.take(index), right=street.take(min(index, 4)).right)
 
-    findings = run_audit(replace(street, take=take), CONFIG).findings
+    findings = audit_source(replace(street, take=take), CONFIG).findings
     frozen = next(finding for finding in findings if finding.code == "frozen")
     assert frozen.fatal
     assert "the right camera is frozen for 5 frames" in frozen.text
@@ -128,15 +128,15 @@ def test_a_frozen_camera_is_found(street: faults.Spoiled) -> None:
 @pytest.mark.parametrize("drive", ["kitti_raw_0013", "kitti_06_51"])
 def test_nothing_is_found_on_real_drives(recon_data: Path, drive: str) -> None:
     source = open_source(recon_data / "driven" / drive)
-    assert run_audit(source, CONFIG).findings == ()
-    assert run_audit(source, CONFIG, quick=True).findings == ()
+    assert audit_source(source, CONFIG).findings == ()
+    assert audit_source(source, CONFIG, quick=True).findings == ()
 
 
 @pytest.mark.real
 @pytest.mark.parametrize("scene", ["Motorcycle", "Piano", "Playroom", "Recycle", "Teddy"])
 def test_nothing_is_found_on_scenes_of_one_pair(recon_data: Path, scene: str) -> None:
     source = open_source(recon_data / "middlebury/MiddEval3/trainingQ" / scene)
-    assert run_audit(source, CONFIG).findings == ()
+    assert audit_source(source, CONFIG).findings == ()
 
 
 @pytest.mark.real
@@ -159,7 +159,7 @@ def test_a_real_drive_is_mended(recon_data: Path, tmp_path: Path, drive: str) ->
 
 
 def test_a_source_of_one_pair_is_measured_too(street: faults.Spoiled) -> None:
-    audit = run_audit(replace(street, count=1), CONFIG)
+    audit = audit_source(replace(street, count=1), CONFIG)
     assert audit.verdict == "good"
     assert audit.figures["frames_read"] == 1
     assert audit.figures["row_error_rms_px"] < 0.2
@@ -180,7 +180,7 @@ def test_frames_that_are_missing_are_told_with_the_place(
     pairs = [replace(pair, index=k) for k, pair in enumerate(pairs)]
     grey = [replace(p, left=p.left[:, :, 0], right=p.right[:, :, 0]) for p in pairs]
     source = open_source(drives.write_kitti(grey, faults.rectified(street), tmp_path))
-    findings = {finding.code: finding.text for finding in run_audit(source, CONFIG).findings}
+    findings = {finding.code: finding.text for finding in audit_source(source, CONFIG).findings}
     assert "missing at 1 places, at most 0.40 s after frame 3" in findings["gaps"]
 
 

@@ -12,21 +12,17 @@ from hypothesis import strategies as st
 
 from recon.core.geometry.se3 import exp_so3
 from recon.core.values import RectifiedCamera
-from recon.rig.audit import (
-    AuditSettings,
-    Finding,
+from recon.rig.audit.alignment import align_rows, count_aligned, mend_rig, turn_features
+from recon.rig.audit.findings import Finding, verdict_of
+from recon.rig.audit.measures import (
     RepeatCounter,
-    align_rows,
-    count_aligned,
     measure_gain,
     measure_sharpness,
     measure_speed,
     measure_time_skew,
-    mend_rig,
-    verdict_of,
 )
-from recon.rig.audit.alignment import turn_features
 from recon.rig.audit.sample import plan_centres, plan_stretches
+from recon.rig.audit.settings import AuditSettings
 
 CAMERA = RectifiedCamera(500.0, 319.5, 199.5, 330.5, 0.3, 640, 400)
 

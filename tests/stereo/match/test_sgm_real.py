@@ -6,19 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from recon.commands.config import load_config
-from recon.commands.evaluate_middlebury import MiddleburyOptions, run_middlebury
+from recon.commands.evaluate_middlebury import run_middlebury
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
 def figures(recon_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
-    options = MiddleburyOptions(
-        matchers=("sgm", "opencv-sgbm"), out=tmp_path_factory.mktemp("real") / "run"
-    )
+    matchers, out = ("sgm", "opencv-sgbm"), tmp_path_factory.mktemp("real") / "run"
     folder = recon_data / "middlebury" / "MiddEval3" / "trainingQ"
-    return run_middlebury(folder, load_config(), options)["matchers"]
+    return run_middlebury(folder, matchers=matchers, out=out)["matchers"]
 
 
 def test_sgm_makes_fewer_and_smaller_errors_than_opencv(figures: dict) -> None:

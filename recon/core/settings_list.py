@@ -1,4 +1,4 @@
-"""What `recon settings` lists: each setting with its default, unit, values and purpose."""
+"""Describes settings: each with its default, unit, values and purpose."""
 
 from __future__ import annotations
 
@@ -9,10 +9,7 @@ from typing import Any, Final, Literal, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from recon.commands.config import PAIR_DEFAULTS, ReconConfig
-from recon.core.errors import SettingsError
-from recon.core.settings import Settings, alternatives, can_be_none, suggest_names
-from recon.stereo.match import Matcher
+from recon.core.settings import Settings, alternatives, can_be_none
 
 _UNITS: Final = {
     "_m_per_frame": "m per frame",
@@ -63,6 +60,13 @@ class SettingEntry:
     values: str
     description: str
 
+    @property
+    def shown_default(self) -> str:
+        """The default with its unit, and that of a pair where it differs."""
+        unit = f" {self.unit}" if self.unit and self.default != "none" else ""
+        differs = self.default_pair != self.default
+        return f"{self.default}{unit}" + (f" (pair: {self.default_pair})" if differs else "")
+
 
 @dataclass(frozen=True)
 class SettingGroup:
@@ -79,30 +83,6 @@ class SettingGroup:
     settings: tuple[SettingEntry, ...]
 
 
-def list_settings(name: str | None = None) -> tuple[SettingGroup, ...]:
-    """List the settings with a dotted name, or all below it.
-
-    Args:
-        name: Dotted name of a setting or a group, or any part of one; None = all.
-
-    Raises:
-        SettingsError: No setting has such a name.
-    """
-    every = tuple(_groups(ReconConfig(), ReconConfig.parse(PAIR_DEFAULTS)))
-    if name is None:
-        return every
-    for match in (_lies_in, _contains):
-        found = tuple(
-            SettingGroup(group.name, group.purpose, chosen)
-            for group in every
-            if (chosen := tuple(entry for entry in group.settings if match(name, entry.name)))
-        )
-        if found:
-            return found
-    names = [entry.name for group in every for entry in group.settings]
-    raise SettingsError(f"no setting is named {name!r}", hint=suggest_names(name, names))
-
-
 def settings_page(groups: Sequence[SettingGroup]) -> str:
     """The page docs/settings.md."""
     lines = [
@@ -117,27 +97,12 @@ def settings_page(groups: Sequence[SettingGroup]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def shown_default(entry: SettingEntry) -> str:
-    """The default with its unit, and that of a pair where it differs."""
-    unit = f" {entry.unit}" if entry.unit and entry.default != "none" else ""
-    differs = entry.default_pair != entry.default
-    return f"{entry.default}{unit}" + (f" (pair: {entry.default_pair})" if differs else "")
-
-
 def _row(entry: SettingEntry) -> str:
-    cells = (shown_default(entry), entry.values, entry.description)
+    cells = (entry.shown_default, entry.values, entry.description)
     return f"| `{entry.name}` | " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
-def _lies_in(group: str, name: str) -> bool:
-    return name == group or name.startswith(f"{group}.")
-
-
-def _contains(part: str, name: str) -> bool:
-    return part in name
-
-
-def _groups(
+def setting_groups(
     drive: Settings, pair: Settings, prefix: str = "", purpose: str | None = None
 ) -> Iterator[SettingGroup]:
     """The groups of a model, each before those inside it; ``purpose`` stands for its docstring."""
@@ -152,7 +117,7 @@ def _groups(
         about = purpose or (type(drive).__doc__ or "").partition("\n")[0].replace("``", "`")
         yield SettingGroup(prefix.removesuffix("."), about, tuple(own))
     for group in inside:
-        yield from _groups(*group)
+        yield from setting_groups(*group)
 
 
 def _entry(name: str, field: FieldInfo, drive: Any, pair: Any) -> SettingEntry:
@@ -191,7 +156,8 @@ def _values(field: FieldInfo) -> str:
 
 def _is_written(kind: Any) -> bool:
     """Whether a file can hold a value of this kind: not none, and no object."""
-    return kind is not type(None) and getattr(kind, "__origin__", None) is not Matcher
+    protocol = getattr(getattr(kind, "__origin__", None), "_is_protocol", False)
+    return kind is not type(None) and not protocol
 
 
 def _kind(kind: Any) -> str:

@@ -1,0 +1,105 @@
+"""Prints results: a table for people, JSON for programs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.console import Console
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from recon.core.settings_list import SettingEntry, SettingGroup
+    from recon.run.installation import Check
+
+
+def print_json(content: Mapping[str, Any]) -> None:
+    """Print the machine-readable summary, the only thing on standard output."""
+    typer.echo(json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False))
+
+
+def print_figures(title: str, figures: Mapping[str, Any]) -> None:
+    """Print a two-column table of figures; nested values appear only in ``--json``."""
+    table = Table(show_header=False)
+    for name, value in figures.items():
+        if isinstance(value, str | int | float) and value is not None:
+            table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
+    if title:
+        typer.echo(title)
+    Console().print(table)
+
+
+def print_evaluation(title: str, figures: Mapping[str, Any]) -> None:
+    """Print the figures of a comparison and of each part, its warnings and its folder."""
+    shown = {key: value for key, value in figures.items() if key != "out"}
+    limits = figures.get("by_threshold", ())
+    if len(limits) > 1:
+        shown = {key: value for key, value in shown.items() if key not in limits[0]}
+    for part in (*figures.get("by_length", ()), *(limits if len(limits) > 1 else ())):
+        (_, name), *values = part.items()
+        shown |= {f"{key} at {name:g} m": value for key, value in values}
+    print_figures(title, shown)
+    for warning in figures["warnings"]:
+        typer.echo(f"warning: {warning}", err=True)
+    if "out" in figures:
+        typer.echo(f"results: {figures['out']}")
+
+
+def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
+    """Print a run's figures, its warnings and its folder."""
+    shown = {key: value for key, value in summary.items() if key != "out"}
+    for group in ("prior", "loops", "trajectory", "map", "disparity"):
+        shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
+    for part in ("voxels", "grid"):
+        figures = summary.get("occupancy", {}).get(part, {})
+        shown |= {f"occupancy.{part}.{key}": value for key, value in figures.items()}
+    if stages:
+        shown |= {f"seconds.{key}": value for key, value in summary["stages"].items()}
+    print_figures("", shown)
+    for warning in summary["warnings"]:
+        typer.echo(f"warning: {warning}", err=True)
+    typer.echo(f"results: {summary['out']}")
+
+
+def print_checks(checks: Sequence[Check], console: Console | None = None) -> None:
+    """Print one line per check, and below the table the hints for those that failed."""
+    out = console or Console()
+    table = Table(show_edge=False, pad_edge=False)
+    for title in ("", "check", "found"):
+        table.add_column(title, overflow="fold")
+    for check in checks:
+        table.add_row(_mark(check), Text(check.name), Text(check.found))
+    out.print(table)
+    failed = [check for check in checks if not check.ok]
+    out.print()
+    for check in failed:
+        out.print(Text.assemble(_mark(check), " ", check.name, ": ", check.hint))
+    if not any(check.needed for check in failed):
+        out.print(Text("ready", style="bold green"))
+
+
+def print_settings(groups: Sequence[SettingGroup], console: Console | None = None) -> None:
+    """Print each setting in two lines: name, default and values; what it does."""
+    out = console or Console(highlight=False)
+    for group in groups:
+        out.print(Text.assemble((group.name, "bold"), f"  {group.purpose}"))
+        for entry in group.settings:
+            out.print(_headline(entry))
+            out.print(Padding(Text(entry.description, style="dim"), (0, 0, 0, 6)))
+        out.print()
+
+
+def _mark(check: Check) -> Text:
+    if check.ok:
+        return Text("ok", style="green")
+    return Text("missing", style="bold red") if check.needed else Text("note", style="yellow")
+
+
+def _headline(entry: SettingEntry) -> Text:
+    return Text.assemble(
+        "  ", (entry.name, "cyan"), f" = {entry.shown_default}", (f"   [{entry.values}]", "dim")
+    )

@@ -1,0 +1,232 @@
+"""Measures of single images, of series of images, and of features in motion."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Final
+
+import cv2
+import numpy as np
+
+from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import Bool, Float32, Float64, UInt8
+from recon.odometry.pnp import find_consensus, fit_pose
+from recon.sources import StampedSource, StereoSource
+
+# Half of the pixels around a corner may be saturated before their median is.
+_AROUND_PX: Final = 9
+_DARK: Final = 12.0
+_BRIGHT: Final = 243.0
+# Mean difference in grey levels; two exposures of a static scene differ more, by sensor noise.
+_SAME_DN: Final = 0.05
+_GAP_PERIODS: Final = 1.7
+"""Time step, in frame periods, above which frames count as missing."""
+_MIN_POINTS: Final = 20
+_MIN_DISPARITY_PX: Final = 2.0
+_AGREE_PX: Final = 2.0
+# Features must move at least this many rows per frame to reveal a time skew.
+_MIN_FLOW_PX: Final = 1.0
+
+
+def measure_gain(left: UInt8, right: UInt8, left_uv: Float32, right_uv: Float32) -> Float64:
+    """Return the brightness of the right image relative to the left, around matched features.
+
+    Args:
+        left: uint8 (H, W).
+        right: uint8 (H, W).
+        left_uv: float32 (N, 2), features in the left image.
+        right_uv: float32 (N, 2), the same features in the right image.
+
+    Returns:
+        float64 (M,), one ratio for each feature whose surroundings are mostly neither black
+        nor saturated.
+    """
+    first, second = (_medians(image, uv) for image, uv in ((left, left_uv), (right, right_uv)))
+    fair = (np.minimum(first, second) > _DARK) & (np.maximum(first, second) < _BRIGHT)
+    return np.asarray(second[fair] / first[fair], dtype=np.float64)
+
+
+def _medians(image: UInt8, uv: Float32) -> Float64:
+    """Return the median brightness around each feature."""
+    smooth = cv2.medianBlur(np.ascontiguousarray(image), _AROUND_PX)
+    height, width = image.shape
+    column = np.clip(np.rint(uv[:, 0]).astype(int), 0, width - 1)
+    row = np.clip(np.rint(uv[:, 1]).astype(int), 0, height - 1)
+    return np.asarray(smooth[row, column], dtype=np.float64)
+
+
+def measure_sharpness(image: UInt8) -> float:
+    """Return the share of the finest detail in all detail of an image, in [0, 1].
+
+    Compares Laplacians at full and at quarter size: blur reduces the first, but not the second.
+    Sensor noise is subtracted from both.
+
+    Args:
+        image: uint8 (H, W).
+    """
+    fine = image.astype(np.float32)
+    coarse = cv2.resize(fine, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    energies = [_detail(layer) for layer in (fine, coarse)]
+    total = sum(energies)
+    return float(energies[0] / total) if total > 0 else 0.0
+
+
+def _detail(image: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> float:
+    """Return mean of the strongest 5 % of absolute Laplacians, minus twice the median of all."""
+    size = np.abs(cv2.Laplacian(image, cv2.CV_32F))
+    noise, strong = np.quantile(size, [0.5, 0.95])
+    return float(max(0.0, size[size >= strong].mean() - 2.0 * noise))
+
+
+@dataclass
+class RepeatCounter:
+    """Counts repeats in a series of pairs.
+
+    Attributes:
+        steps: Number of pairs compared with the previous pair.
+        both: Number of steps in which neither image changed.
+        frozen: Longest run of steps in which only the (left, right) image did not change.
+    """
+
+    steps: int = 0
+    both: int = 0
+    frozen: list[int] = field(default_factory=lambda: [0, 0])
+    _run: list[int] = field(default_factory=lambda: [0, 0])
+    _last: tuple[UInt8, UInt8] | None = None
+
+    def restart(self) -> None:
+        """Start a new series: the next pair does not follow the last one."""
+        self._last, self._run = None, [0, 0]
+
+    def add(self, left: UInt8, right: UInt8) -> None:
+        """Compare a pair with the previous one.
+
+        Args:
+            left: uint8 (H, W) or (H, W, 3).
+            right: uint8, same shape as ``left``.
+        """
+        if self._last is not None:
+            self.steps += 1
+            same = [_same(now, last) for now, last in zip((left, right), self._last, strict=True)]
+            self.both += all(same)
+            for side, alone in enumerate((same[0] and not same[1], same[1] and not same[0])):
+                self._run[side] = self._run[side] + 1 if alone else 0
+                self.frozen[side] = max(self.frozen[side], self._run[side])
+        self._last = (left, right)
+
+
+def _same(now: UInt8, last: UInt8) -> bool:
+    return now.shape == last.shape and bool(cv2.absdiff(now, last).mean() < _SAME_DN)
+
+
+def track(now: UInt8, then: UInt8, uv: Float32) -> tuple[Float32, Bool]:
+    """Track features from one image to the next (Lucas-Kanade).
+
+    Args:
+        now: uint8 (H, W).
+        then: uint8 (H, W), a frame later.
+        uv: float32 (N, 2), features of ``now``.
+
+    Returns:
+        float32 (N, 2), positions in ``then``; and bool (N,), True where tracking back returns to
+        the start.
+    """
+    if not len(uv):
+        return uv, np.zeros(0, np.bool_)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(now, then, uv[:, None], None, winSize=(21, 21))
+    back, again, _ = cv2.calcOpticalFlowPyrLK(then, now, there, None, winSize=(21, 21))
+    near = np.abs(back.reshape(-1, 2) - uv).max(axis=1) < 0.5
+    return there.reshape(-1, 2), np.asarray((found.ravel() > 0) & (again.ravel() > 0) & near)
+
+
+def measure_speed(
+    left_uv: Float32, right_uv: Float32, later_uv: Float32, camera: RectifiedCamera
+) -> float | None:
+    """Distance in metres that the rig moves between two frames, if the calibration is correct.
+
+    Args:
+        left_uv: float32 (N, 2), features in the left image.
+        right_uv: float32 (N, 2), the same features in the right image.
+        later_uv: float32 (N, 2), the same features in the left image of the next frame.
+        camera: The rectified camera.
+
+    Returns:
+        None if too few features agree on one motion.
+    """
+    disparity = left_uv[:, 0] - right_uv[:, 0] + camera.doffs_px
+    near = disparity > _MIN_DISPARITY_PX
+    if near.sum() < _MIN_POINTS:
+        return None
+    depth_m = camera.focal_px * camera.baseline_m / disparity[near].astype(np.float64)
+    rays = np.linalg.inv(camera.matrix) @ np.vstack([left_uv[near].T, np.ones(near.sum())])
+    xyz = (rays * depth_m).T
+    found = find_consensus(
+        xyz,
+        later_uv[near].astype(np.float64),
+        camera,
+        limit_px=_AGREE_PX,
+        iterations=100,
+        min_inliers=max(_MIN_POINTS, math.ceil(0.4 * near.sum())),
+    )
+    if found is None:
+        return None
+    T = fit_pose(xyz[found.agree], later_uv[near][found.agree].astype(np.float64), camera)
+    return float(np.linalg.norm(T[:3, 3]))
+
+
+def measure_time_skew(row_error_px: Float64, row_flow_px: Float64) -> tuple[float, float] | None:
+    """Delay of the right camera in frames, from the vertical motion of features.
+
+    A camera that is s frames late sees a feature whose row moves by v per frame v·s rows lower:
+    the slope of row error over row flow is the skew.
+
+    Args:
+        row_error_px: float64 (N,), right minus left row, with the rig's own row error removed.
+        row_flow_px: float64 (N,), rows that each feature moves from this frame to the next.
+
+    Returns:
+        The skew and its standard error, in frames; None if too few features move enough.
+    """
+    moving = np.abs(row_flow_px) > _MIN_FLOW_PX
+    if moving.sum() < _MIN_POINTS:
+        return None
+    flow, error = row_flow_px[moving], row_error_px[moving]
+    weight = np.ones(len(flow))
+    slope = 0.0
+    for _ in range(10):
+        slope = float(np.sum(weight * flow * error) / np.sum(weight * flow * flow))
+        residual = error - slope * flow
+        scale = 1.4826 * float(np.median(np.abs(residual))) + 1e-3
+        weight = np.where(np.abs(residual) < 3 * scale, 1.0, 0.0)
+    kept = weight > 0
+    variance = float(np.mean((error - slope * flow)[kept] ** 2)) / float(np.sum(flow[kept] ** 2))
+    return slope, float(np.sqrt(variance))
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """Missing frames, from the timestamps of all pairs.
+
+    Attributes:
+        count: Number of gaps; 0 if the timestamps are not known in advance.
+        longest_s: Longest time step.
+        after: Frame before that step.
+        usual_s: Median time step; NaN if unknown.
+    """
+
+    count: int = 0
+    longest_s: float = float("nan")
+    after: int = 0
+    usual_s: float = float("nan")
+
+
+def find_gaps(source: StereoSource) -> Gaps:
+    """Find time steps that are too long, in sources with known timestamps."""
+    steps = np.diff(source.stamps_s) if isinstance(source, StampedSource) else np.zeros(0)
+    usual_s = float(np.median(steps)) if len(steps) else 0.0
+    if usual_s <= 0:
+        return Gaps()
+    after = int(np.argmax(steps))
+    count = int(np.count_nonzero(steps > _GAP_PERIODS * usual_s))
+    return Gaps(count, float(steps[after]), after, usual_s)
