@@ -1,4 +1,4 @@
-"""Typed access to nested mappings read from YAML; errors name the field."""
+"""Typed access to the fields of a file, from YAML or lines of text; errors name the field."""
 
 from __future__ import annotations
 
@@ -52,11 +52,15 @@ class Fields:
         return str(self.get(name))
 
     def numbers(self, name: str, shape: tuple[int, ...] | None = None) -> Float64:
-        """Return the value as float64 of that shape; None = a list of any length."""
+        """Return the value as float64 of that shape; None = a list of any length.
+
+        A text is split into its numbers, also where it is a matrix such as ``[1 0; 0 1]``.
+        """
         value = self.get(name)
+        parts = value.strip("[] ").replace(";", " ").split() if isinstance(value, str) else value
         try:
             # Via text, as PyYAML reads 1e-05 (no dot) as text.
-            array = np.array(value, dtype=np.str_).astype(np.float64)
+            array = np.array(parts, dtype=np.str_).astype(np.float64)
         except (TypeError, ValueError) as error:
             raise self._wrong(name, value, "numbers") from error
         if not np.isfinite(array).all():

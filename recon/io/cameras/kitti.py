@@ -11,6 +11,7 @@ import numpy as np
 from recon.core.errors import CalibrationError, FormatError
 from recon.core.values import RectifiedCamera, check_unsized
 from recon.core.values.arrays import Float64
+from recon.io.fields import Fields
 from recon.io.files import StrPath, read_text, reader
 
 GREY_CAMERAS: Final = (0, 1)
@@ -111,14 +112,8 @@ def _projection(path: StrPath, camera: int) -> Float64:
             got=", ".join(f"P{number}" for number in sorted(rows)) or "no projection matrix",
             hint="a stereo pair needs P0 and P1, or P2 and P3",
         )
-    try:
-        matrix = np.array([float(word) for word in rows[camera].split()]).reshape(3, 4)
-    except ValueError as error:
-        raise FormatError(
-            f"P{camera} is not a 3x4 matrix", where=path, expected="12 numbers"
-        ) from error
-    if not np.isfinite(matrix).all():
-        raise FormatError(f"P{camera} has a value that is not finite", where=path)
+    name = f"P{camera}"
+    matrix = Fields({name: rows[camera]}, path).numbers(name, (3, 4))
     if not np.allclose(matrix[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
         raise FormatError(
             f"P{camera} is not the projection matrix of a rectified camera", where=path

@@ -5,17 +5,14 @@ from __future__ import annotations
 import re
 from typing import Final
 
-import numpy as np
-
-from recon.core.errors import FormatError
 from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, other_size
 from recon.core.values.arrays import Float64
 from recon.io.cameras.kitti import read_kitti_calib
+from recon.io.fields import Fields
 from recon.io.files import StrPath, read_text, reader
 
 _LINE: Final = re.compile(r"^([A-Z](?:_rect)?_\d\d):(.*)$", re.MULTILINE)
-_SIZES: Final = {"S": 2, "K": 9, "D": 5, "R": 9, "T": 3, "S_rect": 2}
 
 
 @reader
@@ -40,43 +37,29 @@ def read_kitti_rig(
 
     Ref: Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013, section 4.
     """
-    rows = dict(_LINE.findall(read_text(path)))
-    if f"S_rect_{cameras[0]:02d}" not in rows:
+    fields = Fields(dict(_LINE.findall(read_text(path))), path)
+    if f"S_rect_{cameras[0]:02d}" not in fields:
         return read_kitti_calib(path, width_px, height_px, cameras)
     recorded, rectified = (
-        tuple(int(n) for n in _numbers(rows, key, cameras[0], path)) for key in ("S", "S_rect")
+        tuple(int(n) for n in fields.numbers(f"{key}_{cameras[0]:02d}", (2,)))
+        for key in ("S", "S_rect")
     )
     if (width_px, height_px) == rectified:
         return read_kitti_calib(path, width_px, height_px, cameras)
     if (width_px, height_px) != recorded:
         expected = f"{rectified[0]}x{rectified[1]} rectified, or {recorded[0]}x{recorded[1]} raw"
         raise other_size(width_px, height_px, expected, path)
-    T_left_0, T_right_0 = (_pose(rows, camera, path) for camera in cameras)
-    left, right = (_camera(rows, camera, recorded, path) for camera in cameras)
+    T_left_0, T_right_0 = (_pose(fields, camera) for camera in cameras)
+    left, right = (_camera(fields, camera, recorded) for camera in cameras)
     return StereoCalibration(left, right, T_right_0 @ invert(T_left_0))
 
 
-def _camera(
-    rows: dict[str, str], camera: int, size: tuple[int, ...], path: StrPath
-) -> CameraIntrinsics:
-    matrix = _numbers(rows, "K", camera, path).reshape(3, 3)
-    return CameraIntrinsics(matrix, _numbers(rows, "D", camera, path), size[0], size[1])
+def _camera(fields: Fields, camera: int, size: tuple[int, ...]) -> CameraIntrinsics:
+    matrix = fields.numbers(f"K_{camera:02d}", (3, 3))
+    return CameraIntrinsics(matrix, fields.numbers(f"D_{camera:02d}", (5,)), size[0], size[1])
 
 
-def _pose(rows: dict[str, str], camera: int, path: StrPath) -> Float64:
+def _pose(fields: Fields, camera: int) -> Float64:
     """Return ``T_camera_camera0``."""
-    rotation = _numbers(rows, "R", camera, path).reshape(3, 3)
-    return make_transform(rotation, _numbers(rows, "T", camera, path))
-
-
-def _numbers(rows: dict[str, str], key: str, camera: int, path: StrPath) -> Float64:
-    name = f"{key}_{camera:02d}"
-    try:
-        numbers = np.array([float(word) for word in rows[name].split()])
-    except KeyError as error:
-        raise FormatError(f"calibration has no {name}", where=path) from error
-    except ValueError as error:
-        raise FormatError(f"{name} has a value that is not a number", where=path) from error
-    if len(numbers) != _SIZES[key] or not np.isfinite(numbers).all():
-        raise FormatError(f"{name} is not {_SIZES[key]} finite numbers", where=path)
-    return numbers
+    rotation = fields.numbers(f"R_{camera:02d}", (3, 3))
+    return make_transform(rotation, fields.numbers(f"T_{camera:02d}", (3,)))

@@ -8,9 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.errors import CalibrationError, FormatError
+from recon.core.errors import CalibrationError
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
+from recon.io.fields import Fields
 from recon.io.files import StrPath, read_text, reader
 
 _LINE: Final = re.compile(r"^\s*(\w+)\s*=\s*(.*?)\s*$", re.MULTILINE)
@@ -50,22 +51,22 @@ def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
         CalibrationError: The cameras differ in focal length or principal row, the baseline is
             not positive, or ``doffs`` is not ``cx1 - cx0``.
     """
-    entries = dict(_LINE.findall(read_text(path)))
-    cam0, cam1 = (_matrix(entries, key, path) for key in ("cam0", "cam1"))
-    doffs_px = _number(entries, "doffs", path)
+    fields = Fields(dict(_LINE.findall(read_text(path))), path)
+    cam0, cam1 = (fields.numbers(key, (3, 3)) for key in ("cam0", "cam1"))
+    doffs_px = fields.number("doffs")
     _check_views(cam0, cam1, doffs_px, path)
     camera = RectifiedCamera(
         focal_px=float(cam0[0, 0]),
         cx_px=float(cam0[0, 2]),
         cy_px=float(cam0[1, 2]),
         cx_right_px=float(cam1[0, 2]),
-        baseline_m=_number(entries, "baseline", path) / 1000,
-        width_px=int(_number(entries, "width", path)),
-        height_px=int(_number(entries, "height", path)),
-        ndisp=int(_number(entries, "ndisp", path)) if "ndisp" in entries else None,
+        baseline_m=fields.number("baseline") / 1000,
+        width_px=fields.count("width"),
+        height_px=fields.count("height"),
+        ndisp=fields.count("ndisp") if "ndisp" in fields else None,
     )
-    vmin, vmax = (_number(entries, k, path) if k in entries else None for k in ("vmin", "vmax"))
-    isint = "isint" in entries and _number(entries, "isint", path) != 0
+    vmin, vmax = (fields.number(k) if k in fields else None for k in ("vmin", "vmax"))
+    isint = "isint" in fields and fields.number("isint") != 0
     return MiddleburyCalib(camera, isint, vmin, vmax, doffs_px)
 
 
@@ -106,34 +107,3 @@ def _check_views(cam0: Float64, cam1: Float64, doffs_px: float, path: StrPath) -
             got=f"{doffs_px:g}",
             expected=f"{cam1[0, 2] - cam0[0, 2]:g}",
         )
-
-
-def _entry(entries: dict[str, str], key: str, path: StrPath) -> str:
-    if key not in entries:
-        raise FormatError(f"calibration has no {key!r}", where=path, expected=f"a line {key}=…")
-    return entries[key]
-
-
-def _number(entries: dict[str, str], key: str, path: StrPath) -> float:
-    text = _entry(entries, key, path)
-    try:
-        number = float(text)
-    except ValueError:
-        number = float("nan")
-    if not np.isfinite(number):
-        raise FormatError(f"{key!r} is not a finite number", where=path, got=text)
-    return number
-
-
-def _matrix(entries: dict[str, str], key: str, path: StrPath) -> Float64:
-    text = _entry(entries, key, path)
-    try:
-        numbers = [float(word) for word in text.strip("[]").replace(";", " ").split()]
-        matrix = np.array(numbers).reshape(3, 3)
-    except ValueError as error:
-        raise FormatError(
-            f"{key!r} is not a 3x3 matrix", where=path, got=text, expected="[f 0 cx; 0 f cy; 0 0 1]"
-        ) from error
-    if not np.isfinite(matrix).all():
-        raise FormatError(f"{key!r} has a value that is not finite", where=path, got=text)
-    return matrix
