@@ -1,8 +1,9 @@
 // A click on an image shows it alone, as large as the window; another click goes back.
-const dialog = document.querySelector("dialog");
+const dialog = document.body.appendChild(document.createElement("dialog"));
+const large = dialog.appendChild(document.createElement("img"));
 for (const image of document.querySelectorAll(".block img")) {
   image.addEventListener("click", () => {
-    dialog.firstElementChild.src = image.src;
+    large.src = image.src;
     dialog.showModal();
   });
 }
