@@ -83,8 +83,8 @@ def depth_error_figure(run: CalibrationRun) -> bytes:
         color=FAINT,
         label=f"matching to {MATCH_SIGMA_PX:g} px",
     )
-    axes.plot(known_m, calibration, "o-", color=ESTIMATE, label="calibration, over the picture")
-    label = f"{100 * CONFIDENCE:.0f} % interval, middle of the picture"
+    axes.plot(known_m, calibration, "o-", color=ESTIMATE, label="calibration, over the image")
+    label = f"{100 * CONFIDENCE:.0f} % interval, middle of the image"
     axes.fill_between(known_m, 1e-3, reach, color=ESTIMATE, alpha=0.15, linewidth=0, label=label)
     axes.set(xscale="log", yscale="log", xlabel="depth, m", ylabel="depth error, cm")
     axes.set_ylim(bottom=max(min([*matching, *calibration]) / 3, 1e-3))

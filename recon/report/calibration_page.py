@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from recon.core.values import StereoPair
@@ -18,7 +15,6 @@ from recon.report.calibration_figures import (
 )
 from recon.report.epipolar import EpipolarImage, epipolar_figure, level_lines, spread_points
 from recon.report.page import write_page
-from recon.report.table import NOT_KNOWN
 from recon.rig.calibrate import shared_pixels
 from recon.rig.calibrate.result import CalibrationRun
 from recon.run.directory import RunDirectory
@@ -48,7 +44,6 @@ def write_calibration_page(run: CalibrationRun, directory: RunDirectory) -> None
         directory,
         found=found,
         figures=figures,
-        depth_rows=_depth_rows(found),
         warnings=found["warnings"],
         verdict=found["verdict"],
         sound=found["verdict"] == "good",
@@ -77,12 +72,3 @@ def epipolar_images(run: CalibrationRun) -> tuple[bytes, bytes]:
         EpipolarImage(rectified.right, placed[1], rows, "Right, rectified: rows of the left"),
     )
     return raw, level
-
-
-def _depth_rows(summary: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
-    rows = []
-    for depth, error in summary["depth_error_cm"].items():
-        texts = {k: NOT_KNOWN if v is None else f"{v:.3g}" for k, v in error.items()}
-        interval = f"{texts['low']} … {texts['high']}"
-        rows.append((f"{depth} m", texts["calibration"], interval, texts["matching"]))
-    return rows

@@ -38,19 +38,10 @@ REASON_COLOURS: Final[Mapping[Reason, Rgb]] = MappingProxyType(
     }
 )
 REASON_LABELS: Final[Mapping[Reason, str]] = MappingProxyType(
-    {
-        Reason.VALID: "valid",
-        Reason.LOW_TEXTURE: "low texture",
-        Reason.AMBIGUOUS: "ambiguous",
-        Reason.LEFT_RIGHT: "left-right check",
-        Reason.OCCLUDED: "occluded",
-        Reason.OUT_OF_RANGE: "out of range",
-        Reason.BORDER: "border",
-        Reason.SPECKLE: "speckle",
-        Reason.EDGE: "flying edge",
-    }
+    {reason: reason.name.lower().replace("_", " ") for reason in Reason}
+    | {Reason.LEFT_RIGHT: "left-right check", Reason.EDGE: "flying edge"}
 )
-_GRID_PICTURE_PX: Final = 1500
+_GRID_IMAGE_PX: Final = 1500
 GRID_FREE: Final[Rgb] = (247, 249, 250)
 GRID_OCCUPIED: Final[Rgb] = (24, 28, 34)
 GRID_UNKNOWN: Final[Rgb] = (190, 197, 204)
@@ -121,10 +112,10 @@ def colour_grid(grid: OccupancyGrid) -> UInt8:
     Returns:
         uint8 (rows, columns, 3) RGB: free is almost white, occupied almost black.
     """
-    picture = np.full((*grid.cells.shape, 3), GRID_UNKNOWN, dtype=np.uint8)
-    picture[grid.cells == FREE] = GRID_FREE
-    picture[grid.cells == OCCUPIED] = GRID_OCCUPIED
-    return picture[::-1]
+    image = np.full((*grid.cells.shape, 3), GRID_UNKNOWN, dtype=np.uint8)
+    image[grid.cells == FREE] = GRID_FREE
+    image[grid.cells == OCCUPIED] = GRID_OCCUPIED
+    return image[::-1]
 
 
 def colour_grid_errors(grid: OccupancyGrid, truth: OccupancyTruth) -> UInt8:
@@ -137,11 +128,11 @@ def colour_grid_errors(grid: OccupancyGrid, truth: OccupancyTruth) -> UInt8:
         is a square of whole pixels, so that small grids are enlarged.
     """
     cells = grid_on_truth(grid, truth)
-    picture = np.full((*cells.shape, 3), GRID_NOT_COUNTED, dtype=np.uint8)
+    image = np.full((*cells.shape, 3), GRID_NOT_COUNTED, dtype=np.uint8)
     for (true, found), colour in GRID_ERRORS.items():
-        picture[truth.seen & (truth.grid.cells == true) & (cells == found)] = colour
-    side = max(1, _GRID_PICTURE_PX // max(picture.shape[:2]))
-    return np.asarray(picture[::-1].repeat(side, axis=0).repeat(side, axis=1))
+        image[truth.seen & (truth.grid.cells == true) & (cells == found)] = colour
+    side = max(1, _GRID_IMAGE_PX // max(image.shape[:2]))
+    return np.asarray(image[::-1].repeat(side, axis=0).repeat(side, axis=1))
 
 
 def colour_values(

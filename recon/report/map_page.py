@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 
 from recon.commands.map import MapRun
@@ -12,16 +10,7 @@ from recon.report.images import stereo_figures
 from recon.report.page import write_page
 from recon.report.paths import drift_figure, grid_figure, health_figure, loops_figure, path_figure
 from recon.report.scene import Json, Scene, plot_scene
-from recon.report.table import number
 from recon.run.directory import RunDirectory
-
-_OCCUPANCY_ROWS: Final = (
-    ("occupied voxels, precision", "voxels", "precision"),
-    ("occupied voxels, recall", "voxels", "recall"),
-    ("occupied cells of the grid, intersection over union", "grid", "iou_occupied"),
-    ("free cells of the grid, intersection over union", "grid", "iou_free"),
-    ("occupied cells that the grid calls free", "grid", "occupied_called_free"),
-)
 
 
 def write_map_page(run: MapRun, directory: RunDirectory) -> None:
@@ -42,12 +31,6 @@ def map_content(run: MapRun) -> Json:
         "figures": _figures(run),
         "view": _view(run),
         "sample": stereo_figures(sample.pair, sample.disparity),
-        "occupancy_rows": _occupancy_rows(run),
-        "notes": [
-            (str(frame), "; ".join(record.notes) or "no measurement")
-            for frame, record in enumerate(run.mapped.health)
-            if record.notes or not record.ok
-        ],
     }
 
 
@@ -79,12 +62,3 @@ def _view(run: MapRun) -> Json | None:
         (name, np.asarray(apply(run.mapped.T_map_world, path.positions_m))) for name, path in drives
     ]
     return plot_scene(Scene(np.eye(4), run.cloud, run.mesh, paths))
-
-
-def _occupancy_rows(run: MapRun) -> list[tuple[str, ...]]:
-    """Voxels and grid compared with ground truth, if it is known."""
-    found = run.summary.get("occupancy") or {}
-    return [
-        (label, *(number(found[part + end].get(key), 3) for end in ("", "_exact")))
-        for label, part, key in (_OCCUPANCY_ROWS if found else ())
-    ]

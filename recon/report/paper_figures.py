@@ -144,5 +144,6 @@ def _style_surface(axes: Any, width: int, height: int) -> None:
     axes.view_init(elev=_ELEVATION_DEG, azim=_AZIMUTH_DEG)
     for axis, label in ((axes.xaxis, "column"), (axes.yaxis, "row"), (axes.zaxis, "disparity")):
         axis.set_label_text(f"{label} (px)")
+        axis.line.set_color(FAINT)
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.set_tick_params(labelsize=8, colors=INK)

@@ -180,7 +180,7 @@ def _colourings(cloud: PointCloud, xyz: Float32) -> list[Json]:
     by_height = [{"label": "height", "marker": scale}]
     if cloud.rgb is None:
         return by_height
-    return [{"label": "picture", "marker": _palette_scale(cloud.rgb)}, *by_height]
+    return [{"label": "image", "marker": _palette_scale(cloud.rgb)}, *by_height]
 
 
 def _palette_scale(rgb: UInt8) -> Json:

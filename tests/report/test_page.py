@@ -167,7 +167,7 @@ def test_plotly_travels_once_compressed_and_only_with_a_scene() -> None:
 
 def test_colourings_of_a_scene_get_a_button_each_where_there_is_a_choice() -> None:
     page = scene_page(view(coloured=True))
-    assert re.findall(r"<button[^>]*>(\w+)</button>", page) == ["picture", "height"]
+    assert re.findall(r"<button[^>]*>(\w+)</button>", page) == ["image", "height"]
     assert "</button>" not in scene_page(view())
 
 

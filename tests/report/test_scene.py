@@ -43,7 +43,7 @@ def test_colours_of_points_come_back_from_their_scale() -> None:
 def test_coloured_cloud_can_also_be_shown_by_height(cloud: PointCloud) -> None:
     both = plot(Scene(np.eye(4), cloud))
     colourings = both["layout"]["meta"]
-    assert [colouring["label"] for colouring in colourings] == ["picture", "height"]
+    assert [colouring["label"] for colouring in colourings] == ["image", "height"]
     lengths = {len(unpack(colouring["marker"]["color"])) for colouring in colourings}
     assert lengths == {len(unpack(both["data"][0]["x"]))}
     plain = PointCloud(cloud.xyz, frame="map")
