@@ -28,12 +28,12 @@ import pyoctomap
 from numpy.typing import NDArray
 
 from recon.commands.config import load_config
-from recon.commands.map import MapOptions, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
 from recon.map import OccupancyBuilder, OccupancySettings
-from recon.report.map_page import write_map_page
 from recon.run.machine import available_cores
 from recon.sources import open_source
 
@@ -86,7 +86,7 @@ def budget(drive: Path, overrides: Sequence[str]) -> dict[str, Any]:
     """Milliseconds per frame of each stage of a drive, and seconds of each later stage."""
     source, config = open_source(drive), load_config(None, overrides)
     with tempfile.TemporaryDirectory() as folder:
-        options = MapOptions(out=Path(folder) / "run", present=write_map_page)
+        options = MapOptions(audit=False, out=Path(folder) / "run")
         before_s = time.process_time()
         summary = run_map(source, config, options).summary
     frames, stages = summary["frames"], summary["stages"]

@@ -19,7 +19,8 @@ from typing import Any, Final
 from recon.commands.config import load_config
 from recon.commands.demo import demo_source
 from recon.commands.evaluate_occupancy import run_evaluate_occupancy
-from recon.commands.map import MapOptions, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.run.summary import plain
 
 ASKED: Final = {
@@ -65,7 +66,9 @@ def figures(seed: int, options: argparse.Namespace, runs: Path) -> dict[str, Any
     street = [f"street.seed={seed}", f"street.frames={options.frames}"]
     config = load_config(None, [*street, *options.set])
     out = runs / f"seed_{seed}"
-    run_map(demo_source(config), config, MapOptions(command="demo", out=out, mesh=False))
+    run_map(
+        demo_source(config), config, MapOptions(audit=False, command="demo", out=out, mesh=False)
+    )
     found = plain(run_evaluate_occupancy(out).metrics)
     flat = {
         f"{part}.{name}": value

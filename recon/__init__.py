@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from recon.commands.audit import run_audit
     from recon.commands.config import ReconConfig, load_config
     from recon.commands.evaluate_middlebury import run_middlebury
-    from recon.commands.map import MapOptions, run_map
+    from recon.commands.map import run_map
+    from recon.commands.map_options import MapOptions
     from recon.commands.occupancy import OccupancyRequest, run_occupancy
     from recon.commands.pair import run_disparity, run_pair
     from recon.core.errors import ReconError
@@ -88,7 +89,8 @@ _HOMES = {
     "recon.rig.audit": ("Audit",),
     "recon.commands.audit": ("run_audit",),
     "recon.commands.config": ("ReconConfig", "load_config"),
-    "recon.commands.map": ("MapOptions", "run_map"),
+    "recon.commands.map": ("run_map",),
+    "recon.commands.map_options": ("MapOptions",),
     "recon.commands.evaluate_middlebury": ("run_middlebury",),
     "recon.commands.occupancy": ("OccupancyRequest", "run_occupancy"),
     "recon.commands.pair": ("run_disparity", "run_pair"),

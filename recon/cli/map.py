@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -106,11 +107,10 @@ def map_(
         from recon.cli.show.announce import announce, warn
         from recon.cli.show.progress import choose_viewer
         from recon.commands.config import matching_overrides, source_overrides
-        from recon.commands.map import MapOptions, run_map
+        from recon.commands.map import run_map
+        from recon.commands.map_options import MapOptions
         from recon.commands.resume import MapRequest, open_requested, plan_map
         from recon.io.trajectory import read_trajectory
-        from recon.report.map_page import write_map_page
-        from recon.rig.audit import quick_warnings
         from recon.sources import read_prior
 
         method = [] if odometry is None else [f"odometry.method={odometry.value}"]
@@ -120,8 +120,6 @@ def map_(
         request, settings = plan_map(asked, config, overrides)
         drive = open_requested(request, settings)
         announce(drive, quiet=quiet, verbose=verbose)
-        found = quick_warnings(drive, settings)
-        warn(found, quiet=quiet, verbose=verbose)
         guide = None if request.prior is None else read_prior(drive, request.prior)
         options = MapOptions(
             out=request.out,
@@ -133,8 +131,7 @@ def map_(
             resume=resume is not None,
             arguments=request.arguments(),
             progress=choose_viewer(quiet=quiet, verbose=verbose),
-            present=write_map_page,
-            warnings=found,
+            tell=partial(warn, quiet=quiet, verbose=verbose),
         )
         run = run_map(drive, settings, options)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Final
 
 from recon.commands.config import ReconConfig
-from recon.commands.map import MapOptions, MapRun, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.map import fusion_range_m
-from recon.report.map_page import write_map_page
+from recon.map.map_run import MapRun
 from recon.run.progress import SILENT, Progress
 from recon.sources.synthetic import SyntheticSource
 from recon.street.street import rig
@@ -42,7 +43,7 @@ def run_demo(
         threads=threads,
         mesh=mesh,
         progress=progress,
-        present=write_map_page,
+        audit=False,
     )
     return run_map(demo_source(config), config, options)
 

@@ -14,7 +14,8 @@ import numpy as np
 from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.commands.demo import demo_source
 from recon.commands.finished_run import OCTOMAP
-from recon.commands.map import MapOptions, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.commands.occupancy import OccupancyRequest, run_occupancy
 from recon.commands.pair import run_pair
 from recon.core.geometry.se3 import exp_so3, make_transform
@@ -103,7 +104,11 @@ def compile_kernels() -> WarmUp:
         folder = Path(name)
         config = load_config(None, _SMALL)
         source = demo_source(config)
-        run_map(source, config, MapOptions(command="demo", out=folder / "drive", mesh=False))
+        run_map(
+            source,
+            config,
+            MapOptions(audit=False, command="demo", out=folder / "drive", mesh=False),
+        )
         run_occupancy(OccupancyRequest(folder / "drive", out=folder / "occupancy"))
         _read_again(folder / "drive" / OCTOMAP)
         _move_submaps(map_sequence(source, config))

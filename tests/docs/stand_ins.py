@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from recon.commands.config import load_config
-from recon.commands.map import MapOptions, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.core.values.board import parse_board
@@ -149,7 +150,7 @@ def results(folder: Path) -> None:
 
 def finished_run(folder: Path) -> None:
     config = load_config(overrides=["audit.quick=false"])
-    run_map(street(), config, MapOptions(out=folder, mesh=False))
+    run_map(street(), config, MapOptions(audit=False, out=folder, mesh=False))
 
 
 def plugin(site: Path) -> None:

@@ -10,7 +10,8 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.commands.demo import demo_source
-from recon.commands.map import MapOptions, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.sources import synthetic
 
 SMALL_STREET = {"frames": 12, "width_px": 256, "height_px": 96, "focal_px": 150.0}
@@ -30,5 +31,7 @@ def small_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run; it must not be changed."""
     config = load_config(None, [f"street.{key}={value}" for key, value in SMALL_STREET.items()])
     out = tmp_path_factory.mktemp("demo") / "run"
-    run_map(demo_source(config), config, MapOptions(command="demo", out=out, mesh=False))
+    run_map(
+        demo_source(config), config, MapOptions(audit=False, command="demo", out=out, mesh=False)
+    )
     return out

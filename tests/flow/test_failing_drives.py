@@ -16,10 +16,12 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.map import MapOptions, MapRun, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.core.errors import CalibrationError, MappingError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import RectifiedCamera, RectifiedPair, Trajectory
+from recon.map.map_run import MapRun
 from recon.odometry import OdometryFrame, OdometryResult, make_odometry
 from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource
@@ -149,7 +151,7 @@ def write_drive(pairs: Iterable[RectifiedPair], folder: Path) -> None:
 
 def map_drive(pairs: Iterable[RectifiedPair], folder: Path) -> MapRun:
     write_drive(pairs, folder / "drive")
-    options = MapOptions(out=folder / "out", mesh=False)
+    options = MapOptions(audit=False, out=folder / "out", mesh=False)
     return run_map(open_source(folder / "drive"), load_config(), options)
 
 
@@ -194,7 +196,7 @@ BODY = make_transform(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0
 
 def test_a_prior_in_body_axes_is_recognised(seen: list[RectifiedPair], tmp_path: Path) -> None:
     write_drive(seen, tmp_path / "drive")
-    options = MapOptions(out=tmp_path / "out", mesh=False, prior=body_path(10, BODY))
+    options = MapOptions(audit=False, out=tmp_path / "out", mesh=False, prior=body_path(10, BODY))
     run = run_map(open_source(tmp_path / "drive"), load_config(), options)
     assert not doubted(run)
     assert run.summary["prior"]["axes"] == "body"
@@ -208,7 +210,7 @@ def test_a_prior_said_to_be_in_the_wrong_axes_fails_with_the_reason(
 ) -> None:
     write_drive(seen, tmp_path / "drive")
     config = load_config(None, ["odometry.prior.axes=camera"])
-    options = MapOptions(out=tmp_path / "out", mesh=False, prior=body_path(10, BODY))
+    options = MapOptions(audit=False, out=tmp_path / "out", mesh=False, prior=body_path(10, BODY))
     with pytest.raises(MappingError, match=r"the map is empty .*check the prior: its axes"):
         run_map(open_source(tmp_path / "drive"), config, options)
     assert not (tmp_path / "out").exists()
@@ -220,7 +222,9 @@ def test_a_drive_out_of_range_fails_with_the_reason(
     write_drive(seen[:4], tmp_path / "drive")
     config = load_config(None, ["cloud.max_range_m=0.5"])
     with pytest.raises(MappingError, match=r"no point in the middle of the drive: .* at .* m"):
-        run_map(open_source(tmp_path / "drive"), config, MapOptions(out=tmp_path / "out"))
+        run_map(
+            open_source(tmp_path / "drive"), config, MapOptions(audit=False, out=tmp_path / "out")
+        )
     assert not (tmp_path / "out").exists()
 
 
@@ -294,7 +298,7 @@ def test_rows_that_are_off_by_five_pixels_are_told(tmp_path: Path) -> None:
     write_kitti(SyntheticSource(street), tmp_path / "drive")
     for path in (tmp_path / "drive" / "image_1").glob("*.png"):
         cv2.imwrite(str(path), np.roll(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), 5, axis=0))
-    options = MapOptions(out=tmp_path / "out", mesh=False)
+    options = MapOptions(audit=False, out=tmp_path / "out", mesh=False)
     run = run_map(open_source(tmp_path / "drive"), load_config(), options)
     assert any("the right image is 5 px too low" in line for line in run.warnings)
 

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.map import MapOptions, MapRun, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.core.values import SequenceTruth, StereoPair
 from recon.io.trajectory import read_tum
 from recon.map.frame_result import FrameResult
-from recon.report.map_page import write_map_page
+from recon.map.map_run import MapRun
 from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
@@ -81,9 +82,7 @@ class _Breaks(Silent):
 def _run(
     drive: _Filmed, out: Path, *settings: str, resume: bool = False, breaks: int = -1
 ) -> MapRun:
-    options = MapOptions(
-        out=out, mesh=False, resume=resume, progress=_Breaks(breaks), present=write_map_page
-    )
+    options = MapOptions(audit=False, out=out, mesh=False, resume=resume, progress=_Breaks(breaks))
     return run_map(drive, load_config(None, settings), options)
 
 

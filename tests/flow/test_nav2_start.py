@@ -13,7 +13,8 @@ import yaml
 
 from recon.commands.config import load_config
 from recon.commands.demo import demo_source
-from recon.commands.map import MapOptions, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.commands.occupancy import OccupancyRequest, run_occupancy
 from recon.core.geometry.se3 import invert
 from recon.core.values import Trajectory
@@ -137,7 +138,9 @@ def test_the_map_can_have_its_origin_on_the_ground(tmp_path: Path) -> None:
     ]
     config = load_config(None, [*street, "axes.origin=ground"])
     out = tmp_path / "run"
-    run = run_map(demo_source(config), config, MapOptions(command="demo", out=out, mesh=False))
+    run = run_map(
+        demo_source(config), config, MapOptions(audit=False, command="demo", out=out, mesh=False)
+    )
     base = read_tum(out / "trajectory_map_base_tum.txt")
     # One frame's ground plane against the ground of the whole drive: some centimetres apart.
     assert abs(base.positions_m[0, 2]) < 0.1
@@ -154,7 +157,7 @@ FLOWN = 1.4 + 0.8 * np.sin(np.arange(FRAMES) / 3)
 
 def _mapped(source: StereoSource, out: Path, poses: Trajectory | None = None) -> Path:
     config = load_config(None, ["loops.enabled=false"])
-    run_map(source, config, MapOptions(out=out, mesh=False, known_poses=poses))
+    run_map(source, config, MapOptions(audit=False, out=out, mesh=False, known_poses=poses))
     return out
 
 

@@ -6,7 +6,8 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.commands.demo import demo_source
-from recon.commands.map import MapOptions, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.core.values import OccupancyMetrics
 
 STREETS = {
@@ -18,7 +19,7 @@ STREETS = {
 
 def _map(overrides: list[str], out) -> OccupancyMetrics:
     config = load_config(None, ["street.frames=30", *overrides])
-    run = run_map(demo_source(config), config, MapOptions(out=out, mesh=False))
+    run = run_map(demo_source(config), config, MapOptions(audit=False, out=out, mesh=False))
     assert run.occupancy_metrics is not None
     assert run.summary["occupancy"]["voxels"]["recall"] == run.occupancy_metrics.voxels.recall
     return run.occupancy_metrics

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.map import MapOptions, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetSettings
 
@@ -18,7 +19,7 @@ STREET = StreetSettings(frames=4, width_px=320, height_px=120, focal_px=180.0)
 def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     base = tmp_path_factory.mktemp("runs")
     for threads in (1, 2):
-        options = MapOptions(out=base / str(threads), threads=threads, mesh=False)
+        options = MapOptions(audit=False, out=base / str(threads), threads=threads, mesh=False)
         run_map(SyntheticSource(STREET), load_config(), options)
     return [base / "1", base / "2"]
 

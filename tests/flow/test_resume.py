@@ -11,10 +11,12 @@ from pathlib import Path
 import pytest
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.map import MapOptions, MapRun, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.map import Store
 from recon.map.frame_result import FrameResult
+from recon.map.map_run import MapRun
 from recon.map.persistent import Map
 from recon.run.progress import SILENT, Silent
 from recon.sources import open_source
@@ -56,7 +58,9 @@ def _config(*more: str) -> ReconConfig:
 def _run(
     drive: Path, out: Path, observer: _Breaks | None = None, *, resume: bool = False
 ) -> MapRun:
-    options = MapOptions(out=out, mesh=False, progress=observer or SILENT, resume=resume)
+    options = MapOptions(
+        audit=False, out=out, mesh=False, progress=observer or SILENT, resume=resume
+    )
     return run_map(open_source(drive), _config(), options)
 
 
@@ -113,7 +117,7 @@ def test_other_settings_another_source_and_other_poses_are_refused(
     with pytest.raises(KeyboardInterrupt):
         _run(drive, tmp_path / "run", _Breaks(12, KeyboardInterrupt()))
     source = open_source(drive)
-    options = MapOptions(out=tmp_path / "run", mesh=False, resume=True)
+    options = MapOptions(audit=False, out=tmp_path / "run", mesh=False, resume=True)
     with pytest.raises(SettingsError, match=r"other settings.*fusion.voxel_m = 0.2, expected 0.1"):
         run_map(source, _config("fusion.voxel_m=0.2"), options)
     other = shutil.copytree(drive, tmp_path / "other")
@@ -122,7 +126,11 @@ def test_other_settings_another_source_and_other_poses_are_refused(
         run_map(open_source(other), _config(), options)
     assert source.truth is not None
     known = MapOptions(
-        out=tmp_path / "run", mesh=False, resume=True, known_poses=source.truth.trajectory
+        audit=False,
+        out=tmp_path / "run",
+        mesh=False,
+        resume=True,
+        known_poses=source.truth.trajectory,
     )
     with pytest.raises(SettingsError, match="other poses"):
         run_map(source, _config(), known)

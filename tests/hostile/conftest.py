@@ -10,7 +10,8 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.commands.demo import demo_source
-from recon.commands.map import MapOptions, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.io.images.image import write_image
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetSettings
@@ -54,7 +55,9 @@ def good_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run with maps."""
     config = load_config(None, [f"street.{key}={value}" for key, value in DRIVE.items()])
     out = tmp_path_factory.mktemp("finished") / "run"
-    run_map(demo_source(config), config, MapOptions(command="demo", out=out, mesh=False))
+    run_map(
+        demo_source(config), config, MapOptions(audit=False, command="demo", out=out, mesh=False)
+    )
     return out
 
 

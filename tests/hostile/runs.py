@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.map import MapOptions, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.commands.resume import MapRequest
 from recon.map.frame_result import FrameResult
 from recon.run.progress import Silent
@@ -34,7 +35,11 @@ def interrupt_run(folder: Path) -> None:
     config = load_config(None, ["checkpoints.every_frames=1", "submaps.length_m=1"])
     request = MapRequest(folder / "drive", mesh=False)
     options = MapOptions(
-        out=folder / "run", mesh=False, progress=_Stops(), arguments=request.arguments()
+        audit=False,
+        out=folder / "run",
+        mesh=False,
+        progress=_Stops(),
+        arguments=request.arguments(),
     )
     with pytest.raises(KeyboardInterrupt):
         run_map(open_source(folder / "drive"), config, options)

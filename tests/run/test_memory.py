@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.map import MapOptions, run_map
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
 from recon.commands.resume import MapRequest, plan_map
 from recon.core.errors import MemoryLimitError, SettingsError
 from recon.core.geometry.se3 import make_transform
@@ -128,13 +129,15 @@ def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(
     request = MapRequest(drive, mesh=False, out=out, memory_limit="500M")
     overrides = ["checkpoints.every_frames=4", "submaps.length_m=4"]
     request, config = plan_map(request, None, overrides)
-    options = MapOptions(out=out, mesh=False, arguments=request.arguments())
+    options = MapOptions(audit=False, out=out, mesh=False, arguments=request.arguments())
     with pytest.raises(MemoryLimitError, match=r"got 600 MB.*--resume .* larger --memory-limit"):
         run_map(open_source(drive), config, options)
     resumed, config = plan_map(MapRequest(None, resume=out, memory_limit="700M"), None, [])
     assert config.memory.limit_mb == 700
     assert config.submaps.length_m == 4
     assert resumed.source == drive
-    run = run_map(open_source(drive), config, MapOptions(out=out, mesh=False, resume=True))
+    run = run_map(
+        open_source(drive), config, MapOptions(audit=False, out=out, mesh=False, resume=True)
+    )
     assert run.summary["frames"] == STREET.frames
     assert "limit_mb: 700" in (out / "config.yaml").read_text()

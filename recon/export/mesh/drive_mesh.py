@@ -83,6 +83,10 @@ class WrittenMesh:
         """Number of vertices."""
         return sum(tile.vertices for tile in self.tiles)
 
+    def to_show(self, directory: RunDirectory) -> TriangleMesh | None:
+        """Return the mesh for images; None if it is too large for memory."""
+        return read_mesh(directory.path("mesh/mesh.ply")) if self.faces <= SAMPLE_FACES else None
+
 
 def store_map(mapped: MappedSequence, settings: MeshSettings, folder: Path) -> TileStore:
     """Store the fused cloud and the voxels of a drive tile by tile.
@@ -134,11 +138,6 @@ def write_drive_mesh(
         layers = {"mesh": whole}
     write_mlp(directory.path("mesh/mesh.mlp"), {**layers, "cloud": cloud}, "map")
     return found
-
-
-def mesh_to_show(written: WrittenMesh, whole: Path) -> TriangleMesh | None:
-    """The mesh for images; None if it is too large for memory."""
-    return read_mesh(whole) if written.faces <= SAMPLE_FACES else None
 
 
 @dataclass(eq=False)

@@ -1,0 +1,85 @@
+"""The results of a mapped drive, and their figures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from recon.core.values import (
+    MapMetrics,
+    OccupancyGrid,
+    OccupancyMetrics,
+    PointCloud,
+    SequenceTruth,
+    TrajectoryMetrics,
+    TriangleMesh,
+)
+from recon.map.axes import base_axes
+from recon.map.sequence import MappedSequence
+from recon.map.settings import DriveSettings
+from recon.run.summary import plain
+
+
+@dataclass(frozen=True, eq=False)
+class MapRun:
+    """Results of a run, from which its report is made.
+
+    Attributes:
+        name: Display name of the source.
+        config: The configuration.
+        mapped: Trajectory, health, fused cloud, voxels.
+        cloud: Even sample of the fused cloud; all points of a small one. Frame ``map``.
+        grid: The flat grid.
+        camera_height_m: Height of the camera above the ground; None = unknown, or not steady.
+        mesh: The surface in map axes, or None if none was requested, none could be made, or it
+            does not fit in memory.
+        truth: Ground truth of path and surface, as far as the source knows it.
+        metrics: Errors against the true path, or None without one.
+        map_metrics: Errors against the true surface, or None without one.
+        occupancy_metrics: Errors against the true occupancy, or None without one.
+        warnings: Problems that did not stop the run.
+        summary: The figures of ``summary.json``.
+    """
+
+    name: str
+    config: DriveSettings
+    mapped: MappedSequence
+    cloud: PointCloud
+    grid: OccupancyGrid
+    camera_height_m: float | None
+    mesh: TriangleMesh | None
+    truth: SequenceTruth | None
+    metrics: TrajectoryMetrics | None
+    map_metrics: MapMetrics | None
+    occupancy_metrics: OccupancyMetrics | None
+    warnings: tuple[str, ...]
+    summary: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        made = f"{self.mapped}, {self.grid}, {self.mesh}"
+        return f"MapRun({self.name!r}, {made}, {len(self.warnings)} warnings)"
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures of path, map and errors."""
+        mapped = self.mapped
+        frames, seconds = len(mapped.trajectory), mapped.seconds
+        measured = {
+            "trajectory": self.metrics,
+            "map": self.map_metrics,
+            "occupancy": self.occupancy_metrics,
+        }
+        return {
+            "source": self.name,
+            "frames": frames,
+            "fps": frames / seconds if seconds > 0 else None,
+            "path_length_m": mapped.trajectory.path_length_m,
+            "frames_not_trusted": sum(not record.ok for record in mapped.health),
+            "focal_px": mapped.camera.focal_px,
+            "field_of_view_deg": mapped.camera.field_of_view_deg,
+            "T_map_world": mapped.T_map_world.tolist(),
+            "camera_height_m": self.camera_height_m,
+            "T_base_camera": base_axes(mapped.T_map_world, self.camera_height_m).tolist(),
+            "warnings": list(self.warnings),
+            **({} if mapped.loops is None else {"loops": mapped.loops.figures()}),
+            **{name: plain(errors) for name, errors in measured.items() if errors is not None},
+        }
