@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from plotly import graph_objects as go
+from plotly.colors import get_colorscale
 
 from recon.core.geometry.se3 import apply
 from recon.core.values import PointCloud, TriangleMesh
@@ -44,6 +45,8 @@ _LAYOUT: Final = {
     "uirevision": "kept",  # changing the colouring does not reset the view
     "scene_aspectmode": "manual",
 }  # fmt: skip
+# By its colours, as plotly.js does not know the name.
+_TURBO: Final = get_colorscale("Turbo")
 _PATH_COLOURS: Final = ("#ff5252", "#ffb74d", "#81c784")
 _OUTLIER_SHARE: Final = 0.002
 # Candidate viewpoints: from behind (x is forward), from the sides, and from above.
@@ -176,7 +179,7 @@ def _colourings(cloud: PointCloud, xyz: Float32) -> list[Json]:
     """By the image if the points have colours, and by height."""
     low, high = value_range(xyz[:, 2])
     height = np.clip((xyz[:, 2] - low) / (high - low) * 255.0, 0, 255).astype(np.uint8)
-    scale = {"color": height, "colorscale": "Turbo", "cmin": 0, "cmax": 255}
+    scale = {"color": height, "colorscale": _TURBO, "cmin": 0, "cmax": 255}
     by_height = [{"label": "height", "marker": scale}]
     if cloud.rgb is None:
         return by_height

@@ -46,6 +46,10 @@ def test_coloured_cloud_can_also_be_shown_by_height(cloud: PointCloud) -> None:
     assert [colouring["label"] for colouring in colourings] == ["image", "height"]
     lengths = {len(unpack(colouring["marker"]["color"])) for colouring in colourings}
     assert lengths == {len(unpack(both["data"][0]["x"]))}
+    scale = colourings[1]["marker"]["colorscale"]
+    assert [scale[0][0], scale[-1][0]] == [0.0, 1.0]
+    assert "#30123b" in scale[0]  # turbo: from dark blue …
+    assert "#7a0402" in scale[-1]  # … to dark red
     plain = PointCloud(cloud.xyz, frame="map")
     assert len(plot(Scene(np.eye(4), plain))["layout"]["meta"]) == 1
 
