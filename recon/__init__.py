@@ -1,4 +1,4 @@
-"""Stereo reconstruction and mapping: from pairs of pictures to maps.
+"""Stereo reconstruction and mapping: from image pairs to maps.
 
 The whole flow in two lines::
 

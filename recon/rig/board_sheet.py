@@ -160,7 +160,7 @@ def _check_pixels(sheet: Sheet, dpi: float) -> None:
     longest = round(max(sheet.width_mm, sheet.height_mm) / _MM_PER_IN * dpi)
     if longest > _LARGEST_PNG_PX:
         raise SettingsError(
-            "picture of the board would be too large",
+            "image of the board would be too large",
             got=f"{longest} px",
             expected=f"at most {_LARGEST_PNG_PX} px",
             hint="a smaller --dpi, or PDF, which has none",

@@ -61,9 +61,9 @@ def available_cores() -> int:
 def peak_memory_mb() -> float:
     """Return the largest resident memory of this process so far, in 10⁶ bytes."""
     # On Linux, the peak from getrusage is inherited from the parent process.
-    told = _PEAK.search(_STATUS.read_text()) if _STATUS.exists() else None
-    if told is not None:
-        return int(told[1]) * 1024 / 1e6
+    found = _PEAK.search(_STATUS.read_text()) if _STATUS.exists() else None
+    if found is not None:
+        return int(found[1]) * 1024 / 1e6
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 

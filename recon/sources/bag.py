@@ -109,15 +109,15 @@ class BagSource:
             return
         # One reader per camera, so that pairs with messages far apart need no buffer.
         views = zip(
-            self._pictures(0, self.pairs.left[start:]),
-            self._pictures(1, self.pairs.right[start:]),
+            self._images(0, self.pairs.left[start:]),
+            self._images(1, self.pairs.right[start:]),
             strict=True,
         )
         for index, (left, right) in enumerate(views, start=start):
             stamp_s = float(self.left_s[self.pairs.left[index]])
             yield join_pair(left, right, stamp_s, index, f"{self.topics[0]}, pair {index}")
 
-    def _pictures(self, side: int, wanted: Sequence[int]) -> Iterator[UInt8]:
+    def _images(self, side: int, wanted: Sequence[int]) -> Iterator[UInt8]:
         """Yield the wanted images of one camera, given by their indices in order."""
         times, topic = self.recorded_ns[side], self.topics[side]
         start_ns = int(times[wanted[0]])

@@ -64,9 +64,9 @@ def list_others(bag: Bag, used: Sequence[str]) -> str:
     Other pairs of image topics are not among them; see `choose_topics`.
     """
     images = [topic.name for topic in bag.topics.values() if topic.kind in _IMAGES]
-    told = {*used, *(name for pair in find_partners(images) for name in pair)}
+    named = {*used, *(name for pair in find_partners(images) for name in pair)}
     others = sorted(
-        t.name for t in bag.topics.values() if t.kind != CAMERA_INFO and t.name not in told
+        t.name for t in bag.topics.values() if t.kind != CAMERA_INFO and t.name not in named
     )
     if not others:
         return ""

@@ -24,8 +24,8 @@ from recon.core.geometry.se3 import invert
 from recon.core.values import SequenceTruth, StereoCalibration, check_size
 from recon.core.values.arrays import Float64
 from recon.io.cameras.euroc import NS, read_euroc_camera, read_euroc_truth
+from recon.sources.images import ImageSource, image_size, pair_listed
 from recon.sources.pairing import check_increasing
-from recon.sources.pictures import PictureSource, pair_listed, picture_size
 from recon.sources.rig import Rig, as_rectified, find_calibration, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_stamped_names
@@ -34,7 +34,7 @@ from recon.sources.truth import truth_at
 _TRUTH: Final = "state_groundtruth_estimate0"
 
 
-def open_euroc(folder: Path, settings: SourceSettings) -> PictureSource:
+def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
     """Open a drive; its images are paired by timestamp.
 
     The ground truth is interpolated to the timestamps; it is used only if it covers every frame.
@@ -48,16 +48,14 @@ def open_euroc(folder: Path, settings: SourceSettings) -> PictureSource:
     views = [root / (settings.left or "cam0"), root / (settings.right or "cam1")]
     lists = [_read_list(view) for view in views]
     frames, roll = pair_listed(lists, settings, root)
-    rig, calibration_files = _read_rig(
-        root, settings, views, picture_size(frames[0].left, settings)
-    )
+    rig, calibration_files = _read_rig(root, settings, views, image_size(frames[0].left, settings))
     truth, note = _read_truth(root, views[0], np.array([frame.timestamp_s for frame in frames]))
-    return PictureSource(
+    return ImageSource(
         name=folder.resolve().name,
         description=f"EuRoC drive, {views[0].name} and {views[1].name}, paired by stamps{roll}"
         f"{note}",
         calibration=rig,
-        pictures=frames,
+        images=frames,
         roll=roll,
         truth=truth,
         texts=(*calibration_files, *(view / "data.csv" for view in views)),

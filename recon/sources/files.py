@@ -108,8 +108,8 @@ def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIX
     """
     levels = [read_levels(path, max_megapixels) for path in (left, right)]
     white = find_white(levels)
-    pictures = [eight_bits(each, white) for each in levels]
-    sizes = [f"{picture.shape[1]}x{picture.shape[0]}" for picture in pictures]
+    images = [eight_bits(each, white) for each in levels]
+    sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in images]
     if sizes[0] != sizes[1]:
         raise SourceError(
             "left and right images differ in size",
@@ -117,14 +117,14 @@ def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIX
             got=f"left {sizes[0]}, right {sizes[1]}",
             hint="both cameras must record the same size",
         )
-    if min(pictures[0].shape[:2]) < LEAST_SIDE_PX:
+    if min(images[0].shape[:2]) < LEAST_SIDE_PX:
         raise SourceError(
             "images are too small to be matched",
             where=left,
             got=sizes[0],
             expected=f"at least {LEAST_SIDE_PX} pixels a side",
         )
-    return join_pair(pictures[0], pictures[1], name=Path(left).name)
+    return join_pair(images[0], images[1], name=Path(left).name)
 
 
 def join_pair(

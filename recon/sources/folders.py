@@ -23,6 +23,15 @@ from recon.core.errors import SourceError
 from recon.core.values.arrays import Float64
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.frames_csv import FRAMES, read_frames
+from recon.sources.images import (
+    ImageFrame,
+    ImageSource,
+    image_size,
+    is_image,
+    list_images,
+    pair_listed,
+    pair_named,
+)
 from recon.sources.pairing import (
     Roll,
     check_increasing,
@@ -31,15 +40,6 @@ from recon.sources.pairing import (
     partner_names,
     split_sides,
     stamps_of_names,
-)
-from recon.sources.pictures import (
-    PictureFrame,
-    PictureSource,
-    is_picture,
-    list_pictures,
-    pair_listed,
-    pair_named,
-    picture_size,
 )
 from recon.sources.rig import read_rig
 from recon.sources.settings import SourceSettings
@@ -65,7 +65,7 @@ class _Pairing:
     texts: tuple[Path, ...] = ()
 
 
-def open_folders(folder: Path, settings: SourceSettings) -> PictureSource:
+def open_folders(folder: Path, settings: SourceSettings) -> ImageSource:
     """Open plain folders; the description says how the images are paired.
 
     Raises:
@@ -77,14 +77,14 @@ def open_folders(folder: Path, settings: SourceSettings) -> PictureSource:
     found = _pair(folder, settings)
     stamps_s, clock = _times(found, settings)
     first = found.pairs[0][0]
-    rig, texts = read_rig(settings, folder, picture_size(first, settings), kitti_cameras_of(first))
+    rig, texts = read_rig(settings, folder, image_size(first, settings), kitti_cameras_of(first))
     truth, note = read_tum_truth(folder, stamps_s)
-    return PictureSource(
+    return ImageSource(
         name=folder.resolve().name,
         description=f"plain folders, {found.how}{found.roll}{clock}{note}",
         calibration=rig,
-        pictures=[
-            PictureFrame(left, right, float(stamp))
+        images=[
+            ImageFrame(left, right, float(stamp))
             for (left, right), stamp in zip(found.pairs, stamps_s, strict=True)
         ],
         roll=found.roll,
@@ -99,26 +99,26 @@ def find_views(folder: Path, settings: SourceSettings) -> tuple[Path, Path] | No
         left = folder / settings.left if settings.left else folder
         inside = folder / settings.right
         right = inside if inside.is_dir() else Path(settings.right)
-        return _with_pictures(left) or left, _with_pictures(right) or right
+        return _with_images(left) or left, _with_images(right) or right
     if settings.left is not None:
         names = [path.name for path in folder.iterdir() if path.is_dir()]
         right_name = next((n for n in partner_names(settings.left) if n in names), None)
         if right_name is not None:
             return find_views(folder, settings.model_copy(update={"right": right_name}))
-    inside_of = {path.name: _with_pictures(path) for path in folder.iterdir() if path.is_dir()}
+    inside_of = {path.name: _with_images(path) for path in folder.iterdir() if path.is_dir()}
     holding = {name: inside for name, inside in inside_of.items() if inside is not None}
     pairs = find_partners(holding)
     if pairs:
         return holding[pairs[0][0]], holding[pairs[0][1]]
-    if find_partners(path.stem for path in folder.iterdir() if is_picture(path)):
+    if find_partners(path.stem for path in folder.iterdir() if is_image(path)):
         return folder, folder
     return None
 
 
-def _with_pictures(folder: Path) -> Path | None:
+def _with_images(folder: Path) -> Path | None:
     """Return the folder itself or its subfolder with the images, or None."""
     places = [folder / name for name in _INSIDE]
-    return next((p for p in places if p.is_dir() and any(map(is_picture, p.iterdir()))), None)
+    return next((p for p in places if p.is_dir() and any(map(is_image, p.iterdir()))), None)
 
 
 def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
@@ -153,8 +153,8 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
 
 def _list_both(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
     if left != right:
-        return list_pictures(left), list_pictures(right)
-    by_stem = {path.stem: path for path in list_pictures(left)}
+        return list_images(left), list_images(right)
+    by_stem = {path.stem: path for path in list_images(left)}
     sides = split_sides(by_stem)
     return [by_stem[name] for name in sides[0]], [by_stem[name] for name in sides[1]]
 
@@ -211,7 +211,7 @@ def _pair_by_stamp(
 def _by_name(left: list[Path], right: list[Path]) -> _Frames | None:
     """Return frames by names that are equal or differ only in the side.
 
-    None if most images have no partner, so that their names tell nothing.
+    None if most images have no partner, so that their names say nothing.
     """
     rights = {path.stem: path for path in right}
     frames: _Frames = []

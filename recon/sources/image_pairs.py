@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Final
 
 from recon.core.errors import SourceError
+from recon.sources.images import IMAGES
 from recon.sources.pairing import natural_key
-from recon.sources.pictures import PICTURES
 
 _NUMBER: Final = re.compile(r"[0-9]+")
 
@@ -49,7 +49,7 @@ def pair_images(left: str | Path, right: str | Path) -> ImagePairs:
     Raises:
         SourceError: A side has no images, most images have no partner, or the sides share files.
     """
-    sides = (list_pictures(left), list_pictures(right))
+    sides = (list_images(left), list_images(right))
     both = set(sides[0]) & set(sides[1])
     if both:
         raise SourceError(
@@ -71,7 +71,7 @@ def pair_images(left: str | Path, right: str | Path) -> ImagePairs:
     return ImagePairs(tuple(zip(*sides, strict=True)), by_order=len(sides[0]) > 1)
 
 
-def list_pictures(where: str | Path) -> list[Path]:
+def list_images(where: str | Path) -> list[Path]:
     """Return the images of a folder or pattern in natural order: 2 before 10.
 
     Raises:
@@ -83,15 +83,15 @@ def list_pictures(where: str | Path) -> list[Path]:
         if folder.is_dir()
         else (Path(name) for name in glob.glob(str(where), recursive=True))  # noqa: PTH207
     )
-    pictures = [path for path in found if path.suffix.lower() in PICTURES and path.is_file()]
-    if not pictures:
+    images = [path for path in found if path.suffix.lower() in IMAGES and path.is_file()]
+    if not images:
         raise SourceError(
             "no images found",
             where=where,
-            expected=", ".join(sorted(PICTURES)),
+            expected=", ".join(sorted(IMAGES)),
             hint='put patterns in quotes: "left*.png"',
         )
-    return sorted(pictures, key=lambda path: natural_key(path.name))
+    return sorted(images, key=lambda path: natural_key(path.name))
 
 
 def _by_name(side: Sequence[Path]) -> dict[Key, Path]:

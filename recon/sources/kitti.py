@@ -26,14 +26,14 @@ from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offs
 from recon.io.cameras.kitti_raw import read_kitti_rig
 from recon.io.files import StrPath
 from recon.io.trajectory import read_kitti_poses
-from recon.sources.pairing import Roll, natural_key
-from recon.sources.pictures import (
-    PictureFrame,
-    PictureSource,
-    is_picture,
+from recon.sources.images import (
+    ImageFrame,
+    ImageSource,
+    image_size,
+    is_image,
     pair_named,
-    picture_size,
 )
+from recon.sources.pairing import Roll, natural_key
 from recon.sources.rig import Rig, as_rectified, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_times_of_pairs
@@ -43,7 +43,7 @@ def open_kitti(
     folder: StrPath,
     settings: SourceSettings | None = None,
     cameras: tuple[int, int] | None = None,
-) -> PictureSource:
+) -> ImageSource:
     """Open a drive in KITTI's odometry layout.
 
     File names, calibration, times and poses are read and checked at once; the images are read
@@ -65,20 +65,20 @@ def open_kitti(
     if not path.is_dir():
         raise SourceError("folder does not exist", where=path)
     pair = cameras or choose_cameras(path, "image_{}")
-    pictures, roll = list_pairs(*(path / f"image_{camera}" for camera in pair))
+    images, roll = list_pairs(*(path / f"image_{camera}" for camera in pair))
     settings = settings or SourceSettings()
     roll = roll.choose(settings, path)
-    pictures = pictures if roll.chosen is None else [pictures[k] for k in roll.chosen]
+    images = images if roll.chosen is None else [images[k] for k in roll.chosen]
     times, time_files = _read_times(path, roll, settings)
-    rig, calibration_files = _read_rig(path, settings, pair, pictures[0][0])
+    rig, calibration_files = _read_rig(path, settings, pair, images[0][0])
     texts = (*calibration_files, *time_files, _find_poses(path))
-    return PictureSource(
+    return ImageSource(
         name=path.resolve().name,
         description=f"KITTI odometry drive, image_{pair[0]} and image_{pair[1]}{roll}",
         calibration=rig,
-        pictures=[
-            PictureFrame(left, right, float(time_s))
-            for (left, right), time_s in zip(pictures, times, strict=True)
+        images=[
+            ImageFrame(left, right, float(time_s))
+            for (left, right), time_s in zip(images, times, strict=True)
         ],
         roll=roll,
         truth=_read_truth(path, times, roll, pair[0]),
@@ -133,7 +133,7 @@ def list_pairs(left: Path, right: Path) -> tuple[list[tuple[Path, Path]], Roll]:
 def _names(folder: Path) -> set[str]:
     if not folder.is_dir():
         raise SourceError("folder does not exist", where=folder)
-    return {path.name for path in folder.iterdir() if is_picture(path)}
+    return {path.name for path in folder.iterdir() if is_image(path)}
 
 
 def _read_times(
@@ -154,10 +154,10 @@ def _read_times(
 
 
 def _read_rig(
-    folder: Path, settings: SourceSettings, cameras: tuple[int, int], picture: Path
+    folder: Path, settings: SourceSettings, cameras: tuple[int, int], image: Path
 ) -> tuple[Rig, tuple[Path, ...]]:
     """Read the calibration; its file need not contain the image size."""
-    path, size = folder / "calib.txt", picture_size(picture, settings)
+    path, size = folder / "calib.txt", image_size(image, settings)
     if settings.calibration is not None:
         return read_rig(settings, folder, size, cameras)
     if not path.exists():

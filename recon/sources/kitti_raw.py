@@ -18,9 +18,9 @@ from typing import Final
 from recon.core.errors import SourceError
 from recon.core.values import RectifiedCamera
 from recon.io.cameras.kitti_raw import read_kitti_rig
+from recon.sources.images import ImageSource, image_size, list_images, pair_listed
 from recon.sources.kitti import choose_cameras
 from recon.sources.pairing import check_increasing
-from recon.sources.pictures import PictureSource, list_pictures, pair_listed, picture_size
 from recon.sources.rig import Rig, as_rectified, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_dates
@@ -28,7 +28,7 @@ from recon.sources.times import read_dates
 _CALIBRATION: Final = "calib_cam_to_cam.txt"
 
 
-def open_kitti_raw(folder: Path, settings: SourceSettings) -> PictureSource:
+def open_kitti_raw(folder: Path, settings: SourceSettings) -> ImageSource:
     """Open a raw drive; its images are paired by timestamp.
 
     Raises:
@@ -41,15 +41,15 @@ def open_kitti_raw(folder: Path, settings: SourceSettings) -> PictureSource:
     views = [folder / f"image_{camera:02d}" for camera in cameras]
     frames, roll = pair_listed([_read_list(v) for v in views], settings, folder)
     rig, calibration_files = _read_rig(
-        folder, settings, cameras, picture_size(frames[0].left, settings)
+        folder, settings, cameras, image_size(frames[0].left, settings)
     )
     rectified = "rectified" if isinstance(rig, RectifiedCamera) else "not rectified"
-    return PictureSource(
+    return ImageSource(
         name=folder.resolve().name,
         description=f"KITTI raw drive, {views[0].name} and {views[1].name}, {rectified}, "
         f"paired by stamps{roll}",
         calibration=rig,
-        pictures=frames,
+        images=frames,
         roll=roll,
         texts=(*calibration_files, *(view / "timestamps.txt" for view in views)),
     )
@@ -57,21 +57,21 @@ def open_kitti_raw(folder: Path, settings: SourceSettings) -> PictureSource:
 
 def _read_list(view: Path) -> list[tuple[float, Path]]:
     """Time stamp and image of each frame; where images are missing, names give the frame."""
-    path, pictures = view / "timestamps.txt", list_pictures(view / "data")
+    path, images = view / "timestamps.txt", list_images(view / "data")
     if not path.exists():
         raise SourceError("times are missing", where=path)
     stamps = read_dates(path)
     check_increasing(stamps, str(path))
-    if len(stamps) == len(pictures):
-        return list(zip(stamps.tolist(), pictures, strict=True))
-    if len(stamps) < len(pictures) or not all(image.stem.isdecimal() for image in pictures):
+    if len(stamps) == len(images):
+        return list(zip(stamps.tolist(), images, strict=True))
+    if len(stamps) < len(images) or not all(image.stem.isdecimal() for image in images):
         raise SourceError(
             "numbers of times and images differ",
             where=path,
             got=f"{len(stamps)} times",
-            expected=f"{len(pictures)}",
+            expected=f"{len(images)}",
         )
-    named = {int(image.stem): image for image in pictures}
+    named = {int(image.stem): image for image in images}
     missing = [view / "data" / f"{number:010d}.png" for number in range(len(stamps))]
     return [(stamp, named.get(k, missing[k])) for k, stamp in enumerate(stamps.tolist())]
 

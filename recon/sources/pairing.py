@@ -81,13 +81,13 @@ class Roll:
     chosen: range | None = None
 
     def __str__(self) -> str:
-        told = ""
+        text = ""
         if any(self.alone):
-            told = f", {self.alone[0]} left and {self.alone[1]} right without a partner left out"
+            text = f", {self.alone[0]} left and {self.alone[1]} right without a partner left out"
         if self.chosen is None:
-            return told
+            return text
         every = f" in steps of {self.chosen.step}" if self.chosen.step > 1 else ""
-        return f"{told}, frames {self.chosen[0]} to {self.chosen[-1]}{every}"
+        return f"{text}, frames {self.chosen[0]} to {self.chosen[-1]}{every}"
 
     @property
     def kept(self) -> Sequence[int]:

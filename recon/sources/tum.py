@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 
 from recon.core.errors import SourceError
+from recon.sources.images import ImageSource, image_size, is_image, pair_listed
 from recon.sources.pairing import check_increasing, find_partners
-from recon.sources.pictures import PictureSource, is_picture, pair_listed, picture_size
 from recon.sources.rig import read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_stamped_names
 from recon.sources.truth import read_tum_truth
 
 
-def open_tum(folder: Path, settings: SourceSettings) -> PictureSource:
+def open_tum(folder: Path, settings: SourceSettings) -> ImageSource:
     """Open a drive with two lists; its images are paired by timestamp.
 
     Raises:
@@ -35,13 +35,13 @@ def open_tum(folder: Path, settings: SourceSettings) -> PictureSource:
     paths = _find_lists(folder, settings)
     lists = [_read_list(path) for path in paths]
     frames, roll = pair_listed(lists, settings, folder)
-    rig, texts = read_rig(settings, folder, picture_size(frames[0].left, settings))
+    rig, texts = read_rig(settings, folder, image_size(frames[0].left, settings))
     truth, note = read_tum_truth(folder, np.array([frame.timestamp_s for frame in frames]))
-    return PictureSource(
+    return ImageSource(
         name=folder.resolve().name,
         description=f"TUM drive, {paths[0].name} and {paths[1].name}, paired by stamps{roll}{note}",
         calibration=rig,
-        pictures=frames,
+        images=frames,
         roll=roll,
         truth=truth,
         texts=(*texts, *paths),
@@ -58,7 +58,7 @@ def _lists(path: Path) -> bool:
     """Return whether a file is a list, by its first entry: a number, then the name of an image."""
     with path.open(encoding="utf-8", errors="replace") as lines:
         words = next((line.split() for line in lines if line.strip() and line[0] != "#"), [])
-    return len(words) >= 2 and is_picture(Path(words[1]))
+    return len(words) >= 2 and is_image(Path(words[1]))
 
 
 def _find_lists(folder: Path, settings: SourceSettings) -> tuple[Path, Path]:

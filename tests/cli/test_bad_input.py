@@ -214,7 +214,7 @@ def prior_with_a_word_in_it(path: Path) -> str:
     "write",
     [prior_without_times, prior_of_another_clock, prior_of_one_pose, prior_with_a_word_in_it],
 )
-def test_a_prior_that_tells_nothing(
+def test_a_prior_that_give_no_answer(
     write: Callable[[Path], str], good_drive: Path, tmp_path: Path
 ) -> None:
     word = write(tmp_path / "prior.txt")

@@ -126,7 +126,7 @@ def test_what_is_wrong_is_one_clear_line_and_nothing_is_left(
 
 
 @pytest.mark.slow
-def test_a_wrong_board_is_told_with_the_true_size(drawn: Path, tmp_path: Path) -> None:
+def test_a_wrong_board_is_reported_with_the_true_size(drawn: Path, tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"does not have 8x6 inner corners \(got 9x6"):
         calibrate(drawn, tmp_path / "out", board="chess:8x6:25mm")
 
@@ -153,7 +153,7 @@ def test_a_charuco_board_of_the_older_pattern_is_found_out(tmp_path: Path) -> No
         np.testing.assert_allclose(left.pixels, placed.left_px[left.numbers], atol=0.5)
 
 
-def test_depth_errors_are_told_in_words() -> None:
+def test_depth_errors_are_reported_in_words() -> None:
     known = {"calibration": 110.4, "low": -3.24, "high": 4.56, "matching": 2.251}
     unknown = dict.fromkeys(known) | {"matching": 0.01}
     working = {"distance_m": 3.548, "calibration_share": 0.0551}

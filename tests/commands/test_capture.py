@@ -136,7 +136,7 @@ def test_the_exposure_of_the_left_camera_is_held_on_both_sides(
     assert "0.400000" in (tmp_path / FRAMES).read_text().splitlines()[1]
 
 
-def test_a_camera_that_goes_silent_is_told_and_what_was_recorded_stays(tmp_path: Path) -> None:
+def test_a_camera_that_goes_silent_is_reported_and_what_was_recorded_stays(tmp_path: Path) -> None:
     times = [0.1 * k for k in range(6)]
     cameras = (FakeCamera("l", times), FakeCamera("/dev/video2", times[:4]))
     with pytest.raises(SourceError, match="/dev/video2: camera gives no more frames"):
@@ -204,7 +204,7 @@ def test_a_camera_that_is_not_there_is_one_line_and_leaves_no_folder(
     assert not (tmp_path / "out").exists()
 
 
-def test_cameras_of_different_size_are_told(pairs: list[StereoPair], tmp_path: Path) -> None:
+def test_cameras_of_different_size_are_reported(pairs: list[StereoPair], tmp_path: Path) -> None:
     drives.write_video(tmp_path / "l.avi", [pair.left for pair in pairs])
     drives.write_video(tmp_path / "r.avi", [pair.right[:, :32] for pair in pairs])
     devices = [str(tmp_path / "l.avi"), str(tmp_path / "r.avi")]

@@ -29,7 +29,7 @@ def test_failed_checks_say_what_to_do() -> None:
     assert missing.hint == "run: pip install no-such-package"
 
 
-def test_a_package_that_cannot_be_imported_is_told_with_its_last_line() -> None:
+def test_a_package_that_cannot_be_imported_is_reported_with_its_last_line() -> None:
     broken = installation.check_package("numpy", "no_such_module")
     assert not broken.ok
     assert "ModuleNotFoundError" in broken.found
@@ -52,13 +52,13 @@ def test_system_libraries_are_looked_for() -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals of this kind")
-def test_a_package_that_crashes_the_process_is_told() -> None:
+def test_a_package_that_crashes_the_process_is_reported() -> None:
     done, told = installation._run_python("import os; os.abort()")
     assert not done
     assert told.startswith("crashed with signal")
 
 
-def test_an_import_that_never_ends_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_import_that_never_ends_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def late(*_: Any, **__: Any) -> None:
         raise subprocess.TimeoutExpired("python", 1)
 
@@ -79,14 +79,14 @@ def test_real_data_may_be_missing_but_not_wrong(
     assert not installation.check_data().ok
 
 
-def test_variables_that_change_kiss_icp_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_variables_that_change_kiss_icp_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("kiss_icp_mapping", "{}")
     check = installation.check_kiss_icp_environment()
     assert not check.ok
     assert "unset kiss_icp_mapping" in check.hint
 
 
-def test_kernels_that_are_not_compiled_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_that_are_not_compiled_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
     assert not next(iter(installation.check_numba())).ok
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "0")

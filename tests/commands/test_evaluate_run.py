@@ -154,7 +154,7 @@ def test_clouds_are_coloured_by_their_errors(drifted: Path) -> None:
         assert cloud.confidence.max() < 0.01
 
 
-def test_what_cannot_be_aligned_is_told(drifted: Path) -> None:
+def test_what_cannot_be_aligned_is_reported(drifted: Path) -> None:
     reference, poses = drifted / "reference.ply", drifted / "poses.txt"
     with pytest.raises(EvaluationError, match="has no path to align"):
         run_evaluate_map(reference, reference, align_to=poses)

@@ -29,7 +29,7 @@ from recon.io.trajectory import write_tum
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 from tests.docs.blocks import ROOT
-from tests.flow.test_newcomer import BOARD, photograph, take_pictures
+from tests.flow.test_newcomer import BOARD, photograph, take_images
 from tests.flow.test_paper import write_scene
 from tests.scenery.boards import board_rig, place_boards, render_views
 from tests.scenery.kitti import write_kitti
@@ -172,7 +172,7 @@ def scenes(folder: Path) -> None:
 
 def board_images(pattern: Path) -> None:
     """Twelve views of a board by both cameras, and one of a room."""
-    take_pictures(pattern.parent, board_rig("radtan", 480, 360))
+    take_images(pattern.parent, board_rig("radtan", 480, 360))
     for side in ("left", "right"):
         (pattern.parent / f"{side}_room.png").rename(pattern.parent / f"{side}.png")
 
@@ -184,8 +184,8 @@ def board_views() -> list[tuple[np.ndarray, np.ndarray]]:
 
 def board_folders(left: Path) -> None:
     for number, pair in enumerate(board_views()):
-        for side, picture in zip(("left", "right"), pair, strict=True):
-            write_image(left.parent / side / f"{number:02d}.png", picture)
+        for side, image in zip(("left", "right"), pair, strict=True):
+            write_image(left.parent / side / f"{number:02d}.png", image)
 
 
 def drive_of_that_rig(folder: Path) -> None:

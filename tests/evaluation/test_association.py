@@ -50,6 +50,6 @@ def test_a_slow_path_meets_every_third_pose_of_a_fast_one() -> None:
     np.testing.assert_allclose(fast.timestamps_s, slow.timestamps_s + 0.002)
 
 
-def test_clocks_that_never_meet_are_told() -> None:
+def test_clocks_that_never_meet_are_reported() -> None:
     with pytest.raises(EvaluationError, match=r"times 0\.000 to 4\.000 s and 1000\.000"):
         associate(path(np.arange(5.0)), path(1000 + np.arange(5.0)), 0.01)

@@ -32,7 +32,7 @@ def test_the_motion_between_two_samples_of_a_corner_is_found(away_m: float) -> N
     assert share > 0.9
 
 
-def test_clouds_that_are_too_far_apart_are_told() -> None:
+def test_clouds_that_are_too_far_apart_are_reported() -> None:
     with pytest.raises(RegistrationError, match="no corresponding points"):
         icp(corner(0), corner(1) + 100, (2.0, 0.5))
 

@@ -192,7 +192,7 @@ def test_a_segment_ends_at_the_first_frame_beyond_its_length() -> None:
         (straight(9), straight(9, 0.0), "too short"),
     ],
 )
-def test_what_cannot_be_compared_is_told(
+def test_what_cannot_be_compared_is_reported(
     estimate: np.ndarray, truth: np.ndarray, told: str
 ) -> None:
     with pytest.raises(EvaluationError) as error:

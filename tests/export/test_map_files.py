@@ -132,7 +132,7 @@ def test_a_map_too_large_for_an_octomap_has_all_else(
     assert not [name for name in folder.files() if "octomap" in name]
 
 
-def test_an_empty_height_band_is_told(mapped: MappedSequence, folder: RunDirectory) -> None:
+def test_an_empty_height_band_is_reported(mapped: MappedSequence, folder: RunDirectory) -> None:
     config = load_config(None, [*SETTINGS, "grid.min_height_m=2", "grid.max_height_m=1"])
     with pytest.raises(MappingError, match="height band"):
         write_map(replace(mapped, config=config), folder, Stopwatch())

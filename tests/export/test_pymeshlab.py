@@ -43,7 +43,7 @@ def test_a_poisoned_cloud_is_an_error_and_not_an_empty_mesh() -> None:
         reconstruct(xyz, ball())
 
 
-def test_a_child_that_dies_is_told_in_one_line(
+def test_a_child_that_dies_is_reported_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "pymeshlab.py").write_text(

@@ -153,7 +153,7 @@ def test_a_scene_without_a_published_range_is_searched_as_far_as_its_truth(
     assert "depth" not in cones["nonocc"]["dense"]
 
 
-def test_tables_maps_and_pictures_are_written(run: tuple[dict[str, Any], Path, str]) -> None:
+def test_tables_maps_and_images_are_written(run: tuple[dict[str, Any], Path, str]) -> None:
     summary, out, _ = run
     assert json.loads((out / "summary.json").read_text()) == summary
     assert "| sad |" in (out / "tables.md").read_text()
@@ -165,8 +165,8 @@ def test_tables_maps_and_pictures_are_written(run: tuple[dict[str, Any], Path, s
     assert float(mean["bad2"]) == pytest.approx(expected, rel=1e-5)
     report = (out / "report.html").read_text()
     assert all(title in report for title in ("Reliability", "Sparsification", "2003/Cones"))
-    picture = read_image(out / "pictures/sad/MiddEval3/trainingQ/Teddy_error.png")
-    assert picture.shape == (HEIGHT, WIDTH, 3)
+    image = read_image(out / "pictures/sad/MiddEval3/trainingQ/Teddy_error.png")
+    assert image.shape == (HEIGHT, WIDTH, 3)
     assert (out / "disparity/opencv-bm/MiddEval3/trainingH/Teddy.pfm").is_file()
 
 
@@ -284,13 +284,11 @@ def test_maps_of_two_sizes_are_refused_in_one_line(tmp_path: Path) -> None:
 
 def test_a_pair_is_matched_by_the_matcher_that_is_named(scenes: Path, tmp_path: Path) -> None:
     scene = scenes / "MiddEval3" / "trainingQ" / "Teddy"
-    pictures = (scene / "im0.png", scene / "im1.png")
+    images = (scene / "im0.png", scene / "im1.png")
     medians = {}
     for name in ("sad", "opencv-sgbm"):
         out = tmp_path / name
-        done = refusals.run(
-            "disparity", *pictures, "--matcher", name, "--ndisp", "16", "--out", out
-        )
+        done = refusals.run("disparity", *images, "--matcher", name, "--ndisp", "16", "--out", out)
         assert done.code == 0, done.err
         assert f"matcher: {name}" in (out / "config.yaml").read_text()
         medians[name] = json.loads((out / "summary.json").read_text())["disparity_median_px"]

@@ -37,13 +37,13 @@ def test_more_frames_must_have_seen_what_is_compared(run: Path) -> None:
 
 
 def test_the_command_prints_json_and_draws_what_is_wrong(run: Path, tmp_path: Path) -> None:
-    picture = tmp_path / "compared.png"
-    done = refusals.run("evaluate", "occupancy", run, "--json", "--picture", picture)
+    image = tmp_path / "compared.png"
+    done = refusals.run("evaluate", "occupancy", run, "--json", "--picture", image)
     assert done.code == 0, done.err
     printed = json.loads(done.out)
     assert printed == json.loads((run / "summary.json").read_text())["occupancy"]
 
-    colours = cv2.imread(str(picture))[..., ::-1].reshape(-1, 3)
+    colours = cv2.imread(str(image))[..., ::-1].reshape(-1, 3)
     counts = {kind: int((colours == rgb).all(axis=1).sum()) for kind, rgb in GRID_ERRORS.items()}
     # A cell is a square of pixels.
     side_px = math.isqrt(sum(counts.values()) // printed["grid"]["cells"])
@@ -96,10 +96,10 @@ def test_grids_that_other_programs_drew_larger_are_compared_all_the_same(
     copy = shutil.copytree(run, tmp_path / "copy")
     grid = read_nav2(copy / "map" / "grid.yaml")
     rows, columns = grid.cells.shape
-    picture = np.full((rows + 7, columns + 5), 205, np.uint8)
+    image = np.full((rows + 7, columns + 5), 205, np.uint8)
     original = cv2.imread(str(copy / "map" / "grid.pgm"), cv2.IMREAD_GRAYSCALE)
-    picture[7:, 5:] = original  # row 0 is the top: the origin moves left, and not down
-    cv2.imwrite(str(copy / "map" / "grid.pgm"), picture)
+    image[7:, 5:] = original  # row 0 is the top: the origin moves left, and not down
+    cv2.imwrite(str(copy / "map" / "grid.pgm"), image)
     text = (copy / "map" / "grid.yaml").read_text()
     x = grid.origin_m[0]
     assert f"- {x}" in text

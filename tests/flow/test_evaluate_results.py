@@ -110,7 +110,7 @@ def test_missing_scenes_are_named_and_left_out_of_all_means(
     assert list(found["matchers"]["mine"]["scenes"]) == ["Piano", "Teddy", "Vintage"]
 
 
-def test_folders_of_one_name_are_told_apart(scenes: Path, results: Path, tmp_path: Path) -> None:
+def test_folders_of_one_name_are_distinguished(scenes: Path, results: Path, tmp_path: Path) -> None:
     for method in ("a", "b"):
         write_pfm(tmp_path / method / "maps" / "Teddy.pfm", truth(scenes))
     both = ("--results", tmp_path / "a" / "maps", "--results", tmp_path / "b" / "maps")

@@ -82,10 +82,10 @@ class Road:
         T_world_left = self.pose(index)
         T_left_right = make_transform(np.eye(3), np.array([CAMERA.baseline_m, 0.0, 0.0]))
         poses = (T_world_left, T_world_left @ T_left_right)
-        left, right = (self._picture(T, index, side) for side, T in enumerate(poses))
+        left, right = (self._image(T, index, side) for side, T in enumerate(poses))
         return RectifiedPair(left, right, CAMERA, timestamp_s=0.1 * index, index=index)
 
-    def _picture(self, T_world_camera: np.ndarray, index: int, side: int) -> np.ndarray:
+    def _image(self, T_world_camera: np.ndarray, index: int, side: int) -> np.ndarray:
         thirds = (-1 / 3, 0.0, 1 / 3)
         light = np.mean(
             [_look(T_world_camera, du, dv, self.grain) for du in thirds for dv in thirds], axis=0
@@ -293,7 +293,7 @@ def test_swapped_eyes_end_in_one_clear_line(seen: list[RectifiedPair], tmp_path:
     assert not (tmp_path / "out").exists()
 
 
-def test_rows_that_are_off_by_five_pixels_are_told(tmp_path: Path) -> None:
+def test_rows_that_are_off_by_five_pixels_are_reported(tmp_path: Path) -> None:
     street = StreetSettings(frames=2, width_px=400, height_px=160, focal_px=260.0)
     write_kitti(SyntheticSource(street), tmp_path / "drive")
     for path in (tmp_path / "drive" / "image_1").glob("*.png"):

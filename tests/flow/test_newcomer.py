@@ -45,7 +45,7 @@ def photograph(camera: CameraIntrinsics, T_left_camera: np.ndarray) -> np.ndarra
     return np.asarray(grey).astype(np.uint8)
 
 
-def take_pictures(folder: Path, rig: StereoCalibration) -> None:
+def take_images(folder: Path, rig: StereoCalibration) -> None:
     board = parse_board(BOARD)
     pairs = render_views(rig, board, place_boards(rig, board, 12, seed=4))
     pairs.append(
@@ -55,9 +55,9 @@ def take_pictures(folder: Path, rig: StereoCalibration) -> None:
         )
     )
     for number, pair in enumerate(pairs):
-        for side, picture in zip(("left", "right"), pair, strict=True):
+        for side, image in zip(("left", "right"), pair, strict=True):
             name = "room" if number == 12 else f"board{number:02d}"
-            write_image(folder / f"{side}_{name}.png", picture)
+            write_image(folder / f"{side}_{name}.png", image)
 
 
 def recon(*arguments: str | Path) -> dict[str, object]:
@@ -71,11 +71,9 @@ def recon(*arguments: str | Path) -> dict[str, object]:
     ("lens", "form"),
     [("radtan", "recon"), ("rational", "ros"), ("fisheye", "opencv")],
 )
-def test_pictures_of_a_board_lead_to_a_cloud_in_metres(
-    tmp_path: Path, lens: Lens, form: str
-) -> None:
+def test_images_of_a_board_lead_to_a_cloud_in_metres(tmp_path: Path, lens: Lens, form: str) -> None:
     rig = board_rig(lens, 480, 360)
-    take_pictures(tmp_path, rig)
+    take_images(tmp_path, rig)
     recon("board", BOARD, "--out", tmp_path / "board.pdf")
     calibrated = recon(
         "calibrate", tmp_path / "left_board*.png", tmp_path / "right_board*.png", "--board", BOARD,

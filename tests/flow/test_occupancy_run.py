@@ -114,7 +114,7 @@ def _alter(run: Path, folder: Path, change: Callable[[Store], None]) -> Path:
     return copy
 
 
-def test_a_run_that_kept_no_rays_is_told(small_demo: Path, tmp_path: Path) -> None:
+def test_a_run_that_kept_no_rays_is_reported(small_demo: Path, tmp_path: Path) -> None:
     copy = _alter(small_demo, tmp_path, lambda store: store.delete("rays"))
     with pytest.raises(FormatError, match=r"kept no rays.*keep_rays=true"):
         _remake(copy, tmp_path / "out")
@@ -136,7 +136,7 @@ def test_rays_and_poses_must_be_of_the_same_frames(small_demo: Path, tmp_path: P
         _remake(copy, tmp_path / "out")
 
 
-def test_a_folder_that_is_no_run_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_run_is_reported(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="not contain a finished run"):
         _remake(tmp_path, tmp_path / "out")
 

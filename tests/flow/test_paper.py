@@ -192,7 +192,7 @@ def test_a_scene_without_truth_is_reconstructed_and_told(scenes: Path, tmp_path:
 
 
 @pytest.mark.parametrize("given", [True, False])
-def test_missing_scenes_are_told_in_one_line(
+def test_missing_scenes_are_reported_in_one_line(
     tmp_path: Path, given: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("RECON_DATA", raising=False)

@@ -107,7 +107,7 @@ def test_a_run_that_is_broken_off_again_and_again_goes_on(
 
 def test_bad_input_leaves_nothing_to_resume(drive: Path, tmp_path: Path) -> None:
     with pytest.raises(FormatError):
-        _run(drive, tmp_path / "run", _Breaks(12, FormatError("picture is truncated")))
+        _run(drive, tmp_path / "run", _Breaks(12, FormatError("image is truncated")))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -179,7 +179,9 @@ def test_a_chain_that_is_not_understood_is_one_clear_line(
         ("my_right_cam.yaml", ("my_left_cam.yaml", "my_right_cam.yaml")),
     ],
 )
-def test_camera_info_files_are_told_by_left_and_right(given: str, names: tuple[str, str]) -> None:
+def test_camera_info_files_are_reported_by_left_and_right(
+    given: str, names: tuple[str, str]
+) -> None:
     assert tuple(path.name for path in camera_info_paths(given)) == names
 
 
@@ -246,7 +248,7 @@ def test_a_fisheye_needs_four_coefficients() -> None:
         CameraIntrinsics(np.eye(3), np.zeros(5), 640, 480, "fisheye")
 
 
-def test_homographies_are_told_from_a_calibration(tmp_path: Path) -> None:
+def test_homographies_are_distinguished_from_a_calibration(tmp_path: Path) -> None:
     path = tmp_path / "homographies.yaml"
     path.write_text("note: up to scale\nwidth_px: 64\nH_left:\n- [1, 0, 0]\n")
     with pytest.raises(CalibrationError, match=r"homographies\.yaml: .*no depth.*recon disparity"):

@@ -182,7 +182,7 @@ def test_what_is_no_image_is_one_clear_line(
         read_image(path)
 
 
-def test_a_damaged_tiff_is_told_by_the_error_alone(
+def test_a_damaged_tiff_is_reported_by_the_error_alone(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     write_image(tmp_path / "a.tif", random_image(60, 80))

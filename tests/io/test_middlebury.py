@@ -196,7 +196,7 @@ def test_cross_check_asks_the_right_view_at_x_minus_d() -> None:
         ("view1.png", "view5.png", "disp1.png", (555, 695), 2, "2005"),
     ],
 )
-def test_older_scenes_are_told_apart_and_their_truth_scaled(
+def test_older_scenes_are_distinguished_and_their_truth_scaled(
     tmp_path: Path,
     left: str,
     right: str,

@@ -218,7 +218,7 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
             read_ply(path)
 
 
-def test_an_unwritable_place_is_told_and_leaves_nothing(tmp_path: Path) -> None:
+def test_an_unwritable_place_is_reported_and_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError):
         write_ply(tmp_path / "file" / "cloud.ply", example_cloud())

@@ -96,7 +96,7 @@ def test_kitti_poses_without_times_are_one_second_apart(tmp_path: Path) -> None:
     assert read_kitti_poses(tmp_path / "p.txt").timestamps_s.tolist() == [0, 1, 2]
 
 
-def test_the_kind_is_told_by_the_columns(tmp_path: Path) -> None:
+def test_the_kind_is_reported_by_the_columns(tmp_path: Path) -> None:
     trajectory = random_trajectory(1, 4)
     write_tum(tmp_path / "tum.txt", trajectory)
     write_kitti_poses(tmp_path / "kitti.txt", trajectory)
@@ -130,7 +130,7 @@ def test_a_bad_trajectory_is_one_line_that_names_the_place(
         read_trajectory(tmp_path / "poses.txt")
 
 
-def test_a_number_of_poses_that_is_not_that_of_the_times_is_told(tmp_path: Path) -> None:
+def test_a_number_of_poses_that_is_not_that_of_the_times_is_reported(tmp_path: Path) -> None:
     (tmp_path / "p.txt").write_text(IDENTITY * 2)
     with pytest.raises(FormatError, match=r"p\.txt: numbers of poses .*\(got 2 poses, expected 3"):
         read_trajectory(tmp_path / "p.txt", np.arange(3.0))

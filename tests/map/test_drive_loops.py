@@ -162,7 +162,7 @@ def test_an_interrupted_drive_gives_the_same_loops(frames, closed, tmp_path, che
     )
 
 
-def test_a_full_disk_is_told_although_another_thread_met_it(frames, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_although_another_thread_met_it(frames, tmp_path, monkeypatch):
     def full(self: Keyframes, stored: StoredKeyframe) -> None:
         raise OutputError("the disk is full")
 
@@ -190,7 +190,7 @@ def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):
     assert looked == [0]
 
 
-def test_a_foreign_keyframe_is_told(frames):
+def test_a_foreign_keyframe_is_reported(frames):
     store = Store.temporary()
     _watch(frames, _circle(), store, upto=3)
     store.put("keyframe", (0, 1), {"a": 1})

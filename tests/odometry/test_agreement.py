@@ -50,17 +50,17 @@ def test_another_exposure_changes_nothing(see: See) -> None:
     assert ask(before, dimmed, STEP).share == pytest.approx(ask(before, now, STEP).share, abs=0.05)
 
 
-def test_an_image_without_texture_tells_nothing(blind: See) -> None:
+def test_an_image_without_texture_give_no_answer(blind: See) -> None:
     found = ask(blind(100), blind(100), np.eye(4))
     assert found.informative == 0
     assert np.isnan(found.share)
 
 
-def test_an_image_that_is_dark_now_tells_nothing(see: See, blind: See) -> None:
+def test_an_image_that_is_dark_now_give_no_answer(see: See, blind: See) -> None:
     assert ask(see(np.eye(4)), blind(2), STEP).informative == 0
 
 
-def test_edges_of_one_direction_tell_nothing(see: See) -> None:
+def test_edges_of_one_direction_give_no_answer(see: See) -> None:
     """Stripes look alike however far the camera went along them."""
     frame = see(np.eye(4))
     stripes = np.tile(np.where(np.arange(160) % 20 < 10, 60, 180)[:, None], (1, 400))

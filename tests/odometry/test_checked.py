@@ -61,7 +61,7 @@ def test_a_motion_that_is_hardly_known_is_not(half_a_metre: list[OdometryFrame])
     assert health.notes == ("the motion is known to 0.30 m only",)
 
 
-def test_a_motion_without_a_deviation_needs_an_image_that_tells(blind: See) -> None:
+def test_a_motion_without_a_deviation_needs_an_image_that_decides(blind: See) -> None:
     frames = [blind(100, index) for index in range(2)]
     health = last_health(frames, forward(0.0, 0.5), OdometryHealth())
     assert not health.ok

@@ -36,7 +36,7 @@ def test_poses_are_picked_by_the_number_of_the_frame(blind: See, street_poses: n
     )
 
 
-def test_a_frame_without_a_pose_is_told(blind: See, street_poses: np.ndarray) -> None:
+def test_a_frame_without_a_pose_is_reported(blind: See, street_poses: np.ndarray) -> None:
     odometry = known(street_poses[:2])
     with pytest.raises(RegistrationError, match=r"frame 2: no known pose .* \(got 2 poses"):
         odometry.register(blind(index=2))

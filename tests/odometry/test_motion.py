@@ -16,7 +16,7 @@ def test_with_known_times_the_velocity_goes_on() -> None:
 
 
 @pytest.mark.parametrize("time_s", [0.0, 0.1, 1000.0, -5.0])
-def test_times_that_tell_nothing_repeat_the_last_motion(time_s: float) -> None:
+def test_times_that_give_no_answer_repeat_the_last_motion(time_s: float) -> None:
     motion = Motion(np.eye(4), 0.0).moved(STEP, 0.1)
     np.testing.assert_allclose(motion.predict(time_s), STEP @ STEP, atol=1e-12)
 

@@ -66,11 +66,11 @@ def test_body_axes_are_turned_into_those_of_the_camera() -> None:
 
 
 @pytest.mark.parametrize(("from_s", "to_s"), [(-0.1, 0.1), (0.3, 0.6), (0.2, 0.2), (0.2, 0.1)])
-def test_outside_of_the_path_nothing_is_told(from_s: float, to_s: float) -> None:
+def test_outside_of_the_path_nothing_is_reported(from_s: float, to_s: float) -> None:
     assert MotionPrior(path(steps(5)), PriorSettings()).motion(from_s, to_s) is None
 
 
-def test_across_a_gap_nothing_is_told() -> None:
+def test_across_a_gap_nothing_is_reported() -> None:
     gappy = MotionPrior(path(steps(3), interval_s=2.0), PriorSettings())
     assert gappy.motion(0.5, 0.6) is None
 

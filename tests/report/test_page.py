@@ -101,7 +101,7 @@ def test_report_loads_nothing_from_outside() -> None:
         assert not re.search(r"https?://", page)
 
 
-def test_browser_is_told_to_refuse_what_is_outside() -> None:
+def test_browser_is_reported_to_refuse_what_is_outside() -> None:
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', audit_page())
     assert policy is not None
     assert "default-src 'none'" in policy[1]

@@ -25,9 +25,9 @@ def test_a_png_has_its_corners_where_they_are_on_paper(
 ) -> None:
     board = parse_board(text)
     figures = write_board(tmp_path / "b.png", board, dpi=150)
-    with Image.open(tmp_path / "b.png") as picture:
-        dpi = picture.info["dpi"]
-        size_mm = np.array(picture.size) * 25.4 / dpi
+    with Image.open(tmp_path / "b.png") as image:
+        dpi = image.info["dpi"]
+        size_mm = np.array(image.size) * 25.4 / dpi
     assert dpi[0] == pytest.approx(figures["dpi"], rel=1e-4)
     # A page is a whole number of pixels.
     np.testing.assert_allclose(size_mm, (297, 210), atol=0.2)

@@ -55,7 +55,7 @@ def test_cost_sums_the_parts_of_a_stage() -> None:
     assert 10 < figures["peak_memory_mb"] < 100_000
 
 
-def test_what_is_wrong_with_frames_is_told_once() -> None:
+def test_what_is_wrong_with_frames_is_reported_once() -> None:
     good, warned = OdometryHealth(), OdometryHealth(warnings=("rows are off",))
     lines = health_warnings([warned, good, warned, good])
     assert lines == ["frames 0-2: rows are off"]

@@ -125,18 +125,18 @@ def plane_pair(
     size = (camera.height_px, camera.width_px)
     # Coarsest lattice spacing of 16 pixels in the left image, at any depth.
     texture = _Texture(16.0 * float(np.nanmedian(depth)) / camera.focal_px, seed)
-    pictures = [
-        _picture(view, planes, texture, np.random.default_rng([seed, side]), noise_dn)
+    images = [
+        _image(view, planes, texture, np.random.default_rng([seed, side]), noise_dn)
         for side, view in enumerate((left, right))
     ]
     truth = DisparityTruth(
         disparity_from_depth(depth, camera).reshape(size),
         _seen_by(right, planes, left, depth, nearest).reshape(size),
     )
-    return PlanePair(RectifiedPair(pictures[0], pictures[1], camera), truth)
+    return PlanePair(RectifiedPair(images[0], images[1], camera), truth)
 
 
-def _picture(
+def _image(
     view: View,
     planes: Sequence[Plane],
     texture: _Texture,

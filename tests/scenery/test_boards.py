@@ -27,17 +27,17 @@ def test_truth_of_a_view_is_the_projection_of_the_board(lens: str) -> None:
 def test_squares_between_true_corners_are_dark_and_light_by_turns() -> None:
     rig = board_rig("fisheye")
     (view,) = place_boards(rig, BOARD, 1)
-    picture = BoardRenderer(rig.left, BOARD).render(view.T_left_board)
+    image = BoardRenderer(rig.left, BOARD).render(view.T_left_board)
     centres = BOARD.corners_m.reshape(4, 6, 3)[:3, :5] + [0.015, 0.015, 0]
     xyz = apply(view.T_left_board, centres.reshape(-1, 3))
     u, v = np.rint(project(rig.left, xyz)).astype(int).T
-    grey = picture[v, u].reshape(3, 5)
+    grey = image[v, u].reshape(3, 5)
     dark = (np.add.outer(np.arange(3), np.arange(5)) % 2) == 0
     assert (grey[dark] < 60).all()
     assert (grey[~dark] > 190).all()
 
 
-def test_positions_fill_the_picture_and_lean_both_ways() -> None:
+def test_positions_fill_the_image_and_tilt_both_ways() -> None:
     rig = board_rig()
     views = place_boards(rig, BOARD, 30)
     pixels = np.concatenate([view.left_px for view in views])
@@ -46,7 +46,7 @@ def test_positions_fill_the_picture_and_lean_both_ways() -> None:
     assert normals[:, :2].min() < -0.2 < 0.2 < normals[:, :2].max()
 
 
-def test_one_seed_gives_one_set_of_pictures() -> None:
+def test_one_seed_gives_one_set_of_images() -> None:
     rig = board_rig()
     one, two = (render_views(rig, BOARD, place_boards(rig, BOARD, 1, seed=3)) for _ in range(2))
     np.testing.assert_array_equal(one[0], two[0])

@@ -35,7 +35,7 @@ def test_doffs_shifts_the_disparity():
     assert np.percentile(_warp_error(scene), 95) < 3.0
 
 
-def test_disparity_of_a_slanted_plane_is_linear_in_the_picture():
+def test_disparity_of_a_slanted_plane_is_linear_in_the_image():
     d = slanted_pair(CAMERA, 10.0, (0.5, -0.2)).truth.values.astype(np.float64)
     v, u = np.mgrid[0:100, 0:200]
     x, y = (u - 99.5) / 200, (v - 49.5) / 200
@@ -43,7 +43,7 @@ def test_disparity_of_a_slanted_plane_is_linear_in_the_picture():
     assert np.allclose(d, 100.0 * (1 - 0.5 * x + 0.2 * y) / 10.0, rtol=1e-6)
 
 
-def test_an_integer_disparity_shifts_the_picture_by_whole_pixels():
+def test_an_integer_disparity_shifts_the_image_by_whole_pixels():
     scene = fronto_parallel_pair(CAMERA, 100.0 / 20.0)
     assert np.array_equal(scene.pair.left[:, 20:], scene.pair.right[:, :-20])
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from recon.core.errors import SourceError
-from recon.sources.image_pairs import list_pictures, pair_images
+from recon.sources.image_pairs import list_images, pair_images
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -43,7 +43,7 @@ def test_folders_are_paired_by_name_whatever_the_suffix(tmp_path: Path) -> None:
     assert names(found.pairs) == [("a.png", "a.jpg"), ("b.png", "b.jpg")]
 
 
-def test_names_that_have_nothing_in_common_are_paired_by_order_and_that_is_told(
+def test_names_that_have_nothing_in_common_are_paired_by_order_and_that_is_reported(
     tmp_path: Path,
 ) -> None:
     touch(tmp_path, "L/100.png", "L/200.png", "R/101.png", "R/202.png")
@@ -70,7 +70,7 @@ def test_a_single_pair_needs_no_names_in_common(tmp_path: Path) -> None:
         (["lx.png", "ly.png"], ["r.png"], r"do not pair up \(got 2 left, 1 right"),
     ],
 )
-def test_pictures_of_which_most_have_no_partner_are_refused(
+def test_images_of_which_most_have_no_partner_are_refused(
     tmp_path: Path, left: list[str], right: list[str], message: str
 ) -> None:
     touch(tmp_path, *left, *right)
@@ -78,7 +78,7 @@ def test_pictures_of_which_most_have_no_partner_are_refused(
         pair_images(str(tmp_path / "l*"), str(tmp_path / "r*"))
 
 
-def test_pictures_without_a_partner_are_left_out_and_named(tmp_path: Path) -> None:
+def test_images_without_a_partner_are_left_out_and_named(tmp_path: Path) -> None:
     touch(tmp_path, *(f"left{n}.png" for n in (1, 2, 3, 5)), "left_notes.png")
     touch(tmp_path, *(f"right{n}.png" for n in (1, 2, 3, 4)), "right_7_again.png")
     found = pair_images(str(tmp_path / "left*"), str(tmp_path / "right*"))
@@ -93,7 +93,7 @@ def test_a_pattern_that_takes_both_sides_is_refused(tmp_path: Path) -> None:
         pair_images(str(tmp_path / "*"), str(tmp_path / "*"))
 
 
-def test_a_pattern_without_pictures_is_told_and_to_be_quoted(tmp_path: Path) -> None:
+def test_a_pattern_without_images_is_reported_and_to_be_quoted(tmp_path: Path) -> None:
     touch(tmp_path, "left1.txt")
     with pytest.raises(SourceError, match=r"no images found.*in quotes"):
-        list_pictures(str(tmp_path / "left*"))
+        list_images(str(tmp_path / "left*"))

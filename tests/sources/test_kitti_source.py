@@ -31,8 +31,8 @@ def make_drive(
     for camera in cameras:
         for frame in range(frames):
             shape = (16, 32) if camera < 2 else (16, 32, 3)
-            picture = rng.integers(0, 256, shape, dtype=np.uint8)
-            write_image(folder / f"image_{camera}" / f"{frame:06d}.png", picture)
+            image = rng.integers(0, 256, shape, dtype=np.uint8)
+            write_image(folder / f"image_{camera}" / f"{frame:06d}.png", image)
     (folder / "calib.txt").write_text("".join(f"P{c}: {CALIB[c]}\n" for c in cameras))
     (folder / "times.txt").write_text("".join(f"{0.1 * frame:.6f}\n" for frame in range(frames)))
     if poses is not None:
@@ -102,7 +102,7 @@ def test_poses_of_the_official_download_are_found_beside_the_sequences(tmp_path:
     assert open_kitti(folder).truth is not None
 
 
-def test_lines_beyond_the_last_picture_are_ignored(tmp_path: Path) -> None:
+def test_lines_beyond_the_last_image_are_ignored(tmp_path: Path) -> None:
     folder = make_drive(tmp_path, 3, poses=IDENTITY * 5)
     (folder / "times.txt").write_text("0\n1\n2\n3\n4\n")
     source = open_kitti(folder)
@@ -111,7 +111,7 @@ def test_lines_beyond_the_last_picture_are_ignored(tmp_path: Path) -> None:
     assert len(source) == len(source.truth.trajectory) == 3
 
 
-def test_other_files_among_the_pictures_are_no_frames(tmp_path: Path) -> None:
+def test_other_files_among_the_images_are_no_frames(tmp_path: Path) -> None:
     folder = make_drive(tmp_path)
     (folder / "image_0" / "Thumbs.db").write_text("x")
     (folder / "image_0" / "._000000.png").write_text("x")
@@ -188,7 +188,7 @@ def test_a_rate_stands_in_for_times(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["image_0/000002.png", "image_1/000001.png"])
-def test_a_picture_of_another_size_is_named_when_its_turn_comes(tmp_path: Path, name: str) -> None:
+def test_an_image_of_another_size_is_named_when_its_turn_comes(tmp_path: Path, name: str) -> None:
     folder = make_drive(tmp_path)
     write_image(folder / name, np.zeros((16, 31), dtype=np.uint8))
     source = open_kitti(folder)
@@ -198,7 +198,7 @@ def test_a_picture_of_another_size_is_named_when_its_turn_comes(tmp_path: Path, 
         list(source)
 
 
-def test_a_truncated_picture_is_named_when_its_turn_comes(tmp_path: Path) -> None:
+def test_a_truncated_image_is_named_when_its_turn_comes(tmp_path: Path) -> None:
     folder = make_drive(tmp_path)
     path = folder / "image_1" / "000001.png"
     path.write_bytes(path.read_bytes()[:100])
@@ -208,7 +208,7 @@ def test_a_truncated_picture_is_named_when_its_turn_comes(tmp_path: Path) -> Non
         next(pairs)
 
 
-def test_a_missing_folder_is_told(tmp_path: Path) -> None:
+def test_a_missing_folder_is_reported(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match="drive: folder does not exist"):
         open_kitti(tmp_path / "drive")
     with pytest.raises(SourceError, match="image_2: folder does not exist"):

@@ -126,7 +126,7 @@ def test_a_true_path_beside_plain_folders_is_read(pairs: list[StereoPair], tmp_p
     assert truth.trajectory.path_length_m == pytest.approx(11, abs=1e-9)
 
 
-def test_both_cameras_in_one_folder_are_told_apart_by_name(
+def test_both_cameras_in_one_folder_are_distinguished_by_name(
     pairs: list[StereoPair], tmp_path: Path
 ) -> None:
     for number, pair in enumerate(pairs, start=1):
@@ -139,7 +139,7 @@ def test_both_cameras_in_one_folder_are_told_apart_by_name(
 
 
 @pytest.mark.real
-def test_the_chessboard_pictures_of_opencv_are_pairs(recon_data: Path) -> None:
+def test_the_chessboard_images_of_opencv_are_pairs(recon_data: Path) -> None:
     source = open_source(recon_data / "calibration" / "opencv_chessboard")
     pairs = list(source)
     assert [pair.name for pair in pairs[7:10]] == ["left08.jpg", "left09.jpg", "left11.jpg"]
@@ -183,7 +183,9 @@ def test_views_may_stand_in_any_order_in_one_video(
      ("1600000000123", 1600000000.123), ("1600000000123456", 1600000000.123456),
      ("0.25", 0.25), ("000012", None), ("left01", None), ("1_5", None)],
 )  # fmt: skip
-def test_names_that_are_stamps_are_told_from_counts(stem: str, seconds: float | None) -> None:
+def test_names_that_are_stamps_are_distinguished_from_counts(
+    stem: str, seconds: float | None
+) -> None:
     assert stamp_of_name(stem) == (seconds if seconds is None else pytest.approx(seconds, abs=1e-6))
 
 
@@ -242,7 +244,7 @@ def test_colours_of_a_message_become_rgb(
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_a_bayer_picture_of_one_colour_gives_that_colour(pattern: str) -> None:
+def test_a_bayer_image_of_one_colour_gives_that_colour(pattern: str) -> None:
     colour = {"r": 200, "g": 90, "b": 20}
     tile = np.array([colour[letter] for letter in pattern], np.uint8).reshape(2, 2)
     mosaic = np.tile(tile, (4, 4))
@@ -259,7 +261,7 @@ def test_sixteen_bits_are_scaled_in_either_order_of_bytes(big_endian: bool) -> N
 
 
 @pytest.mark.parametrize(("encoding", "order"), [("yuv422_yuy2", "yuyv"), ("yuv422", "uyvy")])
-def test_a_grey_yuv_picture_is_grey(encoding: str, order: str) -> None:
+def test_a_grey_yuv_image_is_grey(encoding: str, order: str) -> None:
     data = np.array([126 if letter == "y" else 128 for letter in order * 4], np.uint8)
     image = pixels_of_ros_image(data, encoding, (2, 4), 8)
     # Video levels: 16 is black, 235 white.

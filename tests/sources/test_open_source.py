@@ -19,14 +19,14 @@ MIDDLEBURY = (
 )
 
 
-def picture(width: int = 32, *, colour: bool = False) -> np.ndarray:
+def image(width: int = 32, *, colour: bool = False) -> np.ndarray:
     shape = (16, width, 3) if colour else (16, width)
     return np.random.default_rng(1).integers(0, 256, shape, dtype=np.uint8)
 
 
 def make_kitti(folder: Path) -> Path:
     for camera in (0, 1):
-        write_image(folder / f"image_{camera}" / "000000.png", picture())
+        write_image(folder / f"image_{camera}" / "000000.png", image())
     (folder / "calib.txt").write_text(KITTI)
     (folder / "times.txt").write_text("0\n")
     return folder
@@ -34,14 +34,14 @@ def make_kitti(folder: Path) -> Path:
 
 def make_middlebury(folder: Path) -> Path:
     for name in ("im0.png", "im1.png"):
-        write_image(folder / name, picture(colour=True))
+        write_image(folder / name, image(colour=True))
     (folder / "calib.txt").write_text(MIDDLEBURY)
     return folder
 
 
 def make_files(folder: Path, right_width: int = 32) -> tuple[Path, Path, Path]:
-    write_image(folder / "left.png", picture())
-    write_image(folder / "right.png", picture(right_width))
+    write_image(folder / "left.png", image())
+    write_image(folder / "right.png", image(right_width))
     (folder / "calib.txt").write_text(KITTI)
     return folder / "left.png", folder / "right.png", folder / "calib.txt"
 
@@ -68,7 +68,7 @@ def test_a_middlebury_scene_has_its_geometry_and_no_path(tmp_path: Path) -> None
 
 def test_a_middlebury_scene_without_published_geometry_is_refused(tmp_path: Path) -> None:
     for name in ("im2.png", "im6.png"):
-        write_image(tmp_path / name, picture())
+        write_image(tmp_path / name, image())
     with pytest.raises(CalibrationError, match=r"no calibration is published.*expected calib\.txt"):
         open_source(tmp_path)
 
@@ -82,12 +82,12 @@ def test_one_pair_of_files_is_a_source(tmp_path: Path) -> None:
     assert source.calibration.baseline_m == 0.5
 
 
-def test_a_grey_and_a_coloured_picture_make_a_coloured_pair(tmp_path: Path) -> None:
-    write_image(tmp_path / "l.png", picture())
-    write_image(tmp_path / "r.png", picture(colour=True))
+def test_a_grey_and_a_coloured_image_make_a_coloured_pair(tmp_path: Path) -> None:
+    write_image(tmp_path / "l.png", image())
+    write_image(tmp_path / "r.png", image(colour=True))
     pair = read_pair(tmp_path / "l.png", tmp_path / "r.png")
     assert pair.left.shape == pair.right.shape == (16, 32, 3)
-    np.testing.assert_array_equal(pair.left[:, :, 1], picture())
+    np.testing.assert_array_equal(pair.left[:, :, 1], image())
 
 
 def test_files_of_different_size_are_refused_with_both_sizes(tmp_path: Path) -> None:
@@ -148,7 +148,7 @@ def test_an_unknown_kind_gets_the_choices(tmp_path: Path) -> None:
         open_source(tmp_path, "rosbag")
 
 
-def test_half_a_drive_is_told_as_a_drive_and_not_as_unknown(tmp_path: Path) -> None:
+def test_half_a_drive_is_reported_as_a_drive_and_not_as_unknown(tmp_path: Path) -> None:
     folder = make_kitti(tmp_path)
     (folder / "image_1" / "000000.png").unlink()
     (folder / "image_1").rmdir()

@@ -81,7 +81,7 @@ def test_without_static_transforms_the_poses_stay_those_of_the_body(tmp_path: Pa
 
 
 @pytest.mark.parametrize("kind", ["ros1", "ros2"])
-def test_topics_that_are_not_used_are_told(tmp_path: Path, kind: str) -> None:
+def test_topics_that_are_not_used_are_reported(tmp_path: Path, kind: str) -> None:
     description = open_source(write(tmp_path, kind)).description
     assert "not used: /odom, /tf, /tf_static (for --prior: /odom, /tf)" in description
 

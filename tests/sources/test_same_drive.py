@@ -68,15 +68,15 @@ def test_each_layout_is_recognised_and_gives_every_pixel_and_time(
     read = list(source)
     assert [pair.index for pair in read] == list(range(len(pairs)))
     for ours, truth in zip(read, pairs, strict=True):
-        assert_equal_picture(ours.left, truth.left)
-        assert_equal_picture(ours.right, truth.right)
+        assert_equal_image(ours.left, truth.left)
+        assert_equal_image(ours.right, truth.right)
         # Stamps of today have 0.2 µs in a double.
         assert ours.timestamp_s - read[0].timestamp_s == pytest.approx(truth.timestamp_s, abs=1e-6)
     assert "\n" not in source.description
     assert all(path.is_file() for path in source.files)
 
 
-def assert_equal_picture(ours: np.ndarray, truth: np.ndarray) -> None:
+def assert_equal_image(ours: np.ndarray, truth: np.ndarray) -> None:
     """A video has three channels, of a grey image three equal ones."""
     expected = truth if ours.ndim == 2 else np.repeat(truth[:, :, None], 3, axis=2)
     np.testing.assert_array_equal(ours, expected)
@@ -92,8 +92,8 @@ def test_a_drive_can_be_entered_at_any_pair(
     read = list(open_source(written[layout]).frames(start))
     assert [pair.index for pair in read] == list(range(start, FRAMES))
     for ours, truth in zip(read, pairs[start:], strict=True):
-        assert_equal_picture(ours.left, truth.left)
-        assert_equal_picture(ours.right, truth.right)
+        assert_equal_image(ours.left, truth.left)
+        assert_equal_image(ours.right, truth.right)
 
 
 def trajectory(path: Path) -> Float64:

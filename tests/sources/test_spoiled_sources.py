@@ -70,7 +70,7 @@ def test_a_recording_cut_off_before_its_index_was_written_is_one_line(
 
 
 @pytest.mark.parametrize("kind", ["ros1", "ros2", "mcap"])
-def test_stamps_out_of_order_are_told_with_topic_and_place(
+def test_stamps_out_of_order_are_reported_with_topic_and_place(
     drive: Drive, tmp_path: Path, kind: str
 ) -> None:
     pairs, _ = drive
@@ -84,7 +84,9 @@ def test_stamps_out_of_order_are_told_with_topic_and_place(
     fails(path, r"image_rect, image 6: timestamps are out of order")
 
 
-def test_a_missing_topic_is_told_with_those_that_are_there(drive: Drive, tmp_path: Path) -> None:
+def test_a_missing_topic_is_reported_with_those_that_are_there(
+    drive: Drive, tmp_path: Path
+) -> None:
     path = write_bag(*drive, tmp_path, Recording("ros1"))
     settings = SourceSettings(left="/front/image", right=TOPICS[1])
     fails(path, r"no such image topic \(got /front/image, expected .*image_rect \(12\)", settings)
@@ -105,7 +107,7 @@ def test_a_recording_without_calibration_asks_for_a_file(drive: Drive, tmp_path:
     assert len(list(source)) == 12
 
 
-def test_other_encodings_are_told(drive: Drive, tmp_path: Path) -> None:
+def test_other_encodings_are_reported(drive: Drive, tmp_path: Path) -> None:
     path = write_bag(*drive, tmp_path, Recording("ros1", encoding="32FC1"))
     fails(path, "message 0: image encoding is not supported.*got 32FC1")
 
@@ -185,7 +187,7 @@ def test_a_video_that_ends_a_little_earlier_is_mapped_as_far_as_it_goes(
     assert len(list(source)) == len(source) == 23
 
 
-def test_numbers_of_pictures_that_differ_are_refused_where_names_tell_nothing(
+def test_numbers_of_images_that_differ_are_refused_where_names_give_no_answer(
     drive: Drive, tmp_path: Path
 ) -> None:
     drives.write_folders(*drive, tmp_path)
@@ -204,14 +206,14 @@ def test_stamps_that_never_meet_tell_how_far_they_are_apart(drive: Drive, tmp_pa
     )
 
 
-def test_a_video_that_cannot_be_halved_is_told() -> None:
+def test_a_video_that_cannot_be_halved_is_reported() -> None:
     video = VideoFile(Path("both.avi"), frames=3, width_px=127, height_px=32, rate_hz=10.0)
     with pytest.raises(ReconError, match=r"both.avi: .*cannot be halved \(got 127x32\)"):
         view_size(video, SourceSettings())
     assert view_size(video, SourceSettings(side_by_side="top-bottom")) == (127, 16)
 
 
-def test_a_calibration_of_another_size_is_told(drive: Drive, tmp_path: Path) -> None:
+def test_a_calibration_of_another_size_is_reported(drive: Drive, tmp_path: Path) -> None:
     drives.write_euroc(*drive, tmp_path)
     for path in tmp_path.rglob("*.png"):
         write_image(path, np.zeros((16, 32), np.uint8))
@@ -219,7 +221,7 @@ def test_a_calibration_of_another_size_is_told(drive: Drive, tmp_path: Path) -> 
         open_source(tmp_path)
 
 
-def test_no_calibration_is_told_with_the_option(drive: Drive, tmp_path: Path) -> None:
+def test_no_calibration_is_reported_with_the_option(drive: Drive, tmp_path: Path) -> None:
     drives.write_folders(*drive, tmp_path)
     (tmp_path / "calib.txt").unlink()
     fails(tmp_path, r"calibration is missing.*--calib FILE")

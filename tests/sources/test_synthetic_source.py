@@ -73,7 +73,7 @@ def test_the_kitti_layout_reads_back_with_plain_tools(source, written):
     assert np.allclose(np.loadtxt(written / "times.txt"), [0.0, 0.1, 0.2])
 
 
-def test_grey_pictures_are_the_weighted_colours(source, written):
+def test_grey_images_are_the_weighted_colours(source, written):
     grey = cv2.imread(str(written / "image_0" / "000000.png"), cv2.IMREAD_UNCHANGED)
     expected = cv2.cvtColor(source.camera.pair(0).left, cv2.COLOR_RGB2GRAY)
     # OpenCV rounds its weights to 14 bits.

@@ -19,7 +19,7 @@ from recon.rig.audit.findings import (
     Verdict,
     find_calibration_faults,
     find_geometry_faults,
-    find_picture_faults,
+    find_image_faults,
     find_range_faults,
     find_series_faults,
     verdict_of,
@@ -95,7 +95,7 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     gaps = find_gaps(source)
     reach_px = _reach_px(camera, config.matching)
     findings = [
-        *find_picture_faults(sample, config.matching.matcher),
+        *find_image_faults(sample, config.matching.matcher),
         *find_series_faults(sample, gaps),
         *find_geometry_faults(geometry),
         *find_range_faults(geometry, reach_px, camera),

@@ -78,7 +78,7 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
     return "usable" if found else "good"
 
 
-def find_picture_faults(sample: Sample, matcher: str | Matcher) -> Iterator[Finding]:
+def find_image_faults(sample: Sample, matcher: str | Matcher) -> Iterator[Finding]:
     """Yield problems of single images: unreadable, black, blurred, of unequal brightness.
 
     Args:

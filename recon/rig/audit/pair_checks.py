@@ -26,7 +26,7 @@ from recon.sources.pair_input import PairInput
 #: Findings that images alone support, and those that need a calibration. The inspection of the
 #: frame reports swapped cameras and misaligned rows; few features do not matter if the disparity
 #: is dense.
-_BY_PICTURES: Final = frozenset({"black", "gain", "blur"})
+_BY_IMAGES: Final = frozenset({"black", "gain", "blur"})
 _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
 
 FEW_VALID_SHARE: Final = 0.25
@@ -41,7 +41,7 @@ class _OnePair:
     pair: StereoPair
     calibration: RectifiedCamera | StereoCalibration
     files: tuple[Path, ...] = ()
-    description: str = "two pictures"
+    description: str = "two images"
     truth: SequenceTruth | None = None
 
     @property
@@ -72,7 +72,7 @@ def find_pair_faults(
     """
     if not config.audit.quick:
         return ()
-    codes = _BY_PICTURES | _BY_CALIBRATION if metric else _BY_PICTURES
+    codes = _BY_IMAGES | _BY_CALIBRATION if metric else _BY_IMAGES
     try:
         audit = audit_source(_OnePair(given.pair, given.calibration), config, quick=True)
     except CalibrationError:
@@ -98,13 +98,13 @@ def check_found(
         return ()
     found = f"{100 * share:.0f} % of the pixels have a disparity ({_reasons(disparity)})"
     advice = (
-        "check that both pictures show the same moment, that left and right are not swapped, that "
+        "check that both images show the same moment, that left and right are not swapped, that "
         "the calibration is theirs, and the range (--ndisp)"
     )
     if share > 0:
         return (f"only {found}; {advice}",)
     if np.array_equal(pair.left, pair.right):
-        advice = "left and right are the same picture"
+        advice = "left and right are the same image"
     raise MatchingError(
         "no pixel has a match in the other image",
         where=pair.name or None,

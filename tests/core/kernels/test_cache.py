@@ -60,7 +60,7 @@ def test_folders_of_earlier_sources_are_removed(tmp_path: Path, sources: Path) -
     assert other.is_dir()
 
 
-def test_the_cache_is_where_numba_is_told_to_keep_it(
+def test_the_cache_is_where_numba_is_reported_to_keep_it(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))

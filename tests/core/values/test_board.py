@@ -49,7 +49,7 @@ def test_a_board_tells_itself_as_it_is_read(text: str) -> None:
         "charuco:8x6:30mm:22mm:4x4_50:older",
     ],
 )
-def test_what_is_no_board_is_told_both_forms(text: str) -> None:
+def test_what_is_no_board_is_reported_both_forms(text: str) -> None:
     with pytest.raises(SettingsError, match=r"cannot read this board.*chess:9x6:25mm.*charuco:8x6"):
         parse_board(text)
 

@@ -146,7 +146,9 @@ def test_what_hangs_where_cameras_looked_is_cut_off(store: TileStore, tmp_path: 
     assert len(above) == 0
 
 
-def test_tiles_with_too_few_points_are_told_in_one_line(store: TileStore, tmp_path: Path) -> None:
+def test_tiles_with_too_few_points_are_reported_in_one_line(
+    store: TileStore, tmp_path: Path
+) -> None:
     stray = np.array([[60, 60, 0], [61, 60, 0], [90, 90, 0]], dtype=np.float32)
     cloud = street().select(np.arange(3))
     store.put_cloud(PointCloud(stray, rgb=cloud.rgb, normals=cloud.normals, frame="map"))
@@ -243,7 +245,7 @@ def test_the_run_itself_is_never_replaced(run: Path) -> None:
     assert (run / "map" / "cloud.ply").is_file()
 
 
-def test_a_folder_that_cannot_be_written_is_told(store: TileStore, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported(store: TileStore, tmp_path: Path) -> None:
     (tmp_path / "out").write_text("a file")
     with pytest.raises(OutputError):
         written(store, tmp_path / "out")

@@ -1,4 +1,4 @@
-"""Leaves of octrees: the twin, pieces of any size, and what is no tree."""
+"""Leaves of octrees: the reference, pieces of any size, and what is no tree."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _listed(leaves: Leaves, first: int = 0) -> list[Leaf]:
 
 @settings(max_examples=50)
 @given(trees(), st.integers(1, 7))
-def test_the_kernel_finds_what_the_twin_finds_in_pieces_of_any_size(
+def test_the_kernel_finds_what_the_reference_finds_in_pieces_of_any_size(
     tree: list[int], size: int
 ) -> None:
     children, walk, found = np.array(tree, np.uint8), begin_walk(DEPTH), []

@@ -1,4 +1,4 @@
-"""Which cells a surface crosses: the twin, and walls whose place is known."""
+"""Which cells a surface crosses: the reference, and walls whose place is known."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _block(edge: int) -> np.ndarray:
 
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60))
-def test_the_kernel_finds_what_the_twin_finds(seed: int, number: int) -> None:
+def test_the_kernel_finds_what_the_reference_finds(seed: int, number: int) -> None:
     rng = np.random.default_rng(seed)
     xyz, weights = rng.normal(0, 1.5, (number, 3)), rng.uniform(0.1, 50, number)
     total = _summed(xyz, weights)

@@ -1,4 +1,4 @@
-"""Evidence along rays agrees with the twin, and with what a ray is."""
+"""Evidence along rays agrees with the reference, and with what a ray is."""
 
 from __future__ import annotations
 

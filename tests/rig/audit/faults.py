@@ -94,10 +94,10 @@ def unrectified(
     lens = CameraIntrinsics(K, np.zeros(0), *size)
     centre_m = np.array([camera.baseline_m, 0.0, 0.0])
     T_right_left = make_transform(R_right @ R_left.T, -R_right @ centre_m)
-    pictures = changed(
+    images = changed(
         source, lambda left, right: (warped(left, warps[0], size), warped(right, warps[1], size))
     )
-    return replace(pictures, camera=StereoCalibration(lens, lens, T_right_left))
+    return replace(images, camera=StereoCalibration(lens, lens, T_right_left))
 
 
 def warped(image: np.ndarray, H: np.ndarray, size: tuple[int, int]) -> np.ndarray:

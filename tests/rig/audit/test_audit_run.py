@@ -74,10 +74,10 @@ def test_a_quick_look_finds_what_spoils_every_frame(street: faults.Spoiled, faul
 def test_mending_brings_a_pitch_back_under_a_third_of_a_pixel(
     street: faults.Spoiled, tmp_path: Path, pitch_deg: float
 ) -> None:
-    assert_mended(faults.turned(street, pitch_deg=pitch_deg, roll_deg=0.2), tmp_path)
+    assert_aligned(faults.turned(street, pitch_deg=pitch_deg, roll_deg=0.2), tmp_path)
 
 
-def assert_mended(spoiled: faults.Spoiled, folder: Path) -> None:
+def assert_aligned(spoiled: faults.Spoiled, folder: Path) -> None:
     before = audit_source(spoiled, CONFIG)
     assert "rows" in {finding.code for finding in before.findings}
     path = folder / "mended.yaml"
@@ -95,11 +95,13 @@ def assert_mended(spoiled: faults.Spoiled, folder: Path) -> None:
     assert abs(after.figures["mend_pitch_deg"]) < 0.02
 
 
-def test_a_rig_that_is_not_rectified_is_mended_too(street: faults.Spoiled, tmp_path: Path) -> None:
+def test_a_rig_that_is_not_rectified_is_corrected_too(
+    street: faults.Spoiled, tmp_path: Path
+) -> None:
     """Both raw cameras look elsewhere than the rectified ones; the right one is off by 0.3°."""
     left_rad, right_rad = np.radians([[-0.8, 2.0, 0.6], [1.1, -1.5, -0.7]])
     assert codes(faults.unrectified(street, left_rad, right_rad)) == set()
-    assert_mended(faults.unrectified(street, left_rad, right_rad, pitch_deg=0.3), tmp_path)
+    assert_aligned(faults.unrectified(street, left_rad, right_rad, pitch_deg=0.3), tmp_path)
 
 
 def test_half_a_frame_of_skew_is_measured(street: faults.Spoiled) -> None:
@@ -153,9 +155,9 @@ def test_each_planted_fault_is_found_on_real_drives(
 @pytest.mark.real
 @pytest.mark.slow
 @pytest.mark.parametrize("drive", ["kitti_raw_0013", "kitti_06_51"])
-def test_a_real_drive_is_mended(recon_data: Path, tmp_path: Path, drive: str) -> None:
+def test_a_real_drive_is_corrected(recon_data: Path, tmp_path: Path, drive: str) -> None:
     source = open_source(recon_data / "driven" / drive)
-    assert_mended(faults.turned(source, pitch_deg=0.3), tmp_path)
+    assert_aligned(faults.turned(source, pitch_deg=0.3), tmp_path)
 
 
 def test_a_source_of_one_pair_is_measured_too(street: faults.Spoiled) -> None:
@@ -165,7 +167,7 @@ def test_a_source_of_one_pair_is_measured_too(street: faults.Spoiled) -> None:
     assert audit.figures["row_error_rms_px"] < 0.2
 
 
-def test_a_black_picture_now_and_then_is_no_black_camera(street: faults.Spoiled) -> None:
+def test_a_black_image_now_and_then_is_no_black_camera(street: faults.Spoiled) -> None:
     def take(index: int) -> StereoPair:
         pair = street.take(index)
         return replace(pair, right=np.zeros_like(pair.right)) if index == 4 else pair
@@ -173,7 +175,7 @@ def test_a_black_picture_now_and_then_is_no_black_camera(street: faults.Spoiled)
     assert "black" not in codes(replace(street, take=take))
 
 
-def test_frames_that_are_missing_are_told_with_the_place(
+def test_frames_that_are_missing_are_reported_with_the_place(
     street: faults.Spoiled, tmp_path: Path
 ) -> None:
     pairs = [street.take(index) for index in (0, 1, 2, 3, 7, 8, 9)]

@@ -155,13 +155,13 @@ def test_speed_is_that_of_the_rig_and_scales_with_the_baseline() -> None:
 
 
 def test_repeats_are_counted_apart_from_frozen_cameras() -> None:
-    pictures = [texture(seed) for seed in range(8)]
+    images = [texture(seed) for seed in range(8)]
     counter = RepeatCounter()
     for left, right in ((0, 0), (1, 0), (2, 0), (3, 0), (4, 4), (4, 4), (5, 5)):
-        counter.add(pictures[left], pictures[right])
+        counter.add(images[left], images[right])
     assert (counter.steps, counter.both, counter.frozen) == (6, 1, [0, 3])
     counter.restart()
-    counter.add(pictures[5], pictures[5])
+    counter.add(images[5], images[5])
     assert counter.both == 1
 
 

@@ -39,7 +39,9 @@ def run(
     return run_command(PairInput(pair, camera), settings, out=out)
 
 
-def test_stages_that_take_long_are_told_when_they_begin(pair: StereoPair, tmp_path: Path) -> None:
+def test_stages_that_take_long_are_reported_when_they_begin(
+    pair: StereoPair, tmp_path: Path
+) -> None:
     told: list[str] = []
 
     class Notes(Silent):
@@ -55,7 +57,7 @@ def test_a_good_pair_is_not_warned_of(pair: StereoPair, tmp_path: Path) -> None:
     assert run(pair, tmp_path / "out").warnings == ()
 
 
-def test_pictures_that_show_nothing_are_refused_and_leave_nothing(
+def test_images_that_show_nothing_are_refused_and_leave_nothing(
     pair: StereoPair, tmp_path: Path
 ) -> None:
     dark = replace(pair, right=np.zeros_like(pair.right))
@@ -74,12 +76,12 @@ def test_a_pair_without_a_point_is_refused_with_its_depths(
     assert not (tmp_path / "out").exists()
 
 
-def test_the_same_picture_twice_is_refused_as_such(pair: StereoPair, tmp_path: Path) -> None:
-    with pytest.raises(MatchingError, match="left and right are the same picture"):
+def test_the_same_image_twice_is_refused_as_such(pair: StereoPair, tmp_path: Path) -> None:
+    with pytest.raises(MatchingError, match="left and right are the same image"):
         run(replace(pair, right=pair.left), tmp_path / "out")
 
 
-def test_pictures_of_two_things_are_said_to_be_hardly_a_pair(
+def test_images_of_two_things_are_said_to_be_hardly_a_pair(
     pair: StereoPair, tmp_path: Path
 ) -> None:
     other = replace(pair, right=np.ascontiguousarray(pair.right[::-1]))

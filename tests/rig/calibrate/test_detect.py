@@ -103,7 +103,7 @@ def test_a_wrong_size_is_found_out_and_the_true_one_said(claimed: str, true: str
         check_chessboard(sizes, shown.__getitem__, board)
 
 
-def test_squares_that_were_counted_for_corners_are_told() -> None:
+def test_squares_that_were_counted_for_corners_are_reported() -> None:
     board, shown = parse_board("chess:10x7:25mm"), images("chess:9x6:25mm")
     with pytest.raises(CalibrationError, match="count inner corners, not squares"):
         check_chessboard([None] * len(shown), shown.__getitem__, board)
@@ -116,19 +116,19 @@ def test_a_part_of_a_grid_grows_to_the_whole_and_the_whole_no_further() -> None:
     assert grown_size(left, view.left_px, (9, 6)) == (9, 6)
 
 
-def test_markers_of_another_dictionary_are_told() -> None:
+def test_markers_of_another_dictionary_are_reported() -> None:
     board = parse_board("charuco:8x6:30mm:22mm:4x4_50")
     with pytest.raises(CalibrationError, match=r"another dictionary \(got \S+, expected 4x4_50"):
         check_charuco(4, images(CHARUCO).__getitem__, board)
 
 
-def test_a_charuco_board_of_another_size_is_told() -> None:
+def test_a_charuco_board_of_another_size_is_reported() -> None:
     board = parse_board("charuco:5x4:30mm:22mm:5x5_100")
     with pytest.raises(CalibrationError, match=r"marker ids up to 2\d, expected 0 to 9 for 5x4"):
         check_charuco(4, images(CHARUCO).__getitem__, board)
 
 
-def test_a_larger_board_is_told_although_parts_of_it_passed_for_the_claimed_one() -> None:
+def test_a_larger_board_is_reported_although_parts_of_it_passed_for_the_claimed_one() -> None:
     shown = images("chess:9x6:25mm")
     sizes = [(7, 5), None, None, (7, 5), None, None, None]
     with pytest.raises(CalibrationError, match=r"does not have 7x5.*got 9x6 in \d of 5"):
@@ -144,7 +144,7 @@ def test_views_of_a_part_of_the_claimed_board_are_no_other_board() -> None:
     check_chessboard(sizes, lambda n: cut, parse_board("chess:9x6:25mm"))
 
 
-def test_a_chessboard_for_a_charuco_board_is_told_and_the_other_way_round() -> None:
+def test_a_chessboard_for_a_charuco_board_is_reported_and_the_other_way_round() -> None:
     with pytest.raises(CalibrationError, match=r"without markers \(got 9x6 .*chess:9x6"):
         check_charuco(4, images("chess:9x6:25mm").__getitem__, parse_board(CHARUCO))
     shown = images(CHARUCO)

@@ -80,7 +80,7 @@ def test_a_drive_is_mapped_with_an_object() -> None:
     assert mine.ndisp is not None
 
 
-def test_a_matcher_of_others_is_told_how_far_to_search() -> None:
+def test_a_matcher_of_others_is_reported_how_far_to_search() -> None:
     mine = Flat()
     make_matcher(mine, MatchingSettings()).match(pair())
     assert mine.ndisp is not None
@@ -108,7 +108,7 @@ def test_what_is_no_disparity_of_the_pair_is_refused(found: object, words: str) 
         recon.match(image(), image(), matcher=Flat(found))
 
 
-def test_an_error_inside_is_told_with_its_matcher_and_kept_as_the_cause() -> None:
+def test_an_error_inside_is_reported_with_its_matcher_and_kept_as_the_cause() -> None:
     class Broken:
         name = "mine"
 

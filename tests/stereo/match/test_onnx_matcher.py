@@ -149,7 +149,7 @@ def test_settings_that_contradict_each_other_are_refused() -> None:
             OnnxSettings.parse(values)
 
 
-def test_without_the_extra_the_pip_line_is_told(
+def test_without_the_extra_the_pip_line_is_reported(
     difference: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def absent(name: str) -> None:

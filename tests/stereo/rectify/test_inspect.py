@@ -98,7 +98,7 @@ def test_offset_principal_points_do_not_look_like_swapped_eyes() -> None:
 
 
 @pytest.mark.parametrize("level", [0, 255])
-def test_images_without_features_tell_nothing(level: int) -> None:
+def test_images_without_features_give_no_answer(level: int) -> None:
     blank = np.full((240, 400), level, np.uint8)
     found = inspect_pair(RectifiedPair(blank, blank, CAMERA))
     assert found.features == 0
@@ -106,7 +106,7 @@ def test_images_without_features_tell_nothing(level: int) -> None:
     assert check_inspection(found) == ()
 
 
-def test_images_of_different_scenes_tell_nothing() -> None:
+def test_images_of_different_scenes_give_no_answer() -> None:
     strangers = replace(make_pair(seed=1), right=make_pair(seed=2).right)
     assert check_inspection(inspect_pair(strangers)) == ()
 

@@ -1,4 +1,4 @@
-"""The noise kernel equals its numpy twin, and is band-limited by the pixel's footprint."""
+"""The noise kernel equals its reference, and is band-limited by the pixel's footprint."""
 
 from __future__ import annotations
 

@@ -24,14 +24,14 @@ from recon.sources.files import join_pair
 from recon.sources.pairing import Roll, check_most, natural_key, pair_stamps
 from recon.sources.settings import SourceSettings
 
-PICTURES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
+IMAGES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 
 _WHITE_SAMPLE: Final = 8
 """Frames, spread over a drive of 16-bit images, that its white is taken from."""
 
 
 @dataclass(frozen=True)
-class PictureFrame:
+class ImageFrame:
     """The two files of one frame.
 
     Attributes:
@@ -46,14 +46,14 @@ class PictureFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class PictureSource:
+class ImageSource:
     """A drive in image files, read one pair at a time.
 
     Attributes:
         name: Name of the folder.
         description: Recognised kind and layout, in one line.
         calibration: The rectified camera, or the two raw ones.
-        pictures: The files of each frame, in order.
+        images: The files of each frame, in order.
         roll: Which frames of the recording are pairs.
         truth: Ground truth trajectory, if known.
         texts: Files other than images that were read.
@@ -62,7 +62,7 @@ class PictureSource:
     name: str
     description: str
     calibration: RectifiedCamera | StereoCalibration
-    pictures: Sequence[PictureFrame]
+    images: Sequence[ImageFrame]
     roll: Roll
     truth: SequenceTruth | None = None
     texts: tuple[Path, ...] = ()
@@ -70,8 +70,8 @@ class PictureSource:
     @property
     def files(self) -> Sequence[Path]:
         """Calibration and other text files, then the images."""
-        pictures = (path for frame in self.pictures for path in (frame.left, frame.right))
-        return [*self.texts, *pictures]
+        images = (path for frame in self.images for path in (frame.left, frame.right))
+        return [*self.texts, *images]
 
     @property
     def left_out(self) -> int:
@@ -85,10 +85,10 @@ class PictureSource:
     @property
     def stamps_s(self) -> Float64:
         """float64 (N,), times of the left images."""
-        return np.array([frame.timestamp_s for frame in self.pictures])
+        return np.array([frame.timestamp_s for frame in self.images])
 
     def __len__(self) -> int:
-        return len(self.pictures)
+        return len(self.images)
 
     def __iter__(self) -> Iterator[StereoPair]:
         return self.frames()
@@ -100,8 +100,8 @@ class PictureSource:
             FormatError: An image is missing or damaged.
             CalibrationError: An image has another size than the calibration.
         """
-        for index in range(start, len(self.pictures)):
-            frame = self.pictures[index]
+        for index in range(start, len(self.images)):
+            frame = self.images[index]
             left, right = (self._read(path) for path in (frame.left, frame.right))
             yield join_pair(left, right, frame.timestamp_s, index, frame.left.name)
 
@@ -109,10 +109,10 @@ class PictureSource:
     def white(self) -> int:
         """The 16-bit value that becomes white in all images; from a sample of both cameras."""
         most = self._most_megapixels
-        if not self.pictures or read_levels(self.pictures[0].left, most).dtype == np.uint8:
+        if not self.images or read_levels(self.images[0].left, most).dtype == np.uint8:
             return FULL_WHITE
-        chosen = np.unique(np.linspace(0, len(self.pictures) - 1, _WHITE_SAMPLE).astype(int))
-        frames = [self.pictures[index] for index in chosen]
+        chosen = np.unique(np.linspace(0, len(self.images) - 1, _WHITE_SAMPLE).astype(int))
+        frames = [self.images[index] for index in chosen]
         return find_white(
             read_levels(p, most) for frame in frames for p in (frame.left, frame.right)
         )
@@ -132,7 +132,7 @@ class PictureSource:
 
 def pair_listed(
     lists: Sequence[Sequence[tuple[float, Path]]], settings: SourceSettings, where: Path
-) -> tuple[list[PictureFrame], Roll]:
+) -> tuple[list[ImageFrame], Roll]:
     """Pair two lists of images by time; a listed image that is missing has no partner.
 
     Only the frames that the settings choose are returned.
@@ -161,7 +161,7 @@ def pair_listed(
     frames.sort(key=lambda frame: frame[0])
     chosen, roll = pair_named([frame[1:] for frame in frames])
     paired = [
-        PictureFrame(left, right, frames[k][0])
+        ImageFrame(left, right, frames[k][0])
         for k, (left, right) in zip(roll.paired, chosen, strict=True)
     ]
     roll = roll.choose(settings, where)
@@ -195,7 +195,7 @@ def _existing(path: Path) -> Path | None:
     return path if path.is_file() else None
 
 
-def picture_size(path: Path, settings: SourceSettings) -> tuple[int, int]:
+def image_size(path: Path, settings: SourceSettings) -> tuple[int, int]:
     """Return width and height of an image file, which must not be larger than the settings allow.
 
     Raises:
@@ -205,7 +205,7 @@ def picture_size(path: Path, settings: SourceSettings) -> tuple[int, int]:
     return width_px, height_px
 
 
-def list_pictures(folder: Path) -> list[Path]:
+def list_images(folder: Path) -> list[Path]:
     """Return the images of a folder in natural order: 2 before 10.
 
     Raises:
@@ -213,12 +213,12 @@ def list_pictures(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise SourceError("folder does not exist", where=folder)
-    paths = [path for path in folder.iterdir() if is_picture(path)]
+    paths = [path for path in folder.iterdir() if is_image(path)]
     if not paths:
         raise SourceError("folder contains no images", where=folder, expected="PNG, JPEG or PGM")
     return sorted(paths, key=lambda path: natural_key(path.name))
 
 
-def is_picture(path: Path) -> bool:
+def is_image(path: Path) -> bool:
     """Return whether a file is an image by its suffix; hidden files do not count."""
-    return path.suffix.lower() in PICTURES and not path.name.startswith(".")
+    return path.suffix.lower() in IMAGES and not path.name.startswith(".")
