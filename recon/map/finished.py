@@ -88,7 +88,7 @@ def _compact(session: Session, settings: DriveSettings) -> Iterator[Submap]:
     where = _Places(session, fusion.voxel_m)
     for index, submap in enumerate(session.submaps):
         few = submap.fused.frames < least
-        fused = submap.fused.select(~few | where.seen_elsewhere(index))
+        fused = submap.fused.select(~few | where.shared(index))
         sums = fused.sums.copy()
         sums[:, _PLACED] = _rounded(sums[:, _PLACED], _PLACE_BITS)
         sums[:, _PLACED.stop :] = _rounded(sums[:, _PLACED.stop :], _VALUE_BITS)
@@ -105,10 +105,11 @@ class _Places:
         self._corrections = session.corrections()
         self._boxes = [self._box(index) for index in range(len(self._submaps))]
 
-    def seen_elsewhere(self, index: int) -> Bool:
-        """Which voxels of a submap other submaps saw as well."""
+    def shared(self, index: int) -> Bool:
+        """Which voxels share their place with one of another submap, or, moved, of the same."""
         keys = self._keys(index)
-        found = np.zeros(len(keys), np.bool_)
+        _, where, counts = np.unique(keys, return_inverse=True, return_counts=True)
+        found = counts[where] > 1
         for other, (low, high) in enumerate(self._boxes):
             ours_low, ours_high = self._boxes[index]
             if other != index and (low <= ours_high).all() and (ours_low <= high).all():

@@ -1,0 +1,129 @@
+"""A finished map gives the occupancy of the run exactly, and its cloud up to rounding."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.commands.config import load_config
+from recon.core.errors import FormatError
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.values import PointCloud, RectifiedCamera
+from recon.map.axes import AXES_MAP_WORLD
+from recon.map.finished import keep_map, with_occupancy
+from recon.map.fused_part import FusedPart, join_fused
+from recon.map.occupancy_part import join_occupancy
+from recon.map.persistent import Map
+from recon.map.rays import ray_grain, thin_rays
+from recon.map.session import Session, SessionInfo
+from recon.map.submaps import SubmapBuilder
+from recon.odometry import OdometryHealth
+
+CONFIG = load_config(None, ["submaps.length_m=4"])
+CAMERA = RectifiedCamera(100.0, 9.0, 5.0, 9.0, 0.5, 20, 12)
+T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
+VOXEL_M = CONFIG.fusion.voxel_m
+FRAMES = 14
+
+
+def _mapped(made: Map) -> Session:
+    """A drive along a wall."""
+    rng = np.random.default_rng(1)
+    session = made.begin(SessionInfo("wall", "of a test", FRAMES, start={"identity": {}}))
+    session.set_axes(T_MAP_WORLD, CAMERA)
+    builder = SubmapBuilder(CONFIG.submaps, CONFIG.fusion, CONFIG.occupancy, T_MAP_WORLD)
+    for frame in range(FRAMES):
+        xyz = np.stack(
+            [np.full(900, 2.03), rng.uniform(-1, 1, 900), rng.uniform(2, 9, 900)], axis=1
+        ).astype(np.float32)
+        fields = {
+            "rgb": rng.integers(0, 256, (900, 3)).astype(np.uint8),
+            "sigma_m": rng.uniform(0.05, 0.2, 900).astype(np.float32),
+            "normals": np.tile(np.float32([-1, 0, 0]), (900, 1)),
+        }
+        T = make_transform(np.eye(3), np.array([0.0, 0.0, float(frame)]))
+        rays = thin_rays(PointCloud(xyz, **fields), CONFIG.occupancy)
+        world = PointCloud(xyz + np.float32([0, 0, frame]), frame="world", **fields)
+        builder.integrate(world, rays.cloud(), T)
+        session.add_frame(T, 0.1 * frame, OdometryHealth())
+        session.add_rays(frame, rays, ray_grain(CONFIG.occupancy))
+        if builder.full or frame == FRAMES - 1:
+            session.submaps.add(builder.close())
+    session.set_state({"odometry": None})
+    return session
+
+
+def _cloud(session: Session) -> PointCloud:
+    corrections = session.corrections()
+    parts: list[FusedPart] = []
+    for index, submap in enumerate(session.submaps):
+        fused = submap.fused
+        parts.append(fused if corrections is None else fused.moved(corrections[index], VOXEL_M))
+    settings = CONFIG.fusion
+    cloud = join_fused(parts).cloud(VOXEL_M, settings.min_count, settings.precise_sigma_m)
+    return cloud.select(np.lexsort(np.floor(cloud.xyz / VOXEL_M).T))
+
+
+def test_occupancy_is_that_of_the_run(tmp_path: Path) -> None:
+    with Map.temporary() as made:
+        session = _mapped(made)
+        assert len(session.submaps) >= 3
+        keep_map(made, tmp_path / "map.recon", CONFIG)
+        before = join_occupancy(submap.occupancy for submap in session.submaps).voxels(0.2)
+    with Map.open(tmp_path / "map.recon") as kept:
+        assert [len(submap.occupancy) for submap in kept.session().submaps] == [0] * len(
+            kept.session().submaps
+        )
+        submaps = with_occupancy(kept.session(), CONFIG)
+        after = join_occupancy(submap.occupancy for submap in submaps).voxels(0.2)
+    np.testing.assert_array_equal(before.keys, after.keys)
+    np.testing.assert_array_equal(before.log_odds, after.log_odds)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_the_cloud_is_that_of_the_run_up_to_rounding(tmp_path: Path, closed: bool) -> None:
+    with Map.temporary() as made:
+        session = _mapped(made)
+        if closed:
+            path = session.odometry.T_world_camera
+            bend = make_transform(exp_so3(np.array([0.0, 0.02, 0.0])), np.array([0.0, 0.0, 0.31]))
+            path = np.concatenate([path[: FRAMES // 2], bend @ path[FRAMES // 2 :]])
+            session.set_loops({"closed": [], "refused": [], "T_world_camera": path})
+        keep_map(made, tmp_path / "map.recon", CONFIG)
+        before, rows = _cloud(session), sum(len(submap.fused) for submap in session.submaps)
+    with Map.open(tmp_path / "map.recon") as kept:
+        after = _cloud(kept.session())
+        assert sum(len(submap.fused) for submap in kept.session().submaps) < rows
+    # Moved points may cross into the next voxel by a rounding error.
+    assert abs(len(before) - len(after)) <= (3 if closed else 0)
+    assert len(before) > 500
+    if not closed:
+        np.testing.assert_array_equal(before.count, after.count)
+        np.testing.assert_allclose(after.xyz, before.xyz, rtol=0, atol=2e-5)
+        assert np.abs(after.rgb.astype(int) - before.rgb).max() <= 1
+        np.testing.assert_allclose(after.sigma_m, before.sigma_m, rtol=1e-3)
+
+
+def test_what_only_resuming_needs_is_left_out(tmp_path: Path) -> None:
+    with Map.temporary() as made:
+        session = _mapped(made)
+        keep_map(made, tmp_path / "map.recon", CONFIG)
+        path = session.trajectory
+    with Map.open(tmp_path / "map.recon") as kept:
+        assert "state" not in kept.store.kinds()
+        assert kept.session().info.start == {}
+        np.testing.assert_array_equal(kept.session().trajectory.T_world_camera, path.T_world_camera)
+
+
+def test_a_map_that_lacks_a_submap_is_refused(tmp_path: Path) -> None:
+    with Map.temporary() as made:
+        session = _mapped(made)
+        keep_map(made, tmp_path / "map.recon", CONFIG)
+        last = len(session.submaps) - 1
+    with Map.open(tmp_path / "map.recon", read_only=False) as kept:
+        kept.store.delete("submap_entry", (0, last))
+        kept.commit()
+    with Map.open(tmp_path / "map.recon") as kept, pytest.raises(FormatError, match="submaps"):
+        with_occupancy(kept.session(), CONFIG)

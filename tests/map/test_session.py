@@ -1,0 +1,151 @@
+"""What a session of a map keeps comes back as it was: frames, rays, keyframes, loops, axes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.core.errors import FormatError, ShapeError
+from recon.core.values import RayCloud, RayGrain, RectifiedCamera
+from recon.map.persistent import Map
+from recon.map.session import Session, SessionInfo
+from recon.odometry import OdometryHealth
+
+GRAIN = RayGrain(0.1, 0.1 / 64, 25.0)
+CAMERA = RectifiedCamera(100.0, 9.0, 5.0, 9.5, 0.5, 20, 12)
+FIELDS = ("places", "sigma_m", "confidence", "count")
+
+
+def _fill(session: Session, first: int, last: int) -> None:
+    for number in range(first, last):
+        rng = np.random.default_rng(number)
+        pose = np.eye(4)
+        pose[:3, 3] = rng.normal(size=3) * 10.0 ** rng.integers(-9, 3)
+        health = OdometryHealth(
+            ok=number % 3 > 0,
+            tracks=number,
+            reprojection_px=float(rng.normal()) if number % 2 else float("nan"),
+            notes=("a", "ü") if number % 5 == 0 else (),
+        )
+        session.add_frame(pose, number / 7, health)
+
+
+def _rays(seed: int, count: int) -> RayCloud:
+    rng = np.random.default_rng(seed)
+    return RayCloud(
+        rng.integers(-(2**15), 2**15, (count, 3)).astype(np.int16),
+        rng.uniform(0, 3, count).astype(np.float16),
+        rng.integers(1, 256, count).astype(np.uint8),
+        rng.integers(1, 256, count).astype(np.uint8),
+        GRAIN.unit_m,
+    )
+
+
+def _assert_same(one: Session, other: Session) -> None:
+    for path in ("T_world_camera", "timestamps_s"):
+        ours, theirs = (getattr(session.odometry, path) for session in (one, other))
+        np.testing.assert_array_equal(ours, theirs)
+    assert list(map(repr, one.health)) == list(map(repr, other.health))
+
+
+def test_frames_come_back_bit_by_bit(tmp_path: Path) -> None:
+    path = tmp_path / "map.recon"
+    with Map.create(path) as made:
+        session = made.begin(SessionInfo("drive", "of a test", 40))
+        for last in (1, 8, 8, 40):
+            _fill(session, len(session), last)
+            made.commit()
+            with Map.open(path) as read:
+                _assert_same(read.session(), session)
+                assert read.session().info == session.info
+
+
+def test_a_commit_writes_the_frames_since_the_last_one_alone(tmp_path: Path) -> None:
+    with Map.create(tmp_path / "map.recon") as made:
+        session = made.begin(SessionInfo())
+        for last in (30, 32):
+            _fill(session, len(session), last)
+            made.commit()
+        assert made.store.keys("frames") == [(0, 0), (0, 30)]
+        assert made.store.read("frames", (0, 30))["times_s"].shape == (2,)
+
+
+def test_what_was_not_committed_is_forgotten(tmp_path: Path) -> None:
+    path = tmp_path / "map.recon"
+    with Map.create(path) as made:
+        session = made.begin(SessionInfo())
+        _fill(session, 0, 5)
+        made.commit()
+        _fill(session, 5, 12)
+    with Map.open(path, read_only=False) as again:
+        session = again.session()
+        assert len(session) == 5
+        _fill(session, 5, 20)
+        again.commit()
+    with Map.open(path) as read, Map.temporary() as whole:
+        _fill(unbroken := whole.begin(SessionInfo()), 0, 20)
+        _assert_same(read.session(), unbroken)
+
+
+def test_rays_come_back_exactly() -> None:
+    with Map.temporary() as made:
+        session = made.begin(SessionInfo())
+        kept = [_rays(seed, count) for seed, count in enumerate((1000, 0, 1))]
+        for frame, rays in enumerate(kept):
+            session.add_rays(frame, rays, GRAIN)
+        assert session.ray_frames == 3
+        for frame, rays in enumerate(kept):
+            read, grain = session.rays(frame)
+            assert (grain, read.unit_m) == (GRAIN, rays.unit_m)
+            for name in FIELDS:
+                np.testing.assert_array_equal(getattr(read, name), getattr(rays, name))
+
+
+@pytest.mark.parametrize(
+    "sizes", [(float("nan"),) * 3, (0.1, -1.0, 25.0), (0.1, 0.0, 25.0), (30.0, 0.1, 25.0)]
+)
+def test_impossible_sizes_of_rays_are_refused(sizes: tuple[float, float, float]) -> None:
+    with Map.temporary() as made:
+        session = made.begin(SessionInfo())
+        session.add_rays(0, _rays(0, 3), RayGrain(*sizes))
+        with pytest.raises(FormatError, match="impossible"):
+            session.rays(0)
+
+
+def test_each_drive_of_a_map_has_its_own_records(tmp_path: Path) -> None:
+    path = tmp_path / "map.recon"
+    with Map.create(path) as made:
+        for name, count in (("first", 3), ("second", 5)):
+            session = made.begin(SessionInfo(name))
+            _fill(session, 0, count)
+            session.add_rays(0, _rays(count, count), GRAIN)
+            T = np.eye(4)
+            T[:3, 3] = count
+            session.set_axes(T, CAMERA)
+        made.commit()
+    with Map.open(path) as read:
+        assert [session.info.source for session in read.sessions] == ["first", "second"]
+        assert [len(session) for session in read.sessions] == [3, 5]
+        assert [len(session.rays(0)[0]) for session in read.sessions] == [3, 5]
+        assert read.session(1).T_map_world[0, 3] == 5
+        assert read.session(1).camera == CAMERA
+        with pytest.raises(FormatError, match=r"no such session \(got 2, expected 0, 1"):
+            read.session(2)
+
+
+def test_a_session_without_frames_has_no_path() -> None:
+    with Map.temporary() as made, pytest.raises(FormatError, match="no frame"):
+        _ = made.begin(SessionInfo()).odometry
+
+
+def test_submaps_of_frames_without_a_pose_are_refused(tmp_path: Path) -> None:
+    entry = {"index": 0, "first_frame": 0, "frames": 2, "voxels": 0, "cells": 0}
+    with Map.create(tmp_path / "map.recon") as made:
+        session = made.begin(SessionInfo())
+        _fill(session, 0, 1)
+        made.store.put("submap_entry", (0, 0), entry)
+        made.commit()
+    with pytest.raises((FormatError, ShapeError), match="without a pose"):
+        Map.open(tmp_path / "map.recon")
