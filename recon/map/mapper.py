@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from recon.core.errors import FormatError
 from recon.core.geometry.transform import transform_cloud
 from recon.core.values import PointCloud, RayCloud, RectifiedCamera
 from recon.core.values.arrays import Float64
@@ -122,11 +123,17 @@ class Mapper:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a `state`."""
+        """Continue from a `state`.
+
+        Raises:
+            FormatError: It is not that of the session's frames and submaps.
+        """
         self._odometry.restore(state["odometry"])
         if state["builder"] is not None:
             self._builder = self._new_builder()
             self._builder.restore(state["builder"])
+            if self.session.submaps.frames + self._builder.frames != len(self):
+                raise FormatError("submaps of the drive are missing")
 
     def _builder_from(self, frame: ReconstructedFrame) -> SubmapBuilder:
         """The submap under construction; the first frame fixes the map axes."""

@@ -125,7 +125,7 @@ def test_damaged_rays_leave_nothing_behind(small_demo: Path, tmp_path: Path) -> 
         rays = store.read("rays", (0, 3))
         store.put("rays", (0, 3), {**rays, "count": rays["count"][:-1]})
 
-    with pytest.raises(FormatError, match="count"):
+    with pytest.raises(ReconError, match="count"):
         _remake(_alter(small_demo, tmp_path, damage), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
