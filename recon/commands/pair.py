@@ -104,15 +104,7 @@ def run_disparity(
 ) -> PairRun:
     """Match one pair, and write disparity and reasons alone: what `recon disparity` does.
 
-    Args:
-        given: As for `run_pair`; a pair that is rectified needs no calibration of its own.
-        config: As for `run_pair`.
-        out: As for `run_pair`.
-        threads: As for `run_pair`.
-        progress: As for `run_pair`.
-
-    Raises:
-        ReconError: As for `run_pair`.
+    The arguments and errors are those of `run_pair`.
     """
     config = config or load_config(defaults=PAIR_DEFAULTS)
     with Run("disparity", out, config, threads=threads, progress=progress) as run:
@@ -129,15 +121,9 @@ def run_disparity(
         metrics, figures = _measure(given, disparity)
         summary = {**figures, "disparity_png_scale": scale, "warnings": list(warnings)}
         result = PairRun(
-            name=given.pair.name,
-            config=config,
-            pair=pair,
-            disparity=disparity,
-            summary=summary,
-            truth=given.truth,
-            metrics=metrics,
-            warnings=warnings,
-        )
+            given.pair.name, config, pair, disparity, summary,
+            truth=given.truth, metrics=metrics, warnings=warnings,
+        )  # fmt: skip
         with run.report(summary):
             write_disparity_images(result, run)
         run.finish(summary, source=result.name, inputs=given.files)
