@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from recon.commands.audit import run_audit
     from recon.commands.config import ReconConfig, load_config
     from recon.commands.evaluate_middlebury import run_middlebury
+    from recon.commands.export import run_export
     from recon.commands.map import run_map
     from recon.commands.map_options import MapOptions
-    from recon.commands.occupancy import OccupancyRequest, run_occupancy
+    from recon.commands.occupancy import run_occupancy
     from recon.commands.pair import run_disparity, run_pair
     from recon.core.errors import ReconError
     from recon.core.values import (
@@ -92,7 +93,8 @@ _HOMES = {
     "recon.commands.map": ("run_map",),
     "recon.commands.map_options": ("MapOptions",),
     "recon.commands.evaluate_middlebury": ("run_middlebury",),
-    "recon.commands.occupancy": ("OccupancyRequest", "run_occupancy"),
+    "recon.commands.export": ("run_export",),
+    "recon.commands.occupancy": ("run_occupancy",),
     "recon.commands.pair": ("run_disparity", "run_pair"),
     "recon.sources.pair_input": ("PairInput",),
     "recon.map.persistent": ("Map",),
@@ -131,7 +133,6 @@ __all__ = [
     "MiddleburyRules",
     "MiddleburyScene",
     "OccupancyGrid",
-    "OccupancyRequest",
     "OccupancyVoxels",
     "PairInput",
     "PointCloud",
@@ -167,6 +168,7 @@ __all__ = [
     "reconstruct_mesh",
     "run_audit",
     "run_disparity",
+    "run_export",
     "run_map",
     "run_middlebury",
     "run_occupancy",

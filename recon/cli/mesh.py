@@ -42,9 +42,11 @@ def mesh(
     with session(quiet=quiet):
         from recon.commands.config import PAIR_DEFAULTS, load_config
         from recon.commands.finished_run import is_pair_run
-        from recon.commands.mesh import MeshOptions, run_mesh
+        from recon.commands.mesh import run_mesh
 
-        options = MeshOptions(out=out, formats=tuple(formats or ("ply",)), threads=threads)
         defaults = PAIR_DEFAULTS if source.is_dir() and is_pair_run(source) else None
-        summary = run_mesh(source, load_config(config, set_ or (), defaults), options)
+        settings = load_config(config, set_ or (), defaults)
+        summary = run_mesh(
+            source, settings, formats=tuple(formats or ("ply",)), out=out, threads=threads
+        )
     print_json(summary) if json else print_run(summary, stages=verbose)

@@ -46,7 +46,8 @@ def occupancy(
       recon occupancy outputs/map/latest --min-height 0.5 --max-height 3.2
     """
     with session(quiet=quiet):
-        from recon.commands.occupancy import OccupancyRequest, run_occupancy
+        from recon.commands.finished_run import settings_of
+        from recon.commands.occupancy import run_occupancy
 
         given = {
             "occupancy.resolution_m": resolution,
@@ -55,6 +56,6 @@ def occupancy(
             "occupancy.max_range_m": max_range,
         }
         named = [f"{key}={value}" for key, value in given.items() if value is not None]
-        request = OccupancyRequest(run, [*(set_ or ()), *named], config, out, threads)
-        summary = run_occupancy(request)
+        settings = settings_of(run, config, [*(set_ or ()), *named])
+        summary = run_occupancy(run, settings, out=out, threads=threads)
     print_json(summary) if json else print_run(summary, stages=verbose)

@@ -81,6 +81,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "map": _DRIVE,
     "demo": _DRIVE,
     "occupancy": _DRIVE,
+    "export": _DRIVE,
     "mesh": ("mesh",),
     "pair": (*_FRAME, "mesh"),
     "disparity": ("source", "rectification", "matching"),

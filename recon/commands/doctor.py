@@ -16,7 +16,7 @@ from recon.commands.demo import demo_source
 from recon.commands.finished_run import OCTOMAP
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.commands.occupancy import OccupancyRequest, run_occupancy
+from recon.commands.occupancy import run_occupancy
 from recon.commands.pair import run_pair
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.kernels.cache import when_compiling
@@ -109,7 +109,7 @@ def compile_kernels() -> WarmUp:
             config,
             MapOptions(audit=False, command="demo", out=folder / "drive", mesh=False),
         )
-        run_occupancy(OccupancyRequest(folder / "drive", out=folder / "occupancy"))
+        run_occupancy(folder / "drive", out=folder / "occupancy")
         _read_again(folder / "drive" / OCTOMAP)
         _move_submaps(map_sequence(source, config))
         colour = next(iter(source))
@@ -129,4 +129,4 @@ def _read_again(octomap: Path) -> None:
 def _move_submaps(mapped: MappedSequence) -> None:
     """As closed loops do; so small a drive has none."""
     turn = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
-    mapped.corrected(np.tile(turn, (len(mapped.submaps.entries), 1, 1))).map.voxels()
+    len(mapped.corrected(np.tile(turn, (len(mapped.submaps.entries), 1, 1))).tiles)

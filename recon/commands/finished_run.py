@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from recon.commands.config import ReconConfig, load_config
+from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.errors import FormatError, SettingsError
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64, freeze
@@ -25,7 +26,6 @@ OCTOMAP: Final = "map/octomap.ot"
 CLOUD: Final = "map/cloud.ply"
 PAIR_CLOUD: Final = "clouds/cloud.ply"
 SUMMARY: Final = "summary.json"
-TRAJECTORY: Final = "trajectory_kitti.txt"
 MAPPED_BY: Final = "mapped_by"
 """Record key of a run made from another run: the command that mapped the drive."""
 UNTRUSTED: Final = "untrusted_frames"
@@ -88,6 +88,44 @@ def _read_config(path: Path) -> ReconConfig:
             got=error.got,
             hint="map the drive again",
         ) from error
+
+
+def check_changes(
+    run: FinishedRun, config: ReconConfig | None, sections: Collection[str]
+) -> ReconConfig:
+    """The settings to make something of a run with; those of the run if None are given.
+
+    Raises:
+        SettingsError: They differ from those of the run in another section, which has no effect.
+    """
+    if config is None:
+        return run.config
+    for name in type(config).model_fields:
+        if name not in sections and getattr(config, name) != getattr(run.config, name):
+            raise SettingsError(
+                "this setting has no effect here: the drive is not mapped again",
+                got=name,
+                expected=f"settings of {', '.join(sections)}",
+                hint="recon map takes it",
+            )
+    return config
+
+
+def settings_of(folder: Path, file: Path | None, overrides: Sequence[str]) -> ReconConfig:
+    """The settings of a run of map, demo or pair, with changes.
+
+    Args:
+        folder: Folder of the run.
+        file: YAML file of settings, applied before the overrides; None = none.
+        overrides: ``key=value`` settings.
+
+    Raises:
+        FormatError: The folder does not contain such a run.
+        SettingsError: A setting is invalid.
+    """
+    if is_pair_run(folder):
+        return load_config(file, overrides, PAIR_DEFAULTS)
+    return load_config(file, overrides, open_run(folder).config.model_dump(mode="json"))
 
 
 def is_pair_run(folder: Path) -> bool:

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from recon.core.errors import MeshingError
+from recon.core.geometry.se3 import apply
 from recon.core.values import OccupancyGrid, PointCloud
-from recon.export.files import write_map
+from recon.export.cloud import export_cloud
+from recon.export.grid import export_grid
 from recon.export.mesh import MeshSettings
-from recon.export.mesh.drive_mesh import WrittenMesh, store_map, write_drive_mesh
+from recon.export.mesh.pieces import WrittenMesh, export_mesh
+from recon.export.octomap import export_octomap
 from recon.map.sequence import MappedSequence
 from recon.run.directory import RunDirectory
 from recon.run.progress import SILENT, Progress
@@ -62,8 +67,15 @@ def write_products(
         OutputError: A file cannot be written.
     """
     progress.on_stage("map")
-    made = write_map(mapped, directory, watch)
-    warnings = list(made.warnings)
+    path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
+    trusted = np.array([record.ok for record in mapped.health])
+    with watch.stage("cloud"):
+        cloud = export_cloud(mapped.tiles, directory.path("map/cloud.ply"))
+    with watch.stage("octomap"):
+        voxels, warnings = export_octomap(mapped.tiles, directory.path("map/octomap"))
+    with watch.stage("grid"):
+        flat = export_grid(mapped.tiles, path_m, trusted, directory.path("map/grid"))
+    warnings += flat.warnings
     surface = None
     if mesh is not None:
         progress.on_stage("mesh")
@@ -71,11 +83,11 @@ def write_products(
             surface = _mesh(mapped, mesh, directory, threads, warnings)
         mapped.config.memory.check("mesh")
     return Products(
-        made.cloud,
-        made.points,
-        made.voxels,
-        made.grid,
-        made.camera_height_m,
+        cloud.sample,
+        cloud.points,
+        voxels,
+        flat.grid,
+        flat.camera_height_m,
         surface,
         tuple(warnings),
     )
@@ -89,12 +101,11 @@ def _mesh(
     warnings: list[str],
 ) -> WrittenMesh | None:
     """Write the surface; failure is only a warning, since the map is usable without one."""
-    store = store_map(mapped, settings, directory.state("mesh"))
-    # Each tile being meshed takes memory of its own.
+    # Each piece being meshed takes memory of its own.
     at_once = threads if mapped.config.memory.limit_mb is None else 1
     layer = directory.path("map/cloud.ply")
     try:
-        written = write_drive_mesh(store, settings, directory, layer, at_once)
+        written = export_mesh(mapped.tiles, settings, directory, layer, at_once)
     except MeshingError as error:
         warnings.append(f"no mesh: {error}")
         return None

@@ -41,7 +41,7 @@ def check_map(mapped: MappedSequence, where: str) -> None:
     Raises:
         MappingError: There is no point.
     """
-    if any(len(cloud) for _, cloud in mapped.map.cloud_tiles()):
+    if any(len(tile.cloud) for tile in mapped.tiles):
         return
     why, hint = _explain_poses(mapped.health) or _explain_sample(mapped)
     raise MappingError("the map is empty", where=where, got=why, hint=hint)

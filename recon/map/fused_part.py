@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -60,6 +60,15 @@ class FusedPart:
             self.frames[which],
             self.known,
         )
+
+    def to_tree(self) -> dict[str, Any]:
+        """Everything, as a tree of arrays and plain values."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> FusedPart:
+        """What `to_tree` gave."""
+        return cls(**{**tree, "known": tuple(tree["known"])})
 
     def moved(self, T_new_world: Float64, voxel_m: float) -> FusedPart:
         """The part after a rigid motion: each voxel's sums go to the voxel of its moved mean point.

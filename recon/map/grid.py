@@ -166,8 +166,7 @@ def drop_undecided(voxels: OccupancyVoxels, settings: GridSettings) -> Occupancy
     """
     full = voxels.log_odds >= log_odds(settings.occupied_probability)
     empty = voxels.log_odds <= log_odds(settings.free_probability)
-    known = full | empty
-    return OccupancyVoxels(voxels.keys[known], voxels.log_odds[known], voxels.resolution_m)
+    return voxels.select(full | empty)
 
 
 def _floor(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -56,6 +56,22 @@ class OccupancyPart:
         return OccupancyPart(
             clamped.CellRows(blocks, starts, self.rows.cells[cells], self.rows.values[cells]),
             None if self.points is None else self.points.in_blocks(blocks),
+        )
+
+    def to_tree(self) -> dict[str, Any]:
+        """Everything, as a tree of arrays."""
+        points = self.points
+        return {
+            "rows": self.rows._asdict(),
+            "points": None if points is None else {"keys": points.keys, "sums": points.sums},
+        }
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> OccupancyPart:
+        """What `to_tree` gave."""
+        points = tree["points"]
+        return cls(
+            clamped.CellRows(**tree["rows"]), None if points is None else SurfacePoints(**points)
         )
 
     def moved(self, T_new_map: Float64, resolution_m: float) -> OccupancyPart:

@@ -11,15 +11,17 @@ from typing import Any
 import numpy as np
 
 from recon.core.errors import RegistrationError
+from recon.core.geometry.se3 import invert
+from recon.core.geometry.transform import transform_cloud
 from recon.core.values import OccupancyVoxels, PointCloud, RectifiedCamera, StereoPair, Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.drive_loops import DriveLoops, LoopWatch
-from recon.map.drive_map import DriveMap
 from recon.map.frame_result import FrameResult
 from recon.map.mapper import Mapper
 from recon.map.rays import thin_rays
 from recon.map.settings import DriveSettings
 from recon.map.submap_records import Submaps
+from recon.map.tiles import Tiles, join_clouds, join_voxels
 from recon.map.workspace import Workspace, resuming
 from recon.odometry import (
     KnownPoses,
@@ -97,19 +99,20 @@ class MappedSequence:
         return f"MappedSequence({self.trajectory}, {trusted} of them trusted, {self.seconds:.4g} s)"
 
     @cached_property
-    def map(self) -> DriveMap:
+    def tiles(self) -> Tiles:
         """Fused cloud and occupancy, tile by tile."""
-        return DriveMap(self.submaps, self.config, self.T_map_world, self.T_corrected_world)
+        return Tiles.of_submaps(self.submaps, self.config, self.T_map_world, self.T_corrected_world)
 
     @cached_property
     def cloud(self) -> PointCloud:
-        """The whole fused cloud, frame ``world``; for long drives, see `map`."""
-        return self.map.cloud()
+        """The whole fused cloud, frame ``world``; for long drives, see `tiles`."""
+        whole = join_clouds(tile.cloud for tile in self.tiles)
+        return transform_cloud(whole, invert(self.T_map_world), frame="world")
 
     @cached_property
     def voxels(self) -> OccupancyVoxels:
-        """The whole 3-D occupancy, map axes; for long drives, see `map`."""
-        return self.map.voxels()
+        """The whole 3-D occupancy, map axes; for long drives, see `tiles`."""
+        return join_voxels((tile.voxels for tile in self.tiles), self.tiles.resolution_m)
 
     def corrected(self, T_corrected_world: Float64) -> MappedSequence:
         """The drive with each submap and its part of the path moved rigidly.

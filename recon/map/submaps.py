@@ -19,10 +19,8 @@ from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
 from recon.map.fused import FusionSettings, MapBuilder
 from recon.map.fused_part import FusedPart
-from recon.map.kernels import clamped
 from recon.map.occupancy import OccupancyBuilder, OccupancySettings
 from recon.map.occupancy_part import OccupancyPart
-from recon.map.surface_points import SurfacePoints
 
 _MAX_FRAMES: Final = 100
 """Frames after which a new submap begins at the latest, however slow the drive."""
@@ -79,36 +77,23 @@ class Submap:
 
     def to_tree(self) -> dict[str, Any]:
         """Everything, as a tree of arrays and plain values."""
-        fused, rows, points = self.fused, self.occupancy.rows, self.occupancy.points
         return {
             "index": self.index,
             "first_frame": self.first_frame,
             "frames": self.frames,
-            "fused": {
-                "keys": fused.keys,
-                "sums": fused.sums,
-                "information": fused.information,
-                "frames": fused.frames,
-                "known": list(fused.known),
-            },
-            "occupancy": rows._asdict(),
-            "points": None if points is None else {"keys": points.keys, "sums": points.sums},
+            "fused": self.fused.to_tree(),
+            "occupancy": self.occupancy.to_tree(),
         }
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Submap:
         """What `to_tree` gave."""
-        fused = {**tree["fused"], "known": tuple(tree["fused"]["known"])}
-        points = tree["points"]
         return cls(
             tree["index"],
             tree["first_frame"],
             tree["frames"],
-            FusedPart(**fused),
-            OccupancyPart(
-                clamped.CellRows(**tree["occupancy"]),
-                None if points is None else SurfacePoints(**points),
-            ),
+            FusedPart.from_tree(tree["fused"]),
+            OccupancyPart.from_tree(tree["occupancy"]),
         )
 
 

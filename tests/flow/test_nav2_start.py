@@ -13,9 +13,10 @@ import yaml
 
 from recon.commands.config import load_config
 from recon.commands.demo import demo_source
+from recon.commands.finished_run import settings_of
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.commands.occupancy import OccupancyRequest, run_occupancy
+from recon.commands.occupancy import run_occupancy
 from recon.core.geometry.se3 import invert
 from recon.core.values import Trajectory
 from recon.io.trajectory import read_tum
@@ -86,14 +87,16 @@ def test_a_robot_starts_in_free_space_inside_the_map(small_demo: Path) -> None:
 
 def test_a_remade_map_has_the_same_start(small_demo: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    summary = run_occupancy(OccupancyRequest(small_demo, ("grid.vehicle_width_m=1.8",), out=out))
+    summary = run_occupancy(
+        small_demo, settings_of(small_demo, None, ["grid.vehicle_width_m=1.8"]), out=out
+    )
     # Poses come from a file with 13 digits.
     T_base_camera = _summary(small_demo)["T_base_camera"]
     np.testing.assert_allclose(summary["T_base_camera"], T_base_camera, atol=1e-9)
     served = ServedMap(out)
     assert (served.at(_disc(np.zeros(2), 0.75)) == FREE).all()
     nothing = ("grid.vehicle_width_m=0",)
-    run_occupancy(OccupancyRequest(small_demo, nothing, out=tmp_path / "seen"))
+    run_occupancy(small_demo, settings_of(small_demo, None, nothing), out=tmp_path / "seen")
     assert (ServedMap(tmp_path / "seen").at(np.zeros((1, 2))) == UNKNOWN).all()
 
 
@@ -124,7 +127,7 @@ def test_frames_that_are_not_trusted_free_nothing(small_demo: Path, tmp_path: Pa
     record = json.loads((small_demo / "run.json").read_text())
     assert 0 not in record["untrusted_frames"]
     (copy / "run.json").write_text(json.dumps(record | {"untrusted_frames": [0, 1]}))
-    run_occupancy(OccupancyRequest(copy, out=tmp_path / "out"))
+    run_occupancy(copy, out=tmp_path / "out")
     assert (ServedMap(tmp_path / "out").at(np.zeros((1, 2))) == UNKNOWN).all()
 
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from recon.commands.evaluate_occupancy import run_evaluate_occupancy
-from recon.commands.occupancy import OccupancyRequest, run_occupancy
+from recon.commands.finished_run import settings_of
+from recon.commands.occupancy import run_occupancy
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.core.values import OCCUPIED
 from recon.io.occupancy.nav2 import read_nav2
@@ -23,7 +24,7 @@ from tests.hostile.refusals import assert_refused, run
 
 
 def _remake(run: Path, out: Path, *overrides: str, **changes: Any) -> dict[str, Any]:
-    return run_occupancy(OccupancyRequest(run, overrides, out=out, **changes))
+    return run_occupancy(run, settings_of(run, None, overrides), out=out, **changes)
 
 
 def _copy(run: Path, folder: Path) -> Path:

@@ -16,9 +16,9 @@ from recon.core.geometry.se3 import make_transform
 from recon.core.values import PointCloud
 from recon.map import SubmapBuilder
 from recon.map.axes import AXES_MAP_WORLD
-from recon.map.drive_map import DriveMap
 from recon.map.store import Store
 from recon.map.submap_records import Submaps
+from recon.map.tiles import Tiles, join_clouds, join_voxels
 from recon.run import memory
 from recon.run.memory import MemorySettings, memory_overrides, parse_size_mb
 from recon.sources import open_source
@@ -89,19 +89,21 @@ def test_a_limit_cuts_submaps_and_tiles_smaller_and_the_map_stays_the_same() -> 
     assert len(stores[1]) > 3
     maps = [
         # The limit is that of a map alone here: the libraries of the test take more.
-        DriveMap(store, free.model_copy(update={"memory": _Unwatched(limit_mb=limit)}), T_MAP_WORLD)
+        Tiles.of_submaps(
+            store, free.model_copy(update={"memory": _Unwatched(limit_mb=limit)}), T_MAP_WORLD
+        )
         for store, limit in zip(stores, (None, 4), strict=True)
     ]
-    assert maps[1].cloud_tile_m < maps[0].cloud_tile_m
-    assert maps[1].occupancy_tile_cells < maps[0].occupancy_tile_cells
-    for name in ("cloud", "voxels"):
-        whole, cut = (getattr(drive_map, name)() for drive_map in maps)
-        assert len(whole) == len(cut) > 1000
-    whole, cut = (drive_map.cloud() for drive_map in maps)
+    assert maps[1].edge_cells < maps[0].edge_cells
+    whole, cut = (join_clouds(tile.cloud for tile in tiles) for tiles in maps)
+    assert len(whole) == len(cut) > 1000
     order, other = np.lexsort(whole.xyz.T.round(3)), np.lexsort(cut.xyz.T.round(3))
     # Sums of single precision in another order.
     np.testing.assert_allclose(whole.xyz[order], cut.xyz[other], atol=2e-5)
-    whole_voxels, cut_voxels = (drive_map.voxels() for drive_map in maps)
+    whole_voxels, cut_voxels = (
+        join_voxels((tile.voxels for tile in tiles), tiles.resolution_m) for tiles in maps
+    )
+    assert len(whole_voxels) == len(cut_voxels) > 1000
     order, other = np.lexsort(whole_voxels.keys.T), np.lexsort(cut_voxels.keys.T)
     np.testing.assert_array_equal(whole_voxels.keys[order], cut_voxels.keys[other])
     np.testing.assert_allclose(whole_voxels.log_odds[order], cut_voxels.log_odds[other], atol=1e-5)

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.values.arrays import Float32, Float64, Int32, freeze, size_text
+from recon.core.values.arrays import Bool, Float32, Float64, Int32, freeze, size_text
 
 FREE: Final = 0
 OCCUPIED: Final = 100
@@ -40,6 +40,10 @@ class OccupancyVoxels:
 
     def __len__(self) -> int:
         return len(self.keys)
+
+    def select(self, which: Bool) -> OccupancyVoxels:
+        """The voxels of a boolean mask (N,)."""
+        return OccupancyVoxels(self.keys[which], self.log_odds[which], self.resolution_m)
 
     @property
     def centres_m(self) -> Float64:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from recon.commands.config import PAIR_DEFAULTS, load_config
-from recon.commands.mesh import MeshOptions, run_mesh
+from recon.commands.mesh import run_mesh
 from recon.commands.pair import run_disparity, run_pair
 from recon.core.errors import FormatError, MappingError, MatchingError, SettingsError
 from recon.core.values import RectifiedCamera, StereoPair
@@ -129,9 +129,7 @@ def test_the_run_of_a_pair_is_meshed_again_as_the_pair_was(
     given = PairInput(pair, CAMERA)
     first = run_pair(given, settings, out=tmp_path / "run", formats=("glb",))
     assert (tmp_path / "run" / "mesh" / "mesh.glb").is_file()
-    again = run_mesh(
-        tmp_path / "run", settings, MeshOptions(tmp_path / "again", formats=("glb", "obj"))
-    )
+    again = run_mesh(tmp_path / "run", settings, out=tmp_path / "again", formats=("glb", "obj"))
     assert again["mesh_coverage"] == pytest.approx(first.summary["mesh_coverage"], abs=1e-3)
     for name in ("mesh.ply", "mesh.glb"):
         files = [tmp_path / run / "mesh" / name for run in ("run", "again")]
@@ -144,7 +142,7 @@ def test_a_pair_run_that_does_not_name_its_camera_is_refused(tmp_path: Path) -> 
     (tmp_path / "run.json").write_text('{"command": "pair"}')
     (tmp_path / "summary.json").write_text('{"focal_px": null}')
     with pytest.raises(FormatError, match="does not describe its camera"):
-        run_mesh(tmp_path, load_config(), MeshOptions(tmp_path / "out"))
+        run_mesh(tmp_path, load_config(), out=tmp_path / "out")
 
 
 def test_an_unknown_format_is_refused_before_the_work(pair: StereoPair, tmp_path: Path) -> None:

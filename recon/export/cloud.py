@@ -1,7 +1,10 @@
-"""An even sample of a cloud that is too large for memory, for images and reports."""
+"""The fused cloud of a map as a PLY file, and an even sample of it for images and reports."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -9,9 +12,44 @@ from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud
-from recon.map.drive_map import join_clouds
+from recon.io.models.ply import write_ply_tiles
+from recon.map.tiles import Tiles, join_clouds
 
+SAMPLE_POINTS: Final = 300_000
+"""Points of the fused cloud that are kept for display."""
 _GROWTH: Final = 1.25
+
+
+@dataclass(frozen=True, eq=False)
+class WrittenCloud:
+    """What is kept in memory of a cloud that is written.
+
+    Attributes:
+        points: Number of its points.
+        sample: Even sample of it; all points of a small one. Frame ``map``.
+    """
+
+    points: int
+    sample: PointCloud
+
+
+def export_cloud(tiles: Tiles, path: Path) -> WrittenCloud:
+    """Write the points of all tiles into one PLY file.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    sample = CloudSample(SAMPLE_POINTS, tiles.config.fusion.voxel_m)
+
+    def clouds() -> Iterator[PointCloud]:
+        for tile in tiles:
+            cloud = tile.cloud
+            if len(cloud):
+                sample.add(cloud)
+                yield cloud
+
+    points = write_ply_tiles(path, clouds(), frame="map")
+    return WrittenCloud(points, sample.cloud())
 
 
 class CloudSample:
@@ -29,14 +67,13 @@ class CloudSample:
         self._kept: list[PointCloud] = []
 
     def add(self, cloud: PointCloud) -> None:
-        """Add points; all clouds are in one frame and have the same fields."""
+        """Add points; all clouds are in map axes and have the same fields."""
         self._kept.append(self._thinned(cloud))
         if sum(map(len, self._kept)) > self._limit:
-            whole = join_clouds(self._kept)
-            self._kept = [] if whole is None else [self._within_the_limit(whole)]
+            self._kept = [self._within_the_limit(join_clouds(self._kept))]
 
-    def cloud(self) -> PointCloud | None:
-        """The sample; None if nothing was added."""
+    def cloud(self) -> PointCloud:
+        """The sample."""
         return join_clouds(self._kept)
 
     def _within_the_limit(self, cloud: PointCloud) -> PointCloud:

@@ -11,19 +11,20 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.mesh import MeshOptions, run_mesh
+from recon.commands.mesh import run_mesh
 from recon.core.errors import FormatError, MeshingError, OutputError, SettingsError
 from recon.core.values import OccupancyVoxels, PointCloud, TriangleMesh
 from recon.export.mesh import MeshSettings, Plane, open_edges
-from recon.export.mesh.drive_mesh import write_drive_mesh
+from recon.export.mesh.pieces import export_mesh
 from recon.export.mesh.seams import nearest_on_edges
-from recon.export.mesh.tile_store import TileStore
 from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import write_ply
 from recon.io.occupancy.octomap import write_octomap
+from recon.map.tiles import Tiles
 from recon.run.directory import RunDirectory
 
 STEP_M = 0.1
+CONFIG = load_config(None, ["submaps.tile_m=6.4"])
 SETTINGS = MeshSettings(tile_m=8.0, trim_density_quantile=0.0)
 
 
@@ -48,21 +49,21 @@ def street(seed: int = 0) -> PointCloud:
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> TileStore:
-    return filled(tmp_path / "tiles")
+def store() -> Tiles:
+    return filled()
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[TriangleMesh, list[TriangleMesh]]:
     """The mesh of the street, and its tiles."""
     folder = tmp_path_factory.mktemp("street")
-    whole, tiles, warnings = written(filled(folder / "tiles"), folder / "out")
+    whole, tiles, warnings = written(filled(), folder / "out")
     assert warnings == ()
     return whole, tiles
 
 
-def filled(folder: Path) -> TileStore:
-    store = TileStore(folder, SETTINGS.tile_m)
+def filled() -> Tiles:
+    store = Tiles(CONFIG, np.eye(4))
     cloud = street()
     # As from a drive: in pieces that do not know the tiles.
     for part in np.array_split(np.arange(len(cloud)), 7):
@@ -71,15 +72,15 @@ def filled(folder: Path) -> TileStore:
 
 
 def written(
-    store: TileStore, folder: Path, settings: MeshSettings = SETTINGS, threads: int | None = None
+    store: Tiles, folder: Path, settings: MeshSettings = SETTINGS, threads: int | None = None
 ) -> tuple[TriangleMesh, list[TriangleMesh], tuple[str, ...]]:
     """The whole mesh, that of each tile, and the warnings."""
     with RunDirectory(folder) as directory:
         layer = directory.path("mesh/cloud.ply")
         write_ply(layer, street())
-        found = write_drive_mesh(store, settings, directory, layer, threads)
+        found = export_mesh(store, settings, directory, layer, threads)
         directory.write_json("run.json", {"files": directory.files()})
-    tiles = [read_mesh(folder / "mesh" / "tiles" / tile.path.name) for tile in found.tiles]
+    tiles = [read_mesh(folder / "mesh" / "tiles" / piece.path.name) for piece in found.pieces]
     return read_mesh(folder / "mesh" / "mesh.ply"), tiles, found.warnings
 
 
@@ -108,24 +109,25 @@ def test_no_gap_is_left_where_tiles_meet(made: tuple[TriangleMesh, list[Triangle
         along = np.linspace(0, 1, 5, dtype=np.float32)[None, :, None]
         points = (here[:, :1] * (1 - along) + here[:, 1:] * along).reshape(-1, 3)
         distance_m = nearest_on_edges(points, there).distance_m
-        # Where the rims of street and wall begin, each tile has its own idea, below a voxel.
-        assert distance_m.max() < STEP_M
+        # Where the rims of street and wall begin, each piece has its own idea, within what is
+        # closed (0.15 m).
+        assert distance_m.max() < 0.15
         assert np.percentile(distance_m, 95) < 1e-4
 
 
-def test_tiles_made_at_once_are_those_made_one_by_one(store: TileStore, tmp_path: Path) -> None:
+def test_tiles_made_at_once_are_those_made_one_by_one(store: Tiles, tmp_path: Path) -> None:
     alone, together = (written(store, tmp_path / str(n), threads=n)[0] for n in (1, 3))
     np.testing.assert_array_equal(together.vertices, alone.vertices)
     np.testing.assert_array_equal(together.faces, alone.faces)
 
 
-def test_a_target_is_that_of_all_tiles(store: TileStore, tmp_path: Path) -> None:
+def test_a_target_is_that_of_all_tiles(store: Tiles, tmp_path: Path) -> None:
     settings = SETTINGS.model_copy(update={"target_faces": 4000})
     whole, _, _ = written(store, tmp_path / "out", settings)
     assert 3000 < len(whole.faces) < 5000
 
 
-def test_what_hangs_where_cameras_looked_is_cut_off(store: TileStore, tmp_path: Path) -> None:
+def test_what_hangs_where_cameras_looked_is_cut_off(store: Tiles, tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     ball = rng.normal(0, 1, (3000, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
@@ -146,9 +148,7 @@ def test_what_hangs_where_cameras_looked_is_cut_off(store: TileStore, tmp_path: 
     assert len(above) == 0
 
 
-def test_tiles_with_too_few_points_are_reported_in_one_line(
-    store: TileStore, tmp_path: Path
-) -> None:
+def test_tiles_with_too_few_points_are_reported_in_one_line(store: Tiles, tmp_path: Path) -> None:
     stray = np.array([[60, 60, 0], [61, 60, 0], [90, 90, 0]], dtype=np.float32)
     cloud = street().select(np.arange(3))
     store.put_cloud(PointCloud(stray, rgb=cloud.rgb, normals=cloud.normals, frame="map"))
@@ -159,21 +159,8 @@ def test_tiles_with_too_few_points_are_reported_in_one_line(
 
 def test_a_store_without_a_surface_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(MeshingError, match="no part of the map gives a surface"):
-        written(TileStore(tmp_path / "none", 8.0), tmp_path / "out")
+        written(Tiles(CONFIG, np.eye(4)), tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_the_store_gives_each_point_to_one_tile_and_its_margins(store: TileStore) -> None:
-    cloud = street()
-    assert store.total == len(cloud)
-    for tile in store.tiles:
-        low, high = store.bounds_m(tile)
-        inside = ((cloud.xyz[:, :2] >= low) & (cloud.xyz[:, :2] < high)).all(axis=1)
-        assert store.points(tile) == inside.sum()
-        wide = store.cloud_in(tile, 1.5)
-        assert wide is not None
-        near = ((cloud.xyz[:, :2] >= low - 1.5) & (cloud.xyz[:, :2] < high + 1.5)).all(axis=1)
-        assert len(wide) == near.sum()
 
 
 @pytest.fixture
@@ -192,7 +179,7 @@ def run(tmp_path: Path) -> Path:
 
 def mesh_of(run: Path, *settings: str) -> dict[str, Any]:
     config = load_config(None, ["mesh.tile_m=8", *settings])
-    return run_mesh(run, config, MeshOptions(out=run.parent / "mesh", formats=("ply", "glb")))
+    return run_mesh(run, config, out=run.parent / "mesh", formats=("ply", "glb"))
 
 
 def test_the_map_of_a_run_is_meshed_with_its_free_space(run: Path) -> None:
@@ -241,11 +228,11 @@ def test_a_damaged_map_leaves_the_earlier_mesh(run: Path) -> None:
 
 def test_the_run_itself_is_never_replaced(run: Path) -> None:
     with pytest.raises(SettingsError, match="replace the run"):
-        run_mesh(run, load_config(None, []), MeshOptions(out=run))
+        run_mesh(run, load_config(None, []), out=run)
     assert (run / "map" / "cloud.ply").is_file()
 
 
-def test_a_folder_that_cannot_be_written_is_reported(store: TileStore, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_reported(store: Tiles, tmp_path: Path) -> None:
     (tmp_path / "out").write_text("a file")
     with pytest.raises(OutputError):
         written(store, tmp_path / "out")

@@ -1,0 +1,62 @@
+"""`recon export`: products of a finished run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli.options import Config, Formats, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli.session import session
+from recon.cli.show.tables import print_json, print_run
+
+
+def export(
+    run: Annotated[Path, typer.Argument(help="Folder of a run of map, demo or pair.")],
+    to: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What to make: cloud, grid, octomap, mesh; several separated by commas. A pair "
+            "has cloud and mesh.",
+            show_default="all",
+        ),
+    ] = None,
+    out: Out = None,
+    formats: Formats = None,
+    resolution: Annotated[
+        float | None,
+        typer.Option(help="Cell size of grid and OctoMap in metres.", show_default="as in the run"),
+    ] = None,
+    config: Config = None,
+    set_: Set = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    threads: Threads = None,
+) -> None:
+    """Make the cloud, grid, OctoMap or mesh of a run again, with other settings or formats.
+
+    Nothing is matched again: products are made from the cloud and the rays that
+    the run has kept, in one pass. Settings of occupancy, grid, ground, submaps
+    and mesh can be changed; all others are those of the run.
+
+    Examples:
+      recon export outputs/map/latest --to grid,mesh --format glb --out robot
+      recon export outputs/map/latest --to grid --set grid.max_height_m=3.2
+      recon export outputs/map/latest --to mesh --set mesh.depth=9
+    """
+    with session(quiet=quiet):
+        from recon.commands.export import run_export
+        from recon.commands.finished_run import settings_of
+
+        cells = [] if resolution is None else [f"occupancy.resolution_m={resolution}"]
+        summary = run_export(
+            run,
+            settings_of(run, config, [*(set_ or ()), *cells]),
+            products=[name.strip() for text in to or () for name in text.split(",")],
+            formats=tuple(formats or ("ply",)),
+            out=out,
+            threads=threads,
+        )
+    print_json(summary) if json else print_run(summary, stages=verbose)

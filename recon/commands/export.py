@@ -1,0 +1,99 @@
+"""The story of `recon export`: products of a finished run, with other settings or formats."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
+from recon.commands.finished_run import (
+    PAIR_CLOUD,
+    camera_of_pair,
+    check_changes,
+    is_pair_run,
+    open_run,
+    refuse_as_target,
+)
+from recon.commands.occupancy import REMADE
+from recon.commands.remake import copy_file, mesh_cloud, remake_map
+from recon.core.errors import SettingsError
+from recon.io.models.mesh import check_mesh_formats
+from recon.run.run import Run
+
+PRODUCTS: Final = ("cloud", "grid", "octomap", "mesh")
+_OF_A_PAIR: Final = ("cloud", "mesh")
+
+
+def run_export(
+    source: Path,
+    config: ReconConfig | None = None,
+    *,
+    products: Sequence[str] = (),
+    formats: Sequence[str] = ("ply",),
+    out: Path | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Make products of a finished run, and write them.
+
+    Args:
+        source: Folder of a run of map, demo or pair.
+        config: Its settings with changes, such as ``load_config(source / "config.yaml",
+            ["grid.max_height_m=3"])``; None = its own.
+        products: Which of `PRODUCTS`; empty = all that such a run can give.
+        formats: Formats of the mesh, such as ``("ply", "glb")``.
+        out: Result folder; None = a new one below ``outputs/``.
+        threads: Threads to use; None = all cores.
+
+    Returns:
+        The figures of ``summary.json``.
+
+    Raises:
+        ReconError: There is no such product, the run is damaged or lacks what a product is made
+            from, a setting has no effect, or the folder cannot be written; nothing is left behind.
+    """
+    check_mesh_formats(formats)
+    pair = is_pair_run(source)
+    wanted = _known(products, _OF_A_PAIR if pair else PRODUCTS)
+    refuse_as_target(source, out)
+    if pair:
+        settings = config or load_config(defaults=PAIR_DEFAULTS)
+        with Run("export", out, settings, threads=threads) as run:
+            return _export_pair(source, settings, wanted, run, formats)
+    mapped = open_run(source)
+    settings = check_changes(mapped, config, (*REMADE, "mesh"))
+    with Run("export", out, settings, threads=threads) as run:
+        return remake_map(mapped, settings, wanted, run, formats)
+
+
+def _export_pair(
+    source: Path, config: ReconConfig, products: Sequence[str], run: Run, formats: Sequence[str]
+) -> dict[str, Any]:
+    """Products of a run of `recon pair`."""
+    cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
+    figures: dict[str, Any] = {"run": str(source), "cloud": str(cloud), "warnings": []}
+    if "cloud" in products:
+        copy_file(cloud, run.path(PAIR_CLOUD))
+    if "mesh" in products:
+        figures |= mesh_cloud(cloud, camera, config.mesh, run, formats)
+    run.finish(figures, source=str(source), inputs=[cloud])
+    return figures
+
+
+def _known(products: Sequence[str], possible: Sequence[str]) -> Sequence[str]:
+    """The requested products, or all.
+
+    Raises:
+        SettingsError: One is unknown, or not possible for such a run.
+    """
+    for product in products:
+        if product not in possible:
+            unknown = product not in PRODUCTS
+            raise SettingsError(
+                "unknown product" if unknown else "a pair has no such product",
+                where="--to",
+                got=product,
+                expected=", ".join(possible),
+                hint=None if unknown else "recon map makes it of a drive",
+            )
+    return list(dict.fromkeys(products)) or possible

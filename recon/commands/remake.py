@@ -1,0 +1,194 @@
+"""Products of what a run or a file has: the map of a finished run, or a cloud in one piece."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from shutil import copyfile
+from typing import Any
+
+from recon.commands.config import ReconConfig
+from recon.commands.finished_map import FinishedMap, map_as_written, map_from_rays
+from recon.commands.finished_run import CLOUD, MAPPED_BY, UNTRUSTED, FinishedRun
+from recon.core.values import FREE, OCCUPIED, OccupancyGrid, RectifiedCamera
+from recon.core.values.cloud import Frame
+from recon.export.grid import export_grid
+from recon.export.mesh import (
+    MeshSettings,
+    check_coverage,
+    mesh_coverage,
+    reconstruct_mesh,
+    reconstruct_view,
+)
+from recon.export.mesh.pieces import WHOLE, export_mesh
+from recon.export.octomap import export_octomap
+from recon.io.atomic import atomic_path
+from recon.io.files import reading
+from recon.io.models.mesh import read_mesh, write_mesh
+from recon.io.models.mlp import write_mlp
+from recon.io.models.ply import read_ply, write_ply
+from recon.map import base_axes
+from recon.run.run import Run
+
+_LAYER = "mesh/cloud.ply"
+
+
+def remake_map(
+    source: FinishedRun,
+    config: ReconConfig,
+    products: Collection[str],
+    run: Run,
+    formats: Sequence[str] = ("ply",),
+) -> dict[str, Any]:
+    """Make products of the map of a finished run, and write them with the record of the run.
+
+    Args:
+        source: The run that mapped the drive.
+        config: Its configuration with the requested changes.
+        products: What to make: ``cloud``, ``grid``, ``octomap``, ``mesh``.
+        run: The run that makes them.
+        formats: Formats of the mesh.
+
+    Returns:
+        The figures of ``summary.json``.
+
+    Raises:
+        ReconError: The run is damaged, lacks what a product is made from, or a file cannot be
+            written.
+    """
+    anew = "grid" in products or "octomap" in products
+    with run.stage("map" if anew else "read"):
+        found = (
+            map_from_rays(source, config)
+            if anew
+            else map_as_written(source, voxels="mesh" in products and config.mesh.free_space)
+        )
+    figures: dict[str, Any] = {"run": str(source.folder), "cloud": str(source.folder / CLOUD)}
+    warnings = list(found.warnings)
+    if "cloud" in products:
+        copy_file(source.folder / CLOUD, run.path(CLOUD))
+        figures["points"] = sum(len(tile.cloud) for tile in found.tiles)
+    if "octomap" in products:
+        with run.stage("octomap"):
+            figures["voxels"], told = export_octomap(found.tiles, run.path("map/octomap"))
+        warnings += told
+    if "grid" in products:
+        with run.stage("grid"):
+            figures |= _grid(source, found, run, warnings)
+    if "mesh" in products:
+        figures |= _mesh(source, found, config.mesh, run, formats, warnings)
+    record: dict[str, Any] = {}
+    if anew or "cloud" in products:
+        T_map_world = source.T_map_world.tolist()
+        figures["T_map_world"] = T_map_world
+        record = {
+            MAPPED_BY: source.mapped_by,
+            "T_map_world": T_map_world,
+            UNTRUSTED: list(source.untrusted),
+        }
+    figures["warnings"] = warnings
+    run.finish(figures, source=str(source.folder), inputs=found.files, record=record)
+    return figures
+
+
+def mesh_cloud(
+    path: Path,
+    camera: RectifiedCamera | None,
+    settings: MeshSettings,
+    run: Run,
+    formats: Sequence[str] = ("ply",),
+) -> dict[str, Any]:
+    """Mesh a cloud file in one piece, as its camera saw it if it is that of a pair.
+
+    Returns:
+        The figures of the mesh.
+
+    Raises:
+        ReconError: The cloud cannot be read or gives no surface, or a file cannot be written.
+    """
+    with run.stage("read"):
+        cloud = read_ply(path)
+        write_ply(run.path(_LAYER), cloud)
+    with run.stage("mesh"):
+        if camera is None:
+            mesh, coverage = reconstruct_mesh(cloud, settings), None
+        else:
+            mesh = reconstruct_view(cloud, camera, settings)
+            coverage = mesh_coverage(mesh, cloud)
+    write_mesh(run.path(WHOLE), mesh)
+    frame: Frame | None = None if camera is None else "camera"
+    write_mlp(
+        run.path("mesh/mesh.mlp"), {"mesh": run.path(WHOLE), "cloud": run.path(_LAYER)}, frame
+    )
+    _in_other_formats(run, formats, frame)
+    figures = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
+    if coverage is None:
+        return {**figures, "warnings": []}
+    return {**figures, "mesh_coverage": coverage, "warnings": list(check_coverage(coverage))}
+
+
+def _grid(source: FinishedRun, found: FinishedMap, run: Run, warnings: list[str]) -> dict[str, Any]:
+    """Write the grid of a map; its figures."""
+    written = export_grid(found.tiles, found.path_m, found.trusted, run.path("map/grid"))
+    warnings += written.warnings
+    return {
+        "frames": len(found.path_m),
+        **_cells(written.grid),
+        "camera_height_m": written.camera_height_m,
+        "T_base_camera": base_axes(source.T_map_world, written.camera_height_m).tolist(),
+    }
+
+
+def _mesh(
+    source: FinishedRun,
+    found: FinishedMap,
+    settings: MeshSettings,
+    run: Run,
+    formats: Sequence[str],
+    warnings: list[str],
+) -> dict[str, Any]:
+    """Write the mesh of a map; its figures."""
+    layer = run.path(_LAYER)
+    copy_file(source.folder / CLOUD, layer)
+    with run.stage("mesh"):
+        written = export_mesh(found.tiles, settings, run, layer, run.threads)
+    with run.stage("write"):
+        _in_other_formats(run, formats, "map")
+    warnings += written.warnings
+    return {
+        "points": written.points,
+        "vertices": written.vertices,
+        "faces": written.faces,
+        "tiles": len(written.pieces),
+    }
+
+
+def _in_other_formats(run: Run, formats: Sequence[str], frame: Frame | None) -> None:
+    for suffix in dict.fromkeys(formats):
+        if suffix != "ply":
+            write_mesh(run.path(f"mesh/mesh.{suffix}"), read_mesh(run.path(WHOLE)), frame)
+
+
+def copy_file(file: Path, target: Path) -> None:
+    """Copy a file, atomically.
+
+    Raises:
+        FormatError: It cannot be read.
+        OutputError: The copy cannot be written.
+    """
+    with reading(file):
+        file.stat()
+    with atomic_path(target) as temporary:
+        copyfile(file, temporary)
+
+
+def _cells(grid: OccupancyGrid) -> dict[str, Any]:
+    """Figures of the grid."""
+    rows, columns = grid.cells.shape
+    return {
+        "resolution_m": grid.resolution_m,
+        "rows": rows,
+        "columns": columns,
+        "occupied_cells": int((grid.cells == OCCUPIED).sum()),
+        "free_cells": int((grid.cells == FREE).sum()),
+    }

@@ -1,0 +1,233 @@
+"""The mesh of a map, made in square pieces that are cut at their borders, to bound memory."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import MeshingError
+from recon.core.values import TriangleMesh
+from recon.core.values.arrays import Float32
+from recon.export.mesh import (
+    MeshSettings,
+    Plane,
+    close_seam,
+    cut_mesh,
+    looked_through,
+    open_edges,
+    reconstruct_mesh,
+)
+from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
+from recon.io.models.mlp import write_mlp
+from recon.map.tiles import Tiles
+from recon.map.window import Window
+from recon.run.directory import RunDirectory
+from recon.run.lookahead import side_by_side
+from recon.run.machine import available_cores
+
+WHOLE: Final = "mesh/mesh.ply"
+SAMPLE_FACES: Final = 2_000_000
+"""Largest number of triangles of a mesh that is loaded whole for images."""
+_MOST_AT_ONCE: Final = 4
+_SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))
+"""The four sides of a piece: (axis, 1 for the far side)."""
+_OVERLAP_M: Final = 3.0
+"""Margin around a piece whose points its surface is fitted to as well."""
+_SEAM_M: Final = 0.15
+"""Widest gap that is closed where two pieces meet."""
+_BULGE_M: Final = 2.0
+"""How far a surface may go beyond the points that it is made of."""
+PieceKey = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class MeshPiece:
+    """A piece whose mesh is written.
+
+    Attributes:
+        path: Its PLY file.
+        vertices: Number of vertices.
+        faces: Number of faces.
+    """
+
+    path: Path
+    vertices: int
+    faces: int
+
+
+@dataclass(frozen=True, eq=False)
+class WrittenMesh:
+    """A mesh whose files are written.
+
+    Attributes:
+        points: Number of points of the map.
+        pieces: Its pieces.
+        warnings: Parts that could not be meshed.
+    """
+
+    points: int
+    pieces: tuple[MeshPiece, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def faces(self) -> int:
+        """Number of triangles."""
+        return sum(piece.faces for piece in self.pieces)
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices."""
+        return sum(piece.vertices for piece in self.pieces)
+
+    def to_show(self, directory: RunDirectory) -> TriangleMesh | None:
+        """The mesh for images; None if it is too large for memory."""
+        whole = directory.path(WHOLE)
+        return read_mesh(whole) if self.faces <= SAMPLE_FACES else None
+
+
+def export_mesh(
+    tiles: Tiles,
+    settings: MeshSettings,
+    directory: RunDirectory,
+    cloud: Path,
+    threads: int | None = None,
+) -> WrittenMesh:
+    """Write ``mesh/mesh.ply``, its pieces if there are several, and ``mesh/mesh.mlp``.
+
+    Args:
+        tiles: The map; without voxels no space is known to be free.
+        settings: Settings of the mesh; ``target_faces`` is the total over all pieces.
+        directory: The folder of the run.
+        cloud: A PLY file in it, for the MeshLab project.
+        threads: Pieces reconstructed at a time, each in its own process; None = one per core, at
+            most four, since each needs memory. Does not change results.
+
+    Raises:
+        MeshingError: No piece has a surface.
+        OutputError: A file cannot be written.
+    """
+    at_once = threads or min(available_cores(), _MOST_AT_ONCE)
+    found = _Mesher(tiles, settings, directory, at_once, _count(tiles, settings)).run()
+    if not found.pieces:
+        raise MeshingError(
+            "no part of the map gives a surface", got="; ".join(found.warnings) or "no point"
+        )
+    whole = directory.path(WHOLE)
+    join_meshes(whole, [(piece.path, piece.vertices, piece.faces) for piece in found.pieces])
+    layers = {piece.path.stem: piece.path for piece in found.pieces}
+    if len(found.pieces) == 1:
+        found.pieces[0].path.unlink()
+        layers = {"mesh": whole}
+    write_mlp(directory.path("mesh/mesh.mlp"), {**layers, "cloud": cloud}, "map")
+    return found
+
+
+def _count(tiles: Tiles, settings: MeshSettings) -> Counter[PieceKey]:
+    """Number of points in each piece. Pieces are centred at multiples of their edge."""
+    found: Counter[PieceKey] = Counter()
+    for tile in tiles:
+        homes = np.floor(tile.cloud.xyz[:, :2] / settings.tile_m + 0.5).astype(np.int64)
+        keys, counts = np.unique(homes, axis=0, return_counts=True)
+        found.update(dict(zip(map(tuple, keys.tolist()), counts.tolist(), strict=True)))
+        if settings.free_space:
+            len(tile.voxels)  # made here, and not by several threads at once
+    return found
+
+
+@dataclass(eq=False)
+class _Mesher:
+    """Reconstructs pieces in parallel; each closes its seams to earlier ones, in order."""
+
+    tiles: Tiles
+    settings: MeshSettings
+    directory: RunDirectory
+    threads: int
+    points: Counter[PieceKey]
+    borders: dict[tuple[PieceKey, Plane], Float32] = field(default_factory=dict)
+
+    def run(self) -> WrittenMesh:
+        pieces: list[MeshPiece] = []
+        failed: dict[PieceKey, MeshingError] = {}
+        keys = sorted(self.points)
+        surfaces = side_by_side(self._surface, keys, threads=self.threads)
+        for key, surface in zip(keys, surfaces, strict=True):
+            if isinstance(surface, MeshingError):
+                failed[key] = surface
+                continue
+            mesh = self._joined(key, surface)
+            if len(mesh.faces):
+                path = self.directory.path(f"mesh/tiles/tile_{key[0]}_{key[1]}.ply")
+                write_mesh(path, mesh)
+                pieces.append(MeshPiece(path, len(mesh.vertices), len(mesh.faces)))
+        return WrittenMesh(self.points.total(), tuple(pieces), self._warnings(failed))
+
+    def _warnings(self, failed: dict[PieceKey, MeshingError]) -> tuple[str, ...]:
+        """One line about the pieces without a surface, naming the one with the most points."""
+        if not failed:
+            return ()
+        worst = max(failed, key=self.points.__getitem__)
+        share = sum(self.points[key] for key in failed) / self.points.total()
+        tiles = f"{len(failed)} of {len(self.points)} tiles"
+        return (f"no surface in {tiles}, {share:.1%} of the points ({failed[worst]})",)
+
+    def _surface(self, key: PieceKey) -> TriangleMesh | MeshingError:
+        """The surface of a piece, or the error why there is none, handled when its turn comes."""
+        try:
+            return self._cut(key)
+        except MeshingError as error:
+            return error
+
+    def _cut(self, key: PieceKey) -> TriangleMesh:
+        """The surface of a piece with its margin, cut at the sides of the piece."""
+        wide = self._window(key).wider(_OVERLAP_M)
+        cloud = self.tiles.cloud_in(wide)
+        wrong = None
+        if self.settings.free_space:
+            voxels = self.tiles.voxels_in(wide.wider(_BULGE_M))
+            wrong = partial(looked_through, voxels=voxels) if len(voxels) else None
+        mesh = reconstruct_mesh(
+            cloud,
+            self.settings.model_copy(update={"target_faces": self._target(len(cloud))}),
+            wrong=wrong,
+        )
+        for axis, far in _SIDES:
+            mesh = cut_mesh(mesh, self._plane(key, axis, far), keep_above=not far)
+        return mesh
+
+    def _target(self, seen: int) -> int | None:
+        """Target number of triangles of a piece with its margin, by its share of the points."""
+        target = self.settings.target_faces
+        if target is None:
+            return None
+        return max(4, round(target * seen / self.points.total()))
+
+    def _joined(self, key: PieceKey, mesh: TriangleMesh) -> TriangleMesh:
+        """The mesh of a piece, joined to those of its earlier neighbours."""
+        for axis, far in _SIDES:
+            plane = self._plane(key, axis, far)
+            step = np.zeros(2, int)
+            step[axis] = 1 if far else -1
+            neighbour = (key[0] + int(step[0]), key[1] + int(step[1]))
+            border = self.borders.pop((neighbour, plane), None)
+            if border is not None:
+                mesh = close_seam(mesh, plane, border, _SEAM_M)
+            else:
+                self.borders[key, plane] = open_edges(mesh, plane)
+        return mesh
+
+    def _window(self, key: PieceKey) -> Window:
+        """The bounds of a piece."""
+        (x, y), edge_m = key, self.settings.tile_m
+        return Window(
+            (x * edge_m - edge_m / 2, y * edge_m - edge_m / 2),
+            (x * edge_m + edge_m / 2, y * edge_m + edge_m / 2),
+        )
+
+    def _plane(self, key: PieceKey, axis: int, far: int) -> Plane:
+        window = self._window(key)
+        return Plane(axis, (window.high if far else window.low)[axis])

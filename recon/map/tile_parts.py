@@ -1,0 +1,100 @@
+"""Parts of a map on disk, by the square tile of the map that they lie in."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.kernels.voxels import pack_keys, unpack_keys
+from recon.core.values.arrays import Bool
+from recon.map.store import Store
+from recon.map.window import Window
+
+TileKey = tuple[int, int]
+"""Column and row of a tile; tile (0, 0) has its lower corner in the origin of the map."""
+
+
+class TileParts:
+    """Numbered parts of several kinds in each tile, in a temporary file.
+
+    Args:
+        edge_m: Side of a tile.
+
+    Attributes:
+        edge_m: Side of a tile.
+    """
+
+    def __init__(self, edge_m: float) -> None:
+        self.edge_m = edge_m
+        self._store = Store.temporary()
+        self._numbers: dict[str, dict[TileKey, list[int]]] = defaultdict(dict)
+        self._keys: dict[TileKey, None] = {}
+
+    @property
+    def keys(self) -> list[TileKey]:
+        """The tiles in which there is something, in the order in which they were begun."""
+        return list(self._keys)
+
+    def window(self, key: TileKey) -> Window:
+        """The bounds of a tile."""
+        (column, row), edge_m = key, self.edge_m
+        return Window((column * edge_m, row * edge_m), ((column + 1) * edge_m, (row + 1) * edge_m))
+
+    def near(
+        self, places_m: NDArray[np.floating[Any]], margin_m: float
+    ) -> Iterator[tuple[TileKey, Bool]]:
+        """The tiles that have places (N, 2 or 3) in them or their margin, and which ones."""
+        home = np.floor(places_m[:, :2] / self.edge_m).astype(np.int64)
+        # Packed into one integer, since numpy sorts rows slowly.
+        homes = unpack_keys(np.unique(pack_keys(np.pad(home, ((0, 0), (0, 1))))))
+        reach = math.ceil(margin_m / self.edge_m) or 1
+        steps = range(-reach, reach + 1)
+        found = {(x + i, y + j) for x, y, _ in homes.tolist() for i, j in product(steps, repeat=2)}
+        for key in sorted(found):
+            inside = self.window(key).wider(margin_m).contains(places_m)
+            if inside.any():
+                yield key, inside
+
+    def under(self, window: Window) -> list[TileKey]:
+        """The tiles that a window touches and in which there is something."""
+        low = np.floor(np.array(window.low) / self.edge_m).astype(int).tolist()
+        high = np.floor(np.array(window.high) / self.edge_m).astype(int).tolist()
+        columns, rows = (range(a, b + 1) for a, b in zip(low, high, strict=True))
+        return [key for key in product(columns, rows) if key in self._keys]
+
+    def numbers(self, kind: str, key: TileKey) -> Sequence[int]:
+        """The numbers of the parts of a kind in a tile, in the order in which they were put."""
+        return tuple(self._numbers[kind].get(key, ()))
+
+    def put(
+        self, kind: str, key: TileKey, tree: Mapping[str, Any], number: int | None = None
+    ) -> None:
+        """Keep a part, by default under the next number.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        numbers = self._numbers[kind].setdefault(key, [])
+        numbers.append(len(numbers) if number is None else number)
+        self._store.put(kind, (*key, numbers[-1]), tree)
+        self._keys[key] = None
+
+    def read(self, kind: str, key: TileKey) -> Iterator[tuple[int, dict[str, Any]]]:
+        """The parts of a kind in a tile with their numbers, one at a time; arrays are read-only.
+
+        Raises:
+            FormatError: One is damaged.
+        """
+        # Past the cache: reading a tile again is faster than making it, and it may be large.
+        return ((n, self._store.read(kind, (*key, n))) for n in self.numbers(kind, key))
+
+    def drop(self, kind: str, key: TileKey) -> None:
+        """Forget the parts of a kind in a tile."""
+        for number in self._numbers[kind].pop(key, ()):
+            self._store.delete(kind, (*key, number))

@@ -1,0 +1,381 @@
+"""The map of a drive in square tiles, from which everything that leaves the map is made.
+
+Each submap is read, moved to where the drive has put it, and cut at the borders of the tiles, once.
+A tile is fused and filtered when something first asks for it, and then kept: all products of the
+map take the same tiles, with a few of them in memory at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+from heapq import merge
+from itertools import product
+from operator import itemgetter
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.geometry.se3 import apply
+from recon.core.geometry.transform import transform_cloud
+from recon.core.kernels.voxels import pack_keys, unpack_keys
+from recon.core.values import Frame, OccupancyVoxels, PointCloud
+from recon.core.values.arrays import Bool, Float32, Float64
+from recon.map.floor import find_floors
+from recon.map.fused_part import KNOWABLE, FusedPart, join_fused
+from recon.map.grid import JOINED_CELLS
+from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
+from recon.map.occupancy_part import OccupancyPart, join_occupancy
+from recon.map.settings import DriveSettings
+from recon.map.submaps import Submap, SubmapMotion
+from recon.map.tile_parts import TileKey, TileParts
+from recon.map.window import Window
+from recon.stereo.cloud import filter_cloud
+
+_FUSED: Final = "fused"
+_OCCUPANCY: Final = "occupancy"
+_POINTS: Final = "points"
+_VOXELS: Final = "voxels"
+_FLOORS: Final = "floors"
+_FILTER_MARGIN_M: Final = 1.0
+"""Least margin around a tile for the filters of the fused cloud."""
+_LEAST_TILE_M: Final = 5.0
+_FUSED_BYTES: Final = 60
+_BLOCK_BYTES: Final = 4 * 3 * BLOCK_EDGE**3
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A square of the map, seen from above; its content is made when it is first asked for.
+
+    Attributes:
+        key: Its column and row.
+        tiles: The map.
+    """
+
+    key: TileKey
+    tiles: Tiles
+
+    @property
+    def cloud(self) -> PointCloud:
+        """Its fused and filtered points, frame ``map``."""
+        return self.tiles.cloud(self.key)
+
+    @property
+    def voxels(self) -> OccupancyVoxels:
+        """Its observed voxels."""
+        return self.tiles.voxels(self.key)
+
+
+class Tiles:
+    """A map cut into tiles; iterating gives them along the drive.
+
+    `of_submaps` cuts the map of a drive; `put_cloud` and `put_voxels` add what is fused already.
+
+    Args:
+        config: The configuration.
+        T_map_world: float64 (4, 4), from world to map axes.
+        halvings: How often the tiles of the configuration are halved.
+
+    Attributes:
+        config: The configuration.
+        edge_cells: Side of a tile in voxels; a power of two, at least 8.
+        extent: Smallest x and y of the cells that submaps observed, and the largest plus one.
+        submap_of_frame: int64 (N,), number of the submap of each frame.
+    """
+
+    def __init__(self, config: DriveSettings, T_map_world: Float64, halvings: int = 0) -> None:
+        self.config = config
+        self._T_map_world = T_map_world
+        cells = math.log2(config.submaps.tile_m / config.occupancy.resolution_m)
+        # A power of two, so that a tile is a branch of an octree.
+        self.edge_cells = 1 << max(BLOCK_BITS, round(cells) - halvings)
+        self._parts = TileParts(self.edge_m)
+        self._known: tuple[str, ...] = KNOWABLE
+        self.extent: tuple[TileKey, TileKey] = ((0, 0), (0, 0))
+        self.submap_of_frame: NDArray[np.int64] = np.zeros(0, np.int64)
+        # A cell of a grid depends on the cells joined to it, on their blob, and on adjacent cells.
+        beyond = config.grid.min_blob_cells + JOINED_CELLS + 2
+        self._grid_margin_m = math.ceil(beyond / BLOCK_EDGE) * self._block_m
+
+    @classmethod
+    def of_submaps(
+        cls,
+        submaps: Iterable[Submap],
+        config: DriveSettings,
+        T_map_world: Float64,
+        T_corrected_world: Float64 | None = None,
+        *,
+        fuse: bool = True,
+    ) -> Tiles:
+        """Cut the map of a drive; tiles are halved until the fullest one fits into memory.
+
+        Args:
+            submaps: The submaps, in order; read again where tiles are halved.
+            config: The configuration.
+            T_map_world: float64 (4, 4), from world to map axes.
+            T_corrected_world: float64 (S, 4, 4), a rigid correction of each submap; None = none is
+                corrected.
+            fuse: Make the cloud of the submaps; else it is put in as it was written.
+
+        Raises:
+            FormatError: A submap is damaged.
+            OutputError: There is no room for the tiles.
+        """
+        halvings, tiles = 0, cls(config, T_map_world)
+        while not tiles._cut(submaps, T_corrected_world, fuse=fuse):
+            halvings += 1
+            tiles = cls(config, T_map_world, halvings)
+        return tiles
+
+    @property
+    def resolution_m(self) -> float:
+        """Edge of a voxel."""
+        return self.config.occupancy.resolution_m
+
+    @property
+    def edge_m(self) -> float:
+        """Side of a tile."""
+        return self.edge_cells * self.resolution_m
+
+    def __len__(self) -> int:
+        return len(self._parts.keys)
+
+    def __iter__(self) -> Iterator[Tile]:
+        return (Tile(key, self) for key in self._parts.keys)
+
+    def window(self, key: TileKey) -> Window:
+        """The bounds of a tile."""
+        return self._parts.window(key)
+
+    def put_cloud(self, cloud: PointCloud) -> None:
+        """Add points that are fused and filtered, frame ``map``."""
+        for key, inside in self._parts.near(cloud.xyz, 0.0):
+            self._parts.put(_POINTS, key, _cloud_tree(cloud.select(inside)))
+
+    def put_voxels(self, voxels: OccupancyVoxels) -> None:
+        """Add observed voxels; none is given twice."""
+        for key, inside in self._parts.near(voxels.centres_m, 0.0):
+            self._parts.put(_VOXELS, key, _voxel_tree(voxels.select(inside)))
+
+    def cloud(self, key: TileKey) -> PointCloud:
+        """The fused and filtered points of a tile, frame ``map``.
+
+        Filters see a margin around the tile, so that the tiles together equal the filtered whole
+        (except for statistical limits, which are those of the tile).
+        """
+        if self._parts.numbers(_FUSED, key):
+            fused = self._fused(key)
+            self._parts.drop(_FUSED, key)
+            self._parts.put(_POINTS, key, _cloud_tree(fused))
+            self.config.memory.check("putting the cloud together")
+        found = self._parts.read(_POINTS, key)
+        return join_clouds(PointCloud(**tree, frame="map") for _, tree in found)
+
+    def voxels(self, key: TileKey) -> OccupancyVoxels:
+        """The observed voxels of a tile, map axes."""
+        return _in_window(self.wide_voxels(key), self.window(key))
+
+    def wide_voxels(
+        self, key: TileKey, after: Mapping[int, OccupancyPart] | None = None
+    ) -> OccupancyVoxels:
+        """The observed voxels of a tile and of the margin on which its cells in a grid depend.
+
+        Args:
+            key: The tile.
+            after: What else was observed at the end of submaps, by their numbers.
+        """
+        if self._parts.numbers(_OCCUPANCY, key) and not self._parts.numbers(_VOXELS, key):
+            self._parts.put(_VOXELS, key, self._joined(key))
+            self.config.memory.check("putting the occupancy together")
+        found = self._parts.read(_VOXELS, key)
+        seen = (OccupancyVoxels(**tree, resolution_m=self.resolution_m) for _, tree in found)
+        voxels = join_voxels(seen, self.resolution_m)
+        return self._changed(key, voxels, after) if after else voxels
+
+    def cloud_in(self, window: Window) -> PointCloud:
+        """The points in a window, frame ``map``."""
+        clouds = map(self.cloud, self._parts.under(window))
+        return join_clouds(cloud.select(window.contains(cloud.xyz)) for cloud in clouds)
+
+    def voxels_in(self, window: Window) -> OccupancyVoxels:
+        """The voxels with their centres in a window."""
+        found = map(self.voxels, self._parts.under(window))
+        return join_voxels([_in_window(voxels, window) for voxels in found], self.resolution_m)
+
+    def floors_in(self, window: Window) -> Float32:
+        """float32 (N, 3), what `find_floors` finds in a window."""
+        found = [np.zeros((0, 3), np.float32)]
+        for key in self._parts.under(window):
+            if not self._parts.numbers(_FLOORS, key):
+                self._parts.put(_FLOORS, key, {"xyz": find_floors(self.voxels(key))})
+            found += [tree["xyz"] for _, tree in self._parts.read(_FLOORS, key)]
+        xyz = np.concatenate(found)
+        return xyz[window.contains(xyz)]
+
+    @property
+    def _block_m(self) -> float:
+        return BLOCK_EDGE * self.resolution_m
+
+    def _cut(
+        self, submaps: Iterable[Submap], T_corrected_world: Float64 | None, *, fuse: bool
+    ) -> bool:
+        """Cut all submaps; False where a tile that could be smaller does not fit into memory."""
+        limit = self.config.memory.tile_bytes
+        if self.edge_m < 2 * _LEAST_TILE_M or self.edge_cells == BLOCK_EDGE:
+            limit = None
+        known, frames, size = set(KNOWABLE), [0], Counter[tuple[str, TileKey]]()
+        for number, submap in enumerate(submaps):
+            T = None if T_corrected_world is None else T_corrected_world[number]
+            nothing = submap.fused.select(np.zeros(0, np.intp))
+            moved = self._moved(submap if fuse else replace(submap, fused=nothing), T)
+            frames.append(submap.frames)
+            known &= set(moved.fused.known if len(moved.fused) else KNOWABLE)
+            self.extent = _wider(self.extent, moved.occupancy)
+            for kind, key, part, nbytes in self._pieces(moved):
+                self._parts.put(kind, key, part.to_tree(), number)
+                size[kind, key] += nbytes
+                if limit is not None and size[kind, key] > limit:
+                    return False
+        self.submap_of_frame = np.repeat(np.arange(-1, len(frames) - 1), frames)
+        # Attributes missing in one submap are dropped, so that all tiles have the same fields.
+        self._known = tuple(name for name in KNOWABLE if name in known)
+        return True
+
+    def _moved(self, submap: Submap, T_corrected_world: Float64 | None) -> Submap:
+        """A submap with its correction applied."""
+        if T_corrected_world is None or np.array_equal(T_corrected_world, np.eye(4)):
+            return submap
+        voxel_m = self.config.fusion.voxel_m
+        return submap.moved(
+            SubmapMotion(T_corrected_world, self._T_map_world, voxel_m, self.resolution_m)
+        )
+
+    def _pieces(
+        self, submap: Submap
+    ) -> Iterator[tuple[str, TileKey, FusedPart | OccupancyPart, int]]:
+        """A submap in pieces: their kind, tile, content, and the bytes that joining them takes."""
+        fused, occupancy, voxel_m = submap.fused, submap.occupancy, self.config.fusion.voxel_m
+        filters = self.config.map_filters
+        margin_m = max(_FILTER_MARGIN_M, 2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
+        centres_m = apply(self._T_map_world, (fused.cells + 0.5) * voxel_m)
+        # A voxel more, since a point may lie anywhere in its voxel.
+        for key, inside in self._parts.near(centres_m, margin_m + voxel_m):
+            yield _FUSED, key, fused.select(inside), int(inside.sum()) * _FUSED_BYTES
+        for key, inside in self._parts.near(self._centres_m(occupancy), self._grid_margin_m):
+            yield _OCCUPANCY, key, occupancy.select(inside), int(inside.sum()) * _BLOCK_BYTES
+
+    def _centres_m(self, part: OccupancyPart) -> Float64:
+        """float64 (B, 3), centres of the blocks of a part."""
+        return np.asarray((part.blocks + 0.5) * self._block_m)
+
+    def _fused(self, key: TileKey) -> PointCloud:
+        """The filtered points of a tile, frame ``map``."""
+        config = self.config
+        parts = (FusedPart.from_tree(tree) for _, tree in self._parts.read(_FUSED, key))
+        fused = replace(join_fused(parts), known=self._known)
+        # A drive with fewer frames than the minimum count must still give a map.
+        least = min(config.fusion.min_count, len(self.submap_of_frame))
+        points = fused.cloud(config.fusion.voxel_m, least, config.fusion.precise_sigma_m)
+        filtered = filter_cloud(points, config.map_filters)
+        cloud = transform_cloud(filtered, self._T_map_world, frame="map")
+        return cloud.select(self.window(key).contains(cloud.xyz))
+
+    def _joined(self, key: TileKey) -> dict[str, Any]:
+        """The voxels of a tile and its margin."""
+        # Joined one by one, so that a place passed often takes no more memory than others.
+        part = join_occupancy(self._occupancy(key, {}))
+        return _voxel_tree(part.voxels(self.resolution_m))
+
+    def _occupancy(
+        self, key: TileKey, after: Mapping[int, OccupancyPart]
+    ) -> Iterator[OccupancyPart]:
+        """What each submap observed in a tile and its margin, each followed by ``after``."""
+        own = ((n, OccupancyPart.from_tree(tree)) for n, tree in self._parts.read(_OCCUPANCY, key))
+        # Of one number, that of the submap comes first.
+        return (part for _, part in merge(own, sorted(after.items()), key=itemgetter(0)))
+
+    def _changed(
+        self, key: TileKey, seen: OccupancyVoxels, after: Mapping[int, OccupancyPart]
+    ) -> OccupancyVoxels:
+        """The voxels of a tile with its margin, made again where ``after`` changes something."""
+        wide = self.window(key).wider(self._grid_margin_m)
+        inside = {n: p.select(wide.contains(self._centres_m(p))) for n, p in after.items()}
+        blocks = np.unique(np.concatenate([part.rows.blocks for part in inside.values()]))
+        # Whether a surface crosses a voxel depends on what hit those that touch it.
+        changed, needed = _grown(blocks, 1), _grown(blocks, 2)
+        parts = self._occupancy(key, inside)
+        joined = join_occupancy(p.select(np.isin(p.rows.blocks, needed)) for p in parts)
+        anew = joined.voxels(self.resolution_m)
+        return join_voxels(
+            [
+                seen.select(~np.isin(pack_keys(seen.keys >> BLOCK_BITS), changed)),
+                anew.select(np.isin(pack_keys(anew.keys >> BLOCK_BITS), changed)),
+            ],
+            self.resolution_m,
+        )
+
+
+def join_clouds(clouds: Iterable[PointCloud], frame: Frame = "map") -> PointCloud:
+    """Concatenate clouds of one frame; attributes that one with points lacks are dropped."""
+    parts = [cloud for cloud in clouds if len(cloud)]
+    if not parts:
+        return PointCloud(np.zeros((0, 3), np.float32), frame=frame)
+    names = [field.name for field in fields(PointCloud) if field.name != "frame"]
+    columns = {name: [getattr(cloud, name) for cloud in parts] for name in names}
+    shared = {
+        name: np.concatenate(arrays)
+        for name, arrays in columns.items()
+        if all(array is not None for array in arrays)
+    }
+    return PointCloud(**shared, frame=frame)
+
+
+def join_voxels(parts: Iterable[OccupancyVoxels], resolution_m: float) -> OccupancyVoxels:
+    """Concatenate voxels of one resolution; none is in two parts."""
+    keys, log_odds = [np.zeros((0, 3), np.int32)], [np.zeros(0, np.float32)]
+    for part in parts:
+        keys.append(part.keys)
+        log_odds.append(part.log_odds)
+    return OccupancyVoxels(np.concatenate(keys), np.concatenate(log_odds), resolution_m)
+
+
+def _in_window(voxels: OccupancyVoxels, window: Window) -> OccupancyVoxels:
+    """The voxels with their centres in a window."""
+    low, high = (
+        np.ceil(np.array(xy) / voxels.resolution_m - 0.5) for xy in (window.low, window.high)
+    )
+    x, y = voxels.keys[:, 0], voxels.keys[:, 1]
+    inside: Bool = (x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1])
+    return voxels.select(inside)
+
+
+def _cloud_tree(cloud: PointCloud) -> dict[str, Any]:
+    """The arrays of a cloud by their names."""
+    arrays = {f.name: getattr(cloud, f.name) for f in fields(cloud) if f.name != "frame"}
+    return {name: array for name, array in arrays.items() if array is not None}
+
+
+def _voxel_tree(voxels: OccupancyVoxels) -> dict[str, Any]:
+    return {"keys": voxels.keys, "log_odds": voxels.log_odds}
+
+
+def _grown(blocks: NDArray[np.int64], by: int) -> NDArray[np.int64]:
+    """Packed blocks with those up to ``by`` blocks away from one on each axis."""
+    steps = np.array(list(product(range(-by, by + 1), repeat=3)))
+    around = unpack_keys(blocks)[:, None] + steps
+    return np.unique(pack_keys(around.reshape(-1, 3)))
+
+
+def _wider(extent: tuple[TileKey, TileKey], part: OccupancyPart) -> tuple[TileKey, TileKey]:
+    """An extent of cells that holds those of a part as well."""
+    columns = part.cells[:, :2]
+    if not len(columns):
+        return extent
+    low, high = columns.min(axis=0), columns.max(axis=0) + 1
+    if extent[0] != extent[1]:
+        low, high = np.minimum(low, extent[0]), np.maximum(high, extent[1])
+    return (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))

@@ -1,0 +1,114 @@
+"""`recon export` makes any product of a finished run again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recon.commands.config import PAIR_DEFAULTS, load_config
+from recon.commands.export import run_export
+from recon.commands.finished_run import settings_of
+from recon.commands.pair import run_pair
+from recon.core.errors import FormatError, SettingsError
+from recon.core.values import OCCUPIED, RectifiedCamera, StereoPair
+from recon.io.models.mesh import read_mesh
+from recon.io.models.ply import read_ply
+from recon.io.occupancy.nav2 import read_nav2
+from recon.sources.pair_input import PairInput
+from tests.hostile.refusals import assert_refused, run
+
+
+@pytest.fixture(scope="module")
+def pair_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of a pair that sees a plane of blurred noise."""
+    noise = np.random.default_rng(3).integers(0, 256, (120, 180)).astype(np.uint8)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 1.5)
+    world = np.asarray(cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX), np.uint8)
+    pair = StereoPair(world[:, :160], world[:, 12:172], name="left.png")
+    camera = RectifiedCamera(150.0, 80.0, 60.0, 80.0, 0.1, 160, 120)
+    out = tmp_path_factory.mktemp("pair") / "run"
+    config = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
+    run_pair(PairInput(pair, camera), config, out=out)
+    return out
+
+
+def test_all_products_come_in_one_go(small_demo: Path, tmp_path: Path) -> None:
+    config = settings_of(small_demo, None, ["mesh.depth=5", "mesh.min_component_faces=10"])
+    summary = run_export(small_demo, config, formats=("ply", "glb"), out=tmp_path / "out")
+    for name in ("map/cloud.ply", "map/grid.pgm", "map/grid.yaml", "map/octomap.bt"):
+        assert (tmp_path / "out" / name).read_bytes() == (small_demo / name).read_bytes()
+    assert len(read_mesh(tmp_path / "out/mesh/mesh.glb").faces) == summary["faces"] > 100
+    assert summary["points"] == len(read_ply(small_demo / "map/cloud.ply"))
+    assert {"voxels", "occupied_cells", "camera_height_m", "tiles", "frames"} <= set(summary)
+    record = json.loads((tmp_path / "out/run.json").read_text())
+    assert record["command"] == "export"
+    assert "map/octomap.ot" in record["files"]
+    np.testing.assert_array_equal(record["T_map_world"], summary["T_map_world"])
+
+
+def test_only_what_is_asked_for_is_made(small_demo: Path, tmp_path: Path) -> None:
+    higher = settings_of(small_demo, None, ["grid.min_height_m=2.2", "grid.max_height_m=6"])
+    run_export(small_demo, higher, products=["grid"], out=tmp_path / "out")
+    files = sorted(p.name for p in (tmp_path / "out").rglob("*") if p.is_file())
+    assert files == ["config.yaml", "grid.pgm", "grid.yaml", "run.json", "summary.json"]
+    low, high = (read_nav2(f / "map/grid.yaml") for f in (small_demo, tmp_path / "out"))
+    assert ((low.cells == OCCUPIED) & (high.cells != OCCUPIED)).sum() > 10
+
+
+def test_a_cloud_needs_no_rays(small_demo: Path, tmp_path: Path) -> None:
+    for name in ("run.json", "config.yaml", "map/cloud.ply"):
+        target = tmp_path / "run" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes((small_demo / name).read_bytes())
+    summary = run_export(tmp_path / "run", products=["cloud"], out=tmp_path / "out")
+    assert summary["points"] > 1000
+    with pytest.raises(FormatError, match=r"map\.recon: file does not exist"):
+        run_export(tmp_path / "run", products=["grid"], out=tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--to", "cloud,gird"], "--to: unknown product (got gird, expected cloud, grid, octomap"),
+        (["--to", "mesh", "--format", "step"], "unknown mesh format (got step"),
+        (["--to", "grid", "--set", "fusion.min_count=1"], "no effect here"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_one_line(
+    small_demo: Path, tmp_path: Path, options: list[str], told: str
+) -> None:
+    done = run("export", small_demo, *options, "--out", tmp_path / "out")
+    assert_refused(done, told)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_run_itself_is_never_replaced(small_demo: Path) -> None:
+    with pytest.raises(SettingsError, match="replace the run"):
+        run_export(small_demo, products=["cloud"], out=small_demo)
+
+
+def test_a_run_without_a_map_is_told(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text('{"command": "calibrate"}')
+    with pytest.raises(FormatError, match="made no map"):
+        run_export(tmp_path, out=tmp_path / "out")
+    with pytest.raises(FormatError, match="not contain a finished run"):
+        run_export(tmp_path / "nothing", out=tmp_path / "out")
+
+
+def test_a_pair_gives_its_cloud_and_mesh(pair_run: Path, tmp_path: Path) -> None:
+    config = settings_of(pair_run, None, ["mesh.max_depth=5"])
+    summary = run_export(pair_run, config, formats=("ply", "glb"), out=tmp_path / "out")
+    cloud = "clouds/cloud.ply"
+    assert (tmp_path / "out" / cloud).read_bytes() == (pair_run / cloud).read_bytes()
+    assert len(read_mesh(tmp_path / "out/mesh/mesh.glb").faces) == summary["faces"]
+    assert summary["mesh_coverage"] > 0.5
+
+
+def test_a_pair_has_no_grid(pair_run: Path, tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"a pair has no such product .*grid.*cloud, mesh"):
+        run_export(pair_run, load_config(), products=["grid"], out=tmp_path / "out")
