@@ -1,0 +1,56 @@
+"""The page that leads through the code names what is there, in the order that is enforced."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+LONGEST_WALK = 12
+
+
+@pytest.fixture(scope="module")
+def page(root: Path) -> str:
+    return (root / "docs" / "architecture.md").read_text()
+
+
+def section(page: str, title: str) -> str:
+    """What stands below a heading, up to the next."""
+    _, _, rest = page.partition(f"## {title}")
+    return rest.partition("\n## ")[0]
+
+
+def test_every_file_of_the_page_exists(page: str, root: Path) -> None:
+    named = re.findall(r"`(recon/[\w/]+(?:\.py|/))`", page)
+
+    assert len(named) > 20
+    assert [path for path in named if not (root / path).exists()] == []
+
+
+def test_a_pair_is_followed_through_at_most_twelve_files(page: str) -> None:
+    steps = re.findall(r"^\d+\. `recon/", section(page, "The walk of one pair"), re.MULTILINE)
+
+    assert 8 <= len(steps) <= LONGEST_WALK
+
+
+def test_the_rooms_are_those_whose_order_is_enforced(page: str, pyproject: dict[str, Any]) -> None:
+    rooms = re.findall(r"^\| `(\w+)/` \|", section(page, "Rooms"), re.MULTILINE)
+    contracts = pyproject["tool"]["importlinter"]["contracts"]
+    layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
+
+    assert ["__main__", *rooms] == layers
+
+
+def test_a_story_fits_on_a_screen_or_two(root: Path) -> None:
+    """The commands of the program; what several of them share stands beside them."""
+    stories = {path.stem for path in (root / "recon" / "cli").glob("*.py")}
+    lengths = {
+        path.name: len(path.read_text().splitlines())
+        for path in (root / "recon" / "commands").glob("*.py")
+        if path.stem in stories
+    }
+
+    assert lengths
+    assert {name: lines for name, lines in lengths.items() if lines > 150} == {}
