@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import weakref
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -52,6 +53,7 @@ class Store:
         self._lock = RLock()
         self.path = path
         self.cache = Cache(cache_bytes)
+        weakref.finalize(self, database.close)  # of who reads a map and does not close it
 
     @classmethod
     def create(cls, path: Path, *, cache_bytes: int = CACHE_BYTES) -> Self:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from recon.core.geometry.se3 import invert
-from recon.io.tree_file import read_tree, write_tree
+from recon.map import Store
 from recon.odometry import gate
 from recon.odometry.fused import FusedOdometry
 from recon.odometry.protocol import OdometryFrame, OdometryResult
@@ -89,9 +89,10 @@ def test_a_saved_odometry_goes_on_to_the_bit(
     unbroken = make_odometry(name)
     for frame in street[:6]:
         unbroken.register(frame)
-    write_tree(tmp_path / "state.zip", unbroken.state())
     saved = make_odometry(name)
-    saved.restore(read_tree(tmp_path / "state.zip"))
+    with Store.create(tmp_path / "map.recon") as store:
+        store.put("state", 0, unbroken.state())
+        saved.restore(store.read("state", 0))
     for frame in street[6:]:
         ours, theirs = saved.register(frame), unbroken.register(frame)
         np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
