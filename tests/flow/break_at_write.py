@@ -1,9 +1,9 @@
 """`recon` in a process that ends, is interrupted, or meets a full disk, at its n-th write.
 
 ``python break_at_write.py (kill|interrupt|full|count) N ARGUMENTS…``: a write is what makes a file
-appear whole under its name. ``kill`` ends the process by SIGKILL before it (even N) or after it
-(odd N), ``interrupt`` does what Ctrl-C does, ``full`` lets the disk be full from there on,
-``count`` prints how many writes there were.
+appear whole under its name, or a commit of the map. ``kill`` ends the process by SIGKILL before it
+(even N) or after it (odd N), ``interrupt`` does what Ctrl-C does, ``full`` lets the disk be full
+from there on, ``count`` prints how many writes there were.
 """
 
 from __future__ import annotations
@@ -12,16 +12,21 @@ import errno
 import os
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from recon.cli import main
+from recon.core.errors import OutputError
+from recon.map import Store
 
 MODE, LAST = sys.argv[1], int(sys.argv[2])
-_replace, _fsync = Path.replace, os.fsync
+_replace, _fsync, _commit = Path.replace, os.fsync, Store.commit
 _writes = 0
 
 
-def replace(self: Path, target: Path) -> Path:
+@contextmanager
+def write() -> Iterator[None]:
     global _writes  # noqa: PLW0603
     _writes += 1
     broken = MODE == "kill" and _writes == LAST
@@ -29,10 +34,21 @@ def replace(self: Path, target: Path) -> Path:
         os.kill(os.getpid(), signal.SIGKILL)
     if MODE == "interrupt" and _writes == LAST:
         os.kill(os.getpid(), signal.SIGINT)
-    moved = _replace(self, target)
+    yield
     if broken:
         os.kill(os.getpid(), signal.SIGKILL)
-    return moved
+
+
+def replace(self: Path, target: Path) -> Path:
+    with write():
+        return _replace(self, target)
+
+
+def commit(self: Store) -> None:
+    with write():
+        if MODE == "full" and _writes >= LAST:
+            raise OutputError("the disk is full", got=os.strerror(errno.ENOSPC))
+        _commit(self)
 
 
 def fsync(handle: int) -> None:
@@ -42,6 +58,7 @@ def fsync(handle: int) -> None:
 
 
 Path.replace, os.fsync = replace, fsync  # type: ignore[method-assign,assignment]
+Store.commit = commit  # type: ignore[method-assign]
 sys.argv = ["recon", *sys.argv[3:]]
 try:
     main()
