@@ -119,7 +119,7 @@ def test_a_frame_lost_by_one_camera_is_dropped_of_the_other(tmp_path: Path) -> N
     assert summary["skew_max_ms"] == pytest.approx(2)
     assert summary["gaps"] == 1
     drives.write_calib(tmp_path, SMALL_CAMERA)
-    stamps = [frame.timestamp_s for frame in open_source(tmp_path).pictures]  # type: ignore[attr-defined]
+    stamps = [frame.timestamp_s for frame in open_source(tmp_path).images]  # type: ignore[attr-defined]
     np.testing.assert_allclose(stamps, [t for t in times if round(10 * t) not in {3, 4}])
 
 
