@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import FormatError
 
+Bytes = bytes | memoryview
 _RAW: Final = "raw"
 _ZLIB: Final = "zlib"
 _ARRAY: Final = "array"
@@ -24,8 +25,8 @@ _MOST_INFLATED: Final = 1040
 """Deflate makes nothing more than 1032 times smaller."""
 
 
-def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, bytes]:
-    """A tree as JSON, and the bytes of its arrays, one after the other.
+def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, list[Bytes]]:
+    """A tree as JSON, and the bytes of its arrays, to be written one after the other.
 
     In the JSON, ``{"tree": …}`` is a mapping and ``{"array": …}`` an array: its dtype as numpy
     spells it, its shape, ``C`` or ``F`` for the axis that varies fastest (the last, the first),
@@ -39,7 +40,7 @@ def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, bytes]:
         TypeError: The tree holds something else than mappings with names, sequences, arrays of
             numbers, numbers, texts and None.
     """
-    content: list[bytes | memoryview] = []
+    content: list[Bytes] = []
     size = 0
 
     def plain(value: Any) -> Any:
@@ -57,7 +58,7 @@ def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, bytes]:
             return [plain(item) for item in value]
         return value
 
-    return json.dumps(plain(tree)), b"".join(content)
+    return json.dumps(plain(tree)), content
 
 
 def from_bytes(text: str, content: bytes) -> dict[str, Any]:

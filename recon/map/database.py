@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
 from recon.core.errors import FormatError, OutputError
+from recon.map.arrays import Bytes
 
 FORMAT: Final = 1
 """Number of the format; it grows with every change that older versions cannot read."""
@@ -47,6 +49,31 @@ def make_tables(database: sqlite3.Connection) -> None:
     database.execute(f"PRAGMA user_version = {FORMAT}")
     database.execute(_TABLE)
     database.execute("COMMIT")
+
+
+def insert_record(
+    database: sqlite3.Connection, head: tuple[str, str, str, int], content: Sequence[Bytes]
+) -> None:
+    """Insert a record, in place of one of the same kind and key.
+
+    Bound to a statement, bytes are copied twice, which for a submap is more memory than the submap
+    itself; so room is made for them, and they are written into it piece by piece.
+
+    Args:
+        database: The file.
+        head: Kind, key, tree and checksum.
+        content: The bytes of its arrays.
+    """
+    insert = "INSERT OR REPLACE INTO record VALUES (?, ?, ?, ?, {})"
+    if sys.version_info >= (3, 11):
+        size = sum(map(len, content))
+        row = database.execute(insert.format("zeroblob(?)"), (*head, size)).lastrowid
+        if size:
+            with database.blobopen("record", "content", row) as blob:
+                for piece in content:
+                    blob.write(piece)
+    else:
+        database.execute(insert.format("?"), (*head, b"".join(content)))
 
 
 def begin_to_write(database: sqlite3.Connection) -> None:

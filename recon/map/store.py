@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 import weakref
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import RLock
@@ -16,7 +16,7 @@ from typing_extensions import Self
 
 from recon.core.errors import FormatError
 from recon.io.files import reading
-from recon.map.arrays import from_bytes, to_bytes
+from recon.map.arrays import Bytes, from_bytes, to_bytes
 from recon.map.cache import Cache
 from recon.map.database import (
     begin_to_read,
@@ -25,6 +25,7 @@ from recon.map.database import (
     check_format,
     closed_on_error,
     connect,
+    insert_record,
     make_tables,
     writing,
 )
@@ -210,7 +211,7 @@ class Store:
         for key in self.keys(kind) if keys is None else keys:
             with self._reading():
                 text, _, content = self._row(kind, _name(key))
-            other._insert(kind, _name(key), text, content)
+            other._insert(kind, _name(key), text, [content])
 
     def commit(self) -> None:
         """Make everything so far permanent, all of it or, after an error, nothing.
@@ -255,13 +256,10 @@ class Store:
     ) -> None:
         self.close()
 
-    def _insert(self, kind: str, name: str, text: str, content: bytes) -> None:
-        checksum = _checksum(kind, name, text, content)
+    def _insert(self, kind: str, name: str, text: str, content: Sequence[Bytes]) -> None:
+        checksum = _checksum(kind, name, text, *content)
         with self._lock, writing(self.path):
-            self._database.execute(
-                "INSERT OR REPLACE INTO record VALUES (?, ?, ?, ?, ?)",
-                (kind, name, text, checksum, content),
-            )
+            insert_record(self._database, (kind, name, text, checksum), content)
             self.cache.drop((kind, _key(name)))
 
     def _row(self, kind: str, name: str) -> tuple[str, int, bytes]:
@@ -289,5 +287,8 @@ def _key(name: str) -> Key:
     return numbers if len(numbers) > 1 else numbers[0]
 
 
-def _checksum(kind: str, name: str, text: str, content: bytes) -> int:
-    return zlib.crc32(content, zlib.crc32(f"{kind} {name} {text}".encode()))
+def _checksum(kind: str, name: str, text: str, *content: Bytes) -> int:
+    checksum = zlib.crc32(f"{kind} {name} {text}".encode())
+    for piece in content:
+        checksum = zlib.crc32(piece, checksum)
+    return checksum

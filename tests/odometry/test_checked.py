@@ -65,7 +65,7 @@ def test_a_motion_without_a_deviation_needs_an_image_that_decides(blind: See) ->
     frames = [blind(100, index) for index in range(2)]
     health = last_health(frames, forward(0.0, 0.5), OdometryHealth())
     assert not health.ok
-    assert "can tell one motion from another" in health.notes[-1]
+    assert "can distinguish motions" in health.notes[-1]
 
 
 def test_what_was_not_measured_is_not_doubted_twice(half_a_metre: list[OdometryFrame]) -> None:
