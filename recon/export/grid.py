@@ -34,6 +34,8 @@ from recon.map.tile_parts import TileKey
 from recon.map.tiles import Tiles
 from recon.map.window import Window
 
+_MOST_CELLS: Final = 1_000_000_000
+"""A city of 6 by 6 km at 0.2 m; each is a byte of memory and of the file."""
 _MARGIN_M: Final = 5.0
 """Least distance from the path to the edge of the grid: a footprint must fit in at the start."""
 
@@ -87,7 +89,15 @@ class _Flattening:
     def grid(self) -> WrittenGrid:
         settings, driven = self._along_the_path()
         low, high = self._extent()
-        cells = np.full((high[1] - low[1], high[0] - low[0]), UNKNOWN, np.int8)
+        shape = (high[1] - low[1], high[0] - low[0])
+        if math.prod(shape) > _MOST_CELLS:
+            raise MappingError(
+                "the grid would be too large",
+                got=f"{shape[1]} x {shape[0]} cells",
+                expected=f"at most {_MOST_CELLS:g} cells",
+                hint="a pose or a point may be far off; or set a coarser occupancy.resolution_m",
+            )
+        cells = np.full(shape, UNKNOWN, np.int8)
         path = self._driven_path() if driven else None
         keys = [tile.key for tile in self._tiles]
         for key in dict.fromkeys((*keys, *self._crossed(_MARGIN_M))):

@@ -15,6 +15,7 @@ from recon.core.geometry.se3 import apply
 from recon.core.geometry.transform import transform_cloud
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, PointCloud
 from recon.export.cloud import CloudSample
+from recon.export.grid import export_grid
 from recon.export.products import write_products
 from recon.io.models.ply import read_ply, write_ply_tiles
 from recon.io.occupancy.nav2 import read_nav2
@@ -135,6 +136,16 @@ def test_an_empty_height_band_is_reported(mapped: MappedSequence, folder: RunDir
     config = load_config(None, [*SETTINGS, "grid.min_height_m=2", "grid.max_height_m=1"])
     with pytest.raises(MappingError, match="height band"):
         write_products(replace(mapped, config=config), folder, Stopwatch())
+
+
+def test_a_grid_that_a_far_pose_makes_too_large_is_refused(
+    mapped: MappedSequence, tmp_path: Path
+) -> None:
+    path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
+    path_m[-1] = (1e4, 1e4, 0.0)
+    with pytest.raises(MappingError, match="grid would be too large"):
+        export_grid(mapped.tiles, path_m, np.ones(len(path_m), bool), tmp_path / "grid")
+    assert list(tmp_path.iterdir()) == []
 
 
 def _random_cloud(seed: int, points: int) -> PointCloud:
