@@ -117,7 +117,7 @@ def test_mapping_warns_of_rows_first_and_takes_the_mended_file(
 ) -> None:
     path = drives.write_kitti(*spoiled(drive, pitch_deg=0.6), tmp_path / "drive")
     common = ("--no-mesh", "--json", "--set", "matching.matcher=opencv-bm")
-    done = recon("map", path, *common, "--out", tmp_path / "bad")
+    done = recon("map", path, *common, "--verbose", "--out", tmp_path / "bad")
     events = [json.loads(line) for line in done.stderr.splitlines() if line.startswith("{")]
     order = [event["event"] for event in events]
     assert order.index("source") < order.index("warning") < order.index("frame")
