@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
-
 from recon.core.errors import FormatError, SettingsError
 from recon.core.settings import Settings, merge
 from recon.evaluation.paper.settings import PaperConfig
@@ -201,11 +199,6 @@ def capture_overrides(size: str | None, rate_hz: float | None) -> list[str]:
         "rate_hz": rate_hz,
     }
     return [f"capture.{key}={value}" for key, value in given.items() if value is not None]
-
-
-def dump_config(config: Settings, command: str) -> str:
-    """The settings that determine the result of a command, as YAML; `load_config` restores them."""
-    return str(yaml.safe_dump(config.recorded(command), sort_keys=False))
 
 
 def _recorded(settings: Settings, usual: Sequence[Settings]) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final, Protocol, runtime_checkable
 
@@ -69,27 +68,6 @@ class KeyframeStore(Protocol):
     def get(self, frame: int) -> StoredKeyframe:
         """Return the keyframe of a frame, as it was put."""
         ...
-
-
-class KeyframeMemory:
-    """Keeps keyframes in memory, for short drives."""
-
-    def __init__(self) -> None:
-        self._kept: dict[int, StoredKeyframe] = {}
-
-    def __len__(self) -> int:
-        return len(self._kept)
-
-    def __iter__(self) -> Iterator[StoredKeyframe]:
-        return iter(self._kept.values())
-
-    def put(self, stored: StoredKeyframe) -> None:
-        """Keep a keyframe."""
-        self._kept[stored.keyframe.frame] = stored
-
-    def get(self, frame: int) -> StoredKeyframe:
-        """Return the keyframe of a frame."""
-        return self._kept[frame]
 
 
 class LoopDetector:

@@ -64,15 +64,6 @@ class RunDirectory:
         self._made: list[Path] = []
         self._lock: int | None = None
 
-    @classmethod
-    def for_command(cls, command: str, out: Path | None, *, resume: bool = False) -> Self:
-        """Return the requested folder, or a new one under ``outputs/``."""
-        if out is None:
-            return cls(default_folder(command), latest=True)
-        # A run in a default folder keeps its link when it is resumed.
-        stamped = out.parent.resolve() == default_folder(command).parent.resolve()
-        return cls(out, latest=resume and stamped, resume=resume)
-
     def path(self, name: str) -> Path:
         """Return the path to write the file ``name`` to; its parent folder is created."""
         target = self._partial / name

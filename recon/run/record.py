@@ -1,16 +1,12 @@
-"""The record of a run: versions, inputs and their hashes, command, timings."""
+"""Hashes of what a run has read, for its record."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Mapping
-from datetime import datetime, timezone
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
-
-from recon.run.directory import RECORD, RunDirectory
-from recon.run.machine import versions
 
 _PIECE_BYTES: Final = 1 << 20
 
@@ -30,15 +26,3 @@ def fingerprint(files: Iterable[Path]) -> dict[str, Any]:
                 digest.update(piece)
         count, size = count + 1, size + length
     return {"files": count, "bytes": size, "sha256": digest.hexdigest()}
-
-
-def write_record(run: RunDirectory, command: str, content: Mapping[str, Any]) -> None:
-    """Write ``run.json``, last, since it lists all other files of the run."""
-    record = {
-        "command": command,
-        "finished_utc": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "versions": versions(),
-        **content,
-        "files": [*run.files(), RECORD],
-    }
-    run.write_json(RECORD, record)

@@ -6,9 +6,6 @@ import math
 from dataclasses import asdict, is_dataclass
 from typing import Any
 
-from recon.run.machine import peak_memory_mb
-from recon.run.stopwatch import Stopwatch
-
 
 def plain(value: Any) -> Any:
     """Convert a value for JSON: dataclasses to mappings, NaN and infinity to None."""
@@ -21,12 +18,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value
-
-
-def cost(stopwatch: Stopwatch, total_seconds: float) -> dict[str, Any]:
-    """Return cost of a run: total seconds, seconds per stage (stages overlap), and peak memory."""
-    return {
-        "seconds": round(total_seconds, 3),
-        "stages": {name: round(value, 3) for name, value in stopwatch.seconds.items()},
-        "peak_memory_mb": round(peak_memory_mb(), 1),
-    }

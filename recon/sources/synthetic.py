@@ -6,8 +6,6 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 from recon.core.values import (
     DisparityTruth,
     OccupancyTruth,
@@ -21,8 +19,6 @@ from recon.street.render import StreetCamera, SyntheticFrame
 from recon.street.settings import StreetSettings
 from recon.street.street import StreetWorld, build_street
 from recon.street.truth import true_occupancy, true_surface
-
-_BT601 = np.array([0.299, 0.587, 0.114])
 
 
 class SyntheticSource:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from recon.core.geometry import se3
 from recon.core.values import Disparity, Reason, RectifiedPair, Trajectory
-from recon.places.detector import KeyframeMemory, LoopDetector
+from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.drift import path_lengths
 from recon.places.keyframe import Keyframe, make_keyframe
 from recon.places.settings import DriftSettings
@@ -25,6 +26,27 @@ LAP = 168
 """Frames of a lap: frame 168 stands where frame 0 stood."""
 PERIOD = 40
 """Frames after which the repeated street looks the same."""
+
+
+class KeyframeMemory:
+    """Keeps keyframes in memory, for short drives."""
+
+    def __init__(self) -> None:
+        self._kept: dict[int, StoredKeyframe] = {}
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __iter__(self) -> Iterator[StoredKeyframe]:
+        return iter(self._kept.values())
+
+    def put(self, stored: StoredKeyframe) -> None:
+        """Keep a keyframe."""
+        self._kept[stored.keyframe.frame] = stored
+
+    def get(self, frame: int) -> StoredKeyframe:
+        """Return the keyframe of a frame."""
+        return self._kept[frame]
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from recon.core.geometry import se3
-from recon.places.detector import KeyframeMemory, LoopDetector
+from recon.places.detector import LoopDetector
 from recon.places.settings import DriftSettings
-from tests.places.conftest import LAP, PERIOD, drifted
+from tests.places.conftest import LAP, PERIOD, KeyframeMemory, drifted
 
 FIRST = range(7)
 AGAIN = range(LAP, LAP + 7)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from recon.core.errors import OutputError
+from recon.run import Run
 from recon.run.directory import RunDirectory
 
 
@@ -103,7 +104,7 @@ def test_default_folder_gets_a_link_to_the_latest_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
-        with RunDirectory.for_command("map", None) as run:
+        with Run("map") as run:
             run.write_json("run.json", {"files": []})
     stamps = sorted(p for p in (tmp_path / "outputs" / "map").iterdir() if not p.is_symlink())
     assert len(stamps) == 2

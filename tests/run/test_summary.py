@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from recon.odometry import OdometryHealth
 from recon.odometry.health import health_warnings
-from recon.run.stopwatch import Stopwatch
-from recon.run.summary import cost, plain
+from recon.run import Run
+from recon.run.summary import plain
 
 
 @dataclass(frozen=True)
@@ -44,14 +47,15 @@ def test_a_healthy_drive_has_no_warning() -> None:
     assert health_warnings([OdometryHealth()] * 3) == []
 
 
-def test_cost_sums_the_parts_of_a_stage() -> None:
-    watch = Stopwatch()
-    for _ in range(2):
-        with watch.stage("match"):
-            pass
-    figures = cost(watch, 1.5)
-    assert figures["seconds"] == 1.5
+def test_cost_sums_the_parts_of_a_stage(tmp_path: Path) -> None:
+    figures: dict[str, Any] = {}
+    with Run("map", tmp_path / "run") as run:
+        for _ in range(2):
+            with run.stage("match"):
+                time.sleep(0.01)
+        run.finish(figures, source="", inputs=[])
     assert list(figures["stages"]) == ["match"]
+    assert figures["seconds"] >= figures["stages"]["match"] >= 0.02
     assert 10 < figures["peak_memory_mb"] < 100_000
 
 
