@@ -17,15 +17,14 @@ from recon.core.values.arrays import Float64, freeze
 from recon.io.files import read_text, reader, reading
 from recon.map.axes import check_rigid
 from recon.run.directory import RECORD
+from recon.run.run import CONFIG, SUMMARY
 
 RECORD_BYTES: Final = 1 << 26
 """Larger than any record: it lists the files of a run."""
-CONFIG: Final = "config.yaml"
 GRID: Final = "map/grid.yaml"
 OCTOMAP: Final = "map/octomap.ot"
 CLOUD: Final = "map/cloud.ply"
 PAIR_CLOUD: Final = "clouds/cloud.ply"
-SUMMARY: Final = "summary.json"
 MAPPED_BY: Final = "mapped_by"
 """Record key of a run made from another run: the command that mapped the drive."""
 UNTRUSTED: Final = "untrusted_frames"

@@ -5,9 +5,8 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
-import os
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from recon.map.workspace import ANEW, resuming, session_info
 from recon.run.directory import RECORD, STARTED, RunDirectory, state_folder
 from recon.run.machine import versions
 from recon.run.memory import memory_overrides
+from recon.run.record import fingerprint
 from recon.sources import StereoSource, open_source
 
 _OTHER: Final = {
@@ -153,26 +153,11 @@ def identity_of(
     """Everything that must be unchanged for a resumed run to give the same result."""
     return {
         "config": config.model_dump(mode="json"),
-        "source": {"frames": len(source), **_quick_fingerprint(source.files)},
+        "source": {"frames": len(source), **fingerprint(source.files, head_bytes=_HEAD_BYTES)},
         "poses": _digest(known_poses),
         "prior": _digest(prior),
         "versions": versions(),
     }
-
-
-def _quick_fingerprint(files: Iterable[Path]) -> dict[str, Any]:
-    """Number, total size, and a hash of names and first bytes of files, to tell sources apart.
-
-    Hashing whole files, as at the end of a run, would delay the start of a large drive.
-    """
-    digest, count, size = hashlib.sha256(), 0, 0
-    for path in files:
-        length = path.stat().st_size
-        digest.update(os.fsencode(path.name) + b"\0" + length.to_bytes(8, "little"))
-        with path.open("rb") as content:
-            digest.update(content.read(_HEAD_BYTES))
-        count, size = count + 1, size + length
-    return {"files": count, "bytes": size, "sha256": digest.hexdigest()}
 
 
 def _digest(path: Trajectory | None) -> str | None:
