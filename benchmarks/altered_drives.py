@@ -27,7 +27,7 @@ from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
 from recon.evaluation import evaluate_trajectory
-from recon.map.sequence import map_sequence
+from recon.map.drive.sequence import map_sequence
 from recon.sources import StereoSource, open_source
 
 NOISE_DN = 4.0

@@ -29,15 +29,12 @@ from recon.core.geometry.transform import transform_cloud
 from recon.core.values import OCCUPIED, OccupancyGrid, PointCloud, StereoPair, Trajectory
 from recon.core.values.arrays import Float64
 from recon.evaluation import evaluate_map
-from recon.map import (
-    add_floors,
-    estimate_ground_surface,
-    find_floors,
-    flatten,
-    fusion_range_m,
-)
-from recon.map.sequence import MappedSequence, map_sequence
-from recon.map.workspace import Workspace
+from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.map.drive.workspace import Workspace
+from recon.map.fusion.builder import fusion_range_m
+from recon.map.ground.floor import add_floors, find_floors
+from recon.map.ground.grid import flatten
+from recon.map.ground.surface import estimate_ground_surface
 from recon.odometry import Odometry, OdometryFrame, OdometryResult, make_odometry
 from recon.report.paths import grid_figure, loops_figure
 from recon.sources.synthetic import SyntheticSource
@@ -185,7 +182,7 @@ def mapped_with(
 
     work = Workspace()
     start = time.perf_counter()
-    with patch("recon.map.sequence.make_odometry", drifting):
+    with patch("recon.map.drive.sequence.make_odometry", drifting):
         mapped = map_sequence(source, config, workspace=work)
     seconds = {n: s for n, s in work.stopwatch.seconds.items() if "loops" in n}
     return mapped, seconds | {"all": time.perf_counter() - start}

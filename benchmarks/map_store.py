@@ -26,7 +26,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from recon.map import Store
+from recon.map.store.records import Store
 
 COMMITS = 10
 READS = 30

@@ -59,8 +59,8 @@ if TYPE_CHECKING:
     from recon.io.models.mesh import read_mesh, write_mesh
     from recon.io.models.ply import read_ply, write_ply
     from recon.io.trajectory import read_trajectory
-    from recon.map.persistent import Map
-    from recon.map.sequence import MappedSequence, map_sequence
+    from recon.map.drive.sequence import MappedSequence, map_sequence
+    from recon.map.store.map import Map
     from recon.rig.audit import Audit
     from recon.sources import SourceSettings, StereoSource, open_source
     from recon.sources.pair_input import PairInput
@@ -97,8 +97,8 @@ _HOMES = {
     "recon.commands.occupancy": ("run_occupancy",),
     "recon.commands.pair": ("run_disparity", "run_pair"),
     "recon.sources.pair_input": ("PairInput",),
-    "recon.map.persistent": ("Map",),
-    "recon.map.sequence": ("MappedSequence", "map_sequence"),
+    "recon.map.store.map": ("Map",),
+    "recon.map.drive.sequence": ("MappedSequence", "map_sequence"),
     "recon.sources": ("SourceSettings", "StereoSource", "open_source"),
     "recon.sources.synthetic": ("SyntheticSource",),
     "recon.core.values": (

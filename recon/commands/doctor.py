@@ -22,7 +22,7 @@ from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.kernels.cache import when_compiling
 from recon.core.values import StereoPair
 from recon.io.occupancy.octomap_leaves import octomap_pieces
-from recon.map.sequence import MappedSequence, map_sequence
+from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.run.installation import (
     PACKAGES,
     SYSTEM_LIBRARIES,

@@ -14,9 +14,9 @@ from recon.core.geometry.se3 import apply
 from recon.core.values.arrays import Bool, Float64
 from recon.io.models.ply import read_ply_pieces
 from recon.io.occupancy.octomap_leaves import octomap_pieces
-from recon.map.finished import with_occupancy
-from recon.map.persistent import MAP_FILE, Map
-from recon.map.session import Session
+from recon.map.store.finished import with_occupancy
+from recon.map.store.map import MAP_FILE, Map
+from recon.map.store.session import Session
 from recon.map.tiles import Tiles
 
 

@@ -15,7 +15,7 @@ from recon.core.errors import FormatError, SettingsError
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64, freeze
 from recon.io.files import read_text, reader, reading
-from recon.map.axes import check_rigid
+from recon.map.ground.axes import check_rigid
 from recon.run.directory import RECORD
 from recon.run.run import CONFIG, SUMMARY
 

@@ -11,12 +11,12 @@ from recon.commands.resume import begin_or_resume, identity_of, tell_how_to_resu
 from recon.evaluation.drive import compare_with_truth
 from recon.export.paths import export_paths
 from recon.export.products import Products, write_products
-from recon.map.empty import check_map
-from recon.map.finished import keep_map
-from recon.map.map_run import MapRun
-from recon.map.persistent import MAP_FILE
-from recon.map.sequence import MappedSequence, map_sequence
-from recon.map.workspace import Workspace
+from recon.map.drive.empty import check_map
+from recon.map.drive.map_run import MapRun
+from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.map.drive.workspace import Workspace
+from recon.map.store.finished import keep_map
+from recon.map.store.map import MAP_FILE
 from recon.odometry.health import health_warnings
 from recon.report.map_page import write_map_page
 from recon.rig.audit.audit import quick_warnings

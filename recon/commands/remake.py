@@ -27,7 +27,7 @@ from recon.io.files import reading
 from recon.io.models.mesh import read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.io.models.ply import read_ply, write_ply
-from recon.map import base_axes
+from recon.map.ground.axes import base_axes
 from recon.run.run import Run
 
 _LAYER = "mesh/cloud.ply"

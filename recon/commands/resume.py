@@ -21,8 +21,8 @@ from recon.core.errors import (
     SettingsError,
 )
 from recon.core.values import Trajectory
-from recon.map.persistent import Map
-from recon.map.workspace import ANEW, resuming, session_info
+from recon.map.drive.workspace import ANEW, resuming, session_info
+from recon.map.store.map import Map
 from recon.run.directory import RECORD, STARTED, RunDirectory, state_folder
 from recon.run.machine import versions
 from recon.run.memory import memory_overrides

@@ -17,7 +17,7 @@ from recon.core.values import (
 from recon.evaluation.map import evaluate_map
 from recon.evaluation.occupancy_truth import compare_with_source
 from recon.evaluation.trajectory import evaluate_trajectory
-from recon.map.sequence import MappedSequence
+from recon.map.drive.sequence import MappedSequence
 from recon.sources import StereoSource
 
 SURFACE_THRESHOLD_M: Final = 0.2

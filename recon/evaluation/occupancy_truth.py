@@ -8,8 +8,8 @@ from recon.core.errors import EvaluationError
 from recon.core.values import OccupancyGrid, OccupancyMetrics, OccupancyTruth, OccupancyVoxels
 from recon.core.values.arrays import Float64
 from recon.evaluation import evaluate_occupancy
-from recon.map import drop_undecided
-from recon.map.sequence import MappedSequence
+from recon.map.drive.sequence import MappedSequence
+from recon.map.ground.grid import drop_undecided
 from recon.map.settings import DriveSettings
 from recon.sources import KnowsOccupancy, StereoSource
 

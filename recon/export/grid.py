@@ -15,22 +15,19 @@ from recon.core.errors import MappingError
 from recon.core.values import UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Bool, Float64
 from recon.io.occupancy.nav2 import write_nav2
-from recon.map import (
-    DrivenPath,
+from recon.map.ground.driven import DrivenPath, is_driven, sweep
+from recon.map.ground.floor import add_floors
+from recon.map.ground.grid import flatten
+from recon.map.ground.surface import (
     GroundSettings,
     GroundSurface,
-    add_floors,
     estimate_ground_surface,
-    flatten,
-    free_part,
-    is_driven,
     measure_camera_height,
-    sweep,
 )
-from recon.map.log_odds import log_odds
-from recon.map.occupancy import MIN_PROBABILITY
-from recon.map.occupancy_part import OccupancyPart
-from recon.map.tile_parts import TileKey
+from recon.map.occupancy.builder import MIN_PROBABILITY
+from recon.map.occupancy.log_odds import log_odds
+from recon.map.occupancy.part import OccupancyPart, free_part
+from recon.map.store.tile_parts import TileKey
 from recon.map.tiles import Tiles
 from recon.map.window import Window
 

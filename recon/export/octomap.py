@@ -6,7 +6,7 @@ from pathlib import Path
 
 from recon.core.errors import MappingError
 from recon.io.occupancy.octomap import write_octomap_tiles
-from recon.map import drop_undecided
+from recon.map.ground.grid import drop_undecided
 from recon.map.tiles import Tiles
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from recon.core.geometry.se3 import invert
 from recon.io.trajectory import write_kitti_poses, write_tum
-from recon.map.axes import base_axes
-from recon.map.sequence import MappedSequence
+from recon.map.drive.sequence import MappedSequence
+from recon.map.ground.axes import base_axes
 from recon.run.directory import RunDirectory
 
 

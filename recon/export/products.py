@@ -14,7 +14,7 @@ from recon.export.grid import export_grid
 from recon.export.mesh import MeshSettings
 from recon.export.mesh.pieces import WrittenMesh, export_mesh
 from recon.export.octomap import export_octomap
-from recon.map.sequence import MappedSequence
+from recon.map.drive.sequence import MappedSequence
 from recon.run.directory import RunDirectory
 from recon.run.progress import SILENT, Progress
 from recon.run.stopwatch import Stopwatch

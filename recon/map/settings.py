@@ -5,11 +5,11 @@ from __future__ import annotations
 from pydantic import Field
 
 from recon.core.settings import Settings
-from recon.map.axes import AxesSettings
-from recon.map.fused import FusionSettings
-from recon.map.grid import GridSettings
-from recon.map.ground import GroundSettings
-from recon.map.occupancy import OccupancySettings
+from recon.map.fusion.builder import FusionSettings
+from recon.map.ground.axes import AxesSettings
+from recon.map.ground.grid import GridSettings
+from recon.map.ground.surface import GroundSettings
+from recon.map.occupancy.builder import OccupancySettings
 from recon.map.submaps import SubmapSettings
 from recon.odometry import OdometrySettings
 from recon.places import LoopSettings

@@ -17,10 +17,10 @@ from recon.core.geometry.se3 import invert
 from recon.core.settings import Settings
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
-from recon.map.fused import FusionSettings, MapBuilder
-from recon.map.fused_part import FusedPart
-from recon.map.occupancy import OccupancyBuilder, OccupancySettings
-from recon.map.occupancy_part import OccupancyPart
+from recon.map.fusion.builder import FusionSettings, MapBuilder
+from recon.map.fusion.part import FusedPart
+from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
+from recon.map.occupancy.part import OccupancyPart
 
 _MAX_FRAMES: Final = 100
 """Frames after which a new submap begins at the latest, however slow the drive."""

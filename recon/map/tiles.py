@@ -24,14 +24,14 @@ from recon.core.geometry.transform import transform_cloud
 from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.values import Frame, OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64
-from recon.map.floor import find_floors
-from recon.map.fused_part import KNOWABLE, FusedPart, join_fused
-from recon.map.grid import JOINED_CELLS
+from recon.map.fusion.part import KNOWABLE, FusedPart, join_fused
+from recon.map.ground.floor import find_floors
+from recon.map.ground.grid import JOINED_CELLS
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
-from recon.map.occupancy_part import OccupancyPart, join_occupancy
+from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.settings import DriveSettings
+from recon.map.store.tile_parts import TileKey, TileParts
 from recon.map.submaps import Submap, SubmapMotion
-from recon.map.tile_parts import TileKey, TileParts
 from recon.map.window import Window
 from recon.stereo.cloud import filter_cloud
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from recon.core.geometry.se3 import apply
-from recon.map.map_run import MapRun
+from recon.map.drive.map_run import MapRun
 from recon.report.images import stereo_figures
 from recon.report.page import write_page
 from recon.report.paths import drift_figure, grid_figure, health_figure, loops_figure, path_figure

@@ -18,7 +18,7 @@ from recon.core.values import (
     RectifiedCamera,
 )
 from recon.evaluation import evaluate_occupancy
-from recon.map.axes import AXES_MAP_WORLD
+from recon.map.ground.axes import AXES_MAP_WORLD
 
 EDGE_M = 0.2
 # Half as wide as far: sees 10 m to each side at 20 m.

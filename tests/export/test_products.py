@@ -20,14 +20,10 @@ from recon.export.products import write_products
 from recon.io.models.ply import read_ply, write_ply_tiles
 from recon.io.occupancy.nav2 import read_nav2
 from recon.io.occupancy.octomap import write_octomap
-from recon.map import (
-    add_floors,
-    drop_undecided,
-    estimate_ground_surface,
-    find_floors,
-    flatten,
-)
-from recon.map.sequence import MappedSequence, map_sequence
+from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.map.ground.floor import add_floors, find_floors
+from recon.map.ground.grid import drop_undecided, flatten
+from recon.map.ground.surface import estimate_ground_surface
 from recon.run.directory import RunDirectory
 from recon.run.stopwatch import Stopwatch
 from recon.sources.synthetic import SyntheticSource

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from recon.cli import main
 from recon.core.errors import OutputError
-from recon.map import Store
+from recon.map.store.records import Store
 
 MODE, LAST = sys.argv[1], int(sys.argv[2])
 _replace, _fsync, _commit = Path.replace, os.fsync, Store.commit

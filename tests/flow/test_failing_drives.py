@@ -21,7 +21,7 @@ from recon.commands.map_options import MapOptions
 from recon.core.errors import CalibrationError, MappingError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import RectifiedCamera, RectifiedPair, Trajectory
-from recon.map.map_run import MapRun
+from recon.map.drive.map_run import MapRun
 from recon.odometry import OdometryFrame, OdometryResult, make_odometry
 from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource

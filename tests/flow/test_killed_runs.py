@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from recon.core.errors import FormatError
-from recon.map.persistent import Map
+from recon.map.store.map import Map
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetSettings
 from tests.scenery.kitti import write_kitti

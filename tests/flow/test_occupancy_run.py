@@ -18,7 +18,7 @@ from recon.core.errors import FormatError, OutputError, ReconError, SettingsErro
 from recon.core.values import OCCUPIED
 from recon.io.occupancy.nav2 import read_nav2
 from recon.io.occupancy.octomap import read_octomap
-from recon.map import Store
+from recon.map.store.records import Store
 from recon.stereo import frame
 from tests.hostile.refusals import assert_refused, run
 

@@ -14,10 +14,10 @@ from recon.commands.config import ReconConfig, load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
-from recon.map import Store
-from recon.map.frame_result import FrameResult
-from recon.map.map_run import MapRun
-from recon.map.persistent import Map
+from recon.map.drive.frame_result import FrameResult
+from recon.map.drive.map_run import MapRun
+from recon.map.store.map import Map
+from recon.map.store.records import Store
 from recon.run.progress import SILENT, Silent
 from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource

@@ -36,9 +36,10 @@ from recon.io.occupancy.nav2 import read_nav2, write_nav2
 from recon.io.occupancy.octomap import read_octomap, write_octomap
 from recon.io.trajectory import read_trajectory
 from recon.io.yaml_file import read_yaml
-from recon.map import OccupancySettings, ray_grain
-from recon.map.persistent import Map
-from recon.map.session import SessionInfo
+from recon.map.occupancy.builder import OccupancySettings
+from recon.map.occupancy.rays import ray_grain
+from recon.map.store.map import Map
+from recon.map.store.session import SessionInfo
 from recon.odometry import OdometryHealth
 from recon.sources import open_source
 from recon.sources.times import read_dates, read_stamped_names

@@ -10,7 +10,7 @@ from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.commands.resume import MapRequest
-from recon.map.frame_result import FrameResult
+from recon.map.drive.frame_result import FrameResult
 from recon.run.progress import Silent
 from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource

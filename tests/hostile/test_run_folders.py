@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import pytest
 
-from recon.map import Store
+from recon.map.store.records import Store
 from recon.run.directory import STARTED
 from tests.hostile.calibrations import deep
 from tests.hostile.refusals import assert_refused, run

@@ -9,7 +9,7 @@ import pytest
 
 from recon.core.geometry.se3 import apply, exp_so3
 from recon.core.values import PointCloud
-from recon.map.axes import AxesSettings, GroundPlane, estimate_ground, map_axes
+from recon.map.ground.axes import AxesSettings, GroundPlane, estimate_ground, map_axes
 
 SETTINGS = AxesSettings()
 

@@ -21,11 +21,11 @@ from recon.core.values import (
     RectifiedPair,
     Trajectory,
 )
-from recon.map import drive_loops
-from recon.map.drive_loops import DriveLoops, LoopWatch
-from recon.map.keyframes import Keyframes
-from recon.map.store import Store
-from recon.map.submap_records import SubmapEntry
+from recon.map.drive import drive_loops
+from recon.map.drive.drive_loops import DriveLoops, LoopWatch
+from recon.map.store.keyframes import Keyframes
+from recon.map.store.records import Store
+from recon.map.store.submaps import SubmapEntry
 from recon.places import LoopSettings
 from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
 from recon.places.graph import close_loops

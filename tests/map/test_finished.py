@@ -11,13 +11,13 @@ from recon.commands.config import load_config
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import PointCloud, RectifiedCamera
-from recon.map.axes import AXES_MAP_WORLD
-from recon.map.finished import keep_map, with_occupancy
-from recon.map.fused_part import FusedPart, join_fused
-from recon.map.occupancy_part import join_occupancy
-from recon.map.persistent import Map
-from recon.map.rays import ray_grain, thin_rays
-from recon.map.session import Session, SessionInfo
+from recon.map.fusion.part import FusedPart, join_fused
+from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.occupancy.part import join_occupancy
+from recon.map.occupancy.rays import ray_grain, thin_rays
+from recon.map.store.finished import keep_map, with_occupancy
+from recon.map.store.map import Map
+from recon.map.store.session import Session, SessionInfo
 from recon.map.submaps import SubmapBuilder
 from recon.odometry import OdometryHealth
 

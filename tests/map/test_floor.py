@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from recon.core.values import OccupancyVoxels, PointCloud
-from recon.map import ground
-from recon.map.floor import add_floors, find_floors
-from recon.map.ground import GroundSettings, estimate_ground_surface
+from recon.map.ground import surface as ground
+from recon.map.ground.floor import add_floors, find_floors
+from recon.map.ground.surface import GroundSettings, estimate_ground_surface
 
 EDGE_M = 0.2
 SETTINGS = GroundSettings()

@@ -8,7 +8,7 @@ import pytest
 from recon.core.errors import MappingError
 from recon.core.geometry.triangulation import depth_sigma
 from recon.core.values import PointCloud, RectifiedCamera
-from recon.map.fused import FusionSettings, MapBuilder, fusion_range_m
+from recon.map.fusion.builder import FusionSettings, MapBuilder, fusion_range_m
 
 
 def _cloud(xyz: np.ndarray, **fields: np.ndarray) -> PointCloud:

@@ -9,8 +9,8 @@ import pytest
 
 from recon.core.errors import MappingError
 from recon.core.values import PointCloud
-from recon.map import ground as ground_file
-from recon.map.ground import GroundSettings, GroundSurface, estimate_ground_surface
+from recon.map.ground import surface as ground_file
+from recon.map.ground.surface import GroundSettings, GroundSurface, estimate_ground_surface
 
 CAMERA_M = 1.6
 PATH = np.stack([np.arange(0, 60, 1.0), np.zeros(60), np.zeros(60)], axis=1)

@@ -7,9 +7,9 @@ import pytest
 
 from recon.core.errors import MappingError
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
-from recon.map import grid as grid_file
-from recon.map.grid import GridSettings, drop_undecided, flatten
-from recon.map.ground import GroundSurface
+from recon.map.ground import grid as grid_file
+from recon.map.ground.grid import GridSettings, drop_undecided, flatten
+from recon.map.ground.surface import GroundSurface
 
 SLOPE = 0.1
 

@@ -10,11 +10,11 @@ import pytest
 
 from recon.core.geometry.se3 import apply
 from recon.core.values import FREE, OCCUPIED, PointCloud
-from recon.map.axes import AxesSettings, estimate_ground, map_axes
-from recon.map.fused import FusionSettings, MapBuilder
-from recon.map.grid import GridSettings, flatten
-from recon.map.ground import GroundSettings, estimate_ground_surface
-from recon.map.occupancy import OccupancyBuilder, OccupancySettings
+from recon.map.fusion.builder import FusionSettings, MapBuilder
+from recon.map.ground.axes import AxesSettings, estimate_ground, map_axes
+from recon.map.ground.grid import GridSettings, flatten
+from recon.map.ground.surface import GroundSettings, estimate_ground_surface
+from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
 
 FRAMES = range(0, 36, 2)
 

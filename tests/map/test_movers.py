@@ -6,15 +6,11 @@ import numpy as np
 
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import FREE, OCCUPIED, OccupancyGrid, PointCloud
-from recon.map import (
-    GridSettings,
-    GroundSurface,
-    OccupancyBuilder,
-    OccupancySettings,
-    flatten,
-    thin_rays,
-)
-from recon.map.axes import AXES_MAP_WORLD
+from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.ground.grid import GridSettings, flatten
+from recon.map.ground.surface import GroundSurface
+from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
+from recon.map.occupancy.rays import thin_rays
 
 HEIGHT_M, WALL_M = 1.6, 20.0
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))

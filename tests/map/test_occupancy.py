@@ -11,9 +11,9 @@ import pytest
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import OccupancyVoxels, PointCloud
-from recon.map import occupancy
-from recon.map.axes import AXES_MAP_WORLD
-from recon.map.occupancy import OccupancyBuilder, OccupancySettings
+from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.occupancy import builder as occupancy
+from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
 
 Cell = tuple[int, int, int]
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))

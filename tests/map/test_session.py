@@ -9,8 +9,8 @@ import pytest
 
 from recon.core.errors import FormatError, ShapeError
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera
-from recon.map.persistent import Map
-from recon.map.session import Session, SessionInfo
+from recon.map.store.map import Map
+from recon.map.store.session import Session, SessionInfo
 from recon.odometry import OdometryHealth
 
 GRAIN = RayGrain(0.1, 0.1 / 64, 25.0)

@@ -18,8 +18,8 @@ from hypothesis import given, settings
 from hypothesis.extra import numpy as some
 
 from recon.core.errors import FormatError, OutputError, ReconError
-from recon.map import Store
-from recon.map.cache import Cache
+from recon.map.store.cache import Cache
+from recon.map.store.records import Store
 
 KINDS = ("rays", "submap")
 TYPES = ("<f4", "<f8", "<i2", "<i8", "u1", "?", "<f2", ">f4")
@@ -203,7 +203,7 @@ _WRITER = """
 import sys
 import numpy as np
 from pathlib import Path
-from recon.map import Store
+from recon.map.store.records import Store
 store = Store.create(Path(sys.argv[1]))
 for number in range(10_000):
     store.put("rays", number, {"values": np.full(20_000, number)})
@@ -234,7 +234,7 @@ import resource, sys
 import numpy as np
 from pathlib import Path
 from recon.core.errors import OutputError
-from recon.map import Store
+from recon.map.store.records import Store
 store = Store.create(Path(sys.argv[1]))
 store.put("rays", 0, {"values": np.arange(50_000)})
 store.commit()

@@ -9,20 +9,13 @@ import pytest
 
 from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.values import PointCloud
-from recon.map import (
-    FusionSettings,
-    MapBuilder,
-    OccupancyBuilder,
-    OccupancySettings,
-    Submap,
-    SubmapBuilder,
-    SubmapMotion,
-    SubmapSettings,
-)
 from recon.map import submaps as submaps_file
-from recon.map.axes import AXES_MAP_WORLD
-from recon.map.fused_part import join_fused
-from recon.map.occupancy_part import OccupancyPart, join_occupancy
+from recon.map.fusion.builder import FusionSettings, MapBuilder
+from recon.map.fusion.part import join_fused
+from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
+from recon.map.occupancy.part import OccupancyPart, join_occupancy
+from recon.map.submaps import Submap, SubmapBuilder, SubmapMotion, SubmapSettings
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
 FUSION, OCCUPANCY = FusionSettings(min_count=1), OccupancySettings()

@@ -13,11 +13,13 @@ from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.geometry.transform import transform_cloud
 from recon.core.values import OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Float32, Float64
-from recon.map import Store, SubmapBuilder, find_floors, free_part
-from recon.map.axes import AXES_MAP_WORLD
-from recon.map.fused_part import join_fused
-from recon.map.occupancy_part import join_occupancy
-from recon.map.submap_records import Submaps
+from recon.map.fusion.part import join_fused
+from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.ground.floor import find_floors
+from recon.map.occupancy.part import free_part, join_occupancy
+from recon.map.store.records import Store
+from recon.map.store.submaps import Submaps
+from recon.map.submaps import SubmapBuilder
 from recon.map.tiles import Tiles, join_clouds, join_voxels
 from recon.map.window import Window
 from recon.stereo.cloud import filter_cloud

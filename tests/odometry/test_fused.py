@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from recon.core.geometry.se3 import invert
-from recon.map import Store
+from recon.map.store.records import Store
 from recon.odometry import gate
 from recon.odometry.fused import FusedOdometry
 from recon.odometry.protocol import OdometryFrame, OdometryResult

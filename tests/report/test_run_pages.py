@@ -23,7 +23,7 @@ from recon.core.values import (
     TriangleMesh,
 )
 from recon.core.values.arrays import Float64
-from recon.map.drive_loops import DriveLoops
+from recon.map.drive.drive_loops import DriveLoops
 from recon.odometry.protocol import OdometryHealth
 from recon.places.graph import Closure
 from recon.places.verify import Loop

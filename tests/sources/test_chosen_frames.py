@@ -13,7 +13,7 @@ from recon.core.errors import ReconError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import RectifiedCamera, StereoPair, Trajectory
 from recon.io.images.image import write_image
-from recon.map.sequence import map_sequence
+from recon.map.drive.sequence import map_sequence
 from recon.sources import IncompleteSource, SourceSettings, StampedSource, open_source
 from tests.sources import drives
 from tests.sources.test_stray_frames import LAYOUTS, images

@@ -11,7 +11,7 @@ import pytest
 from recon.commands.config import load_config
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.core.values.arrays import Float64
-from recon.map.sequence import Workspace, map_sequence
+from recon.map.drive.sequence import Workspace, map_sequence
 from recon.sources import StereoSource, open_source, recognise_source
 from tests.sources import drives
 

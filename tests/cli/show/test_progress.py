@@ -10,7 +10,7 @@ from rich.console import Console
 
 from recon.cli.show.progress import JsonLines, ProgressBar, choose_viewer
 from recon.evaluation.middlebury.summary import SceneDone
-from recon.map.frame_result import FrameResult
+from recon.map.drive.frame_result import FrameResult
 from recon.odometry.protocol import OdometryHealth
 from recon.run.progress import SILENT, Progress, Silent
 

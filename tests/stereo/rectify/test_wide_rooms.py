@@ -17,7 +17,7 @@ from recon.io.cameras.kalibr import write_kalibr
 from recon.io.cameras.opencv_yaml import write_opencv_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.image import write_image
-from recon.map.sequence import map_sequence
+from recon.map.drive.sequence import map_sequence
 from recon.sources import open_source
 from recon.sources.pair_input import read_pair_input
 from recon.stereo.frame import FrameReconstructor

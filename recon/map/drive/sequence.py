@@ -15,14 +15,14 @@ from recon.core.geometry.se3 import invert
 from recon.core.geometry.transform import transform_cloud
 from recon.core.values import OccupancyVoxels, PointCloud, RectifiedCamera, StereoPair, Trajectory
 from recon.core.values.arrays import Float64
-from recon.map.drive_loops import DriveLoops, LoopWatch
-from recon.map.frame_result import FrameResult
-from recon.map.mapper import Mapper
-from recon.map.rays import thin_rays
+from recon.map.drive.drive_loops import DriveLoops, LoopWatch
+from recon.map.drive.frame_result import FrameResult
+from recon.map.drive.mapper import Mapper
+from recon.map.drive.workspace import Workspace, resuming
+from recon.map.occupancy.rays import thin_rays
 from recon.map.settings import DriveSettings
-from recon.map.submap_records import Submaps
+from recon.map.store.submaps import Submaps
 from recon.map.tiles import Tiles, join_clouds, join_voxels
-from recon.map.workspace import Workspace, resuming
 from recon.odometry import (
     KnownPoses,
     MotionPrior,

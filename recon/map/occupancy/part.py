@@ -13,7 +13,7 @@ from recon.core.kernels import voxels
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Float32, Float64, Int32
 from recon.map.kernels import clamped, raycast
-from recon.map.surface_points import SurfacePoints, join_points
+from recon.map.occupancy.surface_points import SurfacePoints, join_points
 
 _UNSURE: Final = np.float32(0.01)
 """Log-odds of a voxel that was hit though the surface is likely in another: just above even."""

@@ -15,13 +15,13 @@ from recon.core.kernels import voxels
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Bool, Float32, Int32
 from recon.map.kernels import clamped
-from recon.map.keyframes import KEYFRAME
-from recon.map.occupancy_part import OccupancyPart
-from recon.map.persistent import Map
-from recon.map.session import AXES, LOOPS, RAYS, Session
+from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
-from recon.map.store import Store
-from recon.map.submap_records import Submaps
+from recon.map.store.keyframes import KEYFRAME
+from recon.map.store.map import Map
+from recon.map.store.records import Store
+from recon.map.store.session import AXES, LOOPS, RAYS, Session
+from recon.map.store.submaps import Submaps
 from recon.map.submaps import Submap, SubmapBuilder
 
 _PLACED: Final = slice(0, 4)

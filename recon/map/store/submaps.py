@@ -8,7 +8,7 @@ from typing import Final
 
 from recon.core.errors import FormatError
 from recon.io.files import reading
-from recon.map.store import Store
+from recon.map.store.records import Store
 from recon.map.submaps import Submap
 
 SUBMAP: Final = "submap"

@@ -14,8 +14,8 @@ from recon.core.values import (
     TrajectoryMetrics,
     TriangleMesh,
 )
-from recon.map.axes import base_axes
-from recon.map.sequence import MappedSequence
+from recon.map.drive.sequence import MappedSequence
+from recon.map.ground.axes import base_axes
 from recon.map.settings import DriveSettings
 from recon.run.summary import plain
 

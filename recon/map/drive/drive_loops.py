@@ -12,8 +12,8 @@ import numpy as np
 
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.map.keyframes import Keyframes
-from recon.map.submap_records import SubmapEntry
+from recon.map.store.keyframes import Keyframes
+from recon.map.store.submaps import SubmapEntry
 from recon.places import LoopSettings
 from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.places.drift import path_lengths

@@ -12,12 +12,12 @@ from recon.core.errors import FormatError
 from recon.core.geometry.transform import transform_cloud
 from recon.core.values import PointCloud, RayCloud, RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.map.axes import estimate_ground, map_axes
-from recon.map.frame_result import FrameResult
-from recon.map.fused import fusion_range_m
-from recon.map.rays import ray_grain, thin_rays
-from recon.map.session import Session
+from recon.map.drive.frame_result import FrameResult
+from recon.map.fusion.builder import fusion_range_m
+from recon.map.ground.axes import estimate_ground, map_axes
+from recon.map.occupancy.rays import ray_grain, thin_rays
 from recon.map.settings import DriveSettings
+from recon.map.store.session import Session
 from recon.map.submaps import SubmapBuilder
 from recon.odometry import Odometry, OdometryFrame
 from recon.run.lookahead import OneBehind

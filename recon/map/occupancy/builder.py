@@ -14,9 +14,9 @@ from recon.core.settings import Settings
 from recon.core.values import OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Float32, Float64, Int32
 from recon.map.kernels import clamped, raycast
-from recon.map.log_odds import log_odds
-from recon.map.occupancy_part import OccupancyPart
-from recon.map.surface_points import points_of, sum_points
+from recon.map.occupancy.log_odds import log_odds
+from recon.map.occupancy.part import OccupancyPart
+from recon.map.occupancy.surface_points import points_of, sum_points
 
 _FIRST_POINTS: Final = 1 << 12
 _LEAST_SIGMA_CELLS: Final = 0.1

@@ -13,7 +13,7 @@ import numpy as np
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, RayCloud, RayGrain
 from recon.map.kernels import raycast
-from recon.map.occupancy import (
+from recon.map.occupancy.builder import (
     FREE_MARGIN_SIGMAS,
     OccupancySettings,
     check_camera_cloud,

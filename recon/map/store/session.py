@@ -13,10 +13,10 @@ from recon.core.errors import FormatError
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
 from recon.core.values.arrays import Float64, frozen_array
 from recon.io.files import reading
-from recon.map.axes import check_rigid
-from recon.map.keyframes import Keyframes
-from recon.map.store import Store
-from recon.map.submap_records import Submaps
+from recon.map.ground.axes import check_rigid
+from recon.map.store.keyframes import Keyframes
+from recon.map.store.records import Store
+from recon.map.store.submaps import Submaps
 from recon.odometry import OdometryHealth
 from recon.places.graph import Closure
 

@@ -9,8 +9,8 @@ from typing import Final
 from typing_extensions import Self
 
 from recon.core.errors import FormatError
-from recon.map.session import Session, SessionInfo
-from recon.map.store import CACHE_BYTES, Store
+from recon.map.store.records import CACHE_BYTES, Store
+from recon.map.store.session import Session, SessionInfo
 
 MAP_FILE: Final = "map/map.recon"
 """Where a finished run keeps its map."""

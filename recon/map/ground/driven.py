@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.values.arrays import Bool, Float64, Int32, freeze
-from recon.map.ground import GroundSurface
+from recon.map.ground.surface import GroundSurface
 
 _SAME_M: Final = 0.3
 """Heights of the camera above the ground that differ by less are those of one vehicle."""

@@ -11,8 +11,8 @@ import numpy as np
 from recon.core.errors import MappingError
 from recon.core.geometry.triangulation import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera
-from recon.map import fusion_range_m
-from recon.map.sequence import MappedSequence
+from recon.map.drive.sequence import MappedSequence
+from recon.map.fusion.builder import fusion_range_m
 from recon.odometry import OdometryHealth
 from recon.stereo.cloud import CloudSettings
 from recon.stereo.frame import ReconstructedFrame

@@ -16,9 +16,9 @@ from typing_extensions import Self
 
 from recon.core.errors import FormatError
 from recon.io.files import reading
-from recon.map.arrays import Bytes, from_bytes, to_bytes
-from recon.map.cache import Cache
-from recon.map.database import (
+from recon.map.store.arrays import Bytes, from_bytes, to_bytes
+from recon.map.store.cache import Cache
+from recon.map.store.database import (
     begin_to_read,
     begin_to_write,
     beside,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.values.arrays import Bool
-from recon.map.store import Store
+from recon.map.store.records import Store
 from recon.map.window import Window
 
 TileKey = tuple[int, int]

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from recon.io.files import reading
-from recon.map.store import Store
+from recon.map.store.records import Store
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
 from recon.places.verify import Loop

@@ -13,7 +13,7 @@ from recon.core.kernels import voxels
 from recon.core.settings import Settings
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.core.values.arrays import Float32
-from recon.map.fused_part import CONFIDENCE, KNOWABLE, NORMAL, RGB, VALUES, FusedPart
+from recon.map.fusion.part import CONFIDENCE, KNOWABLE, NORMAL, RGB, VALUES, FusedPart
 
 _MIN_SIGMA_M: Final = 0.02
 """Points more precise than this count as this precise: bounds the weight."""

@@ -10,9 +10,9 @@ from typing import Any, Final
 
 from recon.core.errors import FormatError, ReconError
 from recon.io.files import reading
-from recon.map.persistent import Map
-from recon.map.session import Session, SessionInfo
 from recon.map.settings import DriveSettings
+from recon.map.store.map import Map
+from recon.map.store.session import Session, SessionInfo
 from recon.run.machine import versions
 from recon.run.stopwatch import Stopwatch
 from recon.sources import StereoSource

@@ -1,0 +1,1 @@
+"""One cloud of all that the frames saw: sums per voxel."""

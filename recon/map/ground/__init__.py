@@ -1,0 +1,1 @@
+"""The ground below the path, and the flat grid above it."""

@@ -1,0 +1,1 @@
+"""What is free and what is occupied: log-odds of voxels, from rays."""
