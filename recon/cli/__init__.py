@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from recon import __version__
-from recon.cli import evaluate
+from recon.cli import datasets, evaluate
 from recon.cli.audit import audit
 from recon.cli.board import board
 from recon.cli.calibrate import calibrate
@@ -54,6 +54,7 @@ app.command(rich_help_panel=_CAMERAS)(calibrate)
 app.command(rich_help_panel=_CAMERAS)(rectify)
 app.command(rich_help_panel=_CAMERAS)(capture)
 app.command(rich_help_panel=_CAMERAS)(audit)
+app.add_typer(datasets.app, name="datasets", rich_help_panel=_CAMERAS)
 app.add_typer(evaluate.app, name="evaluate", rich_help_panel=_EVALUATE)
 app.command(rich_help_panel=_EVALUATE)(paper)
 

@@ -13,6 +13,7 @@
     ├── MappingError             a map cannot be built
     ├── MeshingError             a surface cannot be reconstructed
     ├── EvaluationError          an estimate cannot be compared with ground truth
+    ├── DownloadError            a data set cannot be fetched
     ├── OutputError              a result cannot be written
     ├── MemoryLimitError         a run exceeds its memory limit
     └── MissingDependencyError   an optional package is not installed
@@ -118,6 +119,10 @@ class MeshingError(ReconError):
 
 class EvaluationError(ReconError):
     """An estimate cannot be compared with ground truth."""
+
+
+class DownloadError(ReconError):
+    """A data set cannot be fetched."""
 
 
 class OutputError(ReconError):

@@ -7,7 +7,6 @@ was killed, interrupted or met a full disk keeps them if it can be resumed.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shutil
@@ -22,6 +21,7 @@ from typing_extensions import Self
 
 from recon.core.errors import MemoryLimitError, OutputError
 from recon.io.atomic import write_text
+from recon.io.lock import take_lock
 
 RECORD: Final = "run.json"
 STARTED: Final = "map.recon"
@@ -91,7 +91,12 @@ class RunDirectory:
             _refuse_foreign(self.folder)
         self._made = [p for p in (self.folder, *self.folder.parents) if not p.exists()]
         try:
-            self._lock = self._take_lock()
+            self._lock = take_lock(
+                self._partial / _LOCK,
+                "another run is writing to this folder",
+                where=self.folder,
+                hint="wait for it, or choose another --out",
+            )
             self._clear()
         except OSError as error:
             self._withdraw()
@@ -118,26 +123,6 @@ class RunDirectory:
     def resumable(self) -> bool:
         """Whether the run has begun a map."""
         return (state_folder(self.folder) / STARTED).is_file()
-
-    def _take_lock(self) -> int:
-        """Lock the folder against other runs until `_release` or the end of the process."""
-        while True:
-            self._partial.mkdir(parents=True, exist_ok=True)
-            path = self._partial / _LOCK
-            handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                # A run that ended meanwhile has removed the file that was opened here.
-                if path.exists() and os.fstat(handle).st_ino == path.stat().st_ino:
-                    return handle
-            except BlockingIOError as error:
-                os.close(handle)
-                raise OutputError(
-                    "another run is writing to this folder",
-                    where=self.folder,
-                    hint="wait for it, or choose another --out",
-                ) from error
-            os.close(handle)
 
     def _release(self) -> None:
         if self._lock is not None:

@@ -27,6 +27,7 @@ NOT_RUN = {
     r"git clone": "needs a network",
     r"source .venv/bin/activate": "the tests run in an environment that is active",
     r"pip install": "changes the environment; tests/docs/stand_ins.py installs the package",
+    r"recon datasets (fetch|verify)": "needs a network; tests/commands/test_datasets.py has one",
     r"recon capture 0 2": "needs two cameras; tests/commands/test_capture.py records from videos",
 }
 """Beginnings of shell lines that are checked but not run, and why."""

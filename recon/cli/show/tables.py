@@ -65,6 +65,27 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
     typer.echo(f"results: {summary['out']}")
 
 
+def print_datasets(found: Mapping[str, Any]) -> None:
+    """Print data sets or the parts of one: name, size, what is there, and what else is known."""
+    table = Table(show_edge=False, pad_edge=False, show_header=False)
+    for entry in found.get("datasets", found.get("parts", ())):
+        size = entry.get("bytes")
+        there = entry.get("out") or _how_much(entry)
+        about = (entry[key] for key in ("about", "licence") if key in entry)
+        table.add_row(entry["name"], f"{size / 1e9:.2f} GB" if size else "", there, *about)
+    Console().print(table)
+    for key in ("page", "licence", "cite", "layout", "use", "unchecked"):
+        if found.get(key):
+            typer.echo(f"{key}: {found[key]}")
+
+
+def _how_much(entry: Mapping[str, Any]) -> str:
+    """How many of the parts of a data set are there."""
+    if isinstance(entry["fetched"], bool):
+        return "fetched" if entry["fetched"] else ""
+    return f"{entry['fetched']} of {entry['parts']}"
+
+
 def print_checks(checks: Sequence[Check], console: Console | None = None) -> None:
     """Print one line per check, and below the table the hints for those that failed."""
     out = console or Console()

@@ -1,0 +1,216 @@
+"""Data sets arrive as recon reads them, whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import tarfile
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+from recon.commands.datasets import run_fetch, run_list, run_verify
+from recon.core.errors import DownloadError, FormatError, OutputError, SettingsError
+from recon.core.values import RectifiedCamera
+from recon.io import download
+from recon.sources import open_source
+from recon.sources.datasets import datasets, find_parts, parts_of
+from recon.sources.fetching import RECORD
+from recon.sources.registry import recognise_source
+from tests.flow.test_paper import write_scene
+from tests.hostile.refusals import assert_refused, run
+from tests.io.mirror import Mirror, serving
+from tests.scenery.planes import slanted_pair
+
+CAMERA = RectifiedCamera(180.0, 55.0, 40.0, 65.0, 0.2, 120, 80, 24)
+SCENE = "middlebury-2014/Pipes"
+
+
+@pytest.fixture(autouse=True)
+def _no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(download, "_PAUSE_S", 0.0)
+
+
+@pytest.fixture
+def mirror() -> Iterator[Mirror]:
+    with serving(Mirror()) as served:
+        yield served
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files of a scene, by name."""
+    folder = tmp_path_factory.mktemp("scene") / "Pipes"
+    write_scene(folder, slanted_pair(CAMERA, 1.5, (0.1, -0.1), seed=1))
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def zipped(files: Mapping[str, bytes]) -> bytes:
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as file:
+        for name, content in files.items():
+            file.writestr(name, content)
+    return out.getvalue()
+
+
+def tarred(files: Mapping[str, bytes]) -> bytes:
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w") as file:
+        for name, content in files.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            file.addfile(info, io.BytesIO(content))
+    return out.getvalue()
+
+
+def offer_scene(mirror: Mirror, scene: Mapping[str, bytes]) -> None:
+    files = {f"Pipes-perfect/{name}": content for name, content in scene.items()}
+    mirror.files["/Pipes-perfect.zip"] = zipfile_content = zipped(files)
+    assert len(zipfile_content) > 1000
+
+
+def test_every_address_is_that_of_a_file_and_says_how_it_is_checked() -> None:
+    parts = [part for dataset in datasets().values() for part in parts_of(dataset)]
+    assert len({part.name for part in parts}) == len(parts) > 100
+    for part in parts:
+        for one in part.downloads:
+            assert one.address.startswith("https://")
+            assert "{" not in one.address
+            assert "//" not in one.address.removeprefix("https://")
+            hashed = one.promise.digest or one.digest_beside
+            assert bool(hashed) != bool(part.dataset.unchecked)
+
+
+def test_every_fact_of_a_file_is_of_a_file_that_is_fetched() -> None:
+    for dataset in datasets().values():
+        files = {one.file for part in parts_of(dataset) for one in part.downloads}
+        assert set(dataset.files) <= files
+
+
+def test_the_list_says_what_is_there(
+    mirror: Mirror, scene: dict[str, bytes], tmp_path: Path
+) -> None:
+    offer_scene(mirror, scene)
+    run_fetch([SCENE], tmp_path, address=mirror.address)
+    listed = {one["name"]: one for one in run_list(folder=tmp_path)["datasets"]}
+    assert set(listed) == set(datasets())
+    assert (listed["middlebury-2014"]["fetched"], listed["middlebury-2014"]["parts"]) == (1, 23)
+    assert listed["euroc"]["bytes"] == 24_739_377_801
+    parts = {one["name"]: one["fetched"] for one in run_list("middlebury-2014", tmp_path)["parts"]}
+    assert [name for name, fetched in parts.items() if fetched] == [SCENE]
+
+
+def test_a_scene_arrives_as_recon_reads_it(
+    mirror: Mirror, scene: dict[str, bytes], tmp_path: Path
+) -> None:
+    offer_scene(mirror, scene)
+    mirror.break_after = 1000
+    (found,) = run_fetch([SCENE], tmp_path, address=mirror.address)["datasets"]
+    assert found["files"] == len(scene)
+    assert recognise_source(found["out"]) == "middlebury"
+    assert len(open_source(found["out"])) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["middlebury-2014"]
+    assert run_verify([SCENE], tmp_path)["datasets"][0]["files"] == len(scene)
+
+
+def test_what_is_there_is_not_fetched_again(
+    mirror: Mirror, scene: dict[str, bytes], tmp_path: Path
+) -> None:
+    offer_scene(mirror, scene)
+    assert run_fetch([SCENE], tmp_path, address=mirror.address)["datasets"][0]["fetched"]
+    asked = len(mirror.asked)
+    assert not run_fetch([SCENE], tmp_path, address=mirror.address)["datasets"][0]["fetched"]
+    assert len(mirror.asked) == asked
+
+
+@pytest.mark.parametrize("damage", ["changed", "missing"])
+def test_verification_names_the_file_that_is_not_what_was_unpacked(
+    mirror: Mirror, scene: dict[str, bytes], tmp_path: Path, damage: str
+) -> None:
+    offer_scene(mirror, scene)
+    run_fetch([SCENE], tmp_path, address=mirror.address)
+    image = tmp_path / SCENE / "im1.png"
+    if damage == "missing":
+        image.unlink()
+    else:
+        image.write_bytes(image.read_bytes()[:-1] + b"x")
+    with pytest.raises(FormatError, match=r"im1\.png: file of the data set (is|has) " + damage):
+        run_verify([SCENE], tmp_path)
+
+
+def test_the_archives_of_a_part_come_together(mirror: Mirror, tmp_path: Path) -> None:
+    day, drive = "2011_09_28", "2011_09_28_drive_0001"
+    calib, images = b"calib", b"image"
+    mirror.files = {
+        f"/{day}_calib.zip": zipped({f"{day}/calib_cam_to_cam.txt": calib}),
+        f"/{drive}_sync.zip": zipped({f"{day}/{drive}_sync/image_00/data/0000000000.png": images}),
+    }
+    with pytest.raises(DownloadError, match="another file than the list"):
+        run_fetch([f"kitti-raw/{drive}"], tmp_path, address=mirror.address)
+    assert not (tmp_path / "kitti-raw").exists()
+
+
+def test_flights_are_taken_out_of_their_archive(
+    mirror: Mirror, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flight = zipped({"mav0/cam0/data.csv": b"#", "__MACOSX/._mav0": b"x"})
+    content = zipped({"vicon_room1/V1_01/V1_01.zip": flight, "vicon_room1/V1_01/V1_01.bag": b"x"})
+    mirror.files["/vicon_room1.zip"] = content
+    facts = datasets()["euroc"].files["vicon_room1.zip"]
+    digest = f"md5:{hashlib.md5(content).hexdigest()}"  # noqa: S324
+    smaller = facts.model_copy(update={"bytes": len(content), "digest": digest})
+    monkeypatch.setitem(datasets()["euroc"].files, "vicon_room1.zip", smaller)
+    run_fetch(["euroc/vicon_room1"], tmp_path, address=mirror.address)
+    place = tmp_path / "euroc" / "vicon_room1"
+    assert (place / "V1_01" / "mav0" / "cam0" / "data.csv").read_bytes() == b"#"
+    assert sorted(path.name for path in place.iterdir()) == ["V1_01", RECORD]
+
+
+def test_a_hash_beside_the_archive_is_compared(mirror: Mirror, tmp_path: Path) -> None:
+    name = "dataset-room1_512_16"
+    content = tarred({f"{name}/mav0/cam0/data.csv": b"#"})
+    mirror.files[f"/{name}.tar"] = content
+    mirror.files[f"/{name}.tar.md5"] = b"0123456789abcdef0123456789abcdef  x\n"
+    with pytest.raises(DownloadError, match="not what was promised"):
+        run_fetch(["tum-vi/room1"], tmp_path, address=mirror.address)
+    digest = hashlib.md5(content).hexdigest()  # noqa: S324
+    mirror.files[f"/{name}.tar.md5"] = f"{digest} *{name}.tar\n".encode()
+    run_fetch(["tum-vi/room1"], tmp_path, address=mirror.address)
+    record = json.loads((tmp_path / "tum-vi" / "room1" / RECORD).read_text())
+    assert record["archives"][0]["checked"] == f"md5:{digest}"
+    assert list(record["files"]) == ["mav0/cam0/data.csv"]
+
+
+def test_a_hostile_archive_leaves_no_data_set(mirror: Mirror, tmp_path: Path) -> None:
+    mirror.files["/Pipes-perfect.zip"] = zipped({"Pipes-perfect/a": b"1", "../../../b": b"2"})
+    with pytest.raises(FormatError, match="path outside of itself"):
+        run_fetch([SCENE], tmp_path / "data", address=mirror.address)
+    assert not (tmp_path / "data" / "middlebury-2014").exists()
+    assert not list(tmp_path.rglob("b"))
+
+
+def test_a_folder_of_others_is_left_alone(mirror: Mirror, tmp_path: Path) -> None:
+    (tmp_path / SCENE).mkdir(parents=True)
+    with pytest.raises(OutputError, match="not made by recon datasets"):
+        run_fetch([SCENE], tmp_path, address=mirror.address)
+
+
+@pytest.mark.parametrize("name", ["kiti-raw", "kitti-raw/2011_09_26_drive_9999", "../x", ""])
+def test_unknown_names_are_one_line(tmp_path: Path, name: str) -> None:
+    with pytest.raises(SettingsError, match="recon datasets list"):
+        find_parts(name)
+    assert_refused(run("datasets", "fetch", name, "--folder", tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_commands_print_json(mirror: Mirror, scene: dict[str, bytes], tmp_path: Path) -> None:
+    offer_scene(mirror, scene)
+    where = ("--folder", tmp_path, "--json")
+    for words in (("list",), ("fetch", SCENE, "--address", mirror.address), ("verify", SCENE)):
+        ended = run("datasets", *words, *where)
+        assert ended.code == 0, ended.err
+        assert json.loads(ended.out)["datasets"]
+    assert_refused(run("datasets", "verify", "euroc", *where), "was not fetched")
