@@ -18,15 +18,16 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
 
-from recon.core.values import RectifiedPair
+from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import UInt8
 from recon.io.middlebury.scene import stand_in_camera
 from recon.run.machine import peak_memory_mb
-from recon.stereo.match import SadMatcher, SadSettings
+from recon.stereo.match import Matcher, SadMatcher, SadSettings, sad
 from recon.stereo.match.sgm import SgmMatcher, SgmSettings
 
 SIZES = ((480, 640, 64), (375, 1242, 128), (994, 1482, 144))
@@ -127,10 +128,15 @@ def ours(pair: RectifiedPair, threads: int) -> dict[str, Run]:
     """`sad`, `sad` without its second, slanted window (StereoBM has none), and `sgm`."""
     matchers = {
         "sad": SadMatcher(SadSettings(window_px=WINDOW_PX), threads),
-        "sad-upright": SadMatcher(SadSettings(window_px=WINDOW_PX, window_slant=0), threads),
         "sgm": SgmMatcher(SgmSettings(), threads),
     }
-    return {name: partial(matcher.match, pair) for name, matcher in matchers.items()}
+    runs = {name: partial(matcher.match, pair) for name, matcher in matchers.items()}
+    return {**runs, "sad-upright": partial(upright, matchers["sad"], pair)}
+
+
+def upright(matcher: Matcher, pair: RectifiedPair) -> Disparity:
+    with patch.object(sad, "WINDOW_SLANT", 0.0):
+        return matcher.match(pair)
 
 
 def opencv(pair: RectifiedPair, ndisp: int) -> dict[str, Run]:

@@ -279,7 +279,7 @@ class Tiles:
         fused = replace(join_fused(parts), known=self._known)
         # A drive with fewer frames than the minimum count must still give a map.
         least = min(config.fusion.min_count, len(self.submap_of_frame))
-        points = fused.cloud(config.fusion.voxel_m, least, config.fusion.precise_sigma_m)
+        points = fused.cloud(config.fusion.voxel_m, least)
         filtered = filter_cloud(points, config.map_filters)
         cloud = transform_cloud(filtered, self._T_map_world, frame="map")
         return cloud.select(self.window(key).contains(cloud.xyz))

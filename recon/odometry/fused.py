@@ -65,6 +65,10 @@ visual motion."""
 _LOST_SIGMA_DEG: Final = 0.3
 """That of an extrapolated rotation, likewise."""
 
+_ICP_EVERY: Final = 4
+"""Frames from one run of ICP to the next; in between it runs only where the visual motion is
+uncertain."""
+
 _OFFSET_FRAMES: Final = 30
 """Frames over which the mean ICP correction is estimated, and then subtracted: a constant one comes
 from the bias of stereo depth with range, not from the motion."""
@@ -94,7 +98,7 @@ class FusedOdometry:
     """Visual odometry as the prior of every frame, and gated corrections by kiss-icp.
 
     Args:
-        settings: Range of the points, and how often ICP runs.
+        settings: Range of the points.
         prior: How the camera moved by other means.
     """
 
@@ -129,7 +133,7 @@ class FusedOdometry:
         and the map is not updated.
         """
         prior = self._prior(self._visual.track(frame))
-        due = self._frames % self._settings.icp_every == 0
+        due = self._frames % _ICP_EVERY == 0
         self._frames += 1
         if due or not prior.seen or self._icp_may_help(prior):
             result = self._with_icp(prior, frame)

@@ -55,10 +55,4 @@ class OdometrySettings(Settings):
         description="Points farther than this are not used by ICP. Raise it with a wide baseline "
         "in open country.",
     )
-    icp_every: int = Field(
-        4,
-        ge=1,
-        description="ICP runs every n-th frame, and in between only where the visual motion is "
-        "uncertain. Raise it for speed, lower it where features are few.",
-    )
     prior: PriorSettings = PriorSettings()

@@ -9,8 +9,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import invert
 from recon.core.values.arrays import Float64
-from recon.places.drift import Drift, drift_over, is_possible
-from recon.places.settings import DriftSettings
+from recon.places.drift import Drift, DriftModel, drift_over, is_possible
 from recon.places.verify import Loop
 
 Poses: TypeAlias = Mapping[int, tuple[Float64, float]]
@@ -28,7 +27,7 @@ _NEAR_M: Final = 12.0
 _MAJORITY: Final = 2  # keyframes that confirm a loop, for each that contradicts it
 
 
-def agreeing_loops(loops: Sequence[Loop], poses: Poses, drift: DriftSettings) -> list[Loop]:
+def agreeing_loops(loops: Sequence[Loop], poses: Poses, drift: DriftModel) -> list[Loop]:
     """Return the loops that enough others confirm, and few contradict.
 
     Two loops and the odometry between their ends form a cycle that must close within the drift
@@ -55,12 +54,12 @@ def agreeing_loops(loops: Sequence[Loop], poses: Poses, drift: DriftSettings) ->
     return agreeing
 
 
-def _closes(one: Loop, other: Loop, poses: Poses, settings: DriftSettings) -> bool:
+def _closes(one: Loop, other: Loop, poses: Poses, model: DriftModel) -> bool:
     """Return whether two loops agree within the drift of the odometry between them."""
     T_lasts, lasts_m = _between(one.last, other.last, poses)
     T_firsts, firsts_m = _between(one.first, other.first, poses)
     ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
-    drift = drift_over(lasts_m + firsts_m, settings)
+    drift = drift_over(lasts_m + firsts_m, model)
     return is_possible(ring, drift, LOOP_SIGMAS)
 
 

@@ -12,10 +12,9 @@ from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import Float64
 from recon.places.agree import LOOP_SIGMAS, agreeing_loops
-from recon.places.drift import drift_over, is_possible
+from recon.places.drift import DriftModel, drift_over, is_possible
 from recon.places.keyframe import Keyframe, make_keyframe, words_of
 from recon.places.places import Place, Places
-from recon.places.settings import DriftSettings
 from recon.places.verify import Loop, verify
 
 CONTRADICTED: Final = "odometry contradicts"
@@ -81,7 +80,7 @@ class LoopDetector:
         store: Where keyframes go.
     """
 
-    def __init__(self, drift: DriftSettings, store: KeyframeStore) -> None:
+    def __init__(self, drift: DriftModel, store: KeyframeStore) -> None:
         self._drift = drift
         self._store = store
         self._places = Places()

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.values.arrays import Bool, Float64
-from recon.places.settings import DriftSettings
 
 _LOST_FACTOR: Final = 20.0
 """Metres that one metre of extrapolated path counts as."""
@@ -21,6 +20,19 @@ _LOST_M: Final = 2.0
 
 SIGMAS: Final = 3.5
 """Largest possible deviation from odometry, in standard deviations."""
+
+
+@dataclass(frozen=True)
+class DriftModel:
+    """How far odometry may drift; larger values give more candidates and refuse less.
+
+    Attributes:
+        share: Standard deviation of a position, as a share of the path.
+        turn_deg: Standard deviation of the heading after 1 m; grows with the root of the path.
+    """
+
+    share: float = 0.02
+    turn_deg: float = 0.15
 
 
 @dataclass(frozen=True)
@@ -52,20 +64,20 @@ def path_lengths(T_world_camera: Float64, measured: Bool) -> Float64:
     return np.concatenate([np.zeros(min(1, len(measured))), np.cumsum(step_m)])
 
 
-def drift_over(path_m: float, settings: DriftSettings) -> Drift:
+def drift_over(path_m: float, model: DriftModel) -> Drift:
     """Return the drift over a path.
 
     The scale error is constant and the heading a random walk. The position error of the latter is
     that of a straight drive, the worst case: ``turn·√(path³/3)``.
     """
-    position_m, turn_rad = spread_over(np.array(path_m), settings)
+    position_m, turn_rad = spread_over(np.array(path_m), model)
     return Drift(float(position_m), float(turn_rad))
 
 
-def spread_over(path_m: Float64, settings: DriftSettings) -> tuple[Float64, Float64]:
+def spread_over(path_m: Float64, model: DriftModel) -> tuple[Float64, Float64]:
     """Return `drift_over` of many paths (N,): standard deviations of positions and of rotations."""
-    turn = math.radians(settings.turn_deg)
-    position_m = np.hypot(settings.share * path_m, turn * np.sqrt(path_m**3 / 3.0))
+    turn = math.radians(model.turn_deg)
+    position_m = np.hypot(model.share * path_m, turn * np.sqrt(path_m**3 / 3.0))
     return position_m, turn * np.sqrt(path_m)
 
 

@@ -16,9 +16,8 @@ from recon.core.geometry.interpolation import pose_between
 from recon.core.geometry.se3 import as_step, hat, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.places.drift import Drift, drift_over
+from recon.places.drift import Drift, DriftModel, drift_over
 from recon.places.pose_graph import PoseEdge, optimise_poses
-from recon.places.settings import DriftSettings
 from recon.places.verify import Loop
 
 _EASING: Final = 10.0  # factor by which the tolerance of loops falls from round to round
@@ -69,7 +68,7 @@ class Closure:
 
 
 def close_loops(
-    trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop], drift: DriftSettings
+    trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop], drift: DriftModel
 ) -> Closure:
     """Correct a path so that its loops close.
 
@@ -135,13 +134,13 @@ def _solve(start: Float64, steps: list[PoseEdge], ties: list[PoseEdge]) -> tuple
 
 
 def _odometry_edges(
-    trajectory: Trajectory, path_m: Float64, nodes: NDArray[np.intp], settings: DriftSettings
+    trajectory: Trajectory, path_m: Float64, nodes: NDArray[np.intp], model: DriftModel
 ) -> list[PoseEdge]:
     poses = trajectory.T_world_camera
     edges = []
     for k, (first, last) in enumerate(pairwise(nodes)):
         # Where the camera stands still, 0.1 m keeps the information finite.
-        drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1), settings)
+        drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1), model)
         T = invert(poses[first]) @ poses[last]
         edges.append(PoseEdge(k, k + 1, T, _information(drift)))
     return edges
@@ -152,7 +151,7 @@ def _loop_edge(
     trajectory: Trajectory,
     path_m: Float64,
     nodes: NDArray[np.intp],
-    settings: DriftSettings,
+    model: DriftModel,
 ) -> PoseEdge:
     """Return the loop as an edge between the nodes nearest to its frames."""
     poses = trajectory.T_world_camera
@@ -161,7 +160,7 @@ def _loop_edge(
     to_last = invert(poses[loop.last]) @ poses[nodes[last]]
     way_m = abs(float(path_m[nodes[first]] - path_m[loop.first]))
     way_m += abs(float(path_m[nodes[last]] - path_m[loop.last]))
-    drift = drift_over(way_m, settings)
+    drift = drift_over(way_m, model)
     apart_m = float(np.linalg.norm(loop.T_first_last[:3, 3]))
     other = Drift(
         math.hypot(drift.position_m, _LOOP_SIGMA_M, _LOOP_SHARE * apart_m),

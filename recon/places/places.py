@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.values.arrays import Bool, Float64
-from recon.places.drift import SIGMAS, spread_over
-from recon.places.settings import DriftSettings
+from recon.places.drift import SIGMAS, DriftModel, spread_over
 
 _LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms and 10 MB
 
@@ -80,7 +79,7 @@ class Places:
         """float64 (N,)."""
         return self._path_m[: len(self)]
 
-    def near(self, place: Place, drift: DriftSettings) -> Bool:
+    def near(self, place: Place, drift: DriftModel) -> Bool:
         """Return bool (N,), places that drift allows to be in view of a later one."""
         way_m = place.path_m - self.path_m
         sigma_m, sigma_rad = spread_over(np.maximum(way_m, 0.0), drift)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from recon.core.values import (
     Disparity,
@@ -18,6 +19,10 @@ from recon.stereo.cloud import back_project, filter_cloud, remove_flying_edges
 from recon.stereo.match import make_matcher
 from recon.stereo.rectify import Rectifier, check_inspection, inspect_pair
 from recon.stereo.settings import StereoSettings
+
+_INSPECT_EVERY: Final = 50
+"""Frames from one inspection to the next: what it looks for, swapped cameras or rows that do not
+correspond, does not change from frame to frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +85,12 @@ class FrameReconstructor:
         return rectified, disparity
 
     def inspect(self, pair: RectifiedPair) -> tuple[str, ...]:
-        """Return warnings about the geometry of a pair; only every so many pairs are inspected.
+        """Return warnings about the geometry of a pair; every 50th frame is inspected.
 
         Raises:
             CalibrationError: Left and right are swapped.
         """
-        every = self._config.rectification.inspect_every
-        if every is None or pair.index % every:
+        if pair.index % _INSPECT_EVERY:
             return ()
         with self._stopwatch.stage("inspect"):
             found = inspect_pair(pair)

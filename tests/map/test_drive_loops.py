@@ -26,10 +26,9 @@ from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.store.keyframes import Keyframes
 from recon.map.store.records import Store
 from recon.map.store.submaps import SubmapEntry
-from recon.places import LoopSettings
 from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
+from recon.places.drift import DriftModel
 from recon.places.graph import close_loops
-from recon.places.settings import DriftSettings
 from recon.stereo.frame import ReconstructedFrame
 from tests.run.pools import observed_pool
 
@@ -77,7 +76,7 @@ def _watch(
     frames, path: Trajectory, store: Store | None = None, upto: int = FRAMES, committed: int = 0
 ) -> LoopWatch:
     store = store or Store.temporary()
-    watch = LoopWatch(LoopSettings(), Keyframes(store))
+    watch = LoopWatch(Keyframes(store))
     for number, (frame, T) in enumerate(zip(frames[:upto], path.T_world_camera, strict=False)):
         if number == committed:
             watch.settle()
@@ -149,7 +148,7 @@ def test_an_interrupted_drive_gives_the_same_loops(frames, closed, tmp_path, che
         _watch(frames, path, store, upto=killed + 1, committed=checkpoint)
     keyframes = Keyframes(Store.open(tmp_path / "map.recon"))
     assert len(list(keyframes)) == checkpoint
-    resumed = LoopWatch(LoopSettings(), keyframes)
+    resumed = LoopWatch(keyframes)
     resumed.restore(path.T_world_camera[:checkpoint], ALL_MEASURED[:checkpoint])
     for frame, T in zip(frames[checkpoint:], path.T_world_camera[checkpoint:], strict=True):
         resumed.add(frame, T, measured=True)
@@ -181,7 +180,7 @@ def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):
 
     monkeypatch.setattr(LoopDetector, "add", slow)
     monkeypatch.setattr(drive_loops, "ThreadPoolExecutor", pool)
-    watch = LoopWatch(LoopSettings(), Keyframes(Store.temporary()))
+    watch = LoopWatch(Keyframes(Store.temporary()))
     for frame in frames[:4]:
         watch.add(frame, np.eye(4), measured=True)
     while not looked:
@@ -201,7 +200,7 @@ def test_a_foreign_keyframe_is_reported(frames):
 
 def test_loops_that_contradict_odometry_are_a_warning(closed):
     """The settings believe odometry to the millimetre, so that bending it is impossible."""
-    strict = DriftSettings(share=1e-6, turn_deg=1e-5)
+    strict = DriftModel(share=1e-6, turn_deg=1e-5)
     path = closed.odometry
     refused = close_loops(path, path.distances_m, list(closed.closure.closed), strict)
     loops = DriveLoops(path, refused, FRAMES, len(closed.closure.closed), {})
@@ -213,7 +212,7 @@ def test_loops_that_contradict_odometry_are_a_warning(closed):
 @pytest.mark.parametrize(("times", "warned"), [(2, False), (3, True)])
 def test_places_where_the_drive_cannot_have_been_are_a_warning(times, warned):
     path = _circle()
-    nothing = close_loops(path, path.distances_m, [], DriftSettings())
+    nothing = close_loops(path, path.distances_m, [], DriftModel())
     loops = DriveLoops(path, nothing, FRAMES, 0, {CONTRADICTED: times})
 
     assert [("alike" in text) for text in loops.warnings()] == [True] * warned

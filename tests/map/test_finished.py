@@ -62,7 +62,7 @@ def _cloud(session: Session) -> PointCloud:
         fused = submap.fused
         parts.append(fused if corrections is None else fused.moved(corrections[index], VOXEL_M))
     settings = CONFIG.fusion
-    cloud = join_fused(parts).cloud(VOXEL_M, settings.min_count, settings.precise_sigma_m)
+    cloud = join_fused(parts).cloud(VOXEL_M, settings.min_count)
     return cloud.select(np.lexsort(np.floor(cloud.xyz / VOXEL_M).T))
 
 

@@ -8,6 +8,7 @@ import pytest
 from recon.core.errors import MappingError
 from recon.core.geometry.triangulation import depth_sigma
 from recon.core.values import PointCloud, RectifiedCamera
+from recon.map.fusion import part
 from recon.map.fusion.builder import FusionSettings, MapBuilder, fusion_range_m
 
 
@@ -44,14 +45,16 @@ def test_voxels_seen_too_rarely_are_not_exported() -> None:
     assert len(builder.cloud(min_count=1)) == 2
 
 
-def test_precise_voxels_need_one_frame_less() -> None:
+def test_precise_voxels_need_one_frame_less(monkeypatch: pytest.MonkeyPatch) -> None:
     xyz = np.array([[0.05, 0.05, 0.05], [1.05, 1.05, 1.05]])
     # Two frames of 0.1 m make 0.071 m, two of 0.15 m make 0.106 m.
     cloud = _cloud(xyz, sigma_m=np.array([0.1, 0.15], np.float32))
-    for limit_m, exported in ((0.08, 1), (0.07, 0), (0.11, 2), (None, 0)):
-        builder = _build(cloud, cloud, min_count=3, precise_sigma_m=limit_m)
+    builder = _build(cloud, cloud, min_count=3)
+    for limit_m, exported in ((0.08, 1), (0.07, 0), (0.11, 2)):
+        monkeypatch.setattr(part, "PRECISE_SIGMA_M", limit_m)
         assert len(builder.cloud()) == exported
-    once = _build(cloud, min_count=3, precise_sigma_m=10.0)
+    monkeypatch.setattr(part, "PRECISE_SIGMA_M", 10.0)
+    once = _build(cloud, min_count=3)
     assert len(once.cloud()) == 0
     assert len(once.cloud(min_count=1)) == 2
 

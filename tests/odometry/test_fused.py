@@ -2,13 +2,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from recon.core.geometry.se3 import invert
 from recon.map.store.records import Store
-from recon.odometry import gate
+from recon.odometry import fused, gate
 from recon.odometry.fused import FusedOdometry
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.registry import make_odometry
@@ -17,16 +18,10 @@ from recon.odometry.settings import OdometrySettings
 See = Callable[..., OdometryFrame]
 
 
-def always() -> OdometrySettings:
-    """ICP runs in every frame."""
-    return OdometrySettings(icp_every=1)
-
-
-def follow(
-    frames: Iterable[OdometryFrame], settings: OdometrySettings | None = None
-) -> list[OdometryResult]:
-    odometry = FusedOdometry(settings or OdometrySettings())
-    return [odometry.register(frame) for frame in frames]
+def follow(frames: Iterable[OdometryFrame], icp_every: int = 4) -> list[OdometryResult]:
+    odometry = FusedOdometry(OdometrySettings())
+    with patch.object(fused, "_ICP_EVERY", icp_every):
+        return [odometry.register(frame) for frame in frames]
 
 
 def error_m(result: OdometryResult, truth: np.ndarray) -> float:
@@ -35,7 +30,7 @@ def error_m(result: OdometryResult, truth: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def results(street: tuple[OdometryFrame, ...]) -> list[OdometryResult]:
-    return follow(street, always())
+    return follow(street, icp_every=1)
 
 
 def test_the_street_is_followed(results: list[OdometryResult], street_poses: np.ndarray) -> None:
@@ -64,7 +59,7 @@ def test_what_is_refused_says_why(results: list[OdometryResult]) -> None:
 def test_two_runs_are_equal_to_the_bit(
     results: list[OdometryResult], street: tuple[OdometryFrame, ...]
 ) -> None:
-    for once, again in zip(results, follow(street, always()), strict=True):
+    for once, again in zip(results, follow(street, icp_every=1), strict=True):
         np.testing.assert_array_equal(once.T_world_camera, again.T_world_camera)
 
 
@@ -76,7 +71,7 @@ def test_a_sure_prior_asks_icp_now_and_then(
     # An ICP that is never better than this cannot help.
     monkeypatch.setattr(gate, "_ICP_FLOOR_M", 1.0)
     monkeypatch.setattr(gate, "_ICP_FLOOR_DEG", 10.0)
-    found = follow(street, OdometrySettings(icp_every=5))
+    found = follow(street, icp_every=5)
     asked = [index for index, result in enumerate(found) if result.health.icp_points]
     assert asked == [0, 5, 10]
     assert error_m(found[-1], street_poses[-1]) < 0.055

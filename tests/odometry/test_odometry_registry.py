@@ -31,7 +31,7 @@ def test_the_settings_offer_what_there_is() -> None:
         {"method": "lidar"},
         {"prior": {"axis": "body"}},
         {"prior": {"sigma_m": 0}},
-        {"icp_every": 0},
+        {"max_range_m": 0},
     ],
 )
 def test_what_is_no_setting_is_refused(values: dict[str, object]) -> None:

@@ -10,12 +10,12 @@ import pytest
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
 from recon.places.agree import agreeing_loops
+from recon.places.drift import DriftModel
 from recon.places.graph import close_loops
-from recon.places.settings import DriftSettings
 from recon.places.verify import Loop
 from tests.places.conftest import drifted
 
-DRIFT = DriftSettings()
+DRIFT = DriftModel()
 INFORMATION = np.diag([0.05**-2] * 3 + [0.003**-2] * 3)
 LAP = 200
 HOUSE_M = 8

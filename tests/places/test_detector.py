@@ -6,12 +6,12 @@ import numpy as np
 
 from recon.core.geometry import se3
 from recon.places.detector import LoopDetector
-from recon.places.settings import DriftSettings
+from recon.places.drift import DriftModel
 from tests.places.conftest import LAP, PERIOD, KeyframeMemory, drifted
 
 FIRST = range(7)
 AGAIN = range(LAP, LAP + 7)
-BLIND = DriftSettings(share=1.0, turn_deg=5.0)
+BLIND = DriftModel(share=1.0, turn_deg=5.0)
 """As if odometry knew next to nothing."""
 
 
@@ -66,7 +66,7 @@ def test_frames_without_a_measured_pose_are_no_keyframes(block):
 
 def test_standing_still_makes_no_keyframes(block):
     pair, disparity = block.frame(0)
-    detector = LoopDetector(DriftSettings(), KeyframeMemory())
+    detector = LoopDetector(DriftModel(), KeyframeMemory())
     for k in range(5):
         detector.add(k, pair, disparity, np.eye(4), path_m=0.0)
 
@@ -77,7 +77,7 @@ def test_a_restored_detector_goes_on_as_if_it_had_never_stopped(block):
     frames = [*FIRST, *AGAIN]
     whole, path_m = block.detect(frames, block.truth)
     begun, _ = block.detect(frames[:9], block.truth)
-    resumed = LoopDetector(DriftSettings(), begun._store)
+    resumed = LoopDetector(DriftModel(), begun._store)
     for stored in begun._store:
         resumed.restore(stored)
     for k in frames[9:]:

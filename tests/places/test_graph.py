@@ -11,13 +11,12 @@ from recon.core.errors import RegistrationError
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
 from recon.places import graph
-from recon.places.drift import Drift, drift_over, is_possible, path_lengths
+from recon.places.drift import Drift, DriftModel, drift_over, is_possible, path_lengths
 from recon.places.graph import close_loops
-from recon.places.settings import DriftSettings
 from recon.places.verify import Loop
 from tests.places.conftest import drifted
 
-DRIFT = DriftSettings()
+DRIFT = DriftModel()
 INFORMATION = np.diag([0.05**-2] * 3 + [0.003**-2] * 3)
 LAP = 200
 
@@ -163,7 +162,7 @@ def test_a_metre_without_measurement_counts_as_many():
 
 
 def test_drift_grows_with_the_path_and_bounds_what_is_possible():
-    settings = DriftSettings(share=0.02, turn_deg=0.1)
+    settings = DriftModel(share=0.02, turn_deg=0.1)
     near, far = drift_over(50.0, settings), drift_over(500.0, settings)
     off = se3.make_transform(np.eye(3), np.array([5.0, 0.0, 0.0]))
 

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from recon.core.geometry import se3
 from recon.places import places as places_file
-from recon.places.drift import SIGMAS, drift_over
+from recon.places.drift import SIGMAS, DriftModel, drift_over
 from recon.places.places import Place, Places, WordIndex
-from recon.places.settings import DriftSettings
 
 images = st.lists(st.sets(st.integers(0, 30)), max_size=20)
 
@@ -55,7 +54,7 @@ def _place(frame: int, x_m: float, path_m: float, turned_deg: float = 0.0) -> Pl
 
 
 def test_a_place_is_near_if_odometry_could_be_so_wrong():
-    drift = DriftSettings()
+    drift = DriftModel()
     far = drift_over(100.0, drift)
     reach_m = places_file._VIEW_M + SIGMAS * far.position_m
     turn_deg = places_file._VIEW_DEG + np.degrees(SIGMAS * far.angle_rad)
@@ -92,7 +91,7 @@ def test_a_question_after_ten_kilometres_takes_milliseconds():
     seconds = []
     for _ in range(5):
         start = time.perf_counter()
-        places.near(asked, DriftSettings())
+        places.near(asked, DriftModel())
         places.likeness(asked)
         seconds.append(time.perf_counter() - start)
     # Ten milliseconds on an idle core; comparing image with image takes half a second.

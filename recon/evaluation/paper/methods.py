@@ -26,7 +26,7 @@ from recon.evaluation.paper.settings import PaperConfig
 from recon.stereo.cloud import CloudSettings, back_project
 from recon.stereo.frame import FrameReconstructor
 from recon.stereo.match import Matcher, SadMatcher, SadSettings
-from recon.stereo.rectify import RectificationSettings, Rectifier
+from recon.stereo.rectify import Rectifier, to_grey
 
 CORRECTED: Final = "corrected"
 ABSOLUTE: Final = "absolute"
@@ -210,8 +210,9 @@ def _grey_pair(method: str, experiment: Experiment, config: PaperConfig) -> Rect
 
 def _printed_pair(experiment: Experiment) -> RectifiedPair:
     """Return the images converted to grey by Eq. 6."""
-    settings = RectificationSettings(grey="paper")
-    return Rectifier(experiment.camera, settings).rectify(experiment.pair)
+    pair, rectifier = experiment.pair, Rectifier(experiment.camera)
+    left, right = (to_grey(image, "paper") for image in rectifier.warp(pair))
+    return replace(rectifier.rectify(pair), left=left, right=right)
 
 
 def _patch_figure(patch_px: int, found: Disparity, truth: DisparityTruth | None) -> PatchFigure:

@@ -14,15 +14,17 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.store.keyframes import Keyframes
 from recon.map.store.submaps import SubmapEntry
-from recon.places import LoopSettings
 from recon.places.detector import CONTRADICTED, LoopDetector
-from recon.places.drift import path_lengths
+from recon.places.drift import DriftModel, path_lengths
 from recon.places.graph import Closure, close_loops
 from recon.run.stopwatch import Stopwatch
 from recon.stereo.frame import ReconstructedFrame
 
 _TELLING: Final = 3  # implausible place recognitions from which a warning is given
 _BEHIND: Final = 4  # frames by which loop detection may lag behind
+
+DRIFT: Final = DriftModel()
+"""How far the odometry of a drive may drift."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,23 +117,16 @@ class LoopWatch:
     """Detects loops in its own thread while a drive is mapped, and closes them at its end.
 
     Args:
-        settings: Settings of loop detection and closure.
         keyframes: Where keyframes are kept; those in it are of the frames before.
         stopwatch: Records the time spent.
     """
 
-    def __init__(
-        self,
-        settings: LoopSettings,
-        keyframes: Keyframes,
-        stopwatch: Stopwatch | None = None,
-    ) -> None:
-        self._drift = settings.drift
+    def __init__(self, keyframes: Keyframes, stopwatch: Stopwatch | None = None) -> None:
         self._stage = (stopwatch or Stopwatch()).stage
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
         self._waiting: deque[Future[None]] = deque()
         self._keyframes = keyframes
-        self._detector = LoopDetector(settings.drift, keyframes)
+        self._detector = LoopDetector(DRIFT, keyframes)
         self._path_m: list[float] = []
         self._last: Float64 = np.eye(4)
 
@@ -191,7 +186,7 @@ class LoopWatch:
         loops = self._detector.agreeing()
         return DriveLoops(
             odometry=trajectory,
-            closure=close_loops(trajectory, path_m, loops, self._drift),
+            closure=close_loops(trajectory, path_m, loops, DRIFT),
             keyframes=len(self._detector),
             found=len(self._detector.loops),
             refused=dict(self._detector.refused),

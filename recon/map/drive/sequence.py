@@ -183,7 +183,7 @@ def map_sequence(
     odometry = _odometry(config, source, known_poses, prior, used)
     looking = config.loops.enabled and known_poses is None
     session = work.session(source, config)
-    watch = LoopWatch(config.loops, session.keyframes, work.stopwatch) if looking else None
+    watch = LoopWatch(session.keyframes, work.stopwatch) if looking else None
     mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch)
     drive = _Drive(mapper, watch, config, work)
     progress.on_start(source.name, len(source))

@@ -39,14 +39,8 @@ class FusionSettings(Settings):
         3,
         ge=1,
         le=1000,
-        description="Voxels seen by fewer frames are not exported. Lower it for slow or sparse "
-        "drives, raise it where noise is left.",
-    )
-    precise_sigma_m: float | None = Field(
-        0.08,
-        gt=0.0,
-        le=10.0,
-        description="Voxels at least this precise need one frame less; none = none does.",
+        description="Voxels seen by fewer frames are not exported, or by fewer than one less where "
+        "they are precise. Lower it for slow or sparse drives, raise it where noise is left.",
     )
     max_depth_error_m: float | None = Field(
         0.25,
@@ -126,7 +120,7 @@ class MapBuilder:
             As `FusedPart.cloud` gives it.
         """
         s = self._settings
-        return self.part().cloud(s.voxel_m, min_count or s.min_count, s.precise_sigma_m)
+        return self.part().cloud(s.voxel_m, min_count or s.min_count)
 
     def part(self) -> FusedPart:
         """What was seen since the start, or since the last `take`."""

@@ -19,6 +19,9 @@ NORMAL: Final = slice(3, 6)
 CONFIDENCE: Final = 6
 VALUES: Final = 7
 KNOWABLE: Final = ("rgb", "normals", "sigma_m", "confidence")
+PRECISE_SIGMA_M: Final = 0.08
+"""Voxels at least this precise need one frame less."""
+
 _OFFSET: Final = slice(1, 4)
 _TURNED: Final = slice(4 + NORMAL.start, 4 + NORMAL.stop)
 
@@ -90,19 +93,18 @@ class FusedPart:
         points = self._moved_points(T_new_world, voxel_m)
         return voxels.pack_keys(np.floor(points / voxel_m).astype(np.int64))
 
-    def cloud(self, voxel_m: float, least: int, precise_m: float | None = None) -> PointCloud:
+    def cloud(self, voxel_m: float, least: int) -> PointCloud:
         """One point per voxel that enough frames saw.
 
         Args:
             voxel_m: Edge of a voxel.
-            least: How many are enough.
-            precise_m: Where ``sigma_m`` is at most this, one less is enough; None = nowhere.
+            least: How many are enough; one less where ``sigma_m`` is at most `PRECISE_SIGMA_M`.
 
         Returns:
             Frame ``world``. ``sigma_m`` treats frames as independent, and the points of one
             frame in one voxel as one measurement. Voxels whose normals cancel are left out.
         """
-        rows = np.flatnonzero(self.frames >= self._needed(least, precise_m))
+        rows = np.flatnonzero(self.frames >= self._needed(least))
         part = self.select(rows[self._has_direction(rows)])
         weight = part.sums[:, :1]
         values = part.sums[:, 4:] / weight
@@ -124,11 +126,11 @@ class FusedPart:
         points = (self.cells + 0.5) * voxel_m + self.sums[:, _OFFSET] / self.sums[:, :1]
         return apply(T_new_world, points)
 
-    def _needed(self, least: int, precise_m: float | None) -> Int32:
+    def _needed(self, least: int) -> Int32:
         """int32 (N,), frames that must have seen each voxel."""
-        if precise_m is None or "sigma_m" not in self.known:
+        if "sigma_m" not in self.known:
             return np.full(len(self), least, np.int32)
-        precise = self.information >= np.float32(precise_m**-2)
+        precise = self.information >= np.float32(PRECISE_SIGMA_M**-2)
         return np.where(precise, max(1, least - 1), least).astype(np.int32)
 
     def _has_direction(self, rows: NDArray[np.intp]) -> Bool:

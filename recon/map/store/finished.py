@@ -84,7 +84,7 @@ def with_occupancy(session: Session, settings: DriveSettings) -> Submaps:
 def _compact(session: Session, settings: DriveSettings) -> Iterator[Submap]:
     """The submaps of a session as they are kept."""
     fusion = settings.fusion
-    least = min(fusion.min_count, len(session)) - (fusion.precise_sigma_m is not None)
+    least = min(fusion.min_count, len(session)) - 1  # enough where a voxel is precise
     where = _Places(session, fusion.voxel_m)
     for index, submap in enumerate(session.submaps):
         few = submap.fused.frames < least

@@ -8,7 +8,7 @@ widens the images.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -27,11 +27,9 @@ _STEPS: Final = 16
 _LIMIT_PX: Final = 2**15 // _STEPS - 1
 """16ths of a pixel are counted in 16 bits."""
 
-_MODES: Final = {
-    "sgbm": cv2.STEREO_SGBM_MODE_SGBM,
-    "hh": cv2.STEREO_SGBM_MODE_HH,
-    "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-}
+_SGBM_MODE: Final = cv2.STEREO_SGBM_MODE_HH
+"""Eight paths over the whole image, its most accurate."""
+
 _BM_PREFILTER_CAP: Final = 31
 _BM_TEXTURE_THRESHOLD: Final = 10
 """Least sum of prefiltered values in the window; OpenCV's default, as the cap."""
@@ -69,11 +67,6 @@ class OpencvSettings(SearchSettings):
         le=255,
         description="Width of the window; odd. none = 9 for `opencv-bm` (at least 5), 3 for "
         "`opencv-sgbm`.",
-    )
-    mode: Literal["hh", "3way", "sgbm"] = Field(
-        default="hh",
-        description="Of `opencv-sgbm`: 8 paths over the whole image, 3 paths in strips (fastest), "
-        "or 5 paths.",
     )
 
 
@@ -138,7 +131,7 @@ class OpencvSgbmMatcher:
             disp12MaxDiff=LEFT_RIGHT_PX,
             preFilterCap=_SGBM_PREFILTER_CAP,
             uniquenessRatio=_UNIQUENESS_PERCENT,
-            mode=_MODES[s.mode],
+            mode=_SGBM_MODE,
         )
         return _match(pair, engine, s, _Margins.around(s, block_px, ndisp))
 

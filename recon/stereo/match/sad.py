@@ -45,6 +45,11 @@ halves of the widest window it is below 65535, as the kernel wants."""
 _LEAST_SUPPORT: Final = 0.03
 """Least share of a tile's matches at half size that eight disparities must have to be searched."""
 
+WINDOW_SLANT: Final = 1 / 3
+"""Disparity per row of a second window, which competes with the upright one at each pixel; 0 =
+none. On level ground it is baseline / camera height. Its upper and its lower half are moved against
+each other by whole disparities, so that any slant near this one is the same."""
+
 
 class SadSettings(MeasuredSettings):
     """Settings of the SAD matcher."""
@@ -55,14 +60,6 @@ class SadSettings(MeasuredSettings):
         le=55,
         description="Edge of the square window; odd. Smaller keeps thin things and sharp edges, "
         "larger is denser where texture is weak.",
-    )
-    window_slant: float = Field(
-        default=1 / 3,
-        ge=-1.0,
-        le=1.0,
-        description="Disparity per row of a second window, which competes with the upright one "
-        "at each pixel; 0 = none. On level ground it is baseline / camera height. Its upper and "
-        "its lower half are moved against each other by whole disparities, so it is rounded.",
     )
     uniqueness_percent: UniquenessPercent = 2
     min_texture: float = Field(
@@ -139,7 +136,7 @@ class SadMatcher:
         ndisp = s.ndisp_within(camera)
         radius = s.window_px // 2
         # The middles of the two halves lie half a radius above and below the pixel.
-        slant = math.floor(s.window_slant * radius / 2 + 0.5)
+        slant = math.floor(WINDOW_SLANT * radius / 2 + 0.5)
         search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, slant)
         return search, rules_of(s, ndisp, s.window_px**2, min_texture=s.min_texture)
 

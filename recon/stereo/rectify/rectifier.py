@@ -22,7 +22,7 @@ from recon.core.values import (
     check_size,
 )
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
-from recon.stereo.rectify.grey import GreyMode, to_grey
+from recon.stereo.rectify.grey import to_grey
 from recon.stereo.rectify.lens import rectifying_maps, sees_all, unproject
 from recon.stereo.rectify.wide import plan_wide_view
 
@@ -35,7 +35,7 @@ _OUT_OF_PROPORTION: Final = 20.0
 
 
 class RectificationSettings(Settings):
-    """Rectification and grey conversion of raw images."""
+    """Rectification of raw images."""
 
     alpha: float | None = Field(
         default=0.0,
@@ -51,17 +51,6 @@ class RectificationSettings(Settings):
         le=150,
         description="Horizontal field of view of the rectified views, in place of alpha. none = by "
         "alpha; 0 of a fisheye keeps the resolution at its centre, at most 120 degrees.",
-    )
-    grey: GreyMode = Field(
-        default="bt601",
-        description="Weights of the colours in grey images: bt601 as usual, mean = equal, paper = "
-        "as the seed paper prints them.",
-    )
-    inspect_every: int | None = Field(
-        default=50,
-        ge=1,
-        description="Every how many frames features show whether left and right are swapped or "
-        "their rows do not correspond; none = never.",
     )
 
 
@@ -100,7 +89,7 @@ class Rectifier:
     Args:
         calibration: The raw cameras, or the camera of already rectified images, which are only
             checked for size and converted to grey.
-        settings: Zoom and grey conversion.
+        settings: Zoom of the rectified views.
 
     Attributes:
         camera: Geometry of the rectified views.
@@ -140,8 +129,8 @@ class Rectifier:
         """
         left, right = self.warp(pair)
         return RectifiedPair(
-            left=to_grey(left, self.settings.grey),
-            right=to_grey(right, self.settings.grey),
+            left=to_grey(left),
+            right=to_grey(right),
             camera=self.camera,
             left_rgb=left if left.ndim == 3 else None,
             right_rgb=right if right.ndim == 3 else None,

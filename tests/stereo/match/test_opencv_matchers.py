@@ -104,14 +104,6 @@ def test_a_range_beyond_16_bits_is_refused(range_px: dict[str, int]) -> None:
         match("opencv-sgbm", shifted_pair(0), **range_px)
 
 
-def test_the_modes_of_the_semi_global_matcher_differ() -> None:
-    left = cv2.GaussianBlur(shifted_pair(0).left, (9, 9), 0)
-    right = np.roll(left, -5, axis=1) // 2 + 60
-    pair = RectifiedPair(left, right.astype(np.uint8), stand_in_camera(160, 60, 32))
-    maps = [match("opencv-sgbm", pair, mode=mode).values for mode in ("hh", "3way", "sgbm")]
-    assert not np.array_equal(maps[0], maps[1], equal_nan=True)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_an_even_window_is_refused(name: str) -> None:
     with pytest.raises(SettingsError, match="odd"):
