@@ -19,7 +19,7 @@ $(READY): pyproject.toml constraints.txt scripts/setup.sh
 	@scripts/setup.sh
 	@touch $@
 
-$(COMPILED): $(READY) $(wildcard recon/*/kernels/*.py)
+$(COMPILED): $(READY) $(wildcard recon/*/kernels/*.py recon/*/kernels/*/*.py)
 	@echo "setup: compiling the kernels, once: about two minutes"
 	@printf 'setup: %s\n' "$$($(BIN)/recon doctor --compile)"
 	@touch $@
