@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -103,33 +104,32 @@ def map_(
         raise typer.BadParameter("give SOURCE, or --resume FOLDER")
     if poses is not None and prior is not None:
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
+    if out is not None and resume is not None and out.resolve() != resume.resolve():
+        raise typer.BadParameter("--out and --resume name different folders")
     with session(quiet=quiet):
         from recon.cli.show.announce import announce, warn
         from recon.cli.show.progress import choose_viewer
-        from recon.commands.config import matching_overrides, source_overrides
+        from recon.commands.config import load_config, matching_overrides, source_overrides
         from recon.commands.map import run_map
-        from recon.commands.map_options import MapOptions
-        from recon.commands.resume import MapRequest, open_requested, plan_map
-        from recon.io.trajectory import read_trajectory
-        from recon.sources import read_prior
+        from recon.commands.map_options import MapRequest
+        from recon.commands.resume import resumed
+        from recon.run.memory import memory_overrides
 
         method = [] if odometry is None else [f"odometry.method={odometry.value}"]
         views = source_overrides(calib, left, right, tolerance, (start, end, stride))
         overrides = [*(set_ or ()), *method, *matching_overrides(matcher), *views]
-        asked = MapRequest(source, kind, poses, prior, mesh, out, resume, memory_limit)
-        request, settings = plan_map(asked, config, overrides)
-        drive = open_requested(request, settings)
+        request = MapRequest(source, kind, poses, prior, mesh)
+        if resume is None:
+            settings = load_config(config, [*overrides, *memory_overrides(memory_limit)])
+        else:
+            request, settings = resumed(resume, request, config, overrides, memory_limit)
+        drive, options = request.open(settings)
         announce(drive, quiet=quiet, verbose=verbose)
-        guide = None if request.prior is None else read_prior(drive, request.prior)
-        options = MapOptions(
-            out=request.out,
+        options = replace(
+            options,
+            out=resume or out,
             threads=threads,
-            known_poses=None if request.poses is None else read_trajectory(request.poses),
-            prior=None if guide is None else guide.path,
-            prior_origin="" if guide is None else guide.origin,
-            mesh=request.mesh,
             resume=resume is not None,
-            arguments=request.arguments(),
             progress=choose_viewer(quiet=quiet, verbose=verbose),
             tell=partial(warn, quiet=quiet, verbose=verbose),
         )

@@ -1,14 +1,20 @@
-"""The options of `recon map` that are not part of the configuration."""
+"""What `recon map` is asked for: its command line, and the options that come of it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from typing_extensions import Self
+
+from recon.commands.config import ReconConfig
+from recon.core.errors import SettingsError
 from recon.core.values import Trajectory
+from recon.io.trajectory import read_trajectory
 from recon.run.progress import SILENT, Progress
+from recon.sources import StereoSource, open_source, read_prior
 
 
 @dataclass(frozen=True)
@@ -42,3 +48,85 @@ class MapOptions:
     tell: Callable[[tuple[str, ...]], None] = lambda findings: None
     resume: bool = False
     arguments: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MapRequest:
+    """What is mapped with what: the part of the command line that resuming need not repeat.
+
+    Attributes:
+        source: Path of the source.
+        kind: Kind of the source; None = inferred from its files.
+        poses: File of known poses.
+        prior: File of the camera's motion from another sensor, or a topic of the source.
+        mesh: Whether to reconstruct a surface.
+    """
+
+    source: Path | None = None
+    kind: str | None = None
+    poses: Path | None = None
+    prior: str | None = None
+    mesh: bool = True
+
+    def arguments(self) -> dict[str, Any]:
+        """The request as plain values, with absolute paths."""
+        prior = self.prior
+        return {
+            "source": _absolute(self.source),
+            "kind": self.kind,
+            "poses": _absolute(self.poses),
+            "prior": _absolute(Path(prior)) if prior and Path(prior).is_file() else prior,
+            "mesh": self.mesh,
+        }
+
+    @classmethod
+    def of(cls, arguments: Mapping[str, Any]) -> Self:
+        """The request with these `arguments`."""
+        source, poses = (arguments.get(name) for name in ("source", "poses"))
+        return cls(
+            source=None if source is None else Path(source),
+            kind=arguments.get("kind"),
+            poses=None if poses is None else Path(poses),
+            prior=arguments.get("prior"),
+            mesh=bool(arguments.get("mesh")),
+        )
+
+    def over(self, earlier: Self) -> Self:
+        """This request, with what it leaves open as in an earlier one.
+
+        Raises:
+            SettingsError: It wants no mesh, and the earlier one does.
+        """
+        if earlier.mesh and not self.mesh:
+            raise SettingsError("the run was started with a mesh", hint="drop --no-mesh")
+        return replace(
+            earlier,
+            source=self.source or earlier.source,
+            kind=self.kind or earlier.kind,
+            poses=self.poses or earlier.poses,
+            prior=self.prior or earlier.prior,
+        )
+
+    def open(self, config: ReconConfig) -> tuple[StereoSource, MapOptions]:
+        """Open the source, and read the poses and the prior.
+
+        Raises:
+            SettingsError: The request names no source.
+            ReconError: The source cannot give pairs, or a file cannot be read.
+        """
+        if self.source is None:
+            raise SettingsError("there is no source to map", hint="name SOURCE")
+        settings = config.source.model_copy(update={"max_megapixels": config.readable_megapixels})
+        source = open_source(self.source, self.kind, settings)
+        prior = None if self.prior is None else read_prior(source, self.prior)
+        return source, MapOptions(
+            known_poses=None if self.poses is None else read_trajectory(self.poses),
+            prior=None if prior is None else prior.path,
+            prior_origin="" if prior is None else prior.origin,
+            mesh=self.mesh,
+            arguments=self.arguments(),
+        )
+
+
+def _absolute(path: Path | None) -> str | None:
+    return None if path is None else str(path.resolve())

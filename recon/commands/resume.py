@@ -8,11 +8,11 @@ import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
+from recon.commands.map_options import MapRequest
 from recon.core.errors import (
     FormatError,
     MemoryLimitError,
@@ -27,7 +27,7 @@ from recon.run.directory import RECORD, STARTED, RunDirectory, state_folder
 from recon.run.machine import versions
 from recon.run.memory import memory_overrides
 from recon.run.record import fingerprint
-from recon.sources import StereoSource, open_source
+from recon.sources import StereoSource
 
 _OTHER: Final = {
     "config": "other settings",
@@ -43,105 +43,35 @@ _NOTHING: Final = "there is no unfinished run to resume"
 _START_ANEW: Final = "start it without --resume"
 
 
-@dataclass(frozen=True)
-class MapRequest:
-    """The command line of `recon map`, apart from settings.
-
-    Attributes:
-        source: Path of the source; None = that of the run that is resumed.
-        kind: Kind of the source; None = inferred from its files.
-        poses: File of known poses.
-        prior: File of the camera's motion from another sensor, or a topic of the source.
-        mesh: Whether to reconstruct a surface.
-        out: Result folder; None = a new one.
-        resume: Folder of an unfinished run to resume.
-        memory_limit: Memory limit of the run, such as ``2G``.
-    """
-
-    source: Path | None
-    kind: str | None = None
-    poses: Path | None = None
-    prior: str | None = None
-    mesh: bool = True
-    out: Path | None = None
-    resume: Path | None = None
-    memory_limit: str | None = None
-
-    def arguments(self) -> dict[str, Any]:
-        """The arguments needed to resume the run."""
-        return {
-            "source": None if self.source is None else str(self.source.resolve()),
-            "kind": self.kind,
-            "poses": None if self.poses is None else str(self.poses.resolve()),
-            "prior": _place(self.prior),
-            "mesh": self.mesh,
-        }
-
-
-def plan_map(
-    request: MapRequest, config: Path | None, overrides: Sequence[str]
+def resumed(
+    folder: Path,
+    request: MapRequest,
+    config: Path | None,
+    overrides: Sequence[str],
+    memory_limit: str | None,
 ) -> tuple[MapRequest, ReconConfig]:
-    """Complete a request and its configuration from the run that is resumed.
+    """Complete a request by that of an unfinished run, and return its configuration.
+
+    Args:
+        folder: Folder of the run.
+        request: What is asked for now; what it leaves open is as the run was started with.
+        config: YAML file of settings; None = those of the run.
+        overrides: ``key=value`` settings; they and the file must not differ from the run's.
+        memory_limit: Another memory limit, such as ``2G``; None = that of the run.
 
     Raises:
-        SettingsError: A setting is invalid, or contradicts the resumed run.
+        SettingsError: A setting is invalid, or contradicts the run.
         OutputError: There is no run to resume.
     """
-    if request.resume is not None:
-        return _plan_resumed(request, request.resume, config, overrides)
-    return request, load_config(config, [*overrides, *memory_overrides(request.memory_limit)])
-
-
-def _plan_resumed(
-    request: MapRequest, folder: Path, config: Path | None, overrides: Sequence[str]
-) -> tuple[MapRequest, ReconConfig]:
     started = read_started(folder)
-    known = started["arguments"]
+    request = request.over(MapRequest.of(started["arguments"]))
     settings = ReconConfig.parse(started["identity"]["config"], where=str(folder))
-    limit = memory_overrides(request.memory_limit)
-    asked = load_config(config, [*overrides, *limit])
+    asked = load_config(config, [*overrides, *memory_overrides(memory_limit)])
     if config is not None or overrides:
         _refuse_others({"config": asked.model_dump(mode="json")}, started["identity"], folder)
     if asked.memory.limit_mb is not None:
         settings = settings.model_copy(update={_MEMORY: asked.memory})
-    if request.out is not None and request.out.resolve() != folder.resolve():
-        raise SettingsError(
-            "--out and --resume name different folders", got=request.out, expected=folder
-        )
-    if not request.mesh and known.get("mesh"):
-        raise SettingsError("the run was started with a mesh", where=folder, hint="drop --no-mesh")
-    request = replace(
-        request,
-        source=request.source or _path(known.get("source")),
-        kind=request.kind or known.get("kind"),
-        poses=request.poses or _path(known.get("poses")),
-        prior=request.prior or known.get("prior"),
-        mesh=bool(known.get("mesh")),
-        out=folder,
-    )
     return request, settings
-
-
-def _place(name: str | None) -> str | None:
-    """The absolute path of a file; other names, such as topics, unchanged."""
-    return str(Path(name).resolve()) if name is not None and Path(name).is_file() else name
-
-
-def _path(text: str | None) -> Path | None:
-    return None if text is None else Path(text)
-
-
-def open_requested(request: MapRequest, config: ReconConfig) -> StereoSource:
-    """Open the source of a planned request.
-
-    Raises:
-        SettingsError: The request names no source.
-        ReconError: The source cannot give pairs.
-    """
-    if request.source is None:
-        raise SettingsError("there is no source to map", hint="name SOURCE")
-    settings = config.source.model_copy(update={"max_megapixels": config.readable_megapixels})
-    return open_source(request.source, request.kind, settings)
 
 
 def identity_of(

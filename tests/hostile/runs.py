@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from recon.commands.config import load_config
 from recon.commands.map import run_map
-from recon.commands.map_options import MapOptions
-from recon.commands.resume import MapRequest
+from recon.commands.map_options import MapRequest
 from recon.map.drive.frame_result import FrameResult
 from recon.run.progress import Silent
-from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetSettings
 from tests.scenery.kitti import write_kitti
@@ -33,13 +32,7 @@ def interrupt_run(folder: Path) -> None:
     """Write a drive to ``folder/drive`` and an interrupted run of it to ``folder/run``."""
     write_kitti(SyntheticSource(StreetSettings(**DRIVE)), folder / "drive")
     config = load_config(None, ["checkpoints.every_frames=1", "submaps.length_m=1"])
-    request = MapRequest(folder / "drive", mesh=False)
-    options = MapOptions(
-        audit=False,
-        out=folder / "run",
-        mesh=False,
-        progress=_Stops(),
-        arguments=request.arguments(),
-    )
+    source, options = MapRequest(folder / "drive", mesh=False).open(config)
+    options = replace(options, audit=False, out=folder / "run", progress=_Stops())
     with pytest.raises(KeyboardInterrupt):
-        run_map(open_source(folder / "drive"), config, options)
+        run_map(source, config, options)

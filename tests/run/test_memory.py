@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,8 @@ import pytest
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map import run_map
-from recon.commands.map_options import MapOptions
-from recon.commands.resume import MapRequest, plan_map
+from recon.commands.map_options import MapRequest
+from recon.commands.resume import resumed
 from recon.core.errors import MemoryLimitError, SettingsError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import PointCloud
@@ -21,7 +22,6 @@ from recon.map.submaps import SubmapBuilder
 from recon.map.tiles import Tiles, join_clouds, join_voxels
 from recon.run import memory
 from recon.run.memory import MemorySettings, memory_overrides, parse_size_mb
-from recon.sources import open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.street import StreetScene
 from tests.scenery.kitti import write_kitti
@@ -128,18 +128,16 @@ def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(
     peaks = iter([400.0] * 6)
     monkeypatch.setattr(memory, "peak_memory_mb", lambda: next(peaks, 600.0))
     out = tmp_path / "run"
-    request = MapRequest(drive, mesh=False, out=out, memory_limit="500M")
-    overrides = ["checkpoints.every_frames=4", "submaps.length_m=4"]
-    request, config = plan_map(request, None, overrides)
-    options = MapOptions(audit=False, out=out, mesh=False, arguments=request.arguments())
+    overrides = ["checkpoints.every_frames=4", "submaps.length_m=4", "memory.limit_mb=500"]
+    config = load_config(None, overrides)
+    source, options = MapRequest(drive, mesh=False).open(config)
+    options = replace(options, audit=False, out=out)
     with pytest.raises(MemoryLimitError, match=r"got 600 MB.*--resume .* larger --memory-limit"):
-        run_map(open_source(drive), config, options)
-    resumed, config = plan_map(MapRequest(None, resume=out, memory_limit="700M"), None, [])
+        run_map(source, config, options)
+    request, config = resumed(out, MapRequest(mesh=False), None, [], "700M")
     assert config.memory.limit_mb == 700
     assert config.submaps.length_m == 4
-    assert resumed.source == drive
-    run = run_map(
-        open_source(drive), config, MapOptions(audit=False, out=out, mesh=False, resume=True)
-    )
+    assert request.source == drive
+    run = run_map(source, config, replace(options, resume=True))
     assert run.summary["frames"] == STREET.frames
     assert "limit_mb: 700" in (out / "config.yaml").read_text()
