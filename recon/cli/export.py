@@ -47,8 +47,8 @@ def export(
       recon export outputs/map/latest --to mesh --set mesh.depth=9
     """
     with session(quiet=quiet):
+        from recon.commands.config import settings_of
         from recon.commands.export import run_export
-        from recon.commands.finished_run import settings_of
 
         cells = [] if resolution is None else [f"occupancy.resolution_m={resolution}"]
         summary = run_export(

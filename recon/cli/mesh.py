@@ -41,8 +41,8 @@ def mesh(
     """
     with session(quiet=quiet):
         from recon.commands.config import PAIR_DEFAULTS, load_config
-        from recon.commands.finished_run import is_pair_run
         from recon.commands.mesh import run_mesh
+        from recon.run.finished import is_pair_run
 
         defaults = PAIR_DEFAULTS if source.is_dir() and is_pair_run(source) else None
         settings = load_config(config, set_ or (), defaults)

@@ -46,7 +46,7 @@ def occupancy(
       recon occupancy outputs/map/latest --min-height 0.5 --max-height 3.2
     """
     with session(quiet=quiet):
-        from recon.commands.finished_run import settings_of
+        from recon.commands.config import settings_of
         from recon.commands.occupancy import run_occupancy
 
         given = {

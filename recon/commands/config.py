@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,6 +17,8 @@ from recon.map.settings import DriveSettings
 from recon.rig.audit.settings import AuditedSettings
 from recon.rig.calibrate.settings import CalibratedSettings
 from recon.rig.capture import CaptureSettings
+from recon.run.finished import is_pair_run
+from recon.run.run import CONFIG
 from recon.sources.settings import SourceSettings
 from recon.stereo.cloud import ANY_SCALE
 from recon.stereo.match import MATCHERS, MatchingSettings, field_of, name_of, settings_of
@@ -124,6 +126,55 @@ def load_config(
         if path is not None:
             ReconConfig.parse(given, where=str(path))  # blames the file if it is invalid by itself
         raise
+
+
+def settings_of(
+    folder: Path, file: Path | None = None, overrides: Sequence[str] = ()
+) -> ReconConfig:
+    """The settings of a finished run of map, demo or pair, with changes.
+
+    Args:
+        folder: Folder of the run.
+        file: YAML file of settings, applied before the overrides; None = none.
+        overrides: ``key=value`` settings.
+
+    Raises:
+        FormatError: The folder does not contain such a run.
+        SettingsError: A setting is invalid, or one of the run's is not known in this version.
+    """
+    if is_pair_run(folder):
+        return load_config(file, overrides, PAIR_DEFAULTS)
+    try:
+        own = load_config(folder / CONFIG)
+    except SettingsError as error:
+        raise SettingsError(
+            f"the settings of this run are not valid in this version: {error.what}",
+            where=error.where,
+            got=error.got,
+            hint="map the drive again",
+        ) from error
+    return load_config(file, overrides, own.model_dump(mode="json"))
+
+
+def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[str]) -> None:
+    """Refuse settings that differ from those of a run where that has no effect.
+
+    Args:
+        ran: The settings of the run.
+        config: Those to make something of it with.
+        sections: Where they may differ.
+
+    Raises:
+        SettingsError: They differ elsewhere.
+    """
+    for name in type(config).model_fields:
+        if name not in sections and getattr(config, name) != getattr(ran, name):
+            raise SettingsError(
+                "this setting has no effect here: the drive is not mapped again",
+                got=name,
+                expected=f"settings of {', '.join(sections)}",
+                hint="recon map takes it",
+            )
 
 
 def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> list[str]:

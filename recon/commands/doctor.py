@@ -13,7 +13,6 @@ import numpy as np
 
 from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.commands.demo import demo_source
-from recon.commands.finished_run import OCTOMAP
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.commands.occupancy import run_occupancy
@@ -23,6 +22,7 @@ from recon.core.kernels.cache import when_compiling
 from recon.core.values import StereoPair
 from recon.io.occupancy.octomap_leaves import octomap_pieces
 from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.run.finished import OCTOMAP
 from recon.run.installation import (
     PACKAGES,
     SYSTEM_LIBRARIES,

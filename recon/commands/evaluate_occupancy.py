@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from recon.commands.config import ReconConfig, settings_of
 from recon.commands.demo import demo_source
-from recon.commands.finished_run import GRID, OCTOMAP, FinishedRun, open_run
 from recon.core.errors import EvaluationError
 from recon.core.values import OccupancyGrid, OccupancyMetrics, OccupancyTruth
 from recon.evaluation import evaluate_occupancy
@@ -15,6 +15,7 @@ from recon.io.images.image import write_image
 from recon.io.occupancy.nav2 import read_nav2
 from recon.io.occupancy.octomap import read_octomap
 from recon.report.colour import colour_grid_errors
+from recon.run.finished import GRID, OCTOMAP, FinishedRun, open_run
 from recon.sources import KnowsOccupancy
 
 
@@ -50,16 +51,16 @@ def run_evaluate_occupancy(
         EvaluationError: The run has no ground truth, or no cell was seen often enough.
         OutputError: The image cannot be written.
     """
-    run = open_run(folder)
-    source = _source_that_knows(run)
+    run, config = open_run(folder), settings_of(folder)
+    source = _source_that_knows(run, config)
     voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
-    truth = known_occupancy(source, run.config, run.T_map_world, least_frames)
+    truth = known_occupancy(source, config, run.T_map_world, least_frames)
     if image is not None:
         write_image(image, colour_grid_errors(grid, truth))
     return OccupancyComparison(evaluate_occupancy(voxels, grid, truth), grid, truth)
 
 
-def _source_that_knows(run: FinishedRun) -> KnowsOccupancy:
+def _source_that_knows(run: FinishedRun, config: ReconConfig) -> KnowsOccupancy:
     if run.mapped_by != "demo":
         raise EvaluationError(
             "the true occupancy of this run is not known",
@@ -68,4 +69,4 @@ def _source_that_knows(run: FinishedRun) -> KnowsOccupancy:
             expected="a run of recon demo, whose street can be rendered again",
             hint="recon evaluate map compares a run with a reference cloud",
         )
-    return demo_source(run.config)
+    return demo_source(config)

@@ -6,19 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
-from recon.commands.finished_run import (
+from recon.commands.config import ReconConfig, check_changes, settings_of
+from recon.commands.occupancy import REMADE
+from recon.core.errors import SettingsError
+from recon.export.remake import copy_file, from_rays, mesh_cloud, remake_map
+from recon.io.models.mesh import check_mesh_formats
+from recon.run.finished import (
     PAIR_CLOUD,
     camera_of_pair,
-    check_changes,
     is_pair_run,
     open_run,
     refuse_as_target,
 )
-from recon.commands.occupancy import REMADE
-from recon.commands.remake import copy_file, mesh_cloud, remake_map
-from recon.core.errors import SettingsError
-from recon.io.models.mesh import check_mesh_formats
 from recon.run.run import Run
 
 PRODUCTS: Final = ("cloud", "grid", "octomap", "mesh")
@@ -57,13 +56,14 @@ def run_export(
     wanted = _known(products, _OF_A_PAIR if pair else PRODUCTS)
     refuse_as_target(source, out)
     if pair:
-        settings = config or load_config(defaults=PAIR_DEFAULTS)
+        settings = config or settings_of(source)
         with Run("export", out, settings, threads=threads) as run:
             return _export_pair(source, settings, wanted, run, formats)
-    mapped = open_run(source)
-    settings = check_changes(mapped, config, (*REMADE, "mesh"))
+    mapped, ran = open_run(source), settings_of(source)
+    settings = config or ran
+    check_changes(ran, settings, (*(REMADE if from_rays(wanted) else ()), "mesh"))
     with Run("export", out, settings, threads=threads) as run:
-        return remake_map(mapped, settings, wanted, run, formats)
+        return remake_map(mapped, settings, wanted, run, settings.mesh, formats)
 
 
 def _export_pair(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.finished_run import UNTRUSTED
 from recon.commands.map_options import MapOptions
 from recon.commands.resume import begin_or_resume, identity_of, tell_how_to_resume
 from recon.evaluation.drive import compare_with_truth
@@ -21,6 +20,7 @@ from recon.odometry.health import health_warnings
 from recon.report.map_page import write_map_page
 from recon.rig.audit.audit import quick_warnings
 from recon.run import Run
+from recon.run.finished import UNTRUSTED
 from recon.run.summary import plain
 from recon.sources import IncompleteSource, StereoSource
 

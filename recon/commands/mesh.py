@@ -6,16 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from recon.commands.config import ReconConfig
-from recon.commands.finished_run import (
+from recon.commands.config import ReconConfig, settings_of
+from recon.export.remake import mesh_cloud, remake_map
+from recon.io.models.mesh import check_mesh_formats
+from recon.run.finished import (
     PAIR_CLOUD,
     camera_of_pair,
     is_pair_run,
     open_run,
     refuse_as_target,
 )
-from recon.commands.remake import mesh_cloud, remake_map
-from recon.io.models.mesh import check_mesh_formats
 from recon.run.run import Run
 
 
@@ -57,7 +57,7 @@ def run_mesh(
             mapped = open_run(source)
     with Run("mesh", out, config, threads=threads) as run:
         if mapped is not None:
-            return remake_map(mapped, config, ["mesh"], run, formats)
+            return remake_map(mapped, settings_of(source), ["mesh"], run, config.mesh, formats)
         figures = mesh_cloud(cloud, camera, config.mesh, run, formats)
         figures = {"cloud": str(cloud), **figures}
         run.finish(figures, source=str(source), inputs=[cloud])

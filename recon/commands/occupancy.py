@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final
 
-from recon.commands.config import ReconConfig
-from recon.commands.finished_run import check_changes, open_run, refuse_as_target
-from recon.commands.remake import remake_map
+from recon.commands.config import ReconConfig, check_changes, settings_of
+from recon.export.remake import remake_map
+from recon.run.finished import open_run, refuse_as_target
 from recon.run.run import Run
 
 REMADE: Final = ("occupancy", "grid", "ground", "submaps")
@@ -37,8 +37,9 @@ def run_occupancy(
         ReconError: The run kept no rays or is damaged, a setting needs finer or longer rays than
             it kept or has no effect, or the folder cannot be written; nothing is left behind.
     """
-    source = open_run(run)
+    source, ran = open_run(run), settings_of(run)
     refuse_as_target(run, out)
-    settings = check_changes(source, config, REMADE)
+    settings = config or ran
+    check_changes(ran, settings, REMADE)
     with Run("occupancy", out, settings, threads=threads) as made:
-        return remake_map(source, settings, ["octomap", "grid"], made)
+        return remake_map(source, settings, ["octomap", "grid"], made, settings.mesh)

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.commands.config import PAIR_DEFAULTS, load_config
+from recon.commands.config import PAIR_DEFAULTS, load_config, settings_of
 from recon.commands.export import run_export
-from recon.commands.finished_run import settings_of
 from recon.commands.pair import run_pair
 from recon.core.errors import FormatError, SettingsError
 from recon.core.values import OCCUPIED, RectifiedCamera, StereoPair

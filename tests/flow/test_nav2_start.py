@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from recon.commands.config import load_config
+from recon.commands.config import load_config, settings_of
 from recon.commands.demo import demo_source
-from recon.commands.finished_run import settings_of
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.commands.occupancy import run_occupancy

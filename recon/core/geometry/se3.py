@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.errors import FormatError
 from recon.core.values.arrays import Float64
+
+_FARTHEST_M: Final = 1e5
+"""From the first camera to the origin of a map: farther than any drive."""
+_RIGID_TOLERANCE: Final = 1e-6
 
 
 def make_transform(rotation: NDArray[Any], translation_m: NDArray[Any]) -> Float64:
@@ -111,3 +117,25 @@ def orthonormalise(T: NDArray[Any]) -> Float64:
     U, _, Vt = np.linalg.svd(T[:3, :3])
     U[:, -1] *= np.sign(np.linalg.det(U @ Vt))
     return make_transform(U @ Vt, T[:3, 3])
+
+
+def check_rigid(name: str, T: Float64, where: Path | None = None) -> None:
+    """Check a pose that is read from a run: one that is none would spoil or exhaust a map.
+
+    Raises:
+        FormatError: It is not a rigid transform, or implausibly far away.
+    """
+    if not (
+        T.shape == (4, 4)
+        and np.isfinite(T).all()
+        and np.abs(T[:3, 3]).max() <= _FARTHEST_M
+        and np.array_equal(T[3], [0, 0, 0, 1])
+        and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), rtol=0, atol=_RIGID_TOLERANCE)
+        and np.linalg.det(T[:3, :3]) > 0
+    ):
+        raise FormatError(
+            f"{name} is not a rigid transform of a map",
+            where=where,
+            got=T.tolist(),
+            expected=f"a rotation and at most {_FARTHEST_M:g} m",
+        )

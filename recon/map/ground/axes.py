@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from recon.core.errors import FormatError, MappingError
+from recon.core.errors import MappingError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.settings import Settings
 from recon.core.values import PointCloud
@@ -20,10 +19,6 @@ from recon.core.values.arrays import Float64, freeze
 AXES_MAP_WORLD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """The turn from camera-like axes (right, down, forward) to map axes (forward, left, up)."""
 _UP_CAMERA: Final = np.array([0.0, -1.0, 0.0])
-_FARTHEST_M: Final = 1e5
-"""From the first camera to the map's origin: farther than any drive."""
-_RIGID_TOLERANCE: Final = 1e-6
-
 
 _MAX_TILT_DEG: Final = 30.0
 """Planes tilted more than this are no ground."""
@@ -188,25 +183,3 @@ def _fit_plane(xyz: Float64) -> tuple[Float64, float]:
     _, vectors = np.linalg.eigh(np.cov((xyz - centre).T))
     normal: NDArray[Any] = vectors[:, 0] * (-1.0 if vectors[1, 0] > 0 else 1.0)
     return normal, float(-normal @ centre)
-
-
-def check_rigid(name: str, T: Float64, where: Path | None = None) -> None:
-    """Check a pose that is read from a run: one that is none would spoil or exhaust a map.
-
-    Raises:
-        FormatError: It is not a rigid transform, or implausibly far away.
-    """
-    if not (
-        T.shape == (4, 4)
-        and np.isfinite(T).all()
-        and np.abs(T[:3, 3]).max() <= _FARTHEST_M
-        and np.array_equal(T[3], [0, 0, 0, 1])
-        and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), rtol=0, atol=_RIGID_TOLERANCE)
-        and np.linalg.det(T[:3, :3]) > 0
-    ):
-        raise FormatError(
-            f"{name} is not a rigid transform of a map",
-            where=where,
-            got=T.tolist(),
-            expected=f"a rotation and at most {_FARTHEST_M:g} m",
-        )

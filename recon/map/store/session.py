@@ -13,7 +13,6 @@ from recon.core.errors import FormatError
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
 from recon.core.values.arrays import Float64, frozen_array
 from recon.io.files import reading
-from recon.map.ground.axes import check_rigid
 from recon.map.store.keyframes import Keyframes
 from recon.map.store.records import Store
 from recon.map.store.submaps import Submaps

@@ -7,11 +7,9 @@ from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
-from recon.commands.config import ReconConfig
-from recon.commands.finished_map import FinishedMap, map_as_written, map_from_rays
-from recon.commands.finished_run import CLOUD, MAPPED_BY, UNTRUSTED, FinishedRun
 from recon.core.values import FREE, OCCUPIED, OccupancyGrid, RectifiedCamera
 from recon.core.values.cloud import Frame
+from recon.export.finished import FinishedMap, map_as_written, map_from_rays
 from recon.export.grid import export_grid
 from recon.export.mesh import (
     MeshSettings,
@@ -28,6 +26,8 @@ from recon.io.models.mesh import read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.io.models.ply import read_ply, write_ply
 from recon.map.ground.axes import base_axes
+from recon.map.settings import DriveSettings
+from recon.run.finished import CLOUD, MAPPED_BY, UNTRUSTED, FinishedRun
 from recon.run.run import Run
 
 _LAYER = "mesh/cloud.ply"
@@ -35,18 +35,20 @@ _LAYER = "mesh/cloud.ply"
 
 def remake_map(
     source: FinishedRun,
-    config: ReconConfig,
+    config: DriveSettings,
     products: Collection[str],
     run: Run,
+    mesh: MeshSettings,
     formats: Sequence[str] = ("ply",),
 ) -> dict[str, Any]:
     """Make products of the map of a finished run, and write them with the record of the run.
 
     Args:
         source: The run that mapped the drive.
-        config: Its configuration with the requested changes.
+        config: Its settings; where the grid or the OctoMap is made, with changes.
         products: What to make: ``cloud``, ``grid``, ``octomap``, ``mesh``.
         run: The run that makes them.
+        mesh: Settings of the mesh.
         formats: Formats of the mesh.
 
     Returns:
@@ -56,12 +58,12 @@ def remake_map(
         ReconError: The run is damaged, lacks what a product is made from, or a file cannot be
             written.
     """
-    anew = "grid" in products or "octomap" in products
+    anew = from_rays(products)
     with run.stage("map" if anew else "read"):
         found = (
             map_from_rays(source, config)
             if anew
-            else map_as_written(source, voxels="mesh" in products and config.mesh.free_space)
+            else map_as_written(source, config, voxels="mesh" in products and mesh.free_space)
         )
     figures: dict[str, Any] = {"run": str(source.folder), "cloud": str(source.folder / CLOUD)}
     warnings = list(found.warnings)
@@ -76,7 +78,7 @@ def remake_map(
         with run.stage("grid"):
             figures |= _grid(source, found, run, warnings)
     if "mesh" in products:
-        figures |= _mesh(source, found, config.mesh, run, formats, warnings)
+        figures |= _mesh(source, found, mesh, run, formats, warnings)
     record: dict[str, Any] = {}
     if anew or "cloud" in products:
         T_map_world = source.T_map_world.tolist()
@@ -89,6 +91,11 @@ def remake_map(
     figures["warnings"] = warnings
     run.finish(figures, source=str(source.folder), inputs=found.files, record=record)
     return figures
+
+
+def from_rays(products: Collection[str]) -> bool:
+    """Whether products are made from the rays of a run, so that its voxels can be others."""
+    return "grid" in products or "octomap" in products
 
 
 def mesh_cloud(

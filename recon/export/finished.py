@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.commands.config import ReconConfig
-from recon.commands.finished_run import CLOUD, OCTOMAP, FinishedRun
 from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.se3 import apply
 from recon.core.values.arrays import Bool, Float64
 from recon.io.models.ply import read_ply_pieces
 from recon.io.occupancy.octomap_leaves import octomap_pieces
+from recon.map.settings import DriveSettings
 from recon.map.store.finished import with_occupancy
 from recon.map.store.map import MAP_FILE, Map
 from recon.map.store.session import Session
 from recon.map.tiles import Tiles
+from recon.run.finished import CLOUD, OCTOMAP, FinishedRun
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class FinishedMap:
     warnings: tuple[str, ...] = ()
 
 
-def map_from_rays(run: FinishedRun, config: ReconConfig) -> FinishedMap:
+def map_from_rays(run: FinishedRun, config: DriveSettings) -> FinishedMap:
     """Build the occupancy of a run again from the rays in its map; the cloud is that of the run.
 
     Raises:
@@ -58,18 +58,19 @@ def map_from_rays(run: FinishedRun, config: ReconConfig) -> FinishedMap:
     return FinishedMap(tiles, path_m, trusted, files)
 
 
-def map_as_written(run: FinishedRun, *, voxels: bool) -> FinishedMap:
+def map_as_written(run: FinishedRun, config: DriveSettings, *, voxels: bool) -> FinishedMap:
     """Read the cloud of a run, and the voxels that its OctoMap has.
 
     Args:
         run: The run.
+        config: Its settings.
         voxels: Whether voxels are needed; a run without an OctoMap is warned of then.
 
     Raises:
         FormatError: A file of the run is missing or damaged.
     """
     octomap, warnings = run.folder / OCTOMAP, []
-    tiles = Tiles(run.config, run.T_map_world)
+    tiles = Tiles(config, run.T_map_world)
     for cloud in read_ply_pieces(run.folder / CLOUD):
         tiles.put_cloud(cloud)
     if voxels and octomap.is_file():
@@ -81,7 +82,7 @@ def map_as_written(run: FinishedRun, *, voxels: bool) -> FinishedMap:
     return FinishedMap(tiles, nowhere, np.zeros(0, bool), (run.folder / CLOUD,), tuple(warnings))
 
 
-def _check_grain(session: Session, config: ReconConfig) -> None:
+def _check_grain(session: Session, config: DriveSettings) -> None:
     """Refuse a cell size or range that the stored rays do not support."""
     if not session.ray_frames:
         raise FormatError(

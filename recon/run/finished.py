@@ -1,23 +1,21 @@
-"""The record and configuration of a finished run, read from its folder."""
+"""What a finished run has left in its folder, for the commands that go on from there."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.errors import FormatError, SettingsError
+from recon.core.geometry.se3 import check_rigid
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64, freeze
 from recon.io.files import read_text, reader, reading
-from recon.map.ground.axes import check_rigid
 from recon.run.directory import RECORD
-from recon.run.run import CONFIG, SUMMARY
+from recon.run.run import SUMMARY
 
 RECORD_BYTES: Final = 1 << 26
 """Larger than any record: it lists the files of a run."""
@@ -38,14 +36,12 @@ class FinishedRun:
     Attributes:
         folder: Its folder.
         mapped_by: The command that mapped the drive, such as ``demo``.
-        config: Its configuration.
         T_map_world: float64 (4, 4), from world to map axes.
         untrusted: Numbers of the frames whose pose is not to be trusted.
     """
 
     folder: Path
     mapped_by: str
-    config: ReconConfig
     T_map_world: Float64
     untrusted: tuple[int, ...] = ()
 
@@ -54,11 +50,10 @@ class FinishedRun:
 
 
 def open_run(folder: Path) -> FinishedRun:
-    """Read the record and the configuration of a run with maps.
+    """Read the record of a run with maps.
 
     Raises:
         FormatError: The folder does not contain a finished run, or one without maps.
-        SettingsError: Its configuration is not valid in this version.
     """
     path = folder / RECORD
     record = _read_record(path)
@@ -71,60 +66,7 @@ def open_run(folder: Path) -> FinishedRun:
     untrusted = record.get(UNTRUSTED, [])
     if not isinstance(untrusted, list) or not all(type(n) is int for n in untrusted):
         raise FormatError(f"record of the run has no valid {UNTRUSTED}", where=folder / RECORD)
-    return FinishedRun(
-        folder, str(mapped_by), _read_config(folder / CONFIG), T_map_world, tuple(untrusted)
-    )
-
-
-def _read_config(path: Path) -> ReconConfig:
-    """The settings of a run; those of another version may not be known or valid in this one."""
-    try:
-        return load_config(path)
-    except SettingsError as error:
-        raise SettingsError(
-            f"the settings of this run are not valid in this version: {error.what}",
-            where=error.where,
-            got=error.got,
-            hint="map the drive again",
-        ) from error
-
-
-def check_changes(
-    run: FinishedRun, config: ReconConfig | None, sections: Collection[str]
-) -> ReconConfig:
-    """The settings to make something of a run with; those of the run if None are given.
-
-    Raises:
-        SettingsError: They differ from those of the run in another section, which has no effect.
-    """
-    if config is None:
-        return run.config
-    for name in type(config).model_fields:
-        if name not in sections and getattr(config, name) != getattr(run.config, name):
-            raise SettingsError(
-                "this setting has no effect here: the drive is not mapped again",
-                got=name,
-                expected=f"settings of {', '.join(sections)}",
-                hint="recon map takes it",
-            )
-    return config
-
-
-def settings_of(folder: Path, file: Path | None, overrides: Sequence[str]) -> ReconConfig:
-    """The settings of a run of map, demo or pair, with changes.
-
-    Args:
-        folder: Folder of the run.
-        file: YAML file of settings, applied before the overrides; None = none.
-        overrides: ``key=value`` settings.
-
-    Raises:
-        FormatError: The folder does not contain such a run.
-        SettingsError: A setting is invalid.
-    """
-    if is_pair_run(folder):
-        return load_config(file, overrides, PAIR_DEFAULTS)
-    return load_config(file, overrides, open_run(folder).config.model_dump(mode="json"))
+    return FinishedRun(folder, str(mapped_by), T_map_world, tuple(untrusted))
 
 
 def is_pair_run(folder: Path) -> bool:
