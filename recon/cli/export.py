@@ -47,13 +47,13 @@ def export(
       recon export outputs/map/latest --to mesh --set mesh.depth=9
     """
     with session(quiet=quiet):
-        from recon.commands.config import settings_of
+        from recon.commands.config import run_settings
         from recon.commands.export import run_export
 
         cells = [] if resolution is None else [f"occupancy.resolution_m={resolution}"]
         summary = run_export(
             run,
-            settings_of(run, config, [*(set_ or ()), *cells]),
+            run_settings(run, config, [*(set_ or ()), *cells]),
             products=[name.strip() for text in to or () for name in text.split(",")],
             formats=tuple(formats or ("ply",)),
             out=out,

@@ -46,7 +46,7 @@ def occupancy(
       recon occupancy outputs/map/latest --min-height 0.5 --max-height 3.2
     """
     with session(quiet=quiet):
-        from recon.commands.config import settings_of
+        from recon.commands.config import run_settings
         from recon.commands.occupancy import run_occupancy
 
         given = {
@@ -56,6 +56,6 @@ def occupancy(
             "occupancy.max_range_m": max_range,
         }
         named = [f"{key}={value}" for key, value in given.items() if value is not None]
-        settings = settings_of(run, config, [*(set_ or ()), *named])
+        settings = run_settings(run, config, [*(set_ or ()), *named])
         summary = run_occupancy(run, settings, out=out, threads=threads)
     print_json(summary) if json else print_run(summary, stages=verbose)

@@ -128,7 +128,7 @@ def load_config(
         raise
 
 
-def settings_of(
+def run_settings(
     folder: Path, file: Path | None = None, overrides: Sequence[str] = ()
 ) -> ReconConfig:
     """The settings of a finished run of map, demo or pair, with changes.

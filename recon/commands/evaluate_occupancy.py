@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from recon.commands.config import ReconConfig, settings_of
+from recon.commands.config import ReconConfig, run_settings
 from recon.commands.demo import demo_source
 from recon.core.errors import EvaluationError
 from recon.core.values import OccupancyGrid, OccupancyMetrics, OccupancyTruth
@@ -51,7 +51,7 @@ def run_evaluate_occupancy(
         EvaluationError: The run has no ground truth, or no cell was seen often enough.
         OutputError: The image cannot be written.
     """
-    run, config = open_run(folder), settings_of(folder)
+    run, config = open_run(folder), run_settings(folder)
     source = _source_that_knows(run, config)
     voxels, grid = read_octomap(folder / OCTOMAP), read_nav2(folder / GRID)
     truth = known_occupancy(source, config, run.T_map_world, least_frames)

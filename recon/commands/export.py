@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from recon.commands.config import ReconConfig, check_changes, settings_of
+from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.commands.occupancy import REMADE
 from recon.core.errors import SettingsError
 from recon.export.remake import copy_file, from_rays, mesh_cloud, remake_map
@@ -56,10 +56,10 @@ def run_export(
     wanted = _known(products, _OF_A_PAIR if pair else PRODUCTS)
     refuse_as_target(source, out)
     if pair:
-        settings = config or settings_of(source)
+        settings = config or run_settings(source)
         with Run("export", out, settings, threads=threads) as run:
             return _export_pair(source, settings, wanted, run, formats)
-    mapped, ran = open_run(source), settings_of(source)
+    mapped, ran = open_run(source), run_settings(source)
     settings = config or ran
     check_changes(ran, settings, (*(REMADE if from_rays(wanted) else ()), "mesh"))
     with Run("export", out, settings, threads=threads) as run:

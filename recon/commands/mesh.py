@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from recon.commands.config import ReconConfig, settings_of
+from recon.commands.config import ReconConfig, run_settings
 from recon.export.remake import mesh_cloud, remake_map
 from recon.io.models.mesh import check_mesh_formats
 from recon.run.finished import (
@@ -57,7 +57,7 @@ def run_mesh(
             mapped = open_run(source)
     with Run("mesh", out, config, threads=threads) as run:
         if mapped is not None:
-            return remake_map(mapped, settings_of(source), ["mesh"], run, config.mesh, formats)
+            return remake_map(mapped, run_settings(source), ["mesh"], run, config.mesh, formats)
         figures = mesh_cloud(cloud, camera, config.mesh, run, formats)
         figures = {"cloud": str(cloud), **figures}
         run.finish(figures, source=str(source), inputs=[cloud])

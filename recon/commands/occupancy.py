@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final
 
-from recon.commands.config import ReconConfig, check_changes, settings_of
+from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.export.remake import remake_map
 from recon.run.finished import open_run, refuse_as_target
 from recon.run.run import Run
@@ -37,7 +37,7 @@ def run_occupancy(
         ReconError: The run kept no rays or is damaged, a setting needs finer or longer rays than
             it kept or has no effect, or the folder cannot be written; nothing is left behind.
     """
-    source, ran = open_run(run), settings_of(run)
+    source, ran = open_run(run), run_settings(run)
     refuse_as_target(run, out)
     settings = config or ran
     check_changes(ran, settings, REMADE)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.commands.config import PAIR_DEFAULTS, load_config, settings_of
+from recon.commands.config import PAIR_DEFAULTS, load_config, run_settings
 from recon.commands.export import run_export
 from recon.commands.pair import run_pair
 from recon.core.errors import FormatError, SettingsError
@@ -36,7 +36,7 @@ def pair_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_all_products_come_in_one_go(small_demo: Path, tmp_path: Path) -> None:
-    config = settings_of(small_demo, None, ["mesh.depth=5", "mesh.min_component_faces=10"])
+    config = run_settings(small_demo, None, ["mesh.depth=5", "mesh.min_component_faces=10"])
     summary = run_export(small_demo, config, formats=("ply", "glb"), out=tmp_path / "out")
     for name in ("map/cloud.ply", "map/grid.pgm", "map/grid.yaml", "map/octomap.bt"):
         assert (tmp_path / "out" / name).read_bytes() == (small_demo / name).read_bytes()
@@ -50,7 +50,7 @@ def test_all_products_come_in_one_go(small_demo: Path, tmp_path: Path) -> None:
 
 
 def test_only_what_is_asked_for_is_made(small_demo: Path, tmp_path: Path) -> None:
-    higher = settings_of(small_demo, None, ["grid.min_height_m=2.2", "grid.max_height_m=6"])
+    higher = run_settings(small_demo, None, ["grid.min_height_m=2.2", "grid.max_height_m=6"])
     run_export(small_demo, higher, products=["grid"], out=tmp_path / "out")
     files = sorted(p.name for p in (tmp_path / "out").rglob("*") if p.is_file())
     assert files == ["config.yaml", "grid.pgm", "grid.yaml", "run.json", "summary.json"]
@@ -100,7 +100,7 @@ def test_a_run_without_a_map_is_told(tmp_path: Path) -> None:
 
 
 def test_a_pair_gives_its_cloud_and_mesh(pair_run: Path, tmp_path: Path) -> None:
-    config = settings_of(pair_run, None, ["mesh.max_depth=5"])
+    config = run_settings(pair_run, None, ["mesh.max_depth=5"])
     summary = run_export(pair_run, config, formats=("ply", "glb"), out=tmp_path / "out")
     cloud = "clouds/cloud.ply"
     assert (tmp_path / "out" / cloud).read_bytes() == (pair_run / cloud).read_bytes()

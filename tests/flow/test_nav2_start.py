@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from recon.commands.config import load_config, settings_of
+from recon.commands.config import load_config, run_settings
 from recon.commands.demo import demo_source
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
@@ -87,7 +87,7 @@ def test_a_robot_starts_in_free_space_inside_the_map(small_demo: Path) -> None:
 def test_a_remade_map_has_the_same_start(small_demo: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     summary = run_occupancy(
-        small_demo, settings_of(small_demo, None, ["grid.vehicle_width_m=1.8"]), out=out
+        small_demo, run_settings(small_demo, None, ["grid.vehicle_width_m=1.8"]), out=out
     )
     # Poses come from a file with 13 digits.
     T_base_camera = _summary(small_demo)["T_base_camera"]
@@ -95,7 +95,7 @@ def test_a_remade_map_has_the_same_start(small_demo: Path, tmp_path: Path) -> No
     served = ServedMap(out)
     assert (served.at(_disc(np.zeros(2), 0.75)) == FREE).all()
     nothing = ("grid.vehicle_width_m=0",)
-    run_occupancy(small_demo, settings_of(small_demo, None, nothing), out=tmp_path / "seen")
+    run_occupancy(small_demo, run_settings(small_demo, None, nothing), out=tmp_path / "seen")
     assert (ServedMap(tmp_path / "seen").at(np.zeros((1, 2))) == UNKNOWN).all()
 
 

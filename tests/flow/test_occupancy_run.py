@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from recon.commands.config import run_settings
 from recon.commands.evaluate_occupancy import run_evaluate_occupancy
-from recon.commands.config import settings_of
 from recon.commands.occupancy import run_occupancy
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.core.values import OCCUPIED
@@ -24,7 +24,7 @@ from tests.hostile.refusals import assert_refused, run
 
 
 def _remake(run: Path, out: Path, *overrides: str, **changes: Any) -> dict[str, Any]:
-    return run_occupancy(run, settings_of(run, None, overrides), out=out, **changes)
+    return run_occupancy(run, run_settings(run, None, overrides), out=out, **changes)
 
 
 def _copy(run: Path, folder: Path) -> Path:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import FormatError
+from recon.core.geometry.se3 import check_rigid
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
 from recon.core.values.arrays import Float64, frozen_array
 from recon.io.files import reading
