@@ -90,7 +90,7 @@ def test_an_altered_record_is_refused(command: str, change: str, finished: Path)
 
 
 CONFIGS: Final[dict[str, Alter]] = {
-    "cut": cut(0.31),
+    "cut": replaced(b"fusion:\n  voxel_m: 0.1\n  min_"),
     "a list": replaced(b"[]"),
     "not UTF-8": replaced(b"\xff\xfe"),
     "tagged": replaced(b"fusion: {voxel_m: !!int abc}"),
