@@ -19,15 +19,22 @@ LOOP_SIGMAS: Final = Drift(0.3, np.deg2rad(1.0))
 """Standard deviation of a verified loop, added to the drift: small, but never zero."""
 
 _MIN_AGREEING: Final = 3
-"""Loops of different keyframes that must agree."""
+"""Loops that must agree, no two between the same keyframes."""
 
 _NEAR_M: Final = 12.0
 """Path within which neighbouring loops are compared."""
 
-_MAJORITY: Final = 2  # keyframes that confirm a loop, for each that contradicts it
+_MAJORITY: Final = 2  # loops that confirm one, for each that contradicts it
 
 
-def agreeing_loops(loops: Sequence[Loop], poses: Poses, drift: DriftModel) -> list[Loop]:
+def agreeing_loops(
+    loops: Sequence[Loop],
+    firsts: Poses,
+    lasts: Poses,
+    drift: DriftModel,
+    *,
+    keyframes: int = _MIN_AGREEING,
+) -> list[Loop]:
     """Return the loops that enough others confirm, and few contradict.
 
     Two loops and the odometry between their ends form a cycle that must close within the drift
@@ -37,27 +44,33 @@ def agreeing_loops(loops: Sequence[Loop], poses: Poses, drift: DriftModel) -> li
 
     Args:
         loops: Verified loops.
-        poses: For each keyframe of a loop its pose by odometry, and the path up to it.
+        firsts: For each keyframe in which a loop begins its pose by odometry, and the path up to
+            it; in a map without drift of its own, always 0.
+        lasts: The same for those in which one ends; those of another drive may have other axes.
         drift: How far odometry may drift.
+        keyframes: Least number of later keyframes among the loops that agree.
     """
-    paths_m = np.array([(poses[loop.first][1], poses[loop.last][1]) for loop in loops])
+    poses = (firsts, lasts)
+    paths_m = np.array([(firsts[loop.first][1], lasts[loop.last][1]) for loop in loops])
     agreeing = []
     for number, loop in enumerate(loops):
         firsts_m, lasts_m = np.abs(paths_m - paths_m[number]).T
         near = np.flatnonzero(lasts_m <= _NEAR_M)
         rings = {k: _closes(loop, loops[k], poses, drift) for k in near.tolist()}
-        against = {loops[k].last for k, closes in rings.items() if not closes}
+        against = sum(not closes for closes in rings.values())
         # Loops to elsewhere on the path may contradict, but over that distance agree too easily.
-        same = {loops[k].last for k, closes in rings.items() if firsts_m[k] <= _NEAR_M}
-        if len(same - against) >= max(_MIN_AGREEING, _MAJORITY * len(against)):
+        same = [loops[k] for k, closes in rings.items() if closes and firsts_m[k] <= _NEAR_M]
+        confirmed = len(same) >= max(_MIN_AGREEING, _MAJORITY * against)
+        if confirmed and len({other.last for other in same}) >= keyframes:
             agreeing.append(loop)
     return agreeing
 
 
-def _closes(one: Loop, other: Loop, poses: Poses, model: DriftModel) -> bool:
+def _closes(one: Loop, other: Loop, poses: tuple[Poses, Poses], model: DriftModel) -> bool:
     """Return whether two loops agree within the drift of the odometry between them."""
-    T_lasts, lasts_m = _between(one.last, other.last, poses)
-    T_firsts, firsts_m = _between(one.first, other.first, poses)
+    firsts, lasts = poses
+    T_lasts, lasts_m = _between(one.last, other.last, lasts)
+    T_firsts, firsts_m = _between(one.first, other.first, firsts)
     ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
     drift = drift_over(lasts_m + firsts_m, model)
     return is_possible(ring, drift, LOOP_SIGMAS)

@@ -41,14 +41,16 @@ class Seen:
     Attributes:
         uvd: float64 (N, 3), column, row, disparity.
         xyz: float64 (N, 3), the same points in camera axes.
+        camera: That of the frame.
     """
 
     uvd: Float64
     xyz: Float64
+    camera: RectifiedCamera
 
     def select(self, rows: NDArray[np.bool_]) -> Seen:
         """Return some of the points."""
-        return Seen(self.uvd[rows], self.xyz[rows])
+        return Seen(self.uvd[rows], self.xyz[rows], self.camera)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +69,9 @@ class Alignment:
     information: Float64
 
 
-def locate(points: Float64, uv: Float64, camera: RectifiedCamera) -> Float64 | None:
+def locate(points: Float64, seen: Seen) -> Float64 | None:
     """Return the pose of a camera that sees known points, ``T_points_camera``; None = no pose."""
+    uv, camera = seen.uvd[:, :2], seen.camera
     consensus = find_consensus(
         points,
         uv,
@@ -83,42 +86,39 @@ def locate(points: Float64, uv: Float64, camera: RectifiedCamera) -> Float64 | N
     return T if np.isfinite(T).all() else None
 
 
-def refine(first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCamera) -> Alignment:
+def refine(first: Seen, last: Seen, T_first_last: Float64) -> Alignment:
     """Fit the motion to columns, rows and disparities in both frames, with Cauchy weights.
 
     Args:
         first: The matches in the earlier frame.
         last: The same in the later frame.
         T_first_last: float64 (4, 4), initial motion.
-        camera: Of both frames.
     """
     T = T_first_last
     for _ in range(_STEPS):
-        H, g = _normal_equations(first, last, T, camera)
+        H, g = _normal_equations(first, last, T)
         step = np.linalg.solve(H + 1e-9 * np.eye(6), -g)
         T = T @ as_transform(step)
         if np.linalg.norm(step) < 1e-6:
             break
-    H, _ = _normal_equations(first, last, T, camera)
-    return Alignment(T, agreement(first, last, T, camera), _SHARED * H)
+    H, _ = _normal_equations(first, last, T)
+    return Alignment(T, agreement(first, last, T), _SHARED * H)
 
 
-def agreement(first: Seen, last: Seen, T_first_last: Float64, camera: RectifiedCamera) -> Bool:
+def agreement(first: Seen, last: Seen, T_first_last: Float64) -> Bool:
     """Return bool (N,), matches whose reprojection error is within the limit in both frames."""
     agree = np.ones(len(first.xyz), np.bool_)
     for T, points, seen in (
-        (T_first_last, last.xyz, first.uvd),
-        (invert(T_first_last), first.xyz, last.uvd),
+        (T_first_last, last.xyz, first),
+        (invert(T_first_last), first.xyz, last),
     ):
-        u, v, _ = project(apply(T, points), camera)
+        u, v, _ = project(apply(T, points), seen.camera)
         # A point behind the camera has a NaN error, which compares as False.
-        agree &= np.hypot(u - seen[:, 0], v - seen[:, 1]) <= _REPROJECTION_PX
+        agree &= np.hypot(u - seen.uvd[:, 0], v - seen.uvd[:, 1]) <= _REPROJECTION_PX
     return agree
 
 
-def _normal_equations(
-    first: Seen, last: Seen, T: Float64, camera: RectifiedCamera
-) -> tuple[Float64, Float64]:
+def _normal_equations(first: Seen, last: Seen, T: Float64) -> tuple[Float64, Float64]:
     """Return Gauss-Newton's matrix (6, 6) and gradient (6,) for a step in the axes of ``last``."""
     H, g = np.zeros((6, 6)), np.zeros(6)
     # Points of the last frame, seen by the first: they move with the step.
@@ -126,19 +126,17 @@ def _normal_equations(
     turn = T[:3, :3] @ step_jacobian(last.xyz)
     # Points of the first frame, seen by the last: they move against it.
     back = apply(invert(T), first.xyz)
-    for xyz, d_xyz, seen in ((moved, turn, first.uvd), (back, -step_jacobian(back), last.uvd)):
-        r, J = _residuals(xyz, d_xyz, seen, camera)
+    for xyz, d_xyz, seen in ((moved, turn, first), (back, -step_jacobian(back), last)):
+        r, J = _residuals(xyz, d_xyz, seen)
         weight = 1.0 / (1.0 + np.einsum("nk,nk->n", r, r) / _CAUCHY_SIGMAS**2)
         H += np.einsum("nki,n,nkj->ij", J, weight, J)
         g += np.einsum("nki,n,nk->i", J, weight, r)
     return H, g
 
 
-def _residuals(
-    xyz: Float64, d_xyz: Float64, seen: Float64, camera: RectifiedCamera
-) -> tuple[Float64, Float64]:
+def _residuals(xyz: Float64, d_xyz: Float64, seen: Seen) -> tuple[Float64, Float64]:
     """Whitened residuals (N, 3) and their derivatives (N, 3, 6); 0 for points behind a camera."""
-    sigma = np.array([_SIGMA_UV_PX, _SIGMA_UV_PX, _SIGMA_D_PX])
+    sigma, camera = np.array([_SIGMA_UV_PX, _SIGMA_UV_PX, _SIGMA_D_PX]), seen.camera
     front = xyz[:, 2] > 0.1
     z = np.where(front, xyz[:, 2], 1.0)
     f, b = camera.focal_px, camera.baseline_m
@@ -158,6 +156,6 @@ def _residuals(
         -f * b / z**2,
     )
     J = J @ d_xyz / sigma[:, None]
-    return np.where(front[:, None], (predicted - seen) / sigma, 0.0), np.where(
+    return np.where(front[:, None], (predicted - seen.uvd) / sigma, 0.0), np.where(
         front[:, None, None], J, 0.0
     )

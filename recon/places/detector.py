@@ -14,7 +14,7 @@ from recon.core.values.arrays import Float64
 from recon.places.agree import LOOP_SIGMAS, agreeing_loops
 from recon.places.drift import DriftModel, drift_over, is_possible
 from recon.places.keyframe import Keyframe, make_keyframe, words_of
-from recon.places.places import Place, Places
+from recon.places.places import Place, Places, most_alike
 from recon.places.verify import Loop, verify
 
 CONTRADICTED: Final = "odometry contradicts"
@@ -29,12 +29,6 @@ _ANGLE_DEG: Final = 10.0
 
 _MIN_LIKENESS: Final = 0.3
 """Least likeness of a candidate, as a share of that of two neighbouring keyframes."""
-
-_VERIFIED: Final = 3
-"""Most candidates that are verified."""
-
-_APART_M: Final = 4.0
-"""Least path between two candidates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +72,13 @@ class LoopDetector:
     Args:
         drift: How far odometry may drift.
         store: Where keyframes go.
+        search: Whether to look for loops; else keyframes are only kept, for later drives.
     """
 
-    def __init__(self, drift: DriftModel, store: KeyframeStore) -> None:
+    def __init__(self, drift: DriftModel, store: KeyframeStore, *, search: bool = True) -> None:
         self._drift = drift
         self._store = store
+        self._search = search
         self._places = Places()
         self.loops: list[Loop] = []
         self.refused: Counter[str] = Counter()
@@ -114,7 +110,9 @@ class LoopDetector:
         if not measured or not self._is_due(T_world_camera):
             return ()
         keyframe = make_keyframe(frame, pair, disparity)
-        stored = self._compared(StoredKeyframe(keyframe, T_world_camera, path_m), pair)
+        stored = StoredKeyframe(keyframe, T_world_camera, path_m)
+        if self._search:
+            stored = self._compared(stored, pair)
         self._store.put(stored)
         self.restore(stored)
         return stored.loops
@@ -130,7 +128,7 @@ class LoopDetector:
         places = self._places
         known = zip(places.frames, places.T_world_camera, places.path_m.tolist(), strict=True)
         poses = {frame: (T, path_m) for frame, T, path_m in known}
-        return agreeing_loops(self.loops, poses, self._drift)
+        return agreeing_loops(self.loops, poses, poses, self._drift)
 
     def _place(self, stored: StoredKeyframe) -> Place:
         words = words_of(stored.keyframe.descriptors)
@@ -164,15 +162,7 @@ class LoopDetector:
             return []
         likeness = self._places.likeness(place)
         worth = np.flatnonzero(near & (likeness >= _MIN_LIKENESS * likeness[-1]))
-        chosen: list[int] = []
-        path_m = self._places.path_m
-        for number in worth[np.argsort(-likeness[worth], kind="stable")].tolist():
-            gaps_m = np.abs(path_m[chosen] - path_m[number])
-            if gaps_m.min(initial=np.inf) >= _APART_M:
-                chosen.append(number)
-            if len(chosen) == _VERIFIED:
-                break
-        return chosen
+        return most_alike(likeness, worth, self._places.path_m[:, None])
 
     def _possible(self, old: int, new: Place, loop: Loop) -> bool:
         """Return whether drift explains the difference between a loop and odometry."""

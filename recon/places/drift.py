@@ -47,6 +47,11 @@ class Drift:
     position_m: float
     angle_rad: float
 
+    @property
+    def covariance(self) -> Float64:
+        """float64 (6, 6) of a step: translation in metres, rotation vector in radians."""
+        return np.diag([self.position_m**2] * 3 + [self.angle_rad**2] * 3)
+
 
 def path_lengths(T_world_camera: Float64, measured: Bool) -> Float64:
     """Return length of the path up to each frame, in which extrapolated metres count several times.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import RegistrationError
 from recon.core.geometry.interpolation import pose_between
-from recon.core.geometry.se3 import as_step, hat, invert, orthonormalise
+from recon.core.geometry.se3 import adjoint, as_step, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.places.drift import Drift, DriftModel, drift_over
@@ -106,6 +106,13 @@ def close_loops(
     )
 
 
+def loop_bias(loop: Loop) -> Drift:
+    """Return the standard deviations of a loop that more matches do not improve."""
+    apart_m = float(np.linalg.norm(loop.T_first_last[:3, 3]))
+    position_m = math.hypot(_LOOP_SIGMA_M, _LOOP_SHARE * apart_m)
+    return Drift(position_m, math.radians(_LOOP_SIGMA_DEG))
+
+
 def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
     """Return chi-square of an edge."""
     T = invert(T_world_node[edge.first]) @ T_world_node[edge.last]
@@ -142,7 +149,7 @@ def _odometry_edges(
         # Where the camera stands still, 0.1 m keeps the information finite.
         drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1), model)
         T = invert(poses[first]) @ poses[last]
-        edges.append(PoseEdge(k, k + 1, T, _information(drift)))
+        edges.append(PoseEdge(k, k + 1, T, _inverse(drift.covariance)))
     return edges
 
 
@@ -160,35 +167,29 @@ def _loop_edge(
     to_last = invert(poses[loop.last]) @ poses[nodes[last]]
     way_m = abs(float(path_m[nodes[first]] - path_m[loop.first]))
     way_m += abs(float(path_m[nodes[last]] - path_m[loop.last]))
-    drift = drift_over(way_m, model)
-    apart_m = float(np.linalg.norm(loop.T_first_last[:3, 3]))
+    drift, bias = drift_over(way_m, model), loop_bias(loop)
     other = Drift(
-        math.hypot(drift.position_m, _LOOP_SIGMA_M, _LOOP_SHARE * apart_m),
-        math.hypot(drift.angle_rad, math.radians(_LOOP_SIGMA_DEG)),
+        math.hypot(drift.position_m, bias.position_m),
+        math.hypot(drift.angle_rad, bias.angle_rad),
     )
-    covariance = np.linalg.inv(_turned(loop.information, to_last)) + np.linalg.inv(
-        _information(other)
-    )
+    covariance = np.linalg.inv(_turned(loop.information, to_last)) + other.covariance
     T = orthonormalise(to_first @ loop.T_first_last @ to_last)
-    return PoseEdge(first, last, T, np.linalg.inv(covariance), doubtful=True)
+    return PoseEdge(first, last, T, _inverse(covariance), doubtful=True)
 
 
 def _nearest_node(path_m: Float64, nodes: NDArray[np.intp], frame: int) -> int:
     return int(np.argmin(np.abs(path_m[nodes] - path_m[frame])))
 
 
-def _information(drift: Drift) -> Float64:
-    """Return the information (6, 6) of a step with these standard deviations."""
-    return np.diag([drift.position_m**-2] * 3 + [drift.angle_rad**-2] * 3)
+def _inverse(covariance: Float64) -> Float64:
+    """Return the information (6, 6) of a covariance (6, 6)."""
+    return np.asarray(np.linalg.inv(covariance), np.float64)
 
 
 def _turned(information: Float64, T_frame_node: Float64) -> Float64:
     """Return the information of a step in a node's axes, from that in a frame's axes near it."""
-    R, t = T_frame_node[:3, :3], T_frame_node[:3, 3]
-    adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = R
-    adjoint[:3, 3:] = hat(t) @ R
-    turned: Float64 = adjoint.T @ information @ adjoint
+    turn = adjoint(T_frame_node)
+    turned: Float64 = turn.T @ information @ turn
     return turned
 
 

@@ -18,11 +18,17 @@ _LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms 
 _MIN_PATH_M: Final = 25.0
 """Least path between two places that are compared."""
 
-_VIEW_M: Final = 8.0
+VIEW_M: Final = 8.0
 """Largest distance at which two places see enough in common."""
 
-_VIEW_DEG: Final = 45.0
+VIEW_DEG: Final = 45.0
 """Largest such angle between their viewing directions."""
+
+_MOST: Final = 3
+"""Most candidates that are verified."""
+
+_APART_M: Final = 4.0
+"""Least distance between two candidates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +92,30 @@ class Places:
         T = invert(self.T_world_camera) @ place.T_world_camera
         far_m = np.linalg.norm(T[:, :3, 3], axis=1) - SIGMAS * sigma_m
         turned = angle_rad(T) - SIGMAS * sigma_rad
-        near = (far_m <= _VIEW_M) & (turned <= np.deg2rad(_VIEW_DEG))
+        near = (far_m <= VIEW_M) & (turned <= np.deg2rad(VIEW_DEG))
         return np.asarray(near & (way_m >= _MIN_PATH_M))
 
     def likeness(self, place: Place) -> Float64:
         """Return float64 (N,), similarity of each to a place, in [0, 1]."""
         return self._words.likeness(place.words)
+
+
+def most_alike(likeness: Float64, worth: NDArray[np.intp], stands_m: Float64) -> list[int]:
+    """Return the numbers of the few most similar images, each at some distance from the others.
+
+    Args:
+        likeness: float64 (N,), similarity of each image.
+        worth: Numbers of those that may be chosen.
+        stands_m: float64 (N, K), where each was taken.
+    """
+    chosen: list[int] = []
+    for number in worth[np.argsort(-likeness[worth], kind="stable")].tolist():
+        gaps_m = np.linalg.norm(stands_m[chosen] - stands_m[number], axis=1)
+        if gaps_m.min(initial=np.inf) >= _APART_M:
+            chosen.append(number)
+        if len(chosen) == _MOST:
+            break
+    return chosen
 
 
 @dataclass(frozen=True, eq=False)

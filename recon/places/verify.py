@@ -88,18 +88,29 @@ class Verdict:
     refused: str = ""
 
 
-def verify(first: Keyframe, last: Keyframe, camera: RectifiedCamera) -> Verdict:
+def verify(
+    first: Keyframe,
+    last: Keyframe,
+    camera: RectifiedCamera,
+    first_camera: RectifiedCamera | None = None,
+) -> Verdict:
     """Return whether two keyframes show the same place.
 
     Matches must be mutually best. The motions found in either direction must be inverse to each
     other. The inliers must be many, a fair share of the matches, spread over both images, and
     determine the motion in all directions. The coarse disparities must agree with it, too.
+
+    Args:
+        first: The earlier one.
+        last: The later one.
+        camera: That took the later one.
+        first_camera: That took the earlier one; None = the same.
     """
-    seen = match(first, last, camera)
-    aligned = _aligned(*seen, camera)
+    cameras = (first_camera or camera, camera)
+    aligned = _aligned(*match(first, last, *cameras))
     if isinstance(aligned, str):
         return Verdict(None, aligned)
-    dense = dense_agreement(first, last, aligned.T_first_last, camera)
+    dense = dense_agreement(first, last, aligned.T_first_last, *cameras)
     if dense < _MIN_DENSE_SHARE:
         return Verdict(None, "surfaces differ")
     inliers = int(aligned.agree.sum())
@@ -107,61 +118,69 @@ def verify(first: Keyframe, last: Keyframe, camera: RectifiedCamera) -> Verdict:
     return Verdict(Loop(first.frame, last.frame, T, aligned.information, inliers, dense))
 
 
-def _aligned(first: Seen, last: Seen, camera: RectifiedCamera) -> Alignment | str:
+def _aligned(first: Seen, last: Seen) -> Alignment | str:
     """Return the motion between the frames, or why it is not verified."""
-    T_there = locate(first.xyz, last.uvd[:, :2], camera)
+    T_there = locate(first.xyz, last)
     if T_there is None:
         return "no common motion"
-    T_back = locate(last.xyz, first.uvd[:, :2], camera)
+    T_back = locate(last.xyz, first)
     if T_back is None:
         return "no common motion"
     if not _inverse(T_there, T_back):
         return "there and back differ"
-    agree = agreement(first, last, T_there, camera)
+    agree = agreement(first, last, T_there)
     among = (first.select(agree), last.select(agree))
     if int(agree.sum()) < MIN_INLIERS:
         return "few inliers"
-    aligned = refine(*among, T_there, camera)
-    return _weakness(*among, aligned, agree.size, camera) or aligned
+    aligned = refine(*among, T_there)
+    return _weakness(*among, aligned, agree.size) or aligned
 
 
-def match(first: Keyframe, last: Keyframe, camera: RectifiedCamera) -> tuple[Seen, Seen]:
+def match(
+    first: Keyframe, last: Keyframe, first_camera: RectifiedCamera, last_camera: RectifiedCamera
+) -> tuple[Seen, Seen]:
     """Return features that are each other's best match and have a depth in both frames."""
     ours, theirs = (np.isfinite(k.uvd[:, 2]) for k in (first, last))
     pairs = _mutual(first.descriptors[ours], last.descriptors[theirs])
-    uvds = (first.uvd[ours][pairs[:, 0]], last.uvd[theirs][pairs[:, 1]])
-    seen = [Seen(uvd.astype(np.float64), points_of(uvd, camera)) for uvd in uvds]
-    return seen[0], seen[1]
+    return (
+        _seen(first.uvd[ours][pairs[:, 0]], first_camera),
+        _seen(last.uvd[theirs][pairs[:, 1]], last_camera),
+    )
+
+
+def _seen(uvd: Float32, camera: RectifiedCamera) -> Seen:
+    """Return features as a frame sees them."""
+    return Seen(uvd.astype(np.float64), points_of(uvd, camera), camera)
 
 
 def dense_agreement(
     first: Keyframe,
     last: Keyframe,
     T_first_last: Float64,
-    camera: RectifiedCamera,
+    first_camera: RectifiedCamera,
+    last_camera: RectifiedCamera,
 ) -> float:
-    """Share of the coarse disparities of one frame that the other confirms, in the worse direction.
+    """Return the share of coarse disparities that the other frame confirms, in the worse direction.
 
     A smaller disparity than predicted means seeing through the other's surface: a contradiction. A
     larger one means that something is in front of it, which does not count. 0 where the two frames
     hardly overlap.
     """
     shares = (
-        _confirmed(last, first, T_first_last, camera),
-        _confirmed(first, last, invert(T_first_last), camera),
+        _confirmed(_coarse_points(last, last_camera), first, T_first_last, first_camera),
+        _confirmed(_coarse_points(first, first_camera), last, invert(T_first_last), last_camera),
     )
     return min(shares)
 
 
 def _confirmed(
-    source: Keyframe,
+    xyz: Float64,
     target: Keyframe,
     T_target_source: Float64,
     camera: RectifiedCamera,
 ) -> float:
-    """Return the share of the source's coarse points that the target sees where they should be."""
-    uvd = _coarse_uvd(source, camera)
-    u, v, d = project(apply(T_target_source, points_of(uvd, camera)), camera)
+    """Return the share of points of another frame that the target sees where they should be."""
+    u, v, d = project(apply(T_target_source, xyz), camera)
     step, half = _grid(target, camera)
     off = _interpolated(target.coarse, (u - half) / step, (v - half) / step) - d
     tolerance = _DENSE_TOLERANCE_PX + _DENSE_TOLERANCE_SHARE * np.abs(d)
@@ -193,12 +212,13 @@ def _grid(keyframe: Keyframe, camera: RectifiedCamera) -> tuple[int, int]:
     return step, step // 2
 
 
-def _coarse_uvd(keyframe: Keyframe, camera: RectifiedCamera) -> Float64:
-    """Return columns, rows and disparities (N, 3) of the coarse samples that have one."""
+def _coarse_points(keyframe: Keyframe, camera: RectifiedCamera) -> Float64:
+    """Return points (N, 3) in camera axes of the coarse samples that have a disparity."""
     row, column = np.nonzero(keyframe.coarse + camera.doffs_px > 1.0)
     step, half = _grid(keyframe, camera)
     d = keyframe.coarse[row, column]
-    return np.column_stack([column * step + half, row * step + half, d]).astype(np.float64)
+    uvd = np.column_stack([column * step + half, row * step + half, d]).astype(np.float64)
+    return points_of(uvd, camera)
 
 
 def _mutual(ours: UInt8, theirs: UInt8) -> np.ndarray:
@@ -223,21 +243,21 @@ def _weakness(
     last: Seen,
     aligned: Alignment,
     matches: int,
-    camera: RectifiedCamera,
 ) -> str:
     """Return why the inliers are not enough; "" where they are."""
     inliers = int(aligned.agree.sum())
     if inliers < max(MIN_INLIERS, _MIN_INLIER_SHARE * matches):
         return "few inliers"
-    if min(_spread(seen.uvd[aligned.agree], camera) for seen in (first, last)) < (_SPREAD_CELLS):
+    if min(_spread(seen.select(aligned.agree)) for seen in (first, last)) < _SPREAD_CELLS:
         return "inliers in one corner"
     if _sigma_m(aligned.information) > _MAX_SIGMA_M:
         return "motion not fixed"
     return ""
 
 
-def _spread(uvd: Float64, camera: RectifiedCamera) -> int:
+def _spread(seen: Seen) -> int:
     """Of 4 by 4 cells of the image, how many hold a feature."""
+    uvd, camera = seen.uvd, seen.camera
     column = np.clip(uvd[:, 0] * _CELLS / camera.width_px, 0, _CELLS - 1).astype(int)
     row = np.clip(uvd[:, 1] * _CELLS / camera.height_px, 0, _CELLS - 1).astype(int)
     return len(np.unique(row * _CELLS + column))

@@ -59,7 +59,7 @@ def _agreeing(odometry: Trajectory, loops: list[Loop]) -> list[Loop]:
         for loop in loops
         for frame in (loop.first, loop.last)
     }
-    return agreeing_loops(loops, poses, DRIFT)
+    return agreeing_loops(loops, poses, poses, DRIFT)
 
 
 def test_loops_that_tell_the_same_are_believed(odometry, truth):

@@ -56,8 +56,8 @@ def _place(frame: int, x_m: float, path_m: float, turned_deg: float = 0.0) -> Pl
 def test_a_place_is_near_if_odometry_could_be_so_wrong():
     drift = DriftModel()
     far = drift_over(100.0, drift)
-    reach_m = places_file._VIEW_M + SIGMAS * far.position_m
-    turn_deg = places_file._VIEW_DEG + np.degrees(SIGMAS * far.angle_rad)
+    reach_m = places_file.VIEW_M + SIGMAS * far.position_m
+    turn_deg = places_file.VIEW_DEG + np.degrees(SIGMAS * far.angle_rad)
     places = Places()
     for share in (0.0, 0.99, 1.01):
         places.add(_place(len(places), share * reach_m, 0.0))

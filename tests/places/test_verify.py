@@ -49,7 +49,7 @@ def test_surfaces_confirm_the_right_pose(block):
     first, last = block.keyframe(3), block.keyframe(LAP + 3)
 
     T = block.drive.motion(3, LAP + 3)
-    assert dense_agreement(first, last, T, CAMERA) > 0.9
+    assert dense_agreement(first, last, T, CAMERA, CAMERA) > 0.9
 
 
 @pytest.mark.parametrize("offset_m", [(3.0, 0.0, 0.0), (-3.0, 0.0, 0.0), (0.0, -0.5, 0.0)])
@@ -58,11 +58,11 @@ def test_surfaces_contradict_a_wrong_pose(block, offset_m):
     first, last = block.keyframe(3), block.keyframe(LAP + 3)
     T = block.drive.motion(3, LAP + 3) @ se3.make_transform(np.eye(3), np.array(offset_m))
 
-    assert dense_agreement(first, last, T, CAMERA) < 0.85
+    assert dense_agreement(first, last, T, CAMERA, CAMERA) < 0.85
 
 
 def test_surfaces_of_another_street_contradict(block):
-    share = dense_agreement(block.keyframe(3), block.keyframe(60), np.eye(4), CAMERA)
+    share = dense_agreement(block.keyframe(3), block.keyframe(60), np.eye(4), CAMERA, CAMERA)
 
     assert share < verify_file._MIN_DENSE_SHARE
 
@@ -81,11 +81,11 @@ def test_refinement_finds_the_motion_of_exact_points(seed):
     last_xyz = rng.uniform([-4, -1.5, 6], [4, 1.5, 25], (80, 3))
     first_xyz = se3.apply(T, last_xyz)
     first, last = (
-        Seen(np.column_stack(project(xyz, CAMERA)), xyz) for xyz in (first_xyz, last_xyz)
+        Seen(np.column_stack(project(xyz, CAMERA)), xyz, CAMERA) for xyz in (first_xyz, last_xyz)
     )
     start = T @ se3.make_transform(se3.exp_so3(rng.normal(0, 0.01, 3)), rng.normal(0, 0.2, 3))
 
-    aligned = refine(first, last, start, CAMERA)
+    aligned = refine(first, last, start)
 
     assert np.allclose(aligned.T_first_last, T, atol=1e-6)
     assert aligned.agree.all()

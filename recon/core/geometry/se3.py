@@ -112,6 +112,15 @@ def step_jacobian(xyz: NDArray[Any]) -> Float64:
     return J
 
 
+def adjoint(T_a_b: NDArray[Any]) -> Float64:
+    """Return the matrix (6, 6) that turns a step in the axes of b into the same motion in a's."""
+    R, t = T_a_b[:3, :3], T_a_b[:3, 3]
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3] = matrix[3:, 3:] = R
+    matrix[:3, 3:] = hat(t) @ R
+    return matrix
+
+
 def orthonormalise(T: NDArray[Any]) -> Float64:
     """Return the rigid transform nearest to ``T``: its rotation part is made orthonormal by SVD."""
     U, _, Vt = np.linalg.svd(T[:3, :3])

@@ -114,19 +114,28 @@ class DriveLoops:
 
 
 class LoopWatch:
-    """Detects loops in its own thread while a drive is mapped, and closes them at its end.
+    """Keeps keyframes in its own thread while a drive is mapped, and closes loops at its end.
 
     Args:
         keyframes: Where keyframes are kept; those in it are of the frames before.
         stopwatch: Records the time spent.
+        search: Whether to look for loops; the keyframes are kept in any case, to find later drives
+            in the map.
     """
 
-    def __init__(self, keyframes: Keyframes, stopwatch: Stopwatch | None = None) -> None:
+    def __init__(
+        self,
+        keyframes: Keyframes,
+        stopwatch: Stopwatch | None = None,
+        *,
+        search: bool = True,
+    ) -> None:
+        self.searching = search
         self._stage = (stopwatch or Stopwatch()).stage
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
         self._waiting: deque[Future[None]] = deque()
         self._keyframes = keyframes
-        self._detector = LoopDetector(DRIFT, keyframes)
+        self._detector = LoopDetector(DRIFT, keyframes, search=search)
         self._path_m: list[float] = []
         self._last: Float64 = np.eye(4)
 

@@ -183,7 +183,7 @@ def map_sequence(
     odometry = _odometry(config, source, known_poses, prior, used)
     looking = config.loops.enabled and known_poses is None
     session = work.session(source, config)
-    watch = LoopWatch(session.keyframes, work.stopwatch) if looking else None
+    watch = LoopWatch(session.keyframes, work.stopwatch, search=looking)
     mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch)
     drive = _Drive(mapper, watch, config, work)
     progress.on_start(source.name, len(source))
@@ -206,7 +206,7 @@ class _Drive:
     """
 
     def __init__(
-        self, mapper: Mapper, loops: LoopWatch | None, config: DriveSettings, workspace: Workspace
+        self, mapper: Mapper, loops: LoopWatch, config: DriveSettings, workspace: Workspace
     ) -> None:
         self.mapper = mapper
         self._loops = loops
@@ -224,8 +224,7 @@ class _Drive:
 
     def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
         result = self.mapper.add(frame, total=total)
-        if self._loops is not None:
-            self._loops.add(frame, result.T_world_camera, measured=result.health.ok)
+        self._loops.add(frame, result.T_world_camera, measured=result.health.ok)
         if result.index <= total // 2:
             self._sample = frame
         if len(self.mapper) - self._saved >= self._config.checkpoints.every_frames:
@@ -238,15 +237,13 @@ class _Drive:
     def settle(self) -> None:
         """Wait for background work: the integration of the last frame, and the search for loops."""
         self.mapper.settle()
-        if self._loops is not None:
-            self._loops.settle()
+        self._loops.settle()
         self._last = time.perf_counter()
 
     def stop(self) -> None:
         """Stop background work, finished or not."""
         self.mapper.abandon()
-        if self._loops is not None:
-            self._loops.stop()
+        self._loops.stop()
 
     def finish(self, source: StereoSource, reconstructor: FrameReconstructor) -> MappedSequence:
         if not len(self.mapper):
@@ -264,7 +261,7 @@ class _Drive:
             sample=self._sample or self._sample_again(source, reconstructor),
             seconds=self._last - self._start,
         )
-        if self._loops is None:
+        if not self._loops.searching:
             return mapped
         with self._stage("close_loops"):
             loops = self._loops.close(mapped.trajectory)
@@ -273,9 +270,8 @@ class _Drive:
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.mapper.restore(state["mapper"])
-        if self._loops is not None:
-            path, health = self._session.odometry, self._session.health
-            self._loops.restore(path.T_world_camera, [record.ok for record in health])
+        path, health = self._session.odometry, self._session.health
+        self._loops.restore(path.T_world_camera, [record.ok for record in health])
         self._saved = len(self.mapper)
         self._last = time.perf_counter()
         self._start = self._last - state["seconds"]

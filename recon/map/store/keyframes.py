@@ -52,9 +52,18 @@ class Keyframes:
         key = (KEYFRAME, self._session, frame, "keyframe")
         return self._store.cache.get(key, lambda: self._read(frame))
 
+    @property
+    def frames(self) -> list[int]:
+        """The numbers of the frames that are keyframes, in order.
+
+        Raises:
+            FormatError: The file is damaged.
+        """
+        return self._store.numbers(KEYFRAME, self._session)
+
     def __iter__(self) -> Iterator[StoredKeyframe]:
         """All keyframes, in the order of their frames."""
-        return map(self._read, self._store.numbers(KEYFRAME, self._session))
+        return map(self._read, self.frames)
 
     def _read(self, frame: int) -> StoredKeyframe:
         with reading(self._store.name):

@@ -9,6 +9,8 @@ from typing import Final
 from typing_extensions import Self
 
 from recon.core.errors import FormatError
+from recon.core.geometry.se3 import invert
+from recon.core.values.arrays import Float64
 from recon.map.store.records import CACHE_BYTES, Store
 from recon.map.store.session import Session, SessionInfo
 
@@ -81,6 +83,16 @@ class Map:
         raise FormatError(
             "the map has no such session", where=self.store.name, got=number, expected=known
         )
+
+    def T_world_session(self, session: Session) -> Float64:
+        """float64 (4, 4), from the world of a drive to that of the map, which is its first drive's.
+
+        Drives that are linked share the axes of the map.
+
+        Raises:
+            FormatError: The axes are not known.
+        """
+        return invert(self.sessions[0].T_map_world) @ session.T_map_world
 
     def begin(self, info: SessionInfo) -> Session:
         """Add a drive.

@@ -1,0 +1,56 @@
+"""The keyframes of all drives of a map, in its world."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import overload
+
+from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import Float64
+from recon.map.store.map import Map
+from recon.places.known import KnownView
+
+
+class MapViews(Sequence[KnownView]):
+    """What a map can recognise; each view is read when it is asked for.
+
+    Args:
+        map_: The map.
+        sessions: Numbers of the drives to take; None = all.
+
+    Raises:
+        FormatError: The map is damaged.
+    """
+
+    def __init__(self, map_: Map, sessions: Collection[int] | None = None) -> None:
+        self._map = map_
+        self._keys: list[tuple[int, int]] = []
+        self._poses: dict[int, Float64] = {}
+        self._cameras: dict[int, RectifiedCamera] = {}
+        for session in map_.sessions:
+            frames = session.keyframes.frames
+            if frames and (sessions is None or session.number in sessions):
+                T_world_session = map_.T_world_session(session)
+                self._poses[session.number] = T_world_session @ session.trajectory.T_world_camera
+                self._cameras[session.number] = session.camera
+                self._keys.extend((session.number, frame) for frame in frames)
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    @overload
+    def __getitem__(self, number: int) -> KnownView: ...
+    @overload
+    def __getitem__(self, number: slice) -> list[KnownView]: ...
+    def __getitem__(self, number: int | slice) -> KnownView | list[KnownView]:
+        """A view.
+
+        Raises:
+            FormatError: It is damaged.
+        """
+        if isinstance(number, slice):
+            return [self[n] for n in range(*number.indices(len(self)))]
+        session, frame = self._keys[number]
+        stored = self._map.session(session).keyframes.get(frame)
+        pose = self._poses[session][frame]
+        return KnownView(stored.keyframe, self._cameras[session], pose, session)
