@@ -26,9 +26,10 @@ from recon.commands.demo import demo_source
 from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
-from recon.evaluation import evaluate_trajectory
+from recon.evaluation.trajectory import evaluate_trajectory
 from recon.map.drive.sequence import map_sequence
-from recon.sources import StereoSource, open_source
+from recon.sources.protocol import StereoSource
+from recon.sources.registry import open_source
 
 NOISE_DN = 4.0
 EXPOSURE_SHARE = 0.15

@@ -28,7 +28,7 @@ from recon.core.geometry.alignment import fit_points
 from recon.core.geometry.transform import transform_cloud
 from recon.core.values import OCCUPIED, OccupancyGrid, PointCloud, StereoPair, Trajectory
 from recon.core.values.arrays import Float64
-from recon.evaluation import evaluate_map
+from recon.evaluation.map import evaluate_map
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.drive.workspace import Workspace
 from recon.map.fusion.builder import fusion_range_m
@@ -39,7 +39,7 @@ from recon.odometry import Odometry, OdometryFrame, OdometryResult, make_odometr
 from recon.places.drift import DriftModel
 from recon.report.paths import grid_figure, loops_figure
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetScene
+from recon.street.settings import StreetScene
 from recon.street.truth import true_surface
 
 THRESHOLDS_M = (0.2, 0.4)

@@ -35,7 +35,7 @@ from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
 from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
 from recon.run.machine import available_cores
-from recon.sources import open_source
+from recon.sources.registry import open_source
 
 Int64 = NDArray[np.int64]
 RAYS = 100_000

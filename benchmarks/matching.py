@@ -27,7 +27,9 @@ from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import UInt8
 from recon.io.middlebury.scene import stand_in_camera
 from recon.run.machine import peak_memory_mb
-from recon.stereo.match import Matcher, SadMatcher, SadSettings, sad
+from recon.stereo.match import sad
+from recon.stereo.match.protocol import Matcher
+from recon.stereo.match.sad import SadMatcher, SadSettings
 from recon.stereo.match.sgm import SgmMatcher, SgmSettings
 
 SIZES = ((480, 640, 64), (375, 1242, 128), (994, 1482, 144))

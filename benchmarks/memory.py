@@ -27,7 +27,7 @@ from recon.core.values import Trajectory
 from recon.io.atomic import write_text
 from recon.io.trajectory import write_kitti_poses
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetScene
+from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti
 
 FRAMES = (1000, 4000)

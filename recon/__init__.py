@@ -43,14 +43,10 @@ if TYPE_CHECKING:
         Trajectory,
         TriangleMesh,
     )
-    from recon.evaluation import (
-        MiddleburyRules,
-        evaluate_depth,
-        evaluate_disparity,
-        evaluate_map,
-        evaluate_middlebury,
-        evaluate_trajectory,
-    )
+    from recon.evaluation.disparity import evaluate_depth, evaluate_disparity
+    from recon.evaluation.map import evaluate_map
+    from recon.evaluation.middlebury.rules import MiddleburyRules, evaluate_middlebury
+    from recon.evaluation.trajectory import evaluate_trajectory
     from recon.export.mesh import reconstruct_mesh
     from recon.io.cameras.calibration import read_calibration
     from recon.io.images.image import read_image
@@ -61,22 +57,20 @@ if TYPE_CHECKING:
     from recon.io.trajectory import read_trajectory
     from recon.map.drive.sequence import MappedSequence, map_sequence
     from recon.map.store.map import Map
-    from recon.rig.audit import Audit
-    from recon.sources import SourceSettings, StereoSource, open_source
+    from recon.rig.audit.audit import Audit
     from recon.sources.pair_input import PairInput
+    from recon.sources.protocol import StereoSource
+    from recon.sources.registry import open_source
+    from recon.sources.settings import SourceSettings
     from recon.sources.synthetic import SyntheticSource
-    from recon.stereo.match import Matcher
+    from recon.stereo.match.protocol import Matcher
 
 _HOMES = {
     "recon.core.errors": ("ReconError",),
-    "recon.evaluation": (
-        "MiddleburyRules",
-        "evaluate_depth",
-        "evaluate_disparity",
-        "evaluate_map",
-        "evaluate_middlebury",
-        "evaluate_trajectory",
-    ),
+    "recon.evaluation.disparity": ("evaluate_depth", "evaluate_disparity"),
+    "recon.evaluation.map": ("evaluate_map",),
+    "recon.evaluation.middlebury.rules": ("MiddleburyRules", "evaluate_middlebury"),
+    "recon.evaluation.trajectory": ("evaluate_trajectory",),
     "recon.io.cameras.calibration": ("read_calibration",),
     "recon.io.images.image": ("read_image",),
     "recon.io.models.mesh": ("read_mesh", "write_mesh"),
@@ -84,10 +78,10 @@ _HOMES = {
     "recon.io.images.pfm": ("read_pfm", "write_pfm"),
     "recon.io.models.ply": ("read_ply", "write_ply"),
     "recon.io.trajectory": ("read_trajectory",),
-    "recon.stereo.match": ("Matcher",),
+    "recon.stereo.match.protocol": ("Matcher",),
     "recon.export.mesh": ("reconstruct_mesh",),
     "recon.commands.api": ("match", "reconstruct"),
-    "recon.rig.audit": ("Audit",),
+    "recon.rig.audit.audit": ("Audit",),
     "recon.commands.audit": ("run_audit",),
     "recon.commands.config": ("ReconConfig", "load_config"),
     "recon.commands.map": ("run_map",),
@@ -99,7 +93,9 @@ _HOMES = {
     "recon.sources.pair_input": ("PairInput",),
     "recon.map.store.map": ("Map",),
     "recon.map.drive.sequence": ("MappedSequence", "map_sequence"),
-    "recon.sources": ("SourceSettings", "StereoSource", "open_source"),
+    "recon.sources.protocol": ("StereoSource",),
+    "recon.sources.registry": ("open_source",),
+    "recon.sources.settings": ("SourceSettings",),
     "recon.sources.synthetic": ("SyntheticSource",),
     "recon.core.values": (
         "CameraIntrinsics",

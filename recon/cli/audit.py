@@ -67,7 +67,7 @@ def audit(
         from recon.commands.audit import run_audit
         from recon.commands.config import load_config, source_overrides
         from recon.report.audit_table import audit_lines
-        from recon.sources import open_source
+        from recon.sources.registry import open_source
 
         asked = source_overrides(calib, left, right, tolerance, (start, end, stride))
         settings = load_config(config, [*(set_ or ()), *asked])

@@ -72,7 +72,7 @@ def trajectory(
     """
     with session(quiet=quiet):
         from recon.commands.evaluate_trajectory import run_evaluate_trajectory
-        from recon.evaluation import TrajectoryRules
+        from recon.evaluation.trajectory import TrajectoryRules
 
         asked = {
             "alignment": align.value,

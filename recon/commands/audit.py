@@ -7,10 +7,10 @@ from pathlib import Path
 
 from recon.commands.config import ReconConfig
 from recon.report.audit_page import write_audit_page
-from recon.rig.audit import Audit, audit_source, mend_calibration
+from recon.rig.audit.audit import Audit, audit_source, mend_calibration
 from recon.run import Run
-from recon.sources import StereoSource
-from recon.stereo.match import make_matcher
+from recon.sources.protocol import StereoSource
+from recon.stereo.match.registry import make_matcher
 
 
 def run_audit(

@@ -9,15 +9,16 @@ from recon.commands.config import ReconConfig
 from recon.core.errors import OutputError, SourceError
 from recon.core.values.board import CalibrationBoard
 from recon.report.calibration_page import write_calibration_page
-from recon.rig.calibrate import calibrate_stereo, measure_spread
 from recon.rig.calibrate.board_video import is_video, pick_views
 from recon.rig.calibrate.board_views import find_views
+from recon.rig.calibrate.bootstrap import measure_spread
 from recon.rig.calibrate.result import (
     CalibrationForm,
     CalibrationRun,
     describe_calibration,
     write_calibration,
 )
+from recon.rig.calibrate.stereo import calibrate_stereo
 from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
 from recon.run import Run
 from recon.run.machine import serial_algebra

@@ -20,9 +20,10 @@ from recon.rig.capture import CaptureSettings
 from recon.run.finished import is_pair_run
 from recon.run.run import CONFIG
 from recon.sources.settings import SourceSettings
-from recon.stereo.cloud import ANY_SCALE
-from recon.stereo.match import MATCHERS, MatchingSettings, field_of, name_of, settings_of
-from recon.street import StreetSettings
+from recon.stereo.cloud.filters import ANY_SCALE
+from recon.stereo.match.foreign import name_of
+from recon.stereo.match.registry import MATCHERS, MatchingSettings, field_of, settings_of
+from recon.street.settings import StreetSettings
 
 _MOST_DOTS: Final = 10
 _BYTES_PER_PIXEL: Final = 18

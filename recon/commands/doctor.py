@@ -40,7 +40,7 @@ from recon.run.installation import (
     check_system_libraries,
 )
 from recon.sources.pair_input import PairInput
-from recon.stereo.match import MATCHERS
+from recon.stereo.match.registry import MATCHERS
 
 _MATCHERS: Final = tuple(name for name in MATCHERS if name != "onnx")  # it needs a network
 _SMALL: Final = (

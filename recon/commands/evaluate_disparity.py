@@ -10,7 +10,7 @@ import numpy as np
 from recon.core.errors import EvaluationError
 from recon.core.values import Disparity, DisparityTruth, Reason
 from recon.core.values.arrays import Float32
-from recon.evaluation import evaluate_disparity
+from recon.evaluation.disparity import evaluate_disparity
 from recon.evaluation.middlebury.confidence import curve_figures
 from recon.evaluation.middlebury.score import dense_map, named_figures
 from recon.io.images.disparity_png import read_disparity

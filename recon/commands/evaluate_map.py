@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from recon.core.errors import SettingsError
-from recon.evaluation import evaluate_map
+from recon.evaluation.map import evaluate_map
 from recon.evaluation.map_run import (
     MapComparison,
     ReferenceFrame,

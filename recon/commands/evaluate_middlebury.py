@@ -26,7 +26,7 @@ from recon.io.images.pfm import write_pfm
 from recon.report.middlebury_page import draw_result, write_middlebury_page
 from recon.run import Run
 from recon.run.progress import SILENT, Progress
-from recon.stereo.match import Matcher
+from recon.stereo.match.protocol import Matcher
 
 
 def run_middlebury(

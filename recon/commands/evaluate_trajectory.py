@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from recon.core.values import Trajectory
-from recon.evaluation import TrajectoryRules, associate, compare_paths
-from recon.evaluation.association import TOLERANCE_S
+from recon.evaluation.association import TOLERANCE_S, associate
+from recon.evaluation.trajectory import TrajectoryRules, compare_paths
 from recon.evaluation.trajectory_run import TrajectoryRun
 from recon.io.trajectory import holds_times, read_trajectory, write_tum
 from recon.report.trajectory_page import write_trajectory_page

@@ -22,7 +22,7 @@ from recon.rig.audit.audit import quick_warnings
 from recon.run import Run
 from recon.run.finished import UNTRUSTED
 from recon.run.summary import plain
-from recon.sources import IncompleteSource, StereoSource
+from recon.sources.protocol import IncompleteSource, StereoSource
 
 
 def run_map(

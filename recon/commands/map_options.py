@@ -14,7 +14,9 @@ from recon.core.errors import SettingsError
 from recon.core.values import Trajectory
 from recon.io.trajectory import read_trajectory
 from recon.run.progress import SILENT, Progress
-from recon.sources import StereoSource, open_source, read_prior
+from recon.sources.prior import read_prior
+from recon.sources.protocol import StereoSource
+from recon.sources.registry import open_source
 
 
 @dataclass(frozen=True)

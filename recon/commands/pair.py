@@ -8,7 +8,7 @@ from typing import Any
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.values import Disparity, DisparityMetrics
-from recon.evaluation import evaluate_disparity
+from recon.evaluation.disparity import evaluate_disparity
 from recon.export.pair import mesh_frame, write_cloud_files, write_disparity_files
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.drive.empty import check_cloud

@@ -27,7 +27,7 @@ from recon.run.directory import RECORD, STARTED, RunDirectory, state_folder
 from recon.run.machine import versions
 from recon.run.memory import memory_overrides
 from recon.run.record import fingerprint
-from recon.sources import StereoSource
+from recon.sources.protocol import StereoSource
 
 _OTHER: Final = {
     "config": "other settings",

@@ -18,7 +18,7 @@ from recon.evaluation.map import evaluate_map
 from recon.evaluation.occupancy_truth import compare_with_source
 from recon.evaluation.trajectory import evaluate_trajectory
 from recon.map.drive.sequence import MappedSequence
-from recon.sources import StereoSource
+from recon.sources.protocol import StereoSource
 
 SURFACE_THRESHOLD_M: Final = 0.2
 """Distance to the true surface below which a map point counts as correct."""

@@ -7,11 +7,11 @@ from typing import Final
 from recon.core.errors import EvaluationError
 from recon.core.values import OccupancyGrid, OccupancyMetrics, OccupancyTruth, OccupancyVoxels
 from recon.core.values.arrays import Float64
-from recon.evaluation import evaluate_occupancy
+from recon.evaluation.occupancy import evaluate_occupancy
 from recon.map.drive.sequence import MappedSequence
 from recon.map.ground.grid import drop_undecided
 from recon.map.settings import DriveSettings
-from recon.sources import KnowsOccupancy, StereoSource
+from recon.sources.protocol import KnowsOccupancy, StereoSource
 
 LEAST_FRAMES: Final = 3
 """Number of frames that must have seen a cell for it to be compared."""

@@ -14,7 +14,7 @@ from recon.map.submaps import SubmapSettings
 from recon.odometry import OdometrySettings
 from recon.places import LoopSettings
 from recon.run.memory import MemorySettings
-from recon.stereo.cloud import FilterSettings
+from recon.stereo.cloud.filters import FilterSettings
 from recon.stereo.settings import StereoSettings
 
 

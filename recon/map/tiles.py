@@ -33,7 +33,7 @@ from recon.map.settings import DriveSettings
 from recon.map.store.tile_parts import TileKey, TileParts
 from recon.map.submaps import Submap, SubmapMotion
 from recon.map.window import Window
-from recon.stereo.cloud import filter_cloud
+from recon.stereo.cloud.filters import filter_cloud
 
 _FUSED: Final = "fused"
 _OCCUPANCY: Final = "occupancy"

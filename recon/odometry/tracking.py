@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.core.values import Disparity
 from recon.core.values.arrays import Bool, Float32, UInt8
-from recon.stereo.rectify.opencv_features import exposed_as
+from recon.stereo.rectify.features import exposed_as
 
 _WINDOW_PX: Final = 17
 """Edge of the tracked patch."""

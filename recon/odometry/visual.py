@@ -20,7 +20,7 @@ from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in, tree_of
 from recon.odometry.tracking import follow, sample_disparity
 from recon.odometry.window import TrackWindow, adjust, misfits, pose_information, reprojection
-from recon.stereo.rectify.opencv_features import match_features
+from recon.stereo.rectify.features import match_features
 
 _FRAMES: Final = 6
 """Frames adjusted together."""
@@ -182,7 +182,8 @@ class VisualOdometry:
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
         """Return the frame, registered by matching over the whole image; None = that fails."""
-        uv, uv_now = match_features(state.left, frame.pair.left, _RELOCATE_FEATURES, any_scale=True)
+        found = match_features(state.left, frame.pair.left, _RELOCATE_FEATURES, any_scale=True)
+        uv, uv_now = found.left_uv, found.right_uv
         camera, T_world_then = frame.pair.camera, state.window.T_world_camera[-1]
         then = np.column_stack([uv, self._disparity(state.disparity, camera, uv)])
         now = np.column_stack([uv_now, self._disparity(frame.disparity, camera, uv_now)])

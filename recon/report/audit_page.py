@@ -15,11 +15,11 @@ from recon.report.audit_table import audit_lines
 from recon.report.images import disparity_figure, is_wide, pair_figure
 from recon.report.page import write_page
 from recon.report.style import ESTIMATE, INK, WIDE_IN, bare_figure, show_image, styled, to_png
-from recon.rig.audit import Audit
+from recon.rig.audit.audit import Audit
 from recon.rig.audit.sample import Look
 from recon.run.directory import RunDirectory
-from recon.sources import StereoSource
-from recon.stereo.match import Matcher
+from recon.sources.protocol import StereoSource
+from recon.stereo.match.protocol import Matcher
 
 # Row errors are drawn this much longer than they are, since a pixel is invisible in a page. The
 # caption says so.

@@ -15,10 +15,11 @@ from recon.report.calibration_figures import (
 )
 from recon.report.epipolar import EpipolarImage, epipolar_figure, level_lines, spread_points
 from recon.report.page import write_page
-from recon.rig.calibrate import shared_pixels
+from recon.rig.calibrate.quality import shared_pixels
 from recon.rig.calibrate.result import CalibrationRun
 from recon.run.directory import RunDirectory
-from recon.stereo.rectify import Rectifier, epipolar_curves
+from recon.stereo.rectify.epipolar import epipolar_curves
+from recon.stereo.rectify.rectifier import Rectifier
 
 
 def write_calibration_page(run: CalibrationRun, directory: RunDirectory) -> None:

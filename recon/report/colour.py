@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from recon.core.errors import ShapeError
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyTruth, Reason
 from recon.core.values.arrays import UInt8
-from recon.evaluation import grid_on_truth
+from recon.evaluation.occupancy import grid_on_truth
 
 Rgb = tuple[int, int, int]
 

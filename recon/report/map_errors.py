@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 from recon.core.values import PointCloud
-from recon.evaluation import nearest_distances
+from recon.evaluation.map import nearest_distances
 from recon.evaluation.map_run import MapComparison
 from recon.io.models.ply import write_ply
 from recon.report.colour import ERROR_SCALE, colour_values

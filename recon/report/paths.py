@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from recon.core.geometry.se3 import angle_rad, apply, invert
 from recon.core.values import UNKNOWN, OccupancyGrid, Trajectory
 from recon.core.values.arrays import Float64
-from recon.evaluation import TrajectoryComparison
+from recon.evaluation.trajectory import TrajectoryComparison
 from recon.odometry.protocol import OdometryHealth
 from recon.report.colour import GRID_FREE, GRID_OCCUPIED, GRID_UNKNOWN, colour_grid, unit_colour
 from recon.report.images import colour_key

@@ -18,23 +18,15 @@ from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.yaml_file import write_yaml
-from recon.rig.uncalibrated import (
-    UncalibratedRectification,
-    rectify_images,
-)
+from recon.rig.uncalibrated.rectify import UncalibratedRectification, rectify_images
 from recon.run.directory import RunDirectory
 from recon.run.summary import plain
 from recon.sources.files import read_pair
 from recon.sources.image_pairs import ImagePairs
-from recon.stereo.rectify import (
-    RectificationSettings,
-    Rectifier,
-    epipolar_curves,
-    epipolar_lines,
-    match_exactly,
-    plan_turns,
-    to_grey,
-)
+from recon.stereo.rectify.epipolar import epipolar_curves, epipolar_lines
+from recon.stereo.rectify.features import match_exactly
+from recon.stereo.rectify.grey import to_grey
+from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier, plan_turns
 
 _UNCALIBRATED_PAIRS: Final = 8
 """Pairs of a folder whose features are matched where there is no calibration."""

@@ -1,90 +1,48 @@
-"""One pair, given as two image files and a calibration file."""
+"""Sources of one pair: two image files, or a Middlebury scene."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from recon.core.errors import SourceError
-from recon.core.values import RectifiedCamera, SequenceTruth, StereoCalibration, StereoPair
+from recon.core.errors import CalibrationError, SourceError
+from recon.core.values import SequenceTruth, StereoPair
 from recon.core.values.arrays import UInt8
-from recon.io.cameras.calibration import read_calibration
-from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.files import StrPath
 from recon.io.images.image import MAX_MEGAPIXELS, eight_bits, find_white, read_levels
-from recon.io.middlebury.scene import stand_in_camera
+from recon.io.middlebury.scene import read_middlebury_scene
+from recon.sources.pairing import Roll
+from recon.sources.rig import Rig
+from recon.sources.settings import SourceSettings
 
 LEAST_SIDE_PX: Final = 16
 """Smaller than this, an image does not hold the windows that are compared."""
 
 
-class FilesSource:
-    """One pair of images.
+@dataclass(frozen=True, eq=False)
+class OnePair:
+    """One pair as a source.
 
-    Args:
-        left: Left image.
-        right: Right image.
-        calibration: Any calibration file that `read_calibration` supports; None = the images are
-            rectified, and a placeholder camera is used, valid only for matching.
-        metres_per_unit: Unit of the translation in an OpenCV file.
-        max_megapixels: Refuse larger images, in 10⁶ pixels.
-
-    Raises:
-        SourceError: The images differ in size.
-        FormatError: A file is missing, damaged or of another format.
-        CalibrationError: The calibration cannot give depth, or is of another image size.
+    Attributes:
+        pair: The images.
+        calibration: A `RectifiedCamera` if they are already rectified.
+        files: The files that both were read from.
+        description: What it is, in one line.
+        truth: None: what is known of the truth of a pair is a disparity.
     """
 
-    def __init__(
-        self,
-        left: StrPath,
-        right: StrPath,
-        calibration: StrPath | None,
-        *,
-        metres_per_unit: float = 1.0,
-        max_megapixels: float = MAX_MEGAPIXELS,
-    ) -> None:
-        given = (left, right, calibration)
-        self._files = tuple(Path(path) for path in given if path is not None)
-        self._pair = read_pair(left, right, max_megapixels)
-        height_px, width_px = self._pair.left.shape[:2]
-        self._calibration = (
-            stand_in_camera(width_px, height_px)
-            if calibration is None
-            else read_calibration(
-                calibration,
-                width_px,
-                height_px,
-                metres_per_unit=metres_per_unit,
-                cameras=kitti_cameras_of(self._files[0]),
-            )
-        )
+    pair: StereoPair
+    calibration: Rig
+    files: tuple[Path, ...] = ()
+    description: str = "two images"
+    truth: SequenceTruth | None = None
 
     @property
     def name(self) -> str:
-        """Name of the left image."""
-        return self._pair.name
-
-    @property
-    def description(self) -> str:
-        """One line."""
-        return "two images"
-
-    @property
-    def calibration(self) -> RectifiedCamera | StereoCalibration:
-        """A `RectifiedCamera` if the images are already rectified."""
-        return self._calibration
-
-    @property
-    def truth(self) -> SequenceTruth | None:
-        """None."""
-        return None
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """Left image, right image, calibration."""
-        return self._files
+        """Name of the pair."""
+        return self.pair.name
 
     def __len__(self) -> int:
         return 1
@@ -94,7 +52,27 @@ class FilesSource:
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Yield the pair, or nothing from any later start."""
-        yield from (self._pair,)[start:]
+        yield from (self.pair,)[start:]
+
+
+def open_middlebury(folder: Path, settings: SourceSettings) -> OnePair:
+    """Open a Middlebury scene of 2005 or 2006 (with ``dmin.txt``), 2014 or MiddEval3.
+
+    Raises:
+        SourceError: The settings choose no frame of the only one.
+        FormatError: The folder is not a Middlebury scene, or a file in it is damaged.
+        CalibrationError: No calibration is published for the scene, or it cannot give depth.
+    """
+    Roll([""], [0]).choose(settings, folder)
+    scene = read_middlebury_scene(folder)
+    if scene.camera is None:
+        raise CalibrationError(
+            "no calibration is published for this scene, so there is no depth",
+            where=folder,
+            expected="calib.txt, or dmin.txt for scenes of 2005 and 2006",
+        )
+    files = tuple(sorted(path for path in folder.iterdir() if path.is_file()))
+    return OnePair(scene.pair, scene.camera, files, "a Middlebury scene: one rectified pair")
 
 
 def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> StereoPair:

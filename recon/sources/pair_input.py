@@ -10,11 +10,13 @@ import numpy as np
 
 from recon.core.errors import CalibrationError, FormatError, SettingsError
 from recon.core.values import DisparityTruth, RectifiedCamera, StereoCalibration, StereoPair
+from recon.io.cameras.calibration import read_calibration
+from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.images.disparity_png import read_disparity
 from recon.io.images.exif import read_focal_length
 from recon.io.images.image import MAX_MEGAPIXELS
 from recon.io.middlebury.scene import stand_in_camera
-from recon.sources.files import FilesSource
+from recon.sources.files import read_pair
 
 UP_TO_SCALE: Final = "no baseline was given: all lengths are in baselines, not in metres"
 
@@ -90,16 +92,19 @@ def read_pair_input(
             got=calibration,
             hint="give either",
         )
-    source = FilesSource(
-        left,
-        right,
+    pair = read_pair(left, right, max_megapixels)
+    height_px, width_px = pair.left.shape[:2]
+    if calibration is None:
+        given = PairInput(pair, stand_in_camera(width_px, height_px), (left, right))
+        return given if known is None else _with_camera(given, known)
+    rig = read_calibration(
         calibration,
+        width_px,
+        height_px,
         metres_per_unit=metres_per_unit,
-        max_megapixels=max_megapixels,
+        cameras=kitti_cameras_of(left),
     )
-    (pair,) = source
-    given = PairInput(pair, source.calibration, source.files)
-    return given if calibration is not None or known is None else _with_camera(given, known)
+    return PairInput(pair, rig, (left, right, calibration))
 
 
 def _with_camera(given: PairInput, known: KnownCamera) -> PairInput:

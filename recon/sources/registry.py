@@ -13,22 +13,14 @@ from recon.io.images.video import VIDEOS
 from recon.io.middlebury.layout import find_layout
 from recon.sources.bag import BAGS, find_bags, open_bag
 from recon.sources.euroc import open_euroc
+from recon.sources.files import open_middlebury
 from recon.sources.folders import find_views, open_folders
 from recon.sources.kitti import open_kitti
 from recon.sources.kitti_raw import open_kitti_raw
-from recon.sources.middlebury import MiddleburySource
-from recon.sources.pairing import Roll
 from recon.sources.protocol import StereoSource
 from recon.sources.settings import SourceSettings
 from recon.sources.tum import list_files, open_tum
 from recon.sources.video import list_videos, open_video_source
-
-
-def _open_middlebury(path: Path, settings: SourceSettings) -> StereoSource:
-    # A scene has its own calibration, and is one pair.
-    Roll([""], [0]).choose(settings, path)
-    return MiddleburySource(path)
-
 
 SOURCES: Final[dict[str, Callable[[Path, SourceSettings], StereoSource]]] = {
     "kitti": open_kitti,
@@ -38,7 +30,7 @@ SOURCES: Final[dict[str, Callable[[Path, SourceSettings], StereoSource]]] = {
     "folders": open_folders,
     "video": open_video_source,
     "bag": open_bag,
-    "middlebury": _open_middlebury,
+    "middlebury": open_middlebury,
 }
 EXPECTED: Final = (
     "a KITTI drive (odometry or raw), an EuRoC or TUM folder, left and right folders, videos, "

@@ -15,9 +15,12 @@ from recon.core.values import (
     StereoPair,
 )
 from recon.run.stopwatch import Stopwatch
-from recon.stereo.cloud import back_project, filter_cloud, remove_flying_edges
-from recon.stereo.match import make_matcher
-from recon.stereo.rectify import Rectifier, check_inspection, inspect_pair
+from recon.stereo.cloud.back_project import back_project
+from recon.stereo.cloud.edges import remove_flying_edges
+from recon.stereo.cloud.filters import filter_cloud
+from recon.stereo.match.registry import make_matcher
+from recon.stereo.rectify.inspect import check_inspection, inspect_pair
+from recon.stereo.rectify.rectifier import Rectifier
 from recon.stereo.settings import StereoSettings
 
 _INSPECT_EVERY: Final = 50

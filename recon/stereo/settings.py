@@ -6,9 +6,11 @@ from pydantic import Field
 from typing_extensions import Self
 
 from recon.core.settings import Settings
-from recon.stereo.cloud import CloudSettings, FilterSettings
-from recon.stereo.match import Matcher, MatchingSettings, check_matcher
-from recon.stereo.rectify import RectificationSettings
+from recon.stereo.cloud.back_project import CloudSettings
+from recon.stereo.cloud.filters import FilterSettings
+from recon.stereo.match.protocol import Matcher
+from recon.stereo.match.registry import MatchingSettings, check_matcher
+from recon.stereo.rectify.rectifier import RectificationSettings
 
 
 class StereoSettings(Settings):

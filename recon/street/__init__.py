@@ -3,7 +3,3 @@
 `build_street` lays out a street, `StreetCamera` renders it, and `truth` gives the true surfaces
 and obstacles. Only the settings are imported here, as the rest needs Open3D.
 """
-
-from recon.street.settings import StreetScene, StreetSettings
-
-__all__ = ["StreetScene", "StreetSettings"]

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 
 from recon.cli import app
 from recon.core.values import RectifiedCamera, StereoPair
-from recon.sources import SourceSettings, open_source
+from recon.sources.registry import open_source
+from recon.sources.settings import SourceSettings
 from tests.rig.audit import faults
 from tests.sources import drives
 

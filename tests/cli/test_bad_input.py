@@ -12,7 +12,7 @@ import typer
 
 from recon.cli.session import session
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street.settings import StreetSettings
 from tests.hostile.refusals import Ended, assert_refused, run, run_apart
 from tests.scenery.kitti import write_kitti
 

@@ -22,7 +22,7 @@ from recon.io.frames_csv import FRAMES, HEADER
 from recon.rig import capture
 from recon.rig.capture import Recording
 from recon.rig.capture_folder import CaptureFolder
-from recon.sources import open_source
+from recon.sources.registry import open_source
 from tests.sources import drives
 
 CAMERA = RectifiedCamera(60.0, 31.5, 15.5, 31.5, 0.5, 64, 32)

@@ -12,7 +12,7 @@ from recon.commands.evaluate_trajectory import run_evaluate_trajectory
 from recon.core.errors import EvaluationError, FormatError, SourceError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
-from recon.evaluation import TrajectoryRules
+from recon.evaluation.trajectory import TrajectoryRules
 from recon.io.trajectory import write_kitti_poses, write_tum
 from recon.report.paths import widest_axes
 

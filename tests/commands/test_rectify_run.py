@@ -15,7 +15,7 @@ from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.image import read_image, write_image
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street.settings import StreetSettings
 from tests.scenery.boards import board_rig
 
 SMALL = StreetSettings(frames=2, width_px=480, height_px=240, focal_px=280.0)

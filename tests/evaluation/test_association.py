@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from recon.core.errors import EvaluationError
 from recon.core.values import Trajectory
-from recon.evaluation import associate
-from recon.evaluation.association import nearest_times
+from recon.evaluation.association import associate, nearest_times
 
 TIMES = st.lists(st.floats(0, 100), min_size=1, max_size=30).map(np.sort)
 

@@ -11,8 +11,14 @@ from hypothesis import strategies as st
 
 from recon.core.errors import EvaluationError
 from recon.core.values import DisparityTruth, RectifiedCamera
-from recon.evaluation import MiddleburyRules, evaluate_depth, evaluate_middlebury
-from recon.evaluation.middlebury.rules import at_truth_size, scene_weight, weighted_mean
+from recon.evaluation.disparity import evaluate_depth
+from recon.evaluation.middlebury.rules import (
+    MiddleburyRules,
+    at_truth_size,
+    evaluate_middlebury,
+    scene_weight,
+    weighted_mean,
+)
 
 N = float("nan")
 

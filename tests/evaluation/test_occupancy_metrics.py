@@ -17,7 +17,7 @@ from recon.core.values import (
     OccupancyVoxels,
     RectifiedCamera,
 )
-from recon.evaluation import evaluate_occupancy
+from recon.evaluation.occupancy import evaluate_occupancy
 from recon.map.ground.axes import AXES_MAP_WORLD
 
 EDGE_M = 0.2

@@ -10,8 +10,8 @@ import pytest
 from recon.core.geometry.quaternion import quaternion_from_rotation
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
-from recon.evaluation import TrajectoryRules, associate, compare_paths, evaluate_trajectory
-from recon.evaluation.trajectory import align
+from recon.evaluation.association import associate
+from recon.evaluation.trajectory import TrajectoryRules, align, compare_paths, evaluate_trajectory
 
 pytest.importorskip("evo", reason="evo needs Python 3.11")
 

@@ -19,7 +19,6 @@ from recon.export.grid import export_grid
 from recon.export.products import write_products
 from recon.io.models.ply import read_ply, write_ply_tiles
 from recon.io.occupancy.nav2 import read_nav2
-from recon.io.occupancy.octomap import write_octomap
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.ground.floor import add_floors, find_floors
 from recon.map.ground.grid import drop_undecided, flatten
@@ -27,7 +26,8 @@ from recon.map.ground.surface import estimate_ground_surface
 from recon.run.directory import RunDirectory
 from recon.run.stopwatch import Stopwatch
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street.settings import StreetSettings
+from tests.scenery.octomaps import write_octomap
 
 STREET = StreetSettings(frames=20, width_px=192, height_px=72, focal_px=110.0)
 SETTINGS = ["submaps.length_m=4", "submaps.tile_m=6.4", "fusion.min_count=1"]

@@ -23,10 +23,10 @@ from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import RectifiedCamera, RectifiedPair, Trajectory
 from recon.map.drive.map_run import MapRun
 from recon.odometry import OdometryFrame, OdometryResult, make_odometry
-from recon.sources import open_source
+from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
-from recon.stereo.match import make_matcher
-from recon.street import StreetSettings
+from recon.stereo.match.registry import make_matcher
+from recon.street.settings import StreetSettings
 from tests.scenery.kitti import write_kitti
 
 CAMERA = RectifiedCamera(

@@ -16,7 +16,7 @@ import pytest
 from recon.core.errors import FormatError
 from recon.map.store.map import Map
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street.settings import StreetSettings
 from tests.scenery.kitti import write_kitti
 
 STREET = StreetSettings(frames=24, width_px=192, height_px=72, focal_px=110.0)

@@ -23,8 +23,7 @@ from recon.places.drift import DriftModel
 from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
-from recon.street import StreetScene
-from recon.street.settings import CORNER_M
+from recon.street.settings import CORNER_M, StreetScene
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetScene
+from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "mapping.py"

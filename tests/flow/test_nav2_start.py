@@ -19,8 +19,8 @@ from recon.commands.occupancy import run_occupancy
 from recon.core.geometry.se3 import invert
 from recon.core.values import Trajectory
 from recon.io.trajectory import read_tum
-from recon.sources import StereoSource
 from recon.sources.kitti import open_kitti
+from recon.sources.protocol import StereoSource
 from tests.flow.rooms import RoomSource
 
 FOOTPRINT_M = 0.3

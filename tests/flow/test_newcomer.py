@@ -16,8 +16,8 @@ from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.core.values.board import parse_board
 from recon.io.images.image import write_image
 from recon.io.models.ply import read_ply
-from recon.stereo.rectify import RectificationSettings, plan_turns
 from recon.stereo.rectify.lens import unproject
+from recon.stereo.rectify.rectifier import RectificationSettings, plan_turns
 from tests.scenery.boards import Lens, board_rig, place_boards, render_views
 
 BOARD = "chess:9x6:25mm"

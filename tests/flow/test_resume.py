@@ -19,9 +19,9 @@ from recon.map.drive.map_run import MapRun
 from recon.map.store.map import Map
 from recon.map.store.records import Store
 from recon.run.progress import SILENT, Silent
-from recon.sources import open_source
+from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street.settings import StreetSettings
 from tests.scenery.kitti import write_kitti
 
 STREET = StreetSettings(frames=24, width_px=192, height_px=72, focal_px=110.0)

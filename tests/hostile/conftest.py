@@ -14,7 +14,7 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.io.images.image import write_image
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street.settings import StreetSettings
 from tests.hostile.runs import DRIVE, interrupt_run
 from tests.scenery.kitti import write_kitti
 

@@ -33,7 +33,7 @@ from recon.io.images.video import open_video
 from recon.io.models.mesh import read_mesh, write_mesh
 from recon.io.models.ply import read_ply, read_ply_pieces, write_ply
 from recon.io.occupancy.nav2 import read_nav2, write_nav2
-from recon.io.occupancy.octomap import read_octomap, write_octomap
+from recon.io.occupancy.octomap import read_octomap
 from recon.io.trajectory import read_trajectory
 from recon.io.yaml_file import read_yaml
 from recon.map.occupancy.builder import OccupancySettings
@@ -41,9 +41,10 @@ from recon.map.occupancy.rays import ray_grain
 from recon.map.store.map import Map
 from recon.map.store.session import SessionInfo
 from recon.odometry import OdometryHealth
-from recon.sources import open_source
+from recon.sources.registry import open_source
 from recon.sources.times import read_dates, read_stamped_names
 from tests.hostile.calibrations import CAMERA_INFO, VALID
+from tests.scenery.octomaps import write_octomap
 from tests.sources.bags import Recording, write_bag
 from tests.stereo.match.test_onnx_matcher import match, pair_of, write_network
 

@@ -13,7 +13,7 @@ from recon.commands.map_options import MapRequest
 from recon.map.drive.frame_result import FrameResult
 from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street.settings import StreetSettings
 from tests.scenery.kitti import write_kitti
 
 DRIVE = {"frames": 6, "width_px": 256, "height_px": 96, "focal_px": 150.0}

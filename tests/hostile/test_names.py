@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from recon.sources import open_source
 from recon.sources.pairing import natural_key, stamp_of_name
+from recon.sources.registry import open_source
 from tests.hostile.refusals import assert_refused, refusal, run
 
 # The first match may have to compile.

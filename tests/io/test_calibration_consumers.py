@@ -15,7 +15,7 @@ from recon.core.values import StereoCalibration
 from recon.io.cameras.camera_info import write_camera_info
 from recon.io.cameras.kalibr import write_kalibr
 from recon.io.cameras.opencv_yaml import write_opencv_calibration
-from recon.stereo.rectify import RectificationSettings, plan_turns
+from recon.stereo.rectify.rectifier import RectificationSettings, plan_turns
 from tests.scenery.boards import Lens, board_rig
 
 XYZ = np.random.default_rng(0).uniform((-0.6, -0.4, 1.5), (0.6, 0.4, 4.0), (60, 3))

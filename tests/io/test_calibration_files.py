@@ -15,7 +15,7 @@ from recon.io.cameras.camera_info import camera_info_paths, read_camera_info, wr
 from recon.io.cameras.kalibr import read_kalibr, write_kalibr
 from recon.io.cameras.opencv_yaml import read_opencv_calibration, write_opencv_calibration
 from recon.io.cameras.recon_yaml import read_recon_calibration, write_recon_calibration
-from recon.stereo.rectify import RectificationSettings, plan_turns
+from recon.stereo.rectify.rectifier import RectificationSettings, plan_turns
 
 T_RIGHT_LEFT = make_transform(
     exp_so3(np.array([0.01, -0.02, 0.005])), np.array([-0.12, 1e-3, 2e-5])

@@ -19,8 +19,9 @@ from recon.io.cameras.kalibr import write_kalibr
 from recon.io.cameras.opencv_yaml import write_opencv_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.image import write_image
-from recon.sources import SourceSettings, open_source
 from recon.sources.pair_input import read_pair_input
+from recon.sources.registry import open_source
+from recon.sources.settings import SourceSettings
 from tests.sources import drives
 
 RAW, RECTIFIED = (160, 60), (142, 44)

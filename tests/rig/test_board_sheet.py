@@ -12,7 +12,7 @@ from PIL import Image
 from recon.core.errors import OutputError, SettingsError
 from recon.core.values.board import parse_board
 from recon.rig.board_sheet import choose_sheet, write_board
-from recon.rig.calibrate import find_board
+from recon.rig.calibrate.detect import find_board
 
 CHESS = "chess:9x6:25mm"
 CHARUCO = "charuco:8x6:30mm:22mm:5x5_100"

@@ -23,7 +23,7 @@ from recon.map.tiles import Tiles, join_clouds, join_voxels
 from recon.run import memory
 from recon.run.memory import MemorySettings, memory_overrides, parse_size_mb
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetScene
+from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))

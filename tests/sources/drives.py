@@ -13,7 +13,7 @@ import yaml
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.io.images.image import write_image
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetScene
+from recon.street.settings import StreetScene
 
 RATE_HZ = 10.0
 EPOCH_S = 1_600_000_000

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from recon.core.values import RectifiedCamera, StereoPair
-from recon.sources import open_source
+from recon.sources.registry import open_source
 from tests.sources import drives
 
 pytest.importorskip("rosbags", reason="extra ros")

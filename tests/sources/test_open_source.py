@@ -7,8 +7,8 @@ import pytest
 
 from recon.core.errors import CalibrationError, FormatError, ReconError, SourceError
 from recon.io.images.image import write_image
-from recon.sources.files import FilesSource, read_pair
-from recon.sources.middlebury import MiddleburySource
+from recon.sources.files import read_pair
+from recon.sources.pair_input import read_pair_input
 from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source, recognise_source
 
@@ -60,10 +60,10 @@ def test_each_kind_is_recognised_by_its_files_and_keeps_the_protocol(
 
 
 def test_a_middlebury_scene_has_its_geometry_and_no_path(tmp_path: Path) -> None:
-    source = MiddleburySource(make_middlebury(tmp_path))
+    source = open_source(make_middlebury(tmp_path))
     assert (source.calibration.baseline_m, source.calibration.doffs_px) == (0.5, 2)
     assert source.truth is None
-    assert source.scene.ndisp == 20
+    assert source.calibration.ndisp == 20
 
 
 def test_a_middlebury_scene_without_published_geometry_is_refused(tmp_path: Path) -> None:
@@ -73,13 +73,11 @@ def test_a_middlebury_scene_without_published_geometry_is_refused(tmp_path: Path
         open_source(tmp_path)
 
 
-def test_one_pair_of_files_is_a_source(tmp_path: Path) -> None:
-    source = FilesSource(*make_files(tmp_path))
-    assert isinstance(source, StereoSource)
-    assert (source.name, len(source), source.truth) == ("left.png", 1, None)
-    assert len(list(source)) == 1
-    assert [path.name for path in source.files] == ["left.png", "right.png", "calib.txt"]
-    assert source.calibration.baseline_m == 0.5
+def test_one_pair_of_files_is_read_with_its_calibration(tmp_path: Path) -> None:
+    given = read_pair_input(*make_files(tmp_path))
+    assert given.pair.name == "left.png"
+    assert [path.name for path in given.files] == ["left.png", "right.png", "calib.txt"]
+    assert given.calibration.baseline_m == 0.5
 
 
 def test_a_grey_and_a_coloured_image_make_a_coloured_pair(tmp_path: Path) -> None:
@@ -93,7 +91,7 @@ def test_a_grey_and_a_coloured_image_make_a_coloured_pair(tmp_path: Path) -> Non
 def test_files_of_different_size_are_refused_with_both_sizes(tmp_path: Path) -> None:
     files = make_files(tmp_path, right_width=31)
     with pytest.raises(SourceError, match=r"right\.png: .*got left 32x16, right 31x16"):
-        FilesSource(*files)
+        read_pair_input(*files)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +106,7 @@ def test_a_missing_file_of_a_pair_is_named(tmp_path: Path, name: str, message: s
     files = make_files(tmp_path)
     (tmp_path / name).unlink()
     with pytest.raises(FormatError, match=message):
-        FilesSource(*files)
+        read_pair_input(*files)
 
 
 def make_nothing(folder: Path) -> None:

@@ -10,7 +10,8 @@ import pytest
 from recon.core.errors import ReconError
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
-from recon.sources import open_source, read_prior
+from recon.sources.prior import read_prior
+from recon.sources.registry import open_source
 from tests.sources import drives
 
 pytest.importorskip("rosbags", reason="extra ros")

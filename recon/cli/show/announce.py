@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable
 from typing import TextIO
 
-from recon.sources import StereoSource
+from recon.sources.protocol import StereoSource
 
 
 def announce(

@@ -18,8 +18,10 @@ from recon.evaluation.middlebury.rules import values_compared
 from recon.evaluation.middlebury.scenes import ScoredScene
 from recon.evaluation.middlebury.score import Figures, dense_map, score_result
 from recon.io.files import naming
-from recon.stereo.match import Matcher, make_matcher, name_of, searched_ndisp
-from recon.stereo.rectify import Rectifier
+from recon.stereo.match.foreign import name_of
+from recon.stereo.match.protocol import Matcher
+from recon.stereo.match.registry import make_matcher, searched_ndisp
+from recon.stereo.rectify.rectifier import Rectifier
 from recon.stereo.settings import StereoSettings
 
 _WARM_UP_ROWS: Final = 64

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.values import Disparity, DisparityTruth
-from recon.evaluation import (
+from recon.evaluation.confidence import (
     Reliability,
     Sparsification,
     measure_reliability,

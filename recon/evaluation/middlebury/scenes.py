@@ -11,7 +11,7 @@ import numpy as np
 
 from recon.core.errors import SourceError
 from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair
-from recon.evaluation import MiddleburyRules
+from recon.evaluation.middlebury.rules import MiddleburyRules
 from recon.io.middlebury.layout import find_layout, scene_root
 from recon.io.middlebury.scene import MiddleburyScene, read_middlebury_scene, stand_in_camera
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from recon.core.values import DisparityMetrics
 from recon.core.values.arrays import Float32
-from recon.evaluation import evaluate_depth, evaluate_middlebury
-from recon.evaluation.middlebury.rules import values_compared, weighted_mean
+from recon.evaluation.disparity import evaluate_depth
+from recon.evaluation.middlebury.rules import evaluate_middlebury, values_compared, weighted_mean
 from recon.evaluation.middlebury.scenes import ScoredScene
-from recon.stereo.match import fill_holes
+from recon.stereo.match.fill import fill_holes
 
 MASKS: Final = {"nonocc": False, "all": True}
 """Pixels that are scored: those seen by both cameras, or occluded ones as well."""

@@ -15,7 +15,9 @@ from recon.evaluation.middlebury.results import ResultFolder
 from recon.evaluation.middlebury.rules import scene_weight, weighted_mean
 from recon.evaluation.middlebury.score import MASKS, Figures, weighted_figures
 from recon.run.summary import plain
-from recon.stereo.match import Matcher, check_matcher, name_of
+from recon.stereo.match.foreign import name_of
+from recon.stereo.match.protocol import Matcher
+from recon.stereo.match.registry import check_matcher
 
 _FOLDER_NAME: Final = re.compile(r"\w[\w.+ ()-]*")
 _NAMING: Final = "give each object an attribute `name`"

@@ -19,14 +19,15 @@ from recon.core.values import (
     RectifiedPair,
 )
 from recon.core.values.arrays import Float32
-from recon.evaluation import evaluate_disparity
-from recon.evaluation.paper.printed import PrintedMatcher, PrintedSettings
+from recon.evaluation.disparity import evaluate_disparity
+from recon.evaluation.paper.printed import match_as_printed
 from recon.evaluation.paper.scenes import Experiment, camera_of_table_1
 from recon.evaluation.paper.settings import PaperConfig
-from recon.stereo.cloud import CloudSettings, back_project
+from recon.stereo.cloud.back_project import CloudSettings, back_project
 from recon.stereo.frame import FrameReconstructor
-from recon.stereo.match import Matcher, SadMatcher, SadSettings
-from recon.stereo.rectify import Rectifier, to_grey
+from recon.stereo.match.sad import SadMatcher, SadSettings
+from recon.stereo.rectify.grey import to_grey
+from recon.stereo.rectify.rectifier import Rectifier
 
 CORRECTED: Final = "corrected"
 ABSOLUTE: Final = "absolute"
@@ -129,9 +130,8 @@ def apply_method(
             experiment.pair
         )
         return _result(method, experiment, frame.pair, frame.disparity, frame.cloud)
-    matcher = _matcher(method, config.paper.patch_px, config, threads)
     pair = _printed_pair(experiment)
-    disparity = matcher.match(pair)
+    disparity = _match(method, pair, config.paper.patch_px, config, threads)
     pair = replace(pair, camera=camera_of_table_1(pair.camera))
     cloud = back_project(disparity, pair, _EVERY_POINT, normals=False)
     return _result(method, experiment, pair, disparity, cloud)
@@ -145,7 +145,7 @@ def try_patches(
     figures = []
     for patch_px in config.paper.patches_px:
         if patch_px <= min(pair.left.shape):
-            found = _matcher(method, patch_px, config, threads).match(pair)
+            found = _match(method, pair, patch_px, config, threads)
             figures.append(_patch_figure(patch_px, found, experiment.truth))
     return figures
 
@@ -194,12 +194,14 @@ def _result(
     )
 
 
-def _matcher(method: str, patch_px: int, config: PaperConfig, threads: int | None) -> Matcher:
-    """Return the matcher of a method with the given patch size."""
+def _match(
+    method: str, pair: RectifiedPair, patch_px: int, config: PaperConfig, threads: int | None
+) -> Disparity:
+    """Match by a method with the given patch size."""
     if method != CORRECTED:
-        return PrintedMatcher(PrintedSettings(patch_px=patch_px, signed=method == AS_PRINTED))
+        return match_as_printed(pair, patch_px, signed=method == AS_PRINTED)
     settings = {**config.matching.sad.model_dump(), "window_px": patch_px}
-    return SadMatcher(SadSettings.parse(settings), threads)
+    return SadMatcher(SadSettings.parse(settings), threads).match(pair)
 
 
 def _grey_pair(method: str, experiment: Experiment, config: PaperConfig) -> RectifiedPair:

@@ -102,21 +102,13 @@ def paper_figures(results: Sequence[ExperimentResult], config: PaperConfig) -> d
 
 def _table_1_summary(result: ExperimentResult) -> dict[str, Any]:
     """A row of Table 1 as printed, and the corrected values."""
-    row = result.experiment.table_1
+    experiment, camera = result.experiment, result.experiment.camera
+    both = {"baseline_mm": round(1000 * camera.baseline_m, 6), "ndisp": camera.ndisp}
     return {
-        "experiment": row.experiment,
-        "scene": row.scene,
-        "printed": {
-            "focal_length": row.doffs_px,
-            "baseline_mm": row.baseline_mm,
-            "ndisp": row.ndisp,
-        },
-        "corrected": {
-            "focal_px": row.focal_px,
-            "doffs_px": row.doffs_px,
-            "baseline_mm": row.baseline_mm,
-            "ndisp": row.ndisp,
-        },
+        "experiment": experiment.number,
+        "scene": experiment.scene,
+        "printed": {"focal_length": experiment.doffs_px, **both},
+        "corrected": {"focal_px": camera.focal_px, "doffs_px": experiment.doffs_px, **both},
         "depth_error_of_printed_percent": result.table_1_depth_error_percent,
     }
 

@@ -11,32 +11,11 @@ from typing import Final
 from recon.core.errors import CalibrationError, SourceError
 from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair
 from recon.io.middlebury.calib import read_middlebury_calib
-from recon.sources.middlebury import MiddleburySource
+from recon.io.middlebury.scene import read_middlebury_scene
 
 #: Number of the experiment -> scene. Identified by Table 1, see docs/paper.md.
 EXPERIMENTS: Final = MappingProxyType({2: "ArtL", 3: "Jadeplant", 4: "Pipes"})
 _INSIDE_DATA: Final = Path("middlebury", "MiddEval3", "trainingQ")
-
-
-@dataclass(frozen=True)
-class Table1Row:
-    """One row of Table 1, with its numbers under their correct names.
-
-    Attributes:
-        experiment: Number of the experiment in the paper.
-        scene: Name of the scene.
-        doffs_px: Difference of the principal points; printed as the focal length.
-        baseline_mm: Baseline.
-        ndisp: Number of disparities, or None if the scene does not state it.
-        focal_px: The true focal length, which Table 1 lacks.
-    """
-
-    experiment: int
-    scene: str
-    doffs_px: float
-    baseline_mm: float
-    ndisp: int | None
-    focal_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +28,7 @@ class Experiment:
         pair: The colour images.
         camera: Geometry from the scene's ``calib.txt``.
         truth: True disparity of the left view, or None.
-        table_1: Its row of Table 1.
+        doffs_px: Difference of the principal points; Table 1 prints it as the focal length.
         files: Files that the experiment was read from.
     """
 
@@ -58,7 +37,7 @@ class Experiment:
     pair: StereoPair
     camera: RectifiedCamera
     truth: DisparityTruth | None
-    table_1: Table1Row
+    doffs_px: float
     files: tuple[Path, ...]
 
     @property
@@ -123,29 +102,16 @@ def camera_of_table_1(camera: RectifiedCamera) -> RectifiedCamera:
 
 
 def _read_experiment(number: int, folder: Path) -> Experiment:
-    source, row = MiddleburySource(folder), _table_1_row(number, folder)
-    camera = source.calibration
+    scene, calib = read_middlebury_scene(folder), read_middlebury_calib(folder / "calib.txt")
+    camera = calib.camera
+    doffs_px = camera.doffs_px if calib.doffs_px is None else calib.doffs_px
     return Experiment(
         number=number,
-        scene=source.name,
-        pair=source.scene.pair,
+        scene=scene.name,
+        pair=scene.pair,
         # The file rounds doffs and the principal points independently; doffs defines depth.
-        camera=replace(camera, cx_right_px=camera.cx_px + row.doffs_px),
-        truth=source.scene.truth,
-        table_1=row,
-        files=tuple(source.files),
-    )
-
-
-def _table_1_row(number: int, folder: Path) -> Table1Row:
-    """Return the row of Table 1 for an experiment, from the scene's own calibration file."""
-    calib = read_middlebury_calib(folder / "calib.txt")
-    camera = calib.camera
-    return Table1Row(
-        experiment=number,
-        scene=folder.name,
-        doffs_px=camera.doffs_px if calib.doffs_px is None else calib.doffs_px,
-        baseline_mm=round(1000 * camera.baseline_m, 6),
-        ndisp=camera.ndisp,
-        focal_px=camera.focal_px,
+        camera=replace(camera, cx_right_px=camera.cx_px + doffs_px),
+        truth=scene.truth,
+        doffs_px=doffs_px,
+        files=tuple(sorted(path for path in folder.iterdir() if path.is_file())),
     )

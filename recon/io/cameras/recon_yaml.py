@@ -25,21 +25,8 @@ _HEADER: Final = """\
 # xyz_right = rotation * xyz_left + translation_m
 """
 _PINHOLE: Final = (
-    "k1",
-    "k2",
-    "p1",
-    "p2",
-    "k3",
-    "k4",
-    "k5",
-    "k6",
-    "s1",
-    "s2",
-    "s3",
-    "s4",
-    "tx",
-    "ty",
-)
+    "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty",
+)  # fmt: skip
 _FISHEYE: Final = ("k1", "k2", "k3", "k4")
 _RECTIFIED: Final = ("focal_px", "cx_px", "cy_px", "cx_right_px", "baseline_m")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -11,42 +11,27 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError
 from recon.core.values.arrays import UInt8
 
-# Encoding: channels and bits per channel.
-_LAYOUT: Final = {
-    "mono8": (1, 8),
-    "8uc1": (1, 8),
-    "mono16": (1, 16),
-    "16uc1": (1, 16),
-    "rgb8": (3, 8),
-    "bgr8": (3, 8),
-    "8uc3": (3, 8),
-    "rgba8": (4, 8),
-    "bgra8": (4, 8),
-    "8uc4": (4, 8),
-    "bayer_rggb8": (1, 8),
-    "bayer_bggr8": (1, 8),
-    "bayer_gbrg8": (1, 8),
-    "bayer_grbg8": (1, 8),
-    "yuv422": (2, 8),
-    "uyvy": (2, 8),
-    "yuv422_yuy2": (2, 8),
-    "yuyv": (2, 8),
-}
+# Encoding: channels, bits per channel, and how OpenCV makes RGB of it, if it is not there already.
 # OpenCV names a Bayer pattern from pixel (1, 1) on, ROS from pixel (0, 0) on.
-_TO_RGB: Final = {
-    "bgr8": cv2.COLOR_BGR2RGB,
-    "8uc3": cv2.COLOR_BGR2RGB,
-    "rgba8": cv2.COLOR_RGBA2RGB,
-    "bgra8": cv2.COLOR_BGRA2RGB,
-    "8uc4": cv2.COLOR_BGRA2RGB,
-    "bayer_rggb8": cv2.COLOR_BayerBG2RGB,
-    "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
-    "bayer_gbrg8": cv2.COLOR_BayerGR2RGB,
-    "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
-    "yuv422": cv2.COLOR_YUV2RGB_UYVY,
-    "uyvy": cv2.COLOR_YUV2RGB_UYVY,
-    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2,
-    "yuyv": cv2.COLOR_YUV2RGB_YUY2,
+_ENCODINGS: Final[dict[str, tuple[int, int, int | None]]] = {
+    "mono8": (1, 8, None),
+    "8uc1": (1, 8, None),
+    "mono16": (1, 16, None),
+    "16uc1": (1, 16, None),
+    "rgb8": (3, 8, None),
+    "bgr8": (3, 8, cv2.COLOR_BGR2RGB),
+    "8uc3": (3, 8, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, 8, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, 8, cv2.COLOR_BGRA2RGB),
+    "8uc4": (4, 8, cv2.COLOR_BGRA2RGB),
+    "bayer_rggb8": (1, 8, cv2.COLOR_BayerBG2RGB),
+    "bayer_bggr8": (1, 8, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg8": (1, 8, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg8": (1, 8, cv2.COLOR_BayerGB2RGB),
+    "yuv422": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
 }
 
 
@@ -80,33 +65,15 @@ def pixels_of_ros_image(
     Ref: ``sensor_msgs/image_encodings.hpp``.
     """
     name = encoding.lower()
-    if name not in _LAYOUT:
+    if name not in _ENCODINGS:
         raise FormatError(
             "image encoding is not supported",
             where=where,
             got=encoding,
-            expected=", ".join(sorted(_LAYOUT)),
+            expected=", ".join(sorted(_ENCODINGS)),
         )
-    pixels = _unpack(data, name, shape, step, big_endian=big_endian, where=where)
-    if pixels.dtype != np.uint8:
-        return ((pixels.astype(np.uint32) + 128) // 257).astype(np.uint8)
-    if name in _TO_RGB:
-        return np.asarray(cv2.cvtColor(pixels, _TO_RGB[name]), dtype=np.uint8)
-    return pixels
-
-
-def _unpack(
-    data: NDArray[np.uint8],
-    name: str,
-    shape: tuple[int, int],
-    step: int,
-    *,
-    big_endian: bool,
-    where: str,
-) -> NDArray[Any]:
-    """Return pixels (H, W) or (H, W, channels), without the padding of rows."""
     height_px, width_px = shape
-    channels, bits = _LAYOUT[name]
+    channels, bits, to_rgb = _ENCODINGS[name]
     row = width_px * channels * bits // 8
     if step < row or data.size < step * (height_px - 1) + row or min(shape) < 1:
         raise FormatError(
@@ -118,5 +85,8 @@ def _unpack(
     rows = np.lib.stride_tricks.as_strided(data, (height_px, row), (step, 1))
     pixels = np.ascontiguousarray(rows)
     if bits == 16:
-        pixels = pixels.view(">u2" if big_endian else "<u2")
-    return pixels if channels == 1 else pixels.reshape(height_px, width_px, channels)
+        wide = pixels.view(">u2" if big_endian else "<u2")
+        return ((wide.astype(np.uint32) + 128) // 257).astype(np.uint8)
+    if channels > 1:
+        pixels = pixels.reshape(height_px, width_px, channels)
+    return pixels if to_rgb is None else np.asarray(cv2.cvtColor(pixels, to_rgb), dtype=np.uint8)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import struct
-from os import PathLike
 from typing import Any, Final
 
 import numpy as np
@@ -18,6 +17,7 @@ from recon.core.values import TriangleMesh
 from recon.core.values.arrays import UInt8
 from recon.core.values.cloud import Frame
 from recon.io.atomic import write_bytes
+from recon.io.files import StrPath
 
 _FLOAT, _UINT, _USHORT = 5126, 5125, 5123
 _VERTICES, _INDICES = 34962, 34963
@@ -29,7 +29,7 @@ _MATERIAL: Final = {
 _UNLIT: Final = "KHR_materials_unlit"
 
 
-def write_glb(path: str | PathLike[str], mesh: TriangleMesh, frame: Frame | None = None) -> None:
+def write_glb(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> None:
     """Write a mesh as GLB with float vertices, without changing its coordinates.
 
     The y axis of glTF is up, so the node of the mesh is rotated upright if the frame is known.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from os import PathLike
 from pathlib import Path
 from typing import Final
 
@@ -15,7 +14,7 @@ from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Int32
 from recon.core.values.cloud import Frame
 from recon.io.atomic import atomic_path
-from recon.io.files import reader
+from recon.io.files import StrPath, reader
 from recon.io.models.glb import srgb_from_linear, write_glb
 from recon.io.models.ply import colours_of, fill_vertices, normals_of, vertex_dtype
 from recon.io.models.ply_tables import (
@@ -31,7 +30,7 @@ MESH_SUFFIXES: Final = (".ply", ".obj", ".stl", ".glb")
 _INDICES: Final = ("vertex_indices", "vertex_index")
 
 
-def write_mesh(path: str | PathLike[str], mesh: TriangleMesh, frame: Frame | None = None) -> None:
+def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> None:
     """Write a mesh atomically.
 
     PLY is binary with float vertices. PLY, OBJ and GLB keep normals and colours; STL has neither.
@@ -81,7 +80,7 @@ def check_mesh_formats(formats: Sequence[str]) -> None:
         )
 
 
-def join_meshes(path: str | PathLike[str], parts: Sequence[tuple[Path, int, int]]) -> None:
+def join_meshes(path: StrPath, parts: Sequence[tuple[Path, int, int]]) -> None:
     """Join the meshes of several PLY files into one PLY, with at most two in memory.
 
     Args:
@@ -106,7 +105,7 @@ def join_meshes(path: str | PathLike[str], parts: Sequence[tuple[Path, int, int]
 
 
 @reader
-def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
+def read_mesh(path: StrPath) -> TriangleMesh:
     """Read a mesh.
 
     Args:
@@ -144,7 +143,7 @@ def _tables(mesh: TriangleMesh, start: int = 0) -> dict[str, Table]:
     return {"vertex": vertices, "face": faces}
 
 
-def _read_ply(path: str | PathLike[str]) -> TriangleMesh:
+def _read_ply(path: StrPath) -> TriangleMesh:
     _, tables = read_tables(path, ["vertex", "face"])
     vertex, faces = tables.get("vertex"), _faces(tables.get("face"))
     if vertex is None or faces is None or len(faces) == 0:
@@ -166,7 +165,7 @@ def _faces(table: Table | None) -> Int32 | None:
     return None
 
 
-def _checked(mesh: TriangleMesh, path: str | PathLike[str]) -> TriangleMesh:
+def _checked(mesh: TriangleMesh, path: StrPath) -> TriangleMesh:
     """Check that all faces refer to existing vertices and all vertices are finite."""
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise FormatError(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree as ET
@@ -18,6 +17,7 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.core.values.cloud import Frame
 from recon.io.atomic import write_text
+from recon.io.files import StrPath
 
 _IDENTITY: Final = np.eye(4)
 _SENSOR_MM: Final = 36.0
@@ -38,8 +38,8 @@ class Photo:
 
 
 def write_mlp(
-    path: str | PathLike[str],
-    layers: Mapping[str, str | PathLike[str]],
+    path: StrPath,
+    layers: Mapping[str, StrPath],
     frame: Frame | None = None,
     photo: Photo | None = None,
 ) -> None:
@@ -102,7 +102,7 @@ def _rows(T: Float64) -> str:
     return "\n" + "".join(" ".join(f"{x:g}" for x in row) + " \n" for row in T)
 
 
-def _relative(file: str | PathLike[str], project: Path) -> str:
+def _relative(file: StrPath, project: Path) -> str:
     """Return the path of a layer's file relative to the project's folder."""
     if not Path(file).is_file():
         raise OutputError(

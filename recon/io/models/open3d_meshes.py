@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +14,10 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError, MeshingError, OutputError
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32, Int32
+from recon.io.files import StrPath
 
 
-def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
+def write_mesh(path: StrPath, mesh: TriangleMesh) -> None:
     """Write OBJ or STL, chosen by the suffix.
 
     Raises:
@@ -29,7 +29,7 @@ def write_mesh(path: str | PathLike[str], mesh: TriangleMesh) -> None:
         raise OutputError("Open3D could not write the mesh", where=path)
 
 
-def read_mesh(path: str | PathLike[str]) -> TriangleMesh:
+def read_mesh(path: StrPath) -> TriangleMesh:
     """Read OBJ, STL, GLB or another format that Open3D knows, chosen by the suffix.
 
     Raises:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from os import PathLike
 from typing import Any, Final
 
 import numpy as np
@@ -13,14 +12,13 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError
 from recon.core.values import Frame, PointCloud
 from recon.core.values.arrays import Float32, UInt8
-from recon.io.atomic import atomic_path
-from recon.io.files import reader
+from recon.io.files import StrPath, reader
 from recon.io.models.ply_tables import (
     PlyHeader,
     Table,
-    TableStream,
     read_table_pieces,
     read_tables,
+    write_table_stream,
     write_tables,
 )
 
@@ -42,7 +40,7 @@ _FRAMES: Final[tuple[Frame, ...]] = ("camera", "world", "map")
 
 
 def write_ply(
-    path: str | PathLike[str],
+    path: StrPath,
     cloud: PointCloud,
     *,
     quality: Float32 | None = None,
@@ -66,15 +64,13 @@ def write_ply(
     write_tables(path, {"vertex": _table(rated)}, [_FRAME + cloud.frame], ascii=ascii)
 
 
-def write_ply_tiles(
-    path: str | PathLike[str], clouds: Iterable[PointCloud], *, frame: Frame
-) -> int:
+def write_ply_tiles(path: StrPath, clouds: Iterable[PointCloud], *, frame: Frame) -> int:
     """Write several clouds into one file, in the format of `write_ply`.
 
     Args:
         path: The file, written atomically.
         clouds: Clouds in the same frame and with the same fields; one is in memory at a time.
-        frame: Frame of the file if there is no cloud.
+        frame: Their frame.
 
     Returns:
         The number of points.
@@ -82,22 +78,12 @@ def write_ply_tiles(
     Raises:
         OutputError: The file cannot be written.
     """
-    stream: TableStream | None = None
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        for cloud in clouds:
-            table = _table(cloud)
-            if stream is None:
-                stream = TableStream(file, "vertex", table.dtype, [_FRAME + cloud.frame])
-            stream.append(table)
-        if stream is None:
-            nothing = _table(PointCloud(np.zeros((0, 3), np.float32), frame=frame))
-            stream = TableStream(file, "vertex", nothing.dtype, [_FRAME + frame])
-        stream.close()
-    return stream.rows
+    nothing = _table(PointCloud(np.zeros((0, 3), np.float32), frame=frame))
+    return write_table_stream(path, "vertex", map(_table, clouds), [_FRAME + frame], nothing)
 
 
 @reader
-def read_ply(path: str | PathLike[str]) -> PointCloud:
+def read_ply(path: StrPath) -> PointCloud:
     """Read the vertices of a cloud or mesh, in ascii or binary, float or double.
 
     Points with a non-finite coordinate are dropped; organised clouds mark their gaps that way.
@@ -127,9 +113,7 @@ def read_ply(path: str | PathLike[str]) -> PointCloud:
     return kept
 
 
-def read_ply_pieces(
-    path: str | PathLike[str], points_each: int = _PIECE_POINTS
-) -> Iterator[PointCloud]:
+def read_ply_pieces(path: StrPath, points_each: int = _PIECE_POINTS) -> Iterator[PointCloud]:
     """Read positions, normals and colours like `read_ply`, one piece at a time.
 
     Other fields are left out, as the meaning of ``quality`` depends on all its values.
@@ -192,7 +176,7 @@ def _table(cloud: PointCloud) -> Table:
     return table
 
 
-def _vertices(vertex: Table | None, path: str | PathLike[str]) -> Table:
+def _vertices(vertex: Table | None, path: StrPath) -> Table:
     """Check that the vertex table exists and has positions."""
     if vertex is None or not _has(vertex, _XYZ):
         raise FormatError("the PLY file has no vertices with x, y and z", where=path)
@@ -200,7 +184,7 @@ def _vertices(vertex: Table | None, path: str | PathLike[str]) -> Table:
     return vertex
 
 
-def _check_precision(vertex: Table, path: str | PathLike[str]) -> None:
+def _check_precision(vertex: Table, path: StrPath) -> None:
     """Reject coordinates that float32 would round too far, such as UTM: by up to half a metre."""
     for name in _XYZ:
         exact = vertex[name]
@@ -234,7 +218,7 @@ def _finite(cloud: PointCloud) -> PointCloud:
     return cloud if finite.all() else cloud.select(finite)
 
 
-def _check_kept(points: int, kept: int, path: str | PathLike[str]) -> None:
+def _check_kept(points: int, kept: int, path: StrPath) -> None:
     if points and not kept:
         raise FormatError("no point of the PLY file is finite", where=path)
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from os import SEEK_END, PathLike
+from os import SEEK_END
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import FormatError
 from recon.io.atomic import atomic_path
-from recon.io.files import reader, reading
+from recon.io.files import StrPath, reader, reading
 
 #: A structured array with one field per property. Lists are supported only with three entries, as
 #: a field of shape (3,) that follows a field with the length (`list_length`).
@@ -29,6 +29,7 @@ _TYPES: Final[dict[str, str]] = {
 }  # fmt: skip
 _NAMES: Final = {code: name for name, code in list(_TYPES.items())[:8]}
 _ORDERS: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
+_BINARY: Final = "binary_little_endian"
 _LONGEST_HEADER_LINES: Final = 1000
 _LONGEST_NUMBER: Final = 20
 
@@ -54,9 +55,7 @@ def list_length(name: str) -> str:
 
 
 @reader
-def read_tables(
-    path: str | PathLike[str], wanted: Sequence[str]
-) -> tuple[PlyHeader, dict[str, Table]]:
+def read_tables(path: StrPath, wanted: Sequence[str]) -> tuple[PlyHeader, dict[str, Table]]:
     """Read the wanted elements of a PLY file.
 
     Args:
@@ -76,7 +75,7 @@ def read_tables(
 
 
 def read_table_pieces(
-    path: str | PathLike[str], wanted: str, rows_each: int
+    path: StrPath, wanted: str, rows_each: int
 ) -> Iterator[tuple[PlyHeader, Table]]:
     """Read an element of a PLY file piece by piece, each with the header.
 
@@ -99,7 +98,7 @@ def read_table_pieces(
 
 
 def write_tables(
-    path: str | PathLike[str],
+    path: StrPath,
     tables: Mapping[str, Table],
     comments: Sequence[str] = (),
     *,
@@ -110,12 +109,9 @@ def write_tables(
     Raises:
         OutputError: The file cannot be written.
     """
-    encoding = "ascii" if ascii else "binary_little_endian"
-    lines = ["ply", f"format {encoding} 1.0", *(f"comment {comment}" for comment in comments)]
-    for name, table in tables.items():
-        lines += [f"element {name} {len(table)}", *_property_lines(table.dtype)]
+    elements = [(name, len(table), table.dtype) for name, table in tables.items()]
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
-        stream.write("\n".join([*lines, "end_header", ""]).encode())
+        stream.write(_header(elements, comments, "ascii" if ascii else _BINARY))
         for table in tables.values():
             if ascii:
                 _write_rows(stream, table)
@@ -123,9 +119,7 @@ def write_tables(
                 stream.write(table.tobytes())
 
 
-def write_table_parts(
-    path: str | PathLike[str], elements: Mapping[str, tuple[int, Iterable[Table]]]
-) -> None:
+def write_table_parts(path: StrPath, elements: Mapping[str, tuple[int, Iterable[Table]]]) -> None:
     """Write elements whose rows arrive in parts, binary little endian, atomically.
 
     Args:
@@ -138,56 +132,64 @@ def write_table_parts(
     """
     begun = {name: iter(tables) for name, (_, tables) in elements.items()}
     first = {name: next(tables) for name, tables in begun.items()}
-    lines = ["ply", "format binary_little_endian 1.0"]
-    for name, (rows, _) in elements.items():
-        lines += [f"element {name} {rows}", *_property_lines(first[name].dtype)]
+    head = _header([(name, rows, first[name].dtype) for name, (rows, _) in elements.items()])
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
-        stream.write("\n".join([*lines, "end_header", ""]).encode())
+        stream.write(head)
         for name, rest in begun.items():
             stream.write(first.pop(name).tobytes())
             for table in rest:
                 stream.write(table.tobytes())
 
 
-class TableStream:
-    """Writes the rows of one element as they arrive; the row count is filled in at the end.
+def write_table_stream(
+    path: StrPath, name: str, tables: Iterable[Table], comments: Sequence[str], empty: Table
+) -> int:
+    """Write one element whose rows arrive in parts, binary little endian, atomically.
 
     Args:
-        stream: A seekable file at its start, which nothing else writes to.
+        path: The file.
         name: The element.
-        dtype: Dtype of its rows.
+        tables: Its rows; one table is held at a time, and all get the dtype of the first.
         comments: Comment lines.
+        empty: What is written if there is no table.
+
+    Returns:
+        The number of rows, which is filled into the header at the end.
+
+    Raises:
+        OutputError: The file cannot be written.
     """
+    dtype: np.dtype[Any] | None = None
+    rows = 0
 
-    def __init__(
-        self, stream: IO[bytes], name: str, dtype: np.dtype[Any], comments: Sequence[str]
-    ) -> None:
-        self._stream, self._name, self._dtype, self._comments = stream, name, dtype, comments
-        self.rows = 0
-        self._stream.write(self._header())
+    def head() -> bytes:
+        # Padded with a comment to the same length for every number of rows.
+        number = str(rows)
+        padded = [*comments, "." * (_LONGEST_NUMBER - len(number))]
+        return _header([(name, number, empty.dtype if dtype is None else dtype)], padded)
 
-    def append(self, table: Table) -> None:
-        """Write more rows."""
-        self._stream.write(table.astype(self._dtype, copy=False).tobytes())
-        self.rows += len(table)
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        for table in tables:
+            if dtype is None:
+                dtype = table.dtype
+                stream.write(head())
+            stream.write(table.astype(dtype, copy=False).tobytes())
+            rows += len(table)
+        stream.seek(0)
+        stream.write(head())
+    return rows
 
-    def close(self) -> None:
-        """Write the final number of rows into the header."""
-        self._stream.seek(0)
-        self._stream.write(self._header())
 
-    def _header(self) -> bytes:
-        """Return the header, padded with a comment to the same length for every number of rows."""
-        number = str(self.rows)
-        lines = [
-            "ply",
-            "format binary_little_endian 1.0",
-            *(f"comment {comment}" for comment in self._comments),
-            f"comment {'.' * (_LONGEST_NUMBER - len(number))}",
-            f"element {self._name} {number}",
-            *_property_lines(self._dtype),
-        ]
-        return "\n".join([*lines, "end_header", ""]).encode()
+def _header(
+    elements: Sequence[tuple[str, int | str, np.dtype[Any]]],
+    comments: Sequence[str] = (),
+    encoding: str = _BINARY,
+) -> bytes:
+    """Return the header of elements, each with its name, number of rows and dtype."""
+    lines = ["ply", f"format {encoding} 1.0", *(f"comment {comment}" for comment in comments)]
+    for name, rows, dtype in elements:
+        lines += [f"element {name} {rows}", *_property_lines(dtype)]
+    return "\n".join([*lines, "end_header", ""]).encode()
 
 
 def _property_lines(dtype: np.dtype[Any]) -> list[str]:
@@ -216,7 +218,7 @@ def _write_rows(stream: IO[bytes], table: Table) -> None:
     np.savetxt(stream, np.concatenate(columns, axis=1), fmt=formats)
 
 
-def _read_header(stream: IO[bytes], path: str | PathLike[str]) -> PlyHeader:
+def _read_header(stream: IO[bytes], path: StrPath) -> PlyHeader:
     """Parse the header and leave the stream just after it."""
     if stream.readline(8).strip() != b"ply":
         raise FormatError("not a PLY file: it does not start with 'ply'", where=path)
@@ -264,7 +266,7 @@ def _property_fields(words: list[str], order: str) -> list[tuple[Any, ...]]:
 
 
 def _read_body(
-    stream: IO[bytes], header: PlyHeader, wanted: Sequence[str], path: str | PathLike[str]
+    stream: IO[bytes], header: PlyHeader, wanted: Sequence[str], path: StrPath
 ) -> dict[str, Table]:
     """Read element by element until all wanted ones are found."""
     tables: dict[str, Table] = {}
@@ -282,7 +284,7 @@ def _pieces(
     header: PlyHeader,
     element: tuple[str, int, np.dtype[Any]],
     rows_each: int,
-    path: str | PathLike[str],
+    path: StrPath,
 ) -> Iterator[Table]:
     """Yield the rows of an element in pieces; at least one table."""
     name, count, dtype = element
@@ -337,7 +339,7 @@ def _read_text(stream: IO[bytes], count: int, dtype: np.dtype[Any]) -> Table:
     return table
 
 
-def _checked_lists(table: Table, path: str | PathLike[str]) -> Table:
+def _checked_lists(table: Table, path: StrPath) -> Table:
     for name, field in _fields(table.dtype):
         if field.shape and (table[list_length(name)] != 3).any():
             raise FormatError(

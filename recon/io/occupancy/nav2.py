@@ -8,7 +8,6 @@ occupied, below ``free_thresh`` free, else unknown. The first row of the image h
 from __future__ import annotations
 
 import re
-from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,7 +19,7 @@ from recon.core.errors import FormatError
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import UInt8
 from recon.io.atomic import atomic_path, write_text
-from recon.io.files import read_bytes, reader
+from recon.io.files import StrPath, read_bytes, reader
 from recon.io.yaml_file import read_yaml
 
 _OCCUPIED_THRESH: Final = 0.65
@@ -32,7 +31,7 @@ _KEYS: Final = ("image", "resolution", "origin", "negate", "occupied_thresh", "f
 _PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d+)\s+(\d+)\s+(\d+)\s")
 
 
-def write_nav2(path: str | PathLike[str], grid: OccupancyGrid) -> tuple[Path, Path]:
+def write_nav2(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
     """Write ``path.pgm`` and ``path.yaml``, each atomically, the image first.
 
     Args:
@@ -57,7 +56,7 @@ def write_nav2(path: str | PathLike[str], grid: OccupancyGrid) -> tuple[Path, Pa
 
 
 @reader
-def read_nav2(path: str | PathLike[str]) -> OccupancyGrid:
+def read_nav2(path: StrPath) -> OccupancyGrid:
     """Read a map as Nav2 does in mode ``trinary``.
 
     Args:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO
@@ -16,7 +15,7 @@ from recon.core.kernels.voxels import pack_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Int32
 from recon.io.atomic import atomic_path
-from recon.io.files import reader
+from recon.io.files import StrPath, reader
 from recon.io.occupancy.octomap_leaves import octomap_pieces
 from recon.io.occupancy.octree import (
     DEPTH,
@@ -31,25 +30,8 @@ from recon.io.occupancy.octree import (
 Cube = tuple[int, int, int]
 
 
-def write_octomap(path: str | PathLike[str], voxels: OccupancyVoxels) -> tuple[Path, Path]:
-    """Write ``path.bt`` and ``path.ot``, each atomically.
-
-    Args:
-        path: The common path without suffix, such as ``map/octomap``.
-        voxels: The map.
-
-    Returns:
-        The two paths written: ``.bt``, ``.ot``.
-
-    Raises:
-        MappingError: The map is too large for an OctoMap.
-        OutputError: A file cannot be written.
-    """
-    return write_octomap_tiles(path, [voxels], DEPTH // 2, voxels.resolution_m)
-
-
 def write_octomap_tiles(
-    path: str | PathLike[str], tiles: Iterable[OccupancyVoxels], depth: int, resolution_m: float
+    path: StrPath, tiles: Iterable[OccupancyVoxels], depth: int, resolution_m: float
 ) -> tuple[Path, Path]:
     """Write both files from tiles of a map, with one tile in memory at a time.
 
@@ -175,7 +157,7 @@ def _check(voxels: OccupancyVoxels) -> None:
 
 
 @reader
-def read_octomap(path: str | PathLike[str]) -> OccupancyVoxels:
+def read_octomap(path: StrPath) -> OccupancyVoxels:
     """Read an ``.ot`` file; pruned leaves are expanded.
 
     Raises:

@@ -14,7 +14,7 @@ from recon.core.values import Disparity, RectifiedCamera
 from recon.map.drive.sequence import MappedSequence
 from recon.map.fusion.builder import fusion_range_m
 from recon.odometry import OdometryHealth
-from recon.stereo.cloud import CloudSettings
+from recon.stereo.cloud.back_project import CloudSettings
 from recon.stereo.frame import ReconstructedFrame
 
 

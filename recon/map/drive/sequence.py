@@ -37,7 +37,7 @@ from recon.odometry import (
 from recon.run.lookahead import look_ahead
 from recon.run.machine import serial_algebra
 from recon.run.progress import SILENT, Progress
-from recon.sources import IncompleteSource, StampedSource, StereoSource
+from recon.sources.protocol import IncompleteSource, StampedSource, StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 
 

@@ -29,10 +29,10 @@ from recon.rig.audit.measures import Gaps, find_gaps
 from recon.rig.audit.sample import Look, Sample, take_sample
 from recon.rig.audit.settings import AuditedSettings
 from recon.run.summary import plain
-from recon.sources import IncompleteSource, StereoSource
-from recon.stereo.match import MatchingSettings, settings_of
+from recon.sources.protocol import IncompleteSource, StereoSource
+from recon.stereo.match.registry import MatchingSettings, settings_of
 from recon.stereo.match.search import SearchSettings
-from recon.stereo.rectify import Rectifier, plan_turns
+from recon.stereo.rectify.rectifier import Rectifier, plan_turns
 
 RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)
 """Distances for which the depth error is predicted."""

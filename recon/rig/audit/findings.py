@@ -12,7 +12,7 @@ from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, StereoCali
 from recon.rig.audit.geometry import MIN_FEATURES, Geometry
 from recon.rig.audit.measures import Gaps
 from recon.rig.audit.sample import BLANK_DN, Sample
-from recon.stereo.match import Matcher
+from recon.stereo.match.protocol import Matcher
 
 Verdict = Literal["good", "usable", "not usable"]
 _SIDES = ("left", "right")

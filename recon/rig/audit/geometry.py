@@ -12,7 +12,8 @@ from recon.core.values.arrays import Float64
 from recon.rig.audit.alignment import RowAlignment, align_rows
 from recon.rig.audit.measures import measure_time_skew
 from recon.rig.audit.sample import Sample
-from recon.stereo.rectify import PairFeatures, inspect_features
+from recon.stereo.rectify.features import PairFeatures, pool_features
+from recon.stereo.rectify.inspect import inspect_features
 
 # Agreement at a lag, relative to that at lag 0, from which a delay is reported.
 _LAG_FACTOR: Final = 1.25
@@ -59,26 +60,18 @@ def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
         sample: The sampled pairs.
         camera: The rectified camera.
     """
-    features = _pool(sample.features)
+    features = pool_features(sample.features)
     matched = len(features)
     alignment = _align(features, camera)
     skew = _time_skew(sample, camera, alignment)
     lag = _best_lag(sample, skew)
     if lag:
-        features, skew = _pool(sample.lagged[lag]), None
+        features, skew = pool_features(sample.lagged[lag]), None
         alignment = _align(features, camera)
     swapped = inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_share
     disparity = _disparities(features, alignment, camera)
     return Geometry(
         len(sample.features), features, matched, alignment, disparity, swapped, lag, skew
-    )
-
-
-def _pool(found: list[PairFeatures]) -> PairFeatures:
-    empty = np.zeros((0, 2), np.float32)
-    return PairFeatures(
-        np.concatenate([empty, *(features.left_uv for features in found)]),
-        np.concatenate([empty, *(features.right_uv for features in found)]),
     )
 
 

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from recon.core.errors import CalibrationError, MatchingError
-from recon.core.values import (
-    Disparity,
-    Reason,
-    RectifiedCamera,
-    SequenceTruth,
-    StereoCalibration,
-    StereoPair,
-)
+from recon.core.values import Disparity, Reason, StereoPair
 from recon.rig.audit.audit import audit_source
 from recon.rig.audit.findings import Finding
 from recon.rig.audit.settings import AuditedSettings
+from recon.sources.files import OnePair
 from recon.sources.pair_input import PairInput
 
 #: Findings that images alone support, and those that need a calibration. The inspection of the
@@ -32,32 +23,6 @@ _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
 FEW_VALID_SHARE: Final = 0.25
 """Share of pixels with a disparity below which the images are hardly a stereo pair: real pairs,
 even of bare walls, exceed 40 %; swapped images, or those of different moments, stay under 15 %."""
-
-
-@dataclass(frozen=True, eq=False)
-class _OnePair:
-    """A pair as a source of one frame."""
-
-    pair: StereoPair
-    calibration: RectifiedCamera | StereoCalibration
-    files: tuple[Path, ...] = ()
-    description: str = "two images"
-    truth: SequenceTruth | None = None
-
-    @property
-    def name(self) -> str:
-        """Name of the pair."""
-        return self.pair.name
-
-    def __len__(self) -> int:
-        return 1
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
-
-    def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        """Yield the pair, or nothing if ``start`` is after it."""
-        yield from (self.pair,)[start:]
 
 
 def find_pair_faults(
@@ -74,7 +39,7 @@ def find_pair_faults(
         return ()
     codes = _BY_IMAGES | _BY_CALIBRATION if metric else _BY_IMAGES
     try:
-        audit = audit_source(_OnePair(given.pair, given.calibration), config, quick=True)
+        audit = audit_source(OnePair(given.pair, given.calibration), config, quick=True)
     except CalibrationError:
         return ()  # the run itself reports this later
     return tuple(finding for finding in audit.findings if finding.code in codes)

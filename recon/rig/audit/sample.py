@@ -21,8 +21,9 @@ from recon.rig.audit.measures import (
     track,
 )
 from recon.rig.audit.settings import AuditSettings
-from recon.sources import StereoSource
-from recon.stereo.rectify import PairFeatures, Rectifier, match_features
+from recon.sources.protocol import StereoSource
+from recon.stereo.rectify.features import NO_FEATURES, PairFeatures, match_features
+from recon.stereo.rectify.rectifier import Rectifier
 
 # Stretches of a quick audit; each is just long enough to detect a delayed camera.
 _QUICK_RUNS = 2
@@ -32,7 +33,6 @@ _LAG_PAIRS = 4
 _QUICK_REACH = 300
 # Smaller images have no features, and are too small to measure their sharpness.
 _LEAST_SIDE_PX = 16
-_NO_FEATURES = PairFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
 
 
 _RUNS: Final = 6
@@ -212,10 +212,10 @@ class _Sampler:
         sample.contrast_dn.append((float(pair.left.std()), float(pair.right.std())))
         sample.brightness_dn.append((float(pair.left.mean()), float(pair.right.mean())))
         if min(sample.contrast_dn[-1]) < BLANK_DN:
-            self._note(pair, (np.nan, np.nan), _NO_FEATURES)
+            self._note(pair, (np.nan, np.nan), NO_FEATURES)
             return
         if min(pair.left.shape) < _LEAST_SIDE_PX:
-            sample.features.append(_NO_FEATURES)
+            sample.features.append(NO_FEATURES)
             sample.flows.append(np.zeros(0))
             return
         sample.sharpness.append((measure_sharpness(pair.left), measure_sharpness(pair.right)))

@@ -11,17 +11,11 @@ from recon.core.errors import CalibrationError, SourceError
 from recon.core.values.arrays import UInt8
 from recon.core.values.board import CalibrationBoard
 from recon.io.images.image import read_image
-from recon.rig.calibrate import (
-    Sighting,
-    View,
-    check_charuco,
-    check_chessboard,
-    find_board,
-    grown_size,
-    orient_like,
-)
+from recon.rig.calibrate.board_size import check_charuco, check_chessboard, grown_size
+from recon.rig.calibrate.bundle import Sighting, View
+from recon.rig.calibrate.detect import find_board, orient_like
 from recon.sources.image_pairs import ImagePairs
-from recon.stereo.rectify import to_grey
+from recon.stereo.rectify.grey import to_grey
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,11 +14,14 @@ from recon.io.cameras.camera_info import write_camera_info
 from recon.io.cameras.kalibr import write_kalibr
 from recon.io.cameras.opencv_yaml import write_opencv_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
-from recon.rig.calibrate import Spread, StereoFit, View, shared_pixels
 from recon.rig.calibrate.board_views import BoardViews
+from recon.rig.calibrate.bootstrap import Spread
+from recon.rig.calibrate.bundle import View
+from recon.rig.calibrate.quality import shared_pixels
 from recon.rig.calibrate.settings import CalibratedSettings
+from recon.rig.calibrate.stereo import StereoFit
 from recon.rig.calibrate.summary import summarise
-from recon.stereo.rectify import RectifyingTurns, plan_turns
+from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
 
 CalibrationForm = Literal["recon", "opencv", "ros", "kalibr"]
 

@@ -7,15 +7,10 @@ from typing import Any
 import numpy as np
 
 from recon.core.values.arrays import Float64
-from recon.rig.calibrate import (
-    DepthError,
-    Spread,
-    StereoFit,
-    coverage,
-    distances_m,
-    tilt_deg,
-)
 from recon.rig.calibrate.board_views import BoardViews
+from recon.rig.calibrate.bootstrap import DepthError, Spread
+from recon.rig.calibrate.quality import coverage, distances_m, tilt_deg
+from recon.rig.calibrate.stereo import StereoFit
 from recon.rig.calibrate.verdict import TILT_DEG
 from recon.run.summary import plain
 

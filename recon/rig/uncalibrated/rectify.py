@@ -11,11 +11,16 @@ import numpy as np
 
 from recon.core.errors import CalibrationError
 from recon.core.geometry.projection import map_pixels
-from recon.core.values.arrays import Bool, Float64, UInt8
+from recon.core.values.arrays import Float64, UInt8
 from recon.rig.uncalibrated.fundamental import epipoles, find_fundamental, level_homographies
 from recon.rig.uncalibrated.shaping import shape_views
-from recon.stereo.rectify.features import MOST_FEATURES, match_again, match_exactly
-from recon.stereo.rectify.inspect import PairFeatures
+from recon.stereo.rectify.features import (
+    MOST_FEATURES,
+    PairFeatures,
+    match_again,
+    match_exactly,
+    pool_features,
+)
 
 Size = tuple[int, int]
 
@@ -78,10 +83,10 @@ def rectify_images(
         CalibrationError: See `rectify_uncalibrated`.
     """
     height, width = pairs[0][0].shape
-    matched = _joined([match_exactly(left, right, count) for left, right in pairs])
+    matched = pool_features(match_exactly(left, right, count) for left, right in pairs)
     # The initial guess may rest on few matches: the second round checks it.
     H = _fit(matched, (width, height), _FEWEST_AT_FIRST)[:2]
-    again = _joined([match_again(left, right, *H, count) for left, right in pairs])
+    again = pool_features(match_again(left, right, *H, count) for left, right in pairs)
     return rectify_uncalibrated(again, (width, height))
 
 
@@ -108,8 +113,8 @@ def rectify_uncalibrated(
     used = np.arange(len(features)) % _HELD_OUT != 0
     held_out_px = float("nan")
     if used.sum() >= 2 * min_features:
-        trial = _fit(_some(features, used), size, min_features)
-        held_out_px = _held_out(trial[:2], _some(features, ~used))
+        trial = _fit(features.select(used), size, min_features)
+        held_out_px = _held_out(trial[:2], features.select(~used))
     H_left, H_right, F, agreeing = _fit(features, size, min_features)
     left, right = (
         map_pixels(H, uv) for H, uv in ((H_left, agreeing.left_uv), (H_right, agreeing.right_uv))
@@ -135,17 +140,6 @@ def rectify_uncalibrated(
     )
 
 
-def _joined(found: list[PairFeatures]) -> PairFeatures:
-    return PairFeatures(
-        np.concatenate([each.left_uv for each in found]),
-        np.concatenate([each.right_uv for each in found]),
-    )
-
-
-def _some(features: PairFeatures, which: Bool) -> PairFeatures:
-    return PairFeatures(features.left_uv[which], features.right_uv[which])
-
-
 def _fit(
     features: PairFeatures, size: Size, min_features: int
 ) -> tuple[Float64, Float64, Float64, PairFeatures]:
@@ -168,7 +162,7 @@ def _fundamental(features: PairFeatures, min_features: int) -> tuple[Float64, Pa
             expected=f"at least {min_features}",
             hint="are these two views of the same scene, with texture?",
         )
-    return F, _some(features, agreeing)
+    return F, features.select(agreeing)
 
 
 def _check_epipoles(F: Float64, size: Size) -> None:

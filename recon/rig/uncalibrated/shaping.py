@@ -8,7 +8,7 @@ import numpy as np
 
 from recon.core.geometry.projection import map_pixels
 from recon.core.values.arrays import Float64
-from recon.stereo.rectify.inspect import PairFeatures
+from recon.stereo.rectify.features import PairFeatures
 
 Size = tuple[int, int]
 

@@ -9,58 +9,62 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.values import RectifiedPair
-from recon.core.values.arrays import Float32, UInt8
+from recon.core.values.arrays import Bool, Float32, UInt8
+
+_GRADIENT_CAP: Final = 31
+"""Gradients (Sobel units) are clipped to plus or minus this before windows compare them."""
 
 _GAIN_OF_SOBEL: Final = 8.0
 """A 3×3 Sobel filter answers a slope of one grey level per pixel with 8."""
 
 
-def clipped_gradients(image: UInt8, cap: int, rows: range) -> UInt8:
-    """Return horizontal gradients of some rows in Sobel units, clipped to plus or minus ``cap``.
-
-    Args:
-        image: uint8 (H, W).
-        cap: At most 127.
-        rows: N consecutive rows.
+def clipped_gradients(image: UInt8, rows: range) -> UInt8:
+    """Return what windows compare in some rows of an image (H, W): clipped horizontal gradients.
 
     Returns:
-        uint8 (N, W), ``cap`` where there is none.
+        uint8 (N, W) of N consecutive rows, Sobel units, plus the cap.
     """
     gradients = _sobel(image, rows)
-    np.clip(gradients, -cap, cap, out=gradients)
-    gradients += cap
+    np.clip(gradients, -_GRADIENT_CAP, _GRADIENT_CAP, out=gradients)
+    gradients += _GRADIENT_CAP
     return gradients.astype(np.uint8)
 
 
-def texture(pair: RectifiedPair, window: tuple[int, int], least: float, rows: range) -> Float32:
+def texture(pair: RectifiedPair, window_px: int, rows: range) -> Float32:
     """Return mean size of the horizontal gradient in the window around each pixel of the left view.
 
     Args:
         pair: The images.
-        window: Width and height of the window, pixels.
-        least: The threshold; at 0 the texture is not computed, but returned as 0.
+        window_px: Edge of the square window.
         rows: N consecutive rows.
 
     Returns:
         float32 (N, W) of those rows, grey levels per pixel; NaN = no image.
     """
-    width, reach = pair.left.shape[1], window[1] // 2
-    mean = np.zeros((len(rows), width), np.float32)
-    if least > 0:
-        sizes = _sobel(pair.left, _around(rows, reach, len(pair.left)))
-        sums = cv2.boxFilter(
-            np.abs(sizes, out=sizes).view(np.uint16),
-            cv2.CV_32F,
-            window,
-            normalize=False,
-            borderType=cv2.BORDER_REPLICATE,
-        )
-        above = min(reach, rows.start)
-        mean = sums[above : above + len(rows)]
-        mean *= np.float32(1 / (_GAIN_OF_SOBEL * window[0] * window[1]))
-    if pair.valid is not None:
-        mean[~pair.valid[rows.start : rows.stop]] = np.nan
-    return np.asarray(mean, dtype=np.float32)
+    reach = window_px // 2
+    sizes = _sobel(pair.left, _around(rows, reach, len(pair.left)))
+    sums = cv2.boxFilter(
+        np.abs(sizes, out=sizes).view(np.uint16),
+        cv2.CV_32F,
+        (window_px, window_px),
+        normalize=False,
+        borderType=cv2.BORDER_REPLICATE,
+    )
+    above = min(reach, rows.start)
+    mean = sums[above : above + len(rows)]
+    mean *= np.float32(1 / (_GAIN_OF_SOBEL * window_px * window_px))
+    return _where_seen(mean, pair.valid, rows)
+
+
+def no_texture(width: int, valid: Bool | None, rows: range) -> Float32:
+    """Return the same for checks that ask for none: 0, NaN where there is no image."""
+    return _where_seen(np.zeros((len(rows), width), np.float32), valid, rows)
+
+
+def _where_seen(mean: Float32, valid: Bool | None, rows: range) -> Float32:
+    if valid is not None:
+        mean[~valid[rows.start : rows.stop]] = np.nan
+    return mean
 
 
 def _around(rows: range, reach: int, height: int) -> range:

@@ -12,7 +12,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from recon.core.values.arrays import Bool, Float32, UInt8
+from recon.core.values.arrays import UInt8
 from recon.stereo.kernels.half_windows import Search, widest_block
 from recon.stereo.kernels.refine import NO_FIT, Rules
 from recon.stereo.kernels.tiles import Support, Tiles, make_tiles
@@ -30,6 +30,9 @@ TILE_HEIGHT_PX: Final = 16
 _TILE_COLUMNS: Final = 160
 """Columns of a tile together with those that its windows reach over."""
 
+SUPPORT: Final = Support(margin_x=8, margin_y=8, margin=3, matched=0.15, share=0.03, least=4)
+"""How much support at half size offers candidates to a tile."""
+
 
 def halve(image: UInt8) -> UInt8:
     """Means of two by two pixels; the last row and column count twice where they are left over."""
@@ -41,14 +44,6 @@ def halve(image: UInt8) -> UInt8:
     return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def zero_texture(width: int, valid: Bool | None, rows: range) -> Float32:
-    """float32 (N, w), texture for checks that ask for none: 0, NaN where there is no image."""
-    texture = np.zeros((len(rows), width), np.float32)
-    if valid is not None:
-        texture[~valid[2 * rows.start : 2 * rows.stop : 2, ::2]] = np.nan
-    return texture
-
-
 def half_search(search: Search) -> Search:
     """Return what to search at half size."""
     minimum = search.minimum // 2
@@ -57,11 +52,7 @@ def half_search(search: Search) -> Search:
 
 
 def half_rules(search: Search) -> Rules:
-    """Return what makes a match at half size reliable.
-
-    Args:
-        search: That at half size.
-    """
+    """Return what makes a match of a search at half size reliable."""
     return Rules(
         ndisp=search.ndisp,
         minimum=search.minimum,
@@ -84,8 +75,3 @@ def divided(search: Search, shape: tuple[int, int]) -> Tiles:
     height = max(TILE_HEIGHT_PX, search.rows_radius)
     width = min(_TILE_COLUMNS - 2 * search.radius, shape[1])
     return make_tiles(shape, (height, width), search.ndisp)
-
-
-def support(share: float) -> Support:
-    """Return how much support offers candidates to a tile; ``share`` as in `Support`."""
-    return Support(margin_x=8, margin_y=8, margin=3, matched=0.15, share=share, least=4)

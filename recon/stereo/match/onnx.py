@@ -15,7 +15,7 @@ from recon.core.settings import Settings
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
 from recon.stereo.match.onnx_session import OnnxNetwork
-from recon.stereo.match.unrated import unrated_disparity
+from recon.stereo.match.protocol import unrated_disparity
 
 _WHITE: Final = 255.0
 

@@ -18,8 +18,8 @@ from pydantic import Field
 from recon.core.errors import MatchingError
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import UInt8
+from recon.stereo.match.protocol import unrated_disparity
 from recon.stereo.match.search import LEFT_RIGHT_PX, OddInt, SearchSettings
-from recon.stereo.match.unrated import unrated_disparity
 
 _STEPS: Final = 16
 """OpenCV counts in 16ths of a pixel, and searches multiples of 16 disparities."""
@@ -70,18 +70,19 @@ class OpencvSettings(SearchSettings):
     )
 
 
-class OpencvBmMatcher:
-    """``cv2.StereoBM`` as a `Matcher`.
+class OpencvMatcher:
+    """A matcher of OpenCV; a `Matcher`.
+
+    It has no number of threads: OpenCV has one for the whole process, which the commands set.
 
     Args:
         settings: What to search and what to believe.
-        threads: Not used: OpenCV has one number of threads for the whole process, which the
-            commands set (``--threads``).
+        semi_global: ``cv2.StereoSGBM``; else ``cv2.StereoBM``.
     """
 
-    def __init__(self, settings: OpencvSettings, threads: int | None = None) -> None:
-        del threads
+    def __init__(self, settings: OpencvSettings, *, semi_global: bool) -> None:
         self._settings = settings
+        self._semi_global = semi_global
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair.
@@ -89,51 +90,35 @@ class OpencvBmMatcher:
         Raises:
             MatchingError: OpenCV refuses the pair or the settings.
         """
-        s = self._settings
-        ndisp = _range(s, pair.camera)
-        block_px = s.block_px or _BM_BLOCK_PX
-        engine = cv2.StereoBM.create(ndisp, block_px)
-        engine.setMinDisparity(s.min_disparity_px)
-        engine.setPreFilterType(cv2.STEREO_BM_PREFILTER_XSOBEL)
-        engine.setPreFilterCap(_BM_PREFILTER_CAP)
-        engine.setTextureThreshold(_BM_TEXTURE_THRESHOLD)
-        engine.setUniquenessRatio(_UNIQUENESS_PERCENT)
-        engine.setDisp12MaxDiff(LEFT_RIGHT_PX)
-        return _match(pair, engine, s, _Margins.around(s, block_px, ndisp))
+        s, ndisp = self._settings, _range(self._settings, pair.camera)
+        block_px = s.block_px or (_SGBM_BLOCK_PX if self._semi_global else _BM_BLOCK_PX)
+        make = _semi_global_engine if self._semi_global else _block_engine
+        return _match(pair, make(s, ndisp, block_px), s, _Margins.around(s, block_px, ndisp))
 
 
-class OpencvSgbmMatcher:
-    """``cv2.StereoSGBM`` as a `Matcher`.
+def _block_engine(s: OpencvSettings, ndisp: int, block_px: int) -> cv2.StereoBM:
+    engine = cv2.StereoBM.create(ndisp, block_px)
+    engine.setMinDisparity(s.min_disparity_px)
+    engine.setPreFilterType(cv2.STEREO_BM_PREFILTER_XSOBEL)
+    engine.setPreFilterCap(_BM_PREFILTER_CAP)
+    engine.setTextureThreshold(_BM_TEXTURE_THRESHOLD)
+    engine.setUniquenessRatio(_UNIQUENESS_PERCENT)
+    engine.setDisp12MaxDiff(LEFT_RIGHT_PX)
+    return engine
 
-    Args:
-        settings: What to search and what to believe.
-        threads: Not used, as in `OpencvBmMatcher`.
-    """
 
-    def __init__(self, settings: OpencvSettings, threads: int | None = None) -> None:
-        del threads
-        self._settings = settings
-
-    def match(self, pair: RectifiedPair) -> Disparity:
-        """Match one rectified pair.
-
-        Raises:
-            MatchingError: OpenCV refuses the pair or the settings.
-        """
-        s = self._settings
-        ndisp, block_px = _range(s, pair.camera), s.block_px or _SGBM_BLOCK_PX
-        engine = cv2.StereoSGBM.create(
-            minDisparity=s.min_disparity_px,
-            numDisparities=ndisp,
-            blockSize=block_px,
-            P1=_P1 * block_px**2,
-            P2=_P2 * block_px**2,
-            disp12MaxDiff=LEFT_RIGHT_PX,
-            preFilterCap=_SGBM_PREFILTER_CAP,
-            uniquenessRatio=_UNIQUENESS_PERCENT,
-            mode=_SGBM_MODE,
-        )
-        return _match(pair, engine, s, _Margins.around(s, block_px, ndisp))
+def _semi_global_engine(s: OpencvSettings, ndisp: int, block_px: int) -> cv2.StereoSGBM:
+    return cv2.StereoSGBM.create(
+        minDisparity=s.min_disparity_px,
+        numDisparities=ndisp,
+        blockSize=block_px,
+        P1=_P1 * block_px**2,
+        P2=_P2 * block_px**2,
+        disp12MaxDiff=LEFT_RIGHT_PX,
+        preFilterCap=_SGBM_PREFILTER_CAP,
+        uniquenessRatio=_UNIQUENESS_PERCENT,
+        mode=_SGBM_MODE,
+    )
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,7 @@ from recon.stereo.match.foreign import (
     registered_names,
 )
 from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
-from recon.stereo.match.opencv import (
-    OpencvBmMatcher,
-    OpencvSettings,
-    OpencvSgbmMatcher,
-)
+from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.range import AutoRangeMatcher, estimate_ndisp
 from recon.stereo.match.sad import SadMatcher, SadSettings
@@ -32,8 +28,8 @@ from recon.stereo.match.sgm import SgmMatcher, SgmSettings
 MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
     "sad": SadMatcher,
     "sgm": SgmMatcher,
-    "opencv-bm": OpencvBmMatcher,
-    "opencv-sgbm": OpencvSgbmMatcher,
+    "opencv-bm": lambda settings, _: OpencvMatcher(settings, semi_global=False),
+    "opencv-sgbm": lambda settings, _: OpencvMatcher(settings, semi_global=True),
     "onnx": OnnxMatcher,
 }
 

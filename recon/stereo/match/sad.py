@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
 from typing import Final
@@ -11,39 +12,35 @@ from typing import Final
 from pydantic import Field
 
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
-from recon.core.values.arrays import UInt8
-from recon.stereo.kernels.half_windows import Search
-from recon.stereo.kernels.refine import Rules
+from recon.core.values.arrays import Float32, UInt8
+from recon.stereo.kernels.half_windows import Search, empty_scratch, empty_views, lay_out
+from recon.stereo.kernels.minima import empty_minima
+from recon.stereo.kernels.refine import REFINED_BYTES, Refined, Rules, refine_minima, refined_in
+from recon.stereo.kernels.sad import sad_minima
 from recon.stereo.kernels.tiles import Tiles, offer_supported
-from recon.stereo.match.gradients import clipped_gradients, texture
+from recon.stereo.match.gradients import clipped_gradients, no_texture, texture
 from recon.stereo.match.half_size import (
     LEAST_NDISP,
+    SUPPORT,
     divided,
     half_rules,
     half_search,
     halve,
-    support,
     undivided,
-    zero_texture,
 )
+from recon.stereo.match.scratch import ResultPool, ScratchPool
 from recon.stereo.match.search import (
     MeasuredSettings,
     OddInt,
     UniquenessPercent,
     finish,
+    in_strips,
     rules_of,
 )
-from recon.stereo.match.strips import StripSearch, in_strips
-
-_GRADIENT_CAP: Final = 31
-"""Gradients (Sobel units) are clipped to plus or minus this before they are compared."""
 
 _COST_CAP: Final = 20
 """Largest cost of one pixel; limits what an outlier or an edge can do. Times the pixels of both
 halves of the widest window it is below 65535, as the kernel wants."""
-
-_LEAST_SUPPORT: Final = 0.03
-"""Least share of a tile's matches at half size that eight disparities must have to be searched."""
 
 WINDOW_SLANT: Final = 1 / 3
 """Disparity per row of a second window, which competes with the upright one at each pixel; 0 =
@@ -94,8 +91,8 @@ class SadMatcher:
         self._settings = settings
         self._average = average
         self._threads = max(1, threads or os.cpu_count() or 1)
-        self._full = StripSearch(_prefiltered, self._threads)
-        self._half = StripSearch(_prefiltered, self._threads)
+        self._full = _StripSearch(self._threads)
+        self._half = _StripSearch(self._threads)
 
     def match(self, pair: RectifiedPair) -> Disparity:
         """Match one rectified pair.
@@ -106,7 +103,9 @@ class SadMatcher:
         search, rules = self._plan(pair.camera)
         s = self._settings
         with ThreadPoolExecutor(self._threads) as pool:
-            enough = partial(texture, pair, (s.window_px, s.window_px), s.min_texture)
+            enough = partial(texture, pair, s.window_px)
+            if s.min_texture == 0:
+                enough = partial(no_texture, pair.left.shape[1], pair.valid)
             tiles = self._tiles(pool, pair, search)
             refined = self._full.find(pool, (pair.left, pair.right), search, tiles, rules, enough)
             return finish(refined, s, pool, self._threads, average=self._average)
@@ -118,15 +117,15 @@ class SadMatcher:
         halved = half_search(search)
         views = halve(pair.left), halve(pair.right)
         shape = views[0].shape
-        asked = partial(zero_texture, shape[1], pair.valid)
+        valid = None if pair.valid is None else pair.valid[::2, ::2]
+        asked = partial(no_texture, shape[1], valid)
         whole, rules = undivided(halved, shape), half_rules(halved)
         found = self._half.find(pool, views, halved, whole, rules, asked)
         tiles = divided(search, pair.left.shape)
-        wanted = support(_LEAST_SUPPORT)
         values, minimum, ndisp = found.values, search.minimum, search.ndisp
 
         def offer(rows: range) -> None:
-            offer_supported(values, minimum, ndisp, wanted, rows.start, rows.stop, tiles)
+            offer_supported(values, minimum, ndisp, SUPPORT, rows.start, rows.stop, tiles)
 
         in_strips(pool, self._threads, offer, len(tiles.offered))
         return tiles
@@ -141,6 +140,56 @@ class SadMatcher:
         return search, rules_of(s, ndisp, s.window_px**2, min_texture=s.min_texture)
 
 
-def _prefiltered(image: UInt8, rows: range) -> UInt8:
-    """Return what the windows compare in N rows: uint8 (N, W)."""
-    return clipped_gradients(image, _GRADIENT_CAP, rows)
+class _StripSearch:
+    """Searches pairs of images, one strip of rows per thread, and keeps its memory between pairs.
+
+    Args:
+        threads: Strips worked on at once. The result does not depend on it.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._threads = threads
+        self._scratch = ScratchPool(empty_scratch, threads)
+        self._views = ScratchPool(empty_views, 1)
+        self._minima = ScratchPool(empty_minima, 1)
+        self._results = ResultPool(2)
+
+    def find(
+        self,
+        pool: Executor,
+        images: tuple[UInt8, UInt8],
+        search: Search,
+        tiles: Tiles,
+        rules: Rules,
+        texture: Callable[[range], Float32],
+    ) -> Refined:
+        """Search, check and refine.
+
+        Args:
+            pool: Where to work.
+            images: Left and right, uint8 (H, W).
+            search: What is searched.
+            tiles: Which candidates are offered where.
+            rules: What the checks ask for.
+            texture: Gives the texture of some rows of the left image, float32 (N, W).
+        """
+        height, width = images[0].shape
+        results = self._results.lend(REFINED_BYTES * height * width)
+        refined = refined_in(results, height, width)
+
+        def prepare(strip: range) -> None:
+            left, right = (clipped_gradients(image, strip) for image in images)
+            lay_out(left, right, search, strip.start, views)
+
+        def search_strip(strip: range) -> None:
+            with self._scratch.borrow(search, tiles.width) as scratch:
+                sad_minima(views, search, tiles, strip.start, strip.stop, scratch, minima)
+            refine_minima(minima, texture(strip), rules, strip.start, strip.stop, refined)
+
+        with (
+            self._views.borrow(search, tiles.width, height, width) as views,
+            self._minima.borrow(height, width) as minima,
+        ):
+            in_strips(pool, self._threads, prepare, height)
+            in_strips(pool, self._threads, search_strip, height)
+        return refined

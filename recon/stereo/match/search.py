@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Annotated, Final
 
@@ -15,7 +17,6 @@ from recon.core.values.arrays import Float32
 from recon.stereo.kernels.opposite import average_opposite
 from recon.stereo.kernels.refine import EQUIANGULAR, ODDS, Refined, Rules, reject
 from recon.stereo.kernels.speckle import find_speckles
-from recon.stereo.match.strips import in_strips
 
 FIT: Final = EQUIANGULAR
 """How the minimum is placed between whole disparities: the best of the fits for sums of absolute
@@ -175,6 +176,24 @@ def _averaged(values: Float32, pool: Executor, threads: int) -> Float32:
 
     in_strips(pool, threads, average, len(values))
     return averages
+
+
+def in_strips(pool: Executor, threads: int, work: Callable[[range], None], rows: int) -> None:
+    """Work on all rows, in one strip per thread.
+
+    Args:
+        pool: Where to work on all strips but the last, which is left to the thread that calls:
+            to hand work over takes time.
+        threads: Most strips.
+        work: What to do with some rows.
+        rows: How many there are, at least 1.
+    """
+    edges = np.linspace(0, rows, min(threads, rows) + 1).astype(int).tolist()
+    *strips, last = itertools.starmap(range, itertools.pairwise(edges))
+    handed_over = [pool.submit(work, strip) for strip in strips]
+    work(last)
+    for job in handed_over:
+        job.result()
 
 
 def usual_ndisp(width_px: int) -> int:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final
+from typing import Any, Final
 
 from pydantic import Field, model_validator
 from typing_extensions import Self
@@ -29,7 +30,7 @@ from recon.stereo.kernels.semi_global import (
     scratch_bytes,
     semi_global_minima,
 )
-from recon.stereo.match.gradients import texture
+from recon.stereo.match.gradients import no_texture
 from recon.stereo.match.scratch import ResultPool, ScratchPool
 from recon.stereo.match.search import MeasuredSettings, OddInt, finish, rules_of
 
@@ -81,25 +82,33 @@ class SgmSettings(MeasuredSettings):
         le=31,
         description="Edge of the square window; odd. Larger suppresses noise and widens edges.",
     )
-    small_penalty: float = Field(
+    p1: float = Field(
         default=16.0,
         gt=0.0,
         le=255.0,
-        description="P1: for a step of one disparity along a path, as a mean cost of one pixel. "
+        description="Penalty of a step of one disparity along a path, as a mean cost of one pixel. "
         "Smaller where most surfaces are slanted.",
     )
-    large_penalty: float = Field(
+    p2: float = Field(
         default=50.0,
         gt=0.0,
         le=1000.0,
-        description="P2: for a larger step along a path, as a mean cost of one pixel. Larger is "
+        description="Penalty of a larger step along a path, as a mean cost of one pixel. Larger is "
         "smoother, and fills more of what is plain; smaller keeps thin things.",
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _has_new_names(cls, values: Any) -> Any:
+        for old, new in (("small_penalty", "p1"), ("large_penalty", "p2")):
+            if isinstance(values, Mapping) and old in values:
+                raise ValueError(f"{old} is now called {new}")
+        return values
+
     @model_validator(mode="after")
     def _penalties_fit(self) -> Self:
-        if self.small_penalty > self.large_penalty:
-            raise ValueError("small_penalty must not exceed large_penalty")
+        if self.p1 > self.p2:
+            raise ValueError("p1 must not exceed p2")
         return self
 
 
@@ -144,7 +153,7 @@ class SgmMatcher:
         def search(strip: range) -> None:
             with self._scratch.borrow(pair.camera.width_px, paths) as scratch:
                 semi_global_minima(views, window, paths, strip, scratch, minima)
-            enough = texture(pair, (s.window_px, s.window_px), 0.0, strip)
+            enough = no_texture(pair.camera.width_px, pair.valid, strip)
             refine_minima(minima, enough, rules, strip.start, strip.stop, refined)
 
         strips, at_once = self._strips(pair.camera, paths)
@@ -176,14 +185,14 @@ def _window(settings: SgmSettings) -> Window:
         rows_radius=s.window_px // 2,
         gradient_cap=_COST_CAP,
         largest=_LARGEST_COST,
-        levels=_LEVELS / (_LARGEST_COST + s.small_penalty + s.large_penalty),
+        levels=_LEVELS / (_LARGEST_COST + s.p1 + s.p2),
     )
 
 
 def _paths(settings: SgmSettings, ndisp: int, levels: float) -> Paths:
     s = settings
-    p2 = round(s.large_penalty * levels)
-    p1 = max(1, round(s.small_penalty * levels))
+    p2 = round(s.p2 * levels)
+    p1 = max(1, round(s.p1 * levels))
     return Paths(
         ndisp=ndisp,
         minimum=s.min_disparity_px,

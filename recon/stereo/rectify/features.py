@@ -1,29 +1,107 @@
-"""Subpixel feature matches between two images, for any geometry of the cameras."""
+"""Features matched between two images, without use of the camera geometry."""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.geometry.projection import map_pixels
-from recon.core.values.arrays import Float32, Float64, Int32, UInt8
-from recon.stereo.rectify.inspect import PairFeatures
+from recon.core.values.arrays import Float32, Float64, Int32, UInt8, freeze
 
-_RATIO: Final = 0.75
-_BLOCK: Final = 1024  # descriptors compared with all others at once
-# Row error that the initial homographies may leave.
-_ROWS_APART: Final = 12.0
+_RATIO: Final = 0.8
+"""Lowe's ratio test: the best distance must be below this share of the second best."""
+
+_EXACT_RATIO: Final = 0.75
 _CONTRAST: Final = 0.02  # half of OpenCV's default: weak features are still located accurately
+_BLOCK: Final = 1024  # descriptors compared with all others at once
+_ROUGH_PX: Final = 3.0
+"""Features of coarse pyramid levels are a few pixels off; larger shifts are wrong matches."""
 
+_ROWS_APART: Final = 12.0
+"""Row error that the initial homographies may leave."""
 
 MOST_FEATURES: Final = 8000
 """Maximum number of features per image, where a caller does not say."""
 
 
+@dataclass(frozen=True, eq=False)
+class PairFeatures:
+    """Features matched between two images.
+
+    Attributes:
+        left_uv: float32 (N, 2), columns and rows in the left (or first) image, pixels.
+        right_uv: float32 (N, 2), the same features in the right (or second) image.
+    """
+
+    left_uv: Float32
+    right_uv: Float32
+
+    def __post_init__(self) -> None:
+        freeze(self, "left_uv", np.float32, (None, 2))
+        freeze(self, "right_uv", np.float32, (len(self.left_uv), 2))
+
+    def __len__(self) -> int:
+        return len(self.left_uv)
+
+    def select(self, which: NDArray[Any]) -> PairFeatures:
+        """Return the matches of a boolean mask (N,)."""
+        return PairFeatures(self.left_uv[which], self.right_uv[which])
+
+
+NO_FEATURES: Final = PairFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
+
+
+def pool_features(found: Iterable[PairFeatures]) -> PairFeatures:
+    """Return the matches of several pairs together."""
+    parts = [NO_FEATURES, *found]
+    sides = ([part.left_uv for part in parts], [part.right_uv for part in parts])
+    return PairFeatures(np.concatenate(sides[0]), np.concatenate(sides[1]))
+
+
+def match_features(
+    first: UInt8, second: UInt8, count: int, *, any_scale: bool = False
+) -> PairFeatures:
+    """Match features between two images: mutual best matches that pass the ratio test.
+
+    Args:
+        first: uint8 (H, W).
+        second: uint8 (H, W).
+        count: Maximum number of features per image.
+        any_scale: Whether the scale may differ much between the images: uses SIFT, which takes
+            ten times as long as ORB.
+
+    Returns:
+        The matches; those in the second image have subpixel accuracy.
+
+    Ref:
+        Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011;
+        Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
+    """
+    detector: cv2.Feature2D = (
+        cv2.SIFT.create(nfeatures=count, contrastThreshold=_CONTRAST)
+        if any_scale
+        else cv2.ORB.create(nfeatures=count, fastThreshold=10)
+    )
+    (uv, bits), (other_uv, other_bits) = (_describe(detector, side) for side in (first, second))
+    if len(uv) < 2 or len(other_uv) < 2:
+        return NO_FEATURES
+    matcher = cv2.BFMatcher(detector.defaultNorm())
+    there = _distinct(matcher.knnMatch(bits, other_bits, k=2))
+    back = _distinct(matcher.knnMatch(other_bits, bits, k=2))
+    mutual = [(i, j) for i, j in there.items() if back.get(j) == i]
+    at = np.array(mutual, dtype=np.int64).reshape(-1, 2)
+    matched = PairFeatures(uv[at[:, 0]], other_uv[at[:, 1]])
+    # Tracking cannot refine a patch that changed its scale; SIFT is accurate enough.
+    return matched if any_scale else _refined(first, second, matched)
+
+
 def match_exactly(left: UInt8, right: UInt8, count: int = MOST_FEATURES) -> PairFeatures:
-    """Return mutual best matches of SIFT features that pass the ratio test.
+    """Return mutual best matches of SIFT features that pass a stricter ratio test.
 
     Slower than `match_features`, but subpixel accurate and robust to rotation, scale and slant
     between the images.
@@ -32,14 +110,11 @@ def match_exactly(left: UInt8, right: UInt8, count: int = MOST_FEATURES) -> Pair
         left: uint8 (H, W).
         right: uint8 (H, W).
         count: Maximum number of features per image.
-
-    Ref:
-        Lowe, "Distinctive image features from scale-invariant keypoints", IJCV 2004.
     """
     sift = cv2.SIFT.create(nfeatures=count, contrastThreshold=_CONTRAST)
     (left_uv, left_d), (right_uv, right_d) = (_describe(sift, side) for side in (left, right))
     if min(len(left_uv), len(right_uv)) < 2:
-        return PairFeatures(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32))
+        return NO_FEATURES
     at = _mutual_best(left_d, right_d)
     both = np.hstack([left_uv[at[:, 0]], right_uv[at[:, 1]]])
     # SIFT returns a keypoint with two orientations twice.
@@ -76,6 +151,52 @@ def match_again(
     return PairFeatures(back[0], back[1])
 
 
+def exposed_as(model: UInt8, image: UInt8) -> UInt8:
+    """Return an image with the brightness and contrast of another, since tracking needs them equal.
+
+    Args:
+        model: uint8 (H, W), reference for mean and standard deviation.
+        image: uint8 (H, W).
+    """
+    gain = float(model.std()) / max(float(image.std()), 1.0)
+    shift = float(model.mean()) - gain * float(image.mean())
+    return np.asarray(cv2.convertScaleAbs(image, alpha=gain, beta=shift), dtype=np.uint8)
+
+
+def _describe(detector: cv2.Feature2D, image: UInt8) -> tuple[Float32, NDArray[Any]]:
+    """Return positions (N, 2) and descriptors (N, C) of the features of an image."""
+    keypoints, bits = detector.detectAndCompute(image, None)
+    uv = np.array([point.pt for point in keypoints], dtype=np.float32).reshape(-1, 2)
+    return uv, np.zeros((0, 1), np.uint8) if bits is None else np.asarray(bits)
+
+
+def _distinct(candidates: Sequence[Sequence[cv2.DMatch]]) -> dict[int, int]:
+    """Return best matches that pass the ratio test."""
+    return {
+        best.queryIdx: best.trainIdx
+        for best, second in candidates
+        if best.distance < _RATIO * second.distance
+    }
+
+
+def _refined(first: UInt8, second: UInt8, found: PairFeatures) -> PairFeatures:
+    """Return subpixel positions in the second image; matches that move too far are dropped."""
+    if not len(found):
+        return found
+    there, status, _ = cv2.calcOpticalFlowPyrLK(
+        first,
+        exposed_as(first, second),
+        found.left_uv[:, None],
+        found.right_uv[:, None].copy(),
+        winSize=(15, 15),
+        maxLevel=0,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    there = there.reshape(-1, 2)
+    kept = (status.ravel() > 0) & (np.abs(there - found.right_uv).max(axis=1) <= _ROUGH_PX)
+    return PairFeatures(found.left_uv[kept], there[kept].astype(np.float32))
+
+
 def _mutual_best(left: Float32, right: Float32) -> Int32:
     """Return int32 (N, 2), pairs that are each other's best match and pass the ratio test."""
     # SIFT descriptors are whole numbers: float32 sums of products are exact in any order.
@@ -96,11 +217,5 @@ def _mutual_best(left: Float32, right: Float32) -> Int32:
         least[begin : begin + _BLOCK] = squares[rows, first]
         squares[rows, first] = np.inf
         second_best[begin : begin + _BLOCK] = squares.min(axis=1)
-    chosen = (least < _RATIO**2 * second_best) & (back[best] == np.arange(len(left)))
+    chosen = (least < _EXACT_RATIO**2 * second_best) & (back[best] == np.arange(len(left)))
     return np.stack([np.flatnonzero(chosen).astype(np.int32), best[chosen]], axis=1)
-
-
-def _describe(sift: cv2.SIFT, image: UInt8) -> tuple[Float32, Float32]:
-    keypoints, descriptors = sift.detectAndCompute(image, None)
-    uv = np.array([point.pt for point in keypoints], dtype=np.float32).reshape(-1, 2)
-    return uv, np.zeros((0, 128), np.float32) if descriptors is None else descriptors

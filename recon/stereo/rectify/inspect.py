@@ -13,8 +13,8 @@ import numpy as np
 
 from recon.core.errors import CalibrationError
 from recon.core.values import RectifiedPair
-from recon.core.values.arrays import Bool, Float32, UInt8, freeze
-from recon.stereo.rectify import opencv_features
+from recon.core.values.arrays import Bool, Float32
+from recon.stereo.rectify.features import PairFeatures, match_features
 
 _NEAR_PX: Final = 1.0
 """Features with a smaller disparity are too far away to show whether the cameras are swapped."""
@@ -34,26 +34,6 @@ _WARN_ROW_PX: Final = 1.0
 
 _SWAPPED_SHARE: Final = 0.8
 """Share of near features with negative disparity from which the cameras count as swapped."""
-
-
-@dataclass(frozen=True, eq=False)
-class PairFeatures:
-    """Features matched between both images without use of the camera geometry.
-
-    Attributes:
-        left_uv: float32 (N, 2), columns and rows in the left image, pixels.
-        right_uv: float32 (N, 2), the same features in the right image.
-    """
-
-    left_uv: Float32
-    right_uv: Float32
-
-    def __post_init__(self) -> None:
-        freeze(self, "left_uv", np.float32, (None, 2))
-        freeze(self, "right_uv", np.float32, (len(self.left_uv), 2))
-
-    def __len__(self) -> int:
-        return len(self.left_uv)
 
 
 @dataclass(frozen=True)
@@ -77,24 +57,9 @@ class PairInspection:
 
 
 def inspect_pair(pair: RectifiedPair) -> PairInspection:
-    """Measure how well a pair is rectified.
-
-    Args:
-        pair: A pair that should be rectified.
-    """
+    """Measure how well a pair that should be rectified is."""
     features = match_features(pair.left, pair.right, _FEATURES)
     return inspect_features(features, pair.camera.doffs_px)
-
-
-def match_features(left: UInt8, right: UInt8, count: int) -> PairFeatures:
-    """Match features between two images, at any position.
-
-    Args:
-        left: uint8 (H, W).
-        right: uint8 (H, W).
-        count: Maximum number of features per image.
-    """
-    return PairFeatures(*opencv_features.match_features(left, right, count))
 
 
 def inspect_features(

@@ -9,7 +9,7 @@ import pytest
 
 from recon.cli.show.announce import announce, warn
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetSettings
+from recon.street.settings import StreetSettings
 
 SOURCE = SyntheticSource(StreetSettings(frames=3, width_px=64, height_px=32, focal_px=36.0))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.core.values import Disparity, DisparityTruth, Reason
-from recon.evaluation import share_within_sigma
+from recon.evaluation.confidence import share_within_sigma
 from recon.evaluation.middlebury.confidence import confidence_figures, weighted_confidence
 
 SHAPE = (60, 100)

@@ -77,12 +77,15 @@ def test_even_patches_and_none_are_refused(values: dict[str, object]) -> None:
 @pytest.mark.real
 def test_the_real_scenes_have_the_numbers_that_identify_table_1(recon_data: Path) -> None:
     folder = recon_data / "middlebury" / "MiddEval3" / "trainingQ"
-    rows = [one.table_1 for one in read_experiments(folder)]
-    assert [row.experiment for row in rows] == list(EXPERIMENTS)
+    rows = read_experiments(folder)
+    assert [row.number for row in rows] == list(EXPERIMENTS)
     # Ref: doffs, baseline, ndisp as the paper's Table 1 prints them.
-    assert [(row.doffs_px, row.baseline_mm, row.ndisp) for row in rows] == [
+    printed = [
+        (row.doffs_px, round(1e3 * row.camera.baseline_m, 6), row.camera.ndisp) for row in rows
+    ]
+    assert printed == [
         (50.0, 160.0, 64),
         (201.044, 380.135, 160),
         (19.331, 236.922, 75),
     ]
-    assert [row.focal_px for row in rows] == [935.0, 1823.297, 989.886]
+    assert [row.camera.focal_px for row in rows] == [935.0, 1823.297, 989.886]

@@ -19,9 +19,9 @@ from recon.export.mesh.pieces import export_mesh
 from recon.export.mesh.seams import nearest_on_edges
 from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import write_ply
-from recon.io.occupancy.octomap import write_octomap
 from recon.map.tiles import Tiles
 from recon.run.directory import RunDirectory
+from tests.scenery.octomaps import write_octomap
 
 STEP_M = 0.1
 CONFIG = load_config(None, ["submaps.tile_m=6.4"])

@@ -19,7 +19,7 @@ from recon.core.values import (
     StereoPair,
 )
 from recon.core.values.arrays import Float64
-from recon.sources import StereoSource
+from recon.sources.protocol import StereoSource
 
 
 @dataclass(frozen=True, eq=False)

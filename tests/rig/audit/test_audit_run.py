@@ -11,10 +11,11 @@ import pytest
 from recon.commands.config import load_config
 from recon.core.values import StereoCalibration, StereoPair
 from recon.io.cameras.calibration import read_calibration
-from recon.rig.audit import audit_source, mend_calibration
-from recon.sources import StereoSource, open_source
+from recon.rig.audit.audit import audit_source, mend_calibration
+from recon.sources.protocol import StereoSource
+from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetScene
+from recon.street.settings import StreetScene
 from tests.rig.audit import faults
 from tests.sources import drives
 

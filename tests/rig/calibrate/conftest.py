@@ -9,7 +9,7 @@ import pytest
 
 from recon.core.values import StereoCalibration
 from recon.core.values.board import CalibrationBoard, parse_board
-from recon.rig.calibrate import Sighting, View
+from recon.rig.calibrate.bundle import Sighting, View
 from tests.scenery.boards import BoardView, board_rig, place_boards
 
 MakeViews = Callable[..., tuple[StereoCalibration, list[View]]]

@@ -10,8 +10,11 @@ import pytest
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import angle_rad, apply
 from recon.core.values import StereoCalibration
-from recon.rig.calibrate import CalibrationSettings, View, calibrate_stereo, measure_spread, stereo
-from recon.rig.calibrate.bootstrap import measure_depth
+from recon.rig.calibrate import stereo
+from recon.rig.calibrate.bootstrap import measure_depth, measure_spread
+from recon.rig.calibrate.bundle import View
+from recon.rig.calibrate.settings import CalibrationSettings
+from recon.rig.calibrate.stereo import calibrate_stereo
 from recon.stereo.rectify.lens import project, unproject
 
 SIZE = (640, 480)

@@ -10,7 +10,7 @@ import pytest
 import recon
 from recon.core.errors import MatchingError, SettingsError
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
-from recon.stereo.match import MATCHERS, MatchingSettings, make_matcher
+from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher
 from tests.stereo.match.plugins import install_plugin
 
 SHAPE = (20, 60)

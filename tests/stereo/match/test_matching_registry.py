@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from recon.core.errors import SettingsError
-from recon.stereo.match import MATCHERS, Matcher, MatchingSettings, field_of, make_matcher
+from recon.stereo.match.protocol import Matcher
+from recon.stereo.match.registry import MATCHERS, MatchingSettings, field_of, make_matcher
 
 
 @pytest.mark.parametrize("name", MATCHERS)

@@ -9,14 +9,9 @@ import pytest
 from recon.core.errors import MatchingError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury.scene import stand_in_camera
-from recon.stereo.match.opencv import (
-    OpencvBmMatcher,
-    OpencvSettings,
-    OpencvSgbmMatcher,
-)
+from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 
 NAMES = ("opencv-bm", "opencv-sgbm")
-MATCHERS = {"opencv-bm": OpencvBmMatcher, "opencv-sgbm": OpencvSgbmMatcher}
 
 
 def shifted_pair(shift_px: int, shape: tuple[int, int] = (60, 160)) -> RectifiedPair:
@@ -29,7 +24,8 @@ def shifted_pair(shift_px: int, shape: tuple[int, int] = (60, 160)) -> Rectified
 
 
 def match(name: str, pair: RectifiedPair, *, pad: bool = True, **settings: object) -> Disparity:
-    return MATCHERS[name](OpencvSettings(pad=pad, **settings)).match(pair)
+    matcher = OpencvMatcher(OpencvSettings(pad=pad, **settings), semi_global=name == NAMES[1])
+    return matcher.match(pair)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -8,11 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from recon.core.errors import MatchingError, SettingsError
+from recon.core.errors import MatchingError
 from recon.core.values import Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
-from recon.evaluation.paper.printed import PrintedMatcher, PrintedSettings
-from recon.stereo.match import MATCHERS, Matcher
+from recon.evaluation.paper.printed import match_as_printed
 from tests.scenery.planes import fronto_parallel_pair
 
 
@@ -21,21 +20,18 @@ def camera_for(width_px: int, height_px: int, ndisp: int | None = None) -> Recti
     return RectifiedCamera(60.0, *middle, 0.5, width_px, height_px, ndisp)
 
 
-def match(left: UInt8, right: UInt8, **values: object) -> Float32:
+def match(
+    left: UInt8, right: UInt8, patch_px: int, *, signed: bool = True, ndisp: int | None = None
+) -> Float32:
     height, width = left.shape
-    pair = RectifiedPair(left, right, camera_for(width, height))
-    return PrintedMatcher(PrintedSettings.parse(values)).match(pair).values
-
-
-def test_it_is_a_matcher_but_no_registered_one() -> None:
-    assert isinstance(PrintedMatcher(PrintedSettings()), Matcher)
-    assert PrintedMatcher not in MATCHERS.values()
+    pair = RectifiedPair(left, right, camera_for(width, height, ndisp))
+    return match_as_printed(pair, patch_px, signed=signed).values
 
 
 def test_absolute_differences_find_a_wall_to_the_whole_pixel() -> None:
     # 60 px · 0.5 m / 5 m = 6 px exactly.
     scene = fronto_parallel_pair(camera_for(64, 40, 16), 5.0)
-    found = PrintedMatcher(PrintedSettings(patch_px=7, signed=False)).match(scene.pair)
+    found = match_as_printed(scene.pair, 7, signed=False)
     seen = found.valid.copy()
     seen[:, : 6 + 3] = False  # there the right image does not show the patch
     assert np.mean(found.values[seen] == 6) > 0.99
@@ -44,7 +40,7 @@ def test_absolute_differences_find_a_wall_to_the_whole_pixel() -> None:
 
 def test_signed_differences_do_not_find_the_wall() -> None:
     scene = fronto_parallel_pair(camera_for(64, 40, 16), 5.0)
-    found = PrintedMatcher(PrintedSettings(patch_px=7)).match(scene.pair)
+    found = match_as_printed(scene.pair, 7, signed=True)
     assert np.mean(found.values[:, 9:-3] == 6) < 0.3
 
 
@@ -59,7 +55,7 @@ def test_the_least_signed_sum_is_the_brightest_patch_of_the_right_image() -> Non
 def test_only_pixels_whose_patch_leaves_the_image_have_no_value() -> None:
     left = np.random.default_rng(0).integers(0, 256, (20, 30), dtype=np.uint8)
     pair = RectifiedPair(left, left, camera_for(30, 20))
-    found = PrintedMatcher(PrintedSettings(patch_px=5)).match(pair)
+    found = match_as_printed(pair, 5, signed=True)
     expected = np.zeros(left.shape, dtype=bool)
     expected[2:-2, 2:-2] = True
     assert np.array_equal(found.valid, expected)
@@ -77,11 +73,6 @@ def test_a_patch_larger_than_the_image_is_refused() -> None:
     flat = np.zeros((4, 40), dtype=np.uint8)
     with pytest.raises(MatchingError, match="at most 4 px"):
         match(flat, flat, patch_px=5)
-
-
-def test_an_even_patch_is_refused() -> None:
-    with pytest.raises(SettingsError, match="odd"):
-        PrintedSettings.parse({"patch_px": 4})
 
 
 @settings(max_examples=40)

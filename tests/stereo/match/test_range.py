@@ -11,16 +11,11 @@ import pytest
 
 from recon.core.values import Disparity, RectifiedPair
 from recon.io.middlebury.scene import read_middlebury_scene, stand_in_camera
-from recon.stereo.match import (
-    MATCHERS,
-    MatchingSettings,
-    SadSettings,
-    make_matcher,
-    settings_of,
-)
 from recon.stereo.match.range import AutoRangeMatcher, estimate_ndisp
+from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher, settings_of
+from recon.stereo.match.sad import SadSettings
 from recon.stereo.match.search import usual_ndisp
-from recon.stereo.rectify import to_grey
+from recon.stereo.rectify.grey import to_grey
 
 HEIGHT, WIDTH = 160, 480
 

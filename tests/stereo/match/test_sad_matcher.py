@@ -11,7 +11,8 @@ from recon.core.errors import MatchingError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Float32, Float64
 from recon.stereo.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA
-from recon.stereo.match import SadMatcher, SadSettings, sad, search
+from recon.stereo.match import sad, search
+from recon.stereo.match.sad import SadMatcher, SadSettings
 from recon.stereo.match.search import usual_ndisp
 from tests.stereo.match.images import (
     HEIGHT,

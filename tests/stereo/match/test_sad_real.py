@@ -11,7 +11,7 @@ import pytest
 
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32
-from recon.stereo.match import SadMatcher, SadSettings
+from recon.stereo.match.sad import SadMatcher, SadSettings
 
 pytestmark = pytest.mark.real
 

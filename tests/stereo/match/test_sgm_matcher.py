@@ -13,7 +13,8 @@ from recon.core.errors import MatchingError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Float64
 from recon.stereo.kernels.refine import EQUIANGULAR, NO_FIT, PARABOLA
-from recon.stereo.match import SgmMatcher, SgmSettings, search
+from recon.stereo.match import search
+from recon.stereo.match.sgm import SgmMatcher, SgmSettings
 from tests.stereo.match.images import HEIGHT, WIDTH, inner, make_pair, noise, warped_pair
 
 PLAIN = SgmSettings(ndisp=32)
@@ -167,9 +168,9 @@ def test_range_outside_the_image_is_an_error() -> None:
     "wrong",
     [
         {"window_px": 4},
-        {"small_penalty": 70.0},
+        {"p1": 70.0},
         {"window_px": 33},
-        {"large_penalty": 10.0},
+        {"p2": 10.0},
     ],
 )
 def test_settings_that_do_not_fit_are_refused(wrong: dict[str, object]) -> None:
@@ -177,12 +178,17 @@ def test_settings_that_do_not_fit_are_refused(wrong: dict[str, object]) -> None:
         SgmSettings.parse(wrong)
 
 
+def test_an_old_name_of_a_penalty_is_answered_with_the_new_one() -> None:
+    with pytest.raises(SettingsError, match="small_penalty is now called p1"):
+        SgmSettings.parse({"small_penalty": 16.0})
+
+
 @pytest.mark.slow
 def test_memory_of_a_large_pair_is_bounded() -> None:
     code = """
 import resource
 import numpy as np
-from recon.stereo.match import SgmMatcher, SgmSettings
+from recon.stereo.match.sgm import SgmMatcher, SgmSettings
 from recon.core.values import RectifiedCamera, RectifiedPair
 grey = np.random.default_rng(0).integers(0, 256, (2000, 3000), dtype=np.uint8)
 camera = RectifiedCamera(focal_px=3000.0, cx_px=1500.0, cy_px=1000.0, cx_right_px=1500.0,

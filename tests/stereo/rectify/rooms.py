@@ -13,7 +13,7 @@ import yaml
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.io.images.image import write_image
-from recon.stereo.rectify import RectifyingTurns
+from recon.stereo.rectify.rectifier import RectifyingTurns
 from recon.street.image import take_image
 from recon.street.shapes import boxes, cylinder, quads
 from recon.street.soup import Material, Paint, TriangleSoup, merge, move

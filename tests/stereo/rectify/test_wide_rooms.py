@@ -18,11 +18,15 @@ from recon.io.cameras.opencv_yaml import write_opencv_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.image import write_image
 from recon.map.drive.sequence import map_sequence
-from recon.sources import open_source
 from recon.sources.pair_input import read_pair_input
+from recon.sources.registry import open_source
 from recon.stereo.frame import FrameReconstructor
-from recon.stereo.rectify import RectificationSettings, Rectifier, plan_turns
-from recon.stereo.rectify.rectifier import _check_focal
+from recon.stereo.rectify.rectifier import (
+    RectificationSettings,
+    Rectifier,
+    _check_focal,
+    plan_turns,
+)
 from tests.stereo.rectify import rooms
 
 # The polynomial of a lens of TUM VI.
