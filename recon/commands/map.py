@@ -135,6 +135,7 @@ def _summary(
         "odometry": "known poses" if given else result.config.odometry.method,
         **result.figures(),
         "points": made.points,
+        "points_removed": made.removed,
         "voxels": made.voxels,
         "faces": 0 if made.mesh is None else made.mesh.faces,
         **({"frames_left_out": source.left_out} if isinstance(source, IncompleteSource) else {}),

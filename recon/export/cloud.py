@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud
 from recon.io.models.ply import write_ply_tiles
-from recon.map.tiles import Tiles, join_clouds
+from recon.map.joined import join_clouds
+from recon.map.tiles import Tiles
 
 SAMPLE_POINTS: Final = 300_000
 """Points of the fused cloud that are kept for display."""
@@ -26,15 +27,17 @@ class WrittenCloud:
 
     Attributes:
         points: Number of its points.
+        removed: Number of points that were left out since they moved.
         sample: Even sample of it; all points of a small one. Frame ``map``.
     """
 
     points: int
+    removed: int
     sample: PointCloud
 
 
-def export_cloud(tiles: Tiles, path: Path) -> WrittenCloud:
-    """Write the points of all tiles into one PLY file.
+def export_cloud(tiles: Tiles, path: Path, removed: Path) -> WrittenCloud:
+    """Write the points of all tiles into one PLY file, and what was removed into another.
 
     Raises:
         OutputError: It cannot be written.
@@ -49,7 +52,11 @@ def export_cloud(tiles: Tiles, path: Path) -> WrittenCloud:
                 yield cloud
 
     points = write_ply_tiles(path, clouds(), frame="map")
-    return WrittenCloud(points, sample.cloud())
+    left_out = 0
+    if tiles.config.fusion.remove_moving:
+        moved = (tile.removed for tile in tiles)
+        left_out = write_ply_tiles(removed, (cloud for cloud in moved if len(cloud)), frame="map")
+    return WrittenCloud(points, left_out, sample.cloud())
 
 
 class CloudSample:

@@ -27,6 +27,7 @@ class Products:
     Attributes:
         cloud: Even sample of the fused cloud; all points of a small one. Frame ``map``.
         points: Number of points in the whole fused cloud.
+        removed: Number of points left out of it since they moved.
         voxels: Number of observed voxels.
         grid: The flat grid.
         camera_height_m: As in `WrittenGrid`.
@@ -36,6 +37,7 @@ class Products:
 
     cloud: PointCloud
     points: int
+    removed: int
     voxels: int
     grid: OccupancyGrid
     camera_height_m: float | None
@@ -52,7 +54,7 @@ def write_products(
     threads: int | None = None,
     progress: Progress = SILENT,
 ) -> Products:
-    """Write ``map/cloud.ply``, ``map/octomap.*``, ``map/grid.*`` and ``mesh/``.
+    """Write ``map/cloud.ply``, ``removed.ply``, ``octomap.*`` and ``grid.*``, and ``mesh/``.
 
     Args:
         mapped: The mapped drive.
@@ -70,7 +72,8 @@ def write_products(
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
     trusted = np.array([record.ok for record in mapped.health])
     with watch.stage("cloud"):
-        cloud = export_cloud(mapped.tiles, directory.path("map/cloud.ply"))
+        files = [directory.path(f"map/{name}.ply") for name in ("cloud", "removed")]
+        cloud = export_cloud(mapped.tiles, *files)
     with watch.stage("octomap"):
         voxels, warnings = export_octomap(mapped.tiles, directory.path("map/octomap"))
     with watch.stage("grid"):
@@ -85,6 +88,7 @@ def write_products(
     return Products(
         cloud.sample,
         cloud.points,
+        cloud.removed,
         voxels,
         flat.grid,
         flat.camera_height_m,

@@ -9,26 +9,32 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
-from heapq import merge
-from itertools import product
-from operator import itemgetter
-from typing import Any, Final
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import apply
 from recon.core.geometry.transform import transform_cloud
-from recon.core.kernels.voxels import pack_keys, unpack_keys
-from recon.core.values import Frame, OccupancyVoxels, PointCloud
+from recon.core.values import OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64
+from recon.map.drive_chain import OCCUPANCY, DriveChain
 from recon.map.fusion.part import KNOWABLE, FusedPart, join_fused
 from recon.map.ground.floor import find_floors
 from recon.map.ground.grid import JOINED_CELLS
+from recon.map.joined import (
+    cloud_tree,
+    in_window,
+    join_clouds,
+    join_voxels,
+    voxel_tree,
+)
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
-from recon.map.occupancy.part import OccupancyPart, join_occupancy
+from recon.map.occupancy.moving import find_moved
+from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.map.store.tile_parts import TileKey, TileParts
 from recon.map.submaps import Submap, SubmapMotion
@@ -36,10 +42,10 @@ from recon.map.window import Window
 from recon.stereo.cloud.filters import filter_cloud
 
 _FUSED: Final = "fused"
-_OCCUPANCY: Final = "occupancy"
 _POINTS: Final = "points"
 _VOXELS: Final = "voxels"
 _FLOORS: Final = "floors"
+_REMOVED: Final = "removed"
 _FILTER_MARGIN_M: Final = 1.0
 """Least margin around a tile for the filters of the fused cloud."""
 _LEAST_TILE_M: Final = 5.0
@@ -65,6 +71,11 @@ class Tile:
         return self.tiles.cloud(self.key)
 
     @property
+    def removed(self) -> PointCloud:
+        """The points left out of its cloud since they moved, frame ``map``; not filtered."""
+        return self.tiles.removed(self.key)
+
+    @property
     def voxels(self) -> OccupancyVoxels:
         """Its observed voxels."""
         return self.tiles.voxels(self.key)
@@ -84,7 +95,7 @@ class Tiles:
         config: The configuration.
         edge_cells: Side of a tile in voxels; a power of two, at least 8.
         extent: Smallest x and y of the cells that submaps observed, and the largest plus one.
-        submap_of_frame: int64 (N,), number of the submap of each frame.
+        submap_of_frame: int64 (N,), number of the submap of each frame; -1 between two drives.
     """
 
     def __init__(self, config: DriveSettings, T_map_world: Float64, halvings: int = 0) -> None:
@@ -94,11 +105,18 @@ class Tiles:
         # A power of two, so that a tile is a branch of an octree.
         self.edge_cells = 1 << max(BLOCK_BITS, round(cells) - halvings)
         self._parts = TileParts(self.edge_m)
+        self._chain = DriveChain(self._parts)
         self._known: tuple[str, ...] = KNOWABLE
         self.extent: tuple[TileKey, TileKey] = ((0, 0), (0, 0))
         self.submap_of_frame: NDArray[np.int64] = np.zeros(0, np.int64)
-        # A cell of a grid depends on the cells joined to it, on their blob, and on adjacent cells.
+        filters = config.map_filters
+        margin_m = max(_FILTER_MARGIN_M, 2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
+        # A voxel more, since a point may lie anywhere in its voxel.
+        self._filter_margin_m = margin_m + config.fusion.voxel_m
+        # A cell of a grid depends on the cells joined to it, on their blob, and on adjacent cells;
+        # whether a point moved, on the voxels that touch its own.
         beyond = config.grid.min_blob_cells + JOINED_CELLS + 2
+        beyond = max(beyond, math.ceil(self._filter_margin_m / self.resolution_m) + 1)
         self._grid_margin_m = math.ceil(beyond / BLOCK_EDGE) * self._block_m
 
     @classmethod
@@ -109,9 +127,10 @@ class Tiles:
         T_map_world: Float64,
         T_corrected_world: Float64 | None = None,
         *,
+        drives: Sequence[int] = (),
         fuse: bool = True,
     ) -> Tiles:
-        """Cut the map of a drive; tiles are halved until the fullest one fits into memory.
+        """Cut the map of drives; tiles are halved until the fullest one fits into memory.
 
         Args:
             submaps: The submaps, in order; read again where tiles are halved.
@@ -119,6 +138,8 @@ class Tiles:
             T_map_world: float64 (4, 4), from world to map axes.
             T_corrected_world: float64 (S, 4, 4), a rigid correction of each submap; None = none is
                 corrected.
+            drives: Number of submaps of each drive, in the order of the drives: what a later one
+                saw counts more. Empty = all are of one.
             fuse: Make the cloud of the submaps; else it is put in as it was written.
 
         Raises:
@@ -129,6 +150,7 @@ class Tiles:
         while not tiles._cut(submaps, T_corrected_world, fuse=fuse):
             halvings += 1
             tiles = cls(config, T_map_world, halvings)
+        tiles._divide(drives)
         return tiles
 
     @property
@@ -154,30 +176,36 @@ class Tiles:
     def put_cloud(self, cloud: PointCloud) -> None:
         """Add points that are fused and filtered, frame ``map``."""
         for key, inside in self._parts.near(cloud.xyz, 0.0):
-            self._parts.put(_POINTS, key, _cloud_tree(cloud.select(inside)))
+            self._parts.put(_POINTS, key, cloud_tree(cloud.select(inside)))
 
     def put_voxels(self, voxels: OccupancyVoxels) -> None:
         """Add observed voxels; none is given twice."""
         for key, inside in self._parts.near(voxels.centres_m, 0.0):
-            self._parts.put(_VOXELS, key, _voxel_tree(voxels.select(inside)))
+            self._parts.put(_VOXELS, key, voxel_tree(voxels.select(inside)))
+
+    def removed(self, key: TileKey) -> PointCloud:
+        """The points that are left out of the cloud of a tile since they moved."""
+        self.cloud(key)
+        found = self._parts.read(_REMOVED, key)
+        return join_clouds(PointCloud(**tree, frame="map") for _, tree in found)
 
     def cloud(self, key: TileKey) -> PointCloud:
-        """The fused and filtered points of a tile, frame ``map``.
+        """The fused and filtered points of a tile, frame ``map``, without what moved.
 
         Filters see a margin around the tile, so that the tiles together equal the filtered whole
         (except for statistical limits, which are those of the tile).
         """
         if self._parts.numbers(_FUSED, key):
-            fused = self._fused(key)
+            for kind, cloud in zip((_POINTS, _REMOVED), self._fused(key), strict=True):
+                self._parts.put(kind, key, cloud_tree(cloud))
             self._parts.drop(_FUSED, key)
-            self._parts.put(_POINTS, key, _cloud_tree(fused))
             self.config.memory.check("putting the cloud together")
         found = self._parts.read(_POINTS, key)
         return join_clouds(PointCloud(**tree, frame="map") for _, tree in found)
 
     def voxels(self, key: TileKey) -> OccupancyVoxels:
         """The observed voxels of a tile, map axes."""
-        return _in_window(self.wide_voxels(key), self.window(key))
+        return in_window(self.wide_voxels(key), self.window(key))
 
     def wide_voxels(
         self, key: TileKey, after: Mapping[int, OccupancyPart] | None = None
@@ -188,13 +216,18 @@ class Tiles:
             key: The tile.
             after: What else was observed at the end of submaps, by their numbers.
         """
-        if self._parts.numbers(_OCCUPANCY, key) and not self._parts.numbers(_VOXELS, key):
-            self._parts.put(_VOXELS, key, self._joined(key))
+        if self._parts.numbers(OCCUPANCY, key) and not self._parts.numbers(_VOXELS, key):
+            joined = self._chain.joined(key, note=self.config.fusion.remove_moving)
+            self._parts.put(_VOXELS, key, voxel_tree(joined.voxels(self.resolution_m)))
             self.config.memory.check("putting the occupancy together")
         found = self._parts.read(_VOXELS, key)
         seen = (OccupancyVoxels(**tree, resolution_m=self.resolution_m) for _, tree in found)
         voxels = join_voxels(seen, self.resolution_m)
-        return self._changed(key, voxels, after) if after else voxels
+        if not after:
+            return voxels
+        wide = self.window(key).wider(self._grid_margin_m)
+        inside = {n: p.select(wide.contains(self._centres_m(p))) for n, p in after.items()}
+        return self._chain.changed(key, voxels, inside)
 
     def cloud_in(self, window: Window) -> PointCloud:
         """The points in a window, frame ``map``."""
@@ -204,7 +237,7 @@ class Tiles:
     def voxels_in(self, window: Window) -> OccupancyVoxels:
         """The voxels with their centres in a window."""
         found = map(self.voxels, self._parts.under(window))
-        return join_voxels([_in_window(voxels, window) for voxels in found], self.resolution_m)
+        return join_voxels([in_window(voxels, window) for voxels in found], self.resolution_m)
 
     def floors_in(self, window: Window) -> Float32:
         """float32 (N, 3), what `find_floors` finds in a window."""
@@ -259,115 +292,55 @@ class Tiles:
     ) -> Iterator[tuple[str, TileKey, FusedPart | OccupancyPart, int]]:
         """A submap in pieces: their kind, tile, content, and the bytes that joining them takes."""
         fused, occupancy, voxel_m = submap.fused, submap.occupancy, self.config.fusion.voxel_m
-        filters = self.config.map_filters
-        margin_m = max(_FILTER_MARGIN_M, 2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
         centres_m = apply(self._T_map_world, (fused.cells + 0.5) * voxel_m)
-        # A voxel more, since a point may lie anywhere in its voxel.
-        for key, inside in self._parts.near(centres_m, margin_m + voxel_m):
+        for key, inside in self._parts.near(centres_m, self._filter_margin_m):
             yield _FUSED, key, fused.select(inside), int(inside.sum()) * _FUSED_BYTES
         for key, inside in self._parts.near(self._centres_m(occupancy), self._grid_margin_m):
-            yield _OCCUPANCY, key, occupancy.select(inside), int(inside.sum()) * _BLOCK_BYTES
+            yield OCCUPANCY, key, occupancy.select(inside), int(inside.sum()) * _BLOCK_BYTES
 
     def _centres_m(self, part: OccupancyPart) -> Float64:
         """float64 (B, 3), centres of the blocks of a part."""
         return np.asarray((part.blocks + 0.5) * self._block_m)
 
-    def _fused(self, key: TileKey) -> PointCloud:
-        """The filtered points of a tile, frame ``map``."""
-        config = self.config
-        parts = (FusedPart.from_tree(tree) for _, tree in self._parts.read(_FUSED, key))
-        fused = replace(join_fused(parts), known=self._known)
+    def _divide(self, drives: Sequence[int]) -> None:
+        """Note which submaps are of which drive."""
+        self._chain.drive_of = np.repeat(np.arange(len(drives)), np.array(drives, np.int64))
+        ends = np.searchsorted(self.submap_of_frame, np.cumsum(drives, dtype=np.int64)[:-1])
+        self.submap_of_frame = np.insert(self.submap_of_frame, ends, -1)
+
+    def _fused(self, key: TileKey) -> tuple[PointCloud, PointCloud]:
+        """The points of a tile, frame ``map``: the filtered ones, and those that moved."""
+        kept, removed = [], []
+        numbered = ((n, FusedPart.from_tree(tree)) for n, tree in self._parts.read(_FUSED, key))
+        for drive, parts in groupby(numbered, key=self._chain.drive):
+            fused = join_fused(part for _, part in parts)
+            moved = self._moved_rows(key, drive, fused)
+            kept.append(fused.select(~moved))
+            removed.append(fused.select(moved))
+        cloud = filter_cloud(self._exported(kept), self.config.map_filters)
+        return self._placed(key, cloud), self._placed(key, self._exported(removed))
+
+    def _exported(self, parts: Iterable[FusedPart]) -> PointCloud:
+        """The points of voxels that enough frames saw, frame ``world``."""
+        fusion = self.config.fusion
         # A drive with fewer frames than the minimum count must still give a map.
-        least = min(config.fusion.min_count, len(self.submap_of_frame))
-        points = fused.cloud(config.fusion.voxel_m, least)
-        filtered = filter_cloud(points, config.map_filters)
-        cloud = transform_cloud(filtered, self._T_map_world, frame="map")
-        return cloud.select(self.window(key).contains(cloud.xyz))
+        least = min(fusion.min_count, len(self.submap_of_frame))
+        fused = replace(join_fused(parts), known=self._known)
+        return fused.cloud(fusion.voxel_m, least)
 
-    def _joined(self, key: TileKey) -> dict[str, Any]:
-        """The voxels of a tile and its margin."""
-        # Joined one by one, so that a place passed often takes no more memory than others.
-        part = join_occupancy(self._occupancy(key, {}))
-        return _voxel_tree(part.voxels(self.resolution_m))
+    def _placed(self, key: TileKey, cloud: PointCloud) -> PointCloud:
+        """The points in a tile, frame ``map``, of a cloud in frame ``world``."""
+        placed = transform_cloud(cloud, self._T_map_world, frame="map")
+        return placed.select(self.window(key).contains(placed.xyz))
 
-    def _occupancy(
-        self, key: TileKey, after: Mapping[int, OccupancyPart]
-    ) -> Iterator[OccupancyPart]:
-        """What each submap observed in a tile and its margin, each followed by ``after``."""
-        own = ((n, OccupancyPart.from_tree(tree)) for n, tree in self._parts.read(_OCCUPANCY, key))
-        # Of one number, that of the submap comes first.
-        return (part for _, part in merge(own, sorted(after.items()), key=itemgetter(0)))
-
-    def _changed(
-        self, key: TileKey, seen: OccupancyVoxels, after: Mapping[int, OccupancyPart]
-    ) -> OccupancyVoxels:
-        """The voxels of a tile with its margin, made again where ``after`` changes something."""
-        wide = self.window(key).wider(self._grid_margin_m)
-        inside = {n: p.select(wide.contains(self._centres_m(p))) for n, p in after.items()}
-        blocks = np.unique(np.concatenate([part.rows.blocks for part in inside.values()]))
-        # Whether a surface crosses a voxel depends on what hit those that touch it.
-        changed, needed = _grown(blocks, 1), _grown(blocks, 2)
-        parts = self._occupancy(key, inside)
-        joined = join_occupancy(p.select(np.isin(p.rows.blocks, needed)) for p in parts)
-        anew = joined.voxels(self.resolution_m)
-        return join_voxels(
-            [
-                seen.select(~np.isin(pack_keys(seen.keys >> BLOCK_BITS), changed)),
-                anew.select(np.isin(pack_keys(anew.keys >> BLOCK_BITS), changed)),
-            ],
-            self.resolution_m,
-        )
-
-
-def join_clouds(clouds: Iterable[PointCloud], frame: Frame = "map") -> PointCloud:
-    """Concatenate clouds of one frame; attributes that one with points lacks are dropped."""
-    parts = [cloud for cloud in clouds if len(cloud)]
-    if not parts:
-        return PointCloud(np.zeros((0, 3), np.float32), frame=frame)
-    names = [field.name for field in fields(PointCloud) if field.name != "frame"]
-    columns = {name: [getattr(cloud, name) for cloud in parts] for name in names}
-    shared = {
-        name: np.concatenate(arrays)
-        for name, arrays in columns.items()
-        if all(array is not None for array in arrays)
-    }
-    return PointCloud(**shared, frame=frame)
-
-
-def join_voxels(parts: Iterable[OccupancyVoxels], resolution_m: float) -> OccupancyVoxels:
-    """Concatenate voxels of one resolution; none is in two parts."""
-    keys, log_odds = [np.zeros((0, 3), np.int32)], [np.zeros(0, np.float32)]
-    for part in parts:
-        keys.append(part.keys)
-        log_odds.append(part.log_odds)
-    return OccupancyVoxels(np.concatenate(keys), np.concatenate(log_odds), resolution_m)
-
-
-def _in_window(voxels: OccupancyVoxels, window: Window) -> OccupancyVoxels:
-    """The voxels with their centres in a window."""
-    low, high = (
-        np.ceil(np.array(xy) / voxels.resolution_m - 0.5) for xy in (window.low, window.high)
-    )
-    x, y = voxels.keys[:, 0], voxels.keys[:, 1]
-    inside: Bool = (x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1])
-    return voxels.select(inside)
-
-
-def _cloud_tree(cloud: PointCloud) -> dict[str, Any]:
-    """The arrays of a cloud by their names."""
-    arrays = {f.name: getattr(cloud, f.name) for f in fields(cloud) if f.name != "frame"}
-    return {name: array for name, array in arrays.items() if array is not None}
-
-
-def _voxel_tree(voxels: OccupancyVoxels) -> dict[str, Any]:
-    return {"keys": voxels.keys, "log_odds": voxels.log_odds}
-
-
-def _grown(blocks: NDArray[np.int64], by: int) -> NDArray[np.int64]:
-    """Packed blocks with those up to ``by`` blocks away from one on each axis."""
-    steps = np.array(list(product(range(-by, by + 1), repeat=3)))
-    around = unpack_keys(blocks)[:, None] + steps
-    return np.unique(pack_keys(around.reshape(-1, 3)))
+    def _moved_rows(self, key: TileKey, drive: int, fused: FusedPart) -> Bool:
+        """Which rows of what a drive fused in a tile and its margin are of something that moved."""
+        fusion = self.config.fusion
+        if not fusion.remove_moving:
+            return np.zeros(len(fused), np.bool_)
+        voxels = self.wide_voxels(key)
+        passed = self._chain.passed(key, drive)
+        return find_moved(fused, fusion.voxel_m, self._T_map_world, voxels, passed)
 
 
 def _wider(extent: tuple[TileKey, TileKey], part: OccupancyPart) -> tuple[TileKey, TileKey]:

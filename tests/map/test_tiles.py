@@ -16,11 +16,12 @@ from recon.core.values.arrays import Float32, Float64
 from recon.map.fusion.part import join_fused
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.ground.floor import find_floors
+from recon.map.joined import join_clouds, join_voxels
 from recon.map.occupancy.part import free_part, join_occupancy
 from recon.map.store.records import Store
 from recon.map.store.submaps import Submaps
 from recon.map.submaps import SubmapBuilder
-from recon.map.tiles import Tiles, join_clouds, join_voxels
+from recon.map.tiles import Tiles
 from recon.map.window import Window
 from recon.stereo.cloud.filters import filter_cloud
 
@@ -94,8 +95,8 @@ def test_tiles_of_the_occupancy_together_are_the_whole(store: Submaps) -> None:
 def test_a_tile_is_made_once(store: Submaps, monkeypatch: pytest.MonkeyPatch) -> None:
     tiles = _tiles(store)
     first = [(tile.cloud.xyz, tile.voxels.keys) for tile in tiles]
-    for name in ("join_fused", "join_occupancy"):
-        monkeypatch.delattr(f"recon.map.tiles.{name}")
+    for name in ("tiles.join_fused", "drive_chain.join_occupancy"):
+        monkeypatch.delattr(f"recon.map.{name}")
     again = [(tile.cloud.xyz, tile.voxels.keys) for tile in tiles]
     for ours, theirs in zip(again, first, strict=True):
         np.testing.assert_array_equal(ours[0], theirs[0])

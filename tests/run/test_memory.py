@@ -16,10 +16,11 @@ from recon.core.errors import MemoryLimitError, SettingsError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import PointCloud
 from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.joined import join_clouds, join_voxels
 from recon.map.store.records import Store
 from recon.map.store.submaps import Submaps
 from recon.map.submaps import SubmapBuilder
-from recon.map.tiles import Tiles, join_clouds, join_voxels
+from recon.map.tiles import Tiles
 from recon.run import memory
 from recon.run.memory import MemorySettings, memory_overrides, parse_size_mb
 from recon.sources.synthetic import SyntheticSource

@@ -1,7 +1,6 @@
 """Surface meshes from point clouds, whole or in tiles with closed seams."""
 
 from recon.export.mesh.cut import Plane, cut_mesh
-from recon.export.mesh.free_space import looked_through
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
 from recon.export.mesh.seams import close_seam, open_edges
 from recon.export.mesh.view import check_coverage, mesh_coverage, reconstruct_view
@@ -12,7 +11,6 @@ __all__ = [
     "check_coverage",
     "close_seam",
     "cut_mesh",
-    "looked_through",
     "mesh_coverage",
     "open_edges",
     "reconstruct_mesh",

@@ -18,12 +18,12 @@ from recon.export.mesh import (
     Plane,
     close_seam,
     cut_mesh,
-    looked_through,
     open_edges,
     reconstruct_mesh,
 )
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
+from recon.map.occupancy.free_space import looked_through
 from recon.map.tiles import Tiles
 from recon.map.window import Window
 from recon.run.directory import RunDirectory

@@ -19,10 +19,11 @@ from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.frame_result import FrameResult
 from recon.map.drive.mapper import Mapper
 from recon.map.drive.workspace import Workspace, resuming
+from recon.map.joined import join_clouds, join_voxels
 from recon.map.occupancy.rays import thin_rays
 from recon.map.settings import DriveSettings
 from recon.map.store.submaps import Submaps
-from recon.map.tiles import Tiles, join_clouds, join_voxels
+from recon.map.tiles import Tiles
 from recon.odometry import (
     KnownPoses,
     MotionPrior,

@@ -49,6 +49,11 @@ class FusionSettings(Settings):
         description="Points are fused up to the depth at which a matching error of 0.3 px makes "
         "this error; none = all. Raise it to map farther and less precisely.",
     )
+    remove_moving: bool = Field(
+        default=True,
+        description="Leave points of things that moved out of the cloud and the mesh: those in "
+        "space that rays of other frames went through. They are written to map/removed.ply.",
+    )
 
 
 def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:

@@ -81,7 +81,7 @@ class FusedPart:
         """
         if not len(self):
             return self
-        points = self._moved_points(T_new_world, voxel_m)
+        points = apply(T_new_world, self.points(voxel_m))
         cells = np.floor(points / voxel_m).astype(np.int64)
         sums = self.sums.copy()
         sums[:, _OFFSET] = self.sums[:, :1] * (points - (cells + 0.5) * voxel_m)
@@ -90,7 +90,7 @@ class FusedPart:
 
     def moved_keys(self, T_new_world: Float64, voxel_m: float) -> NDArray[np.int64]:
         """int64 (N,), packed cell of each row after a rigid motion, several rows in one or not."""
-        points = self._moved_points(T_new_world, voxel_m)
+        points = apply(T_new_world, self.points(voxel_m))
         return voxels.pack_keys(np.floor(points / voxel_m).astype(np.int64))
 
     def cloud(self, voxel_m: float, least: int) -> PointCloud:
@@ -121,10 +121,9 @@ class FusedPart:
             frame="world",
         )
 
-    def _moved_points(self, T_new_world: Float64, voxel_m: float) -> Float64:
-        """float64 (N, 3), the mean point of each voxel after a rigid motion."""
-        points = (self.cells + 0.5) * voxel_m + self.sums[:, _OFFSET] / self.sums[:, :1]
-        return apply(T_new_world, points)
+    def points(self, voxel_m: float) -> Float64:
+        """float64 (N, 3), the mean point of each voxel, world axes."""
+        return np.asarray((self.cells + 0.5) * voxel_m + self.sums[:, _OFFSET] / self.sums[:, :1])
 
     def _needed(self, least: int) -> Int32:
         """int32 (N,), frames that must have seen each voxel."""

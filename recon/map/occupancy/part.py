@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -84,6 +84,14 @@ class OccupancyPart:
             None if self.points is None else self.points.moved(T_cells),
         )
         return moved.select(np.diff(moved.rows.starts) > 0)
+
+    def outdoing(self, most: float) -> OccupancyPart:
+        """The part of a later drive, before which log-odds count as ``most`` at the most."""
+        change, low, high = self.rows.values.T
+        # x -> min(max(x + change, low), high) after x -> min(max(x, -most), most).
+        ends = [np.clip(change + end, low, high) for end in (-most, most)]
+        values = np.stack([change, *ends], axis=1).astype(np.float32)
+        return replace(self, rows=self.rows._replace(values=values))
 
     def voxels(self, resolution_m: float) -> OccupancyVoxels:
         """The log-odds of a drive that consists of this part alone.

@@ -1,0 +1,111 @@
+"""What drives observed in a tile, one after the other: what a later one saw counts more."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from functools import reduce
+from heapq import merge
+from itertools import groupby
+from operator import itemgetter
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.kernels.voxels import pack_keys
+from recon.core.values import OccupancyVoxels
+from recon.map.joined import grown_blocks, join_voxels
+from recon.map.kernels.raycast import BLOCK_BITS
+from recon.map.occupancy.log_odds import log_odds
+from recon.map.occupancy.moving import passed_cells
+from recon.map.occupancy.part import OccupancyPart, join_occupancy
+from recon.map.store.tile_parts import TileKey, TileParts
+
+OCCUPANCY: Final = "occupancy"
+"""Kind of the parts of submaps in the tiles."""
+_PASSED: Final = "passed"
+_OLD: Final = log_odds(0.85)
+"""Log-odds that count at most for a later drive: five rays of it free what was surely occupied."""
+
+
+class DriveChain:
+    """Chains the occupancy of the submaps in a tile.
+
+    Args:
+        parts: What the submaps observed in the tiles, numbered by submap.
+
+    Attributes:
+        drive_of: int64 (S,), the drive of each submap; empty = all are of one.
+    """
+
+    def __init__(self, parts: TileParts) -> None:
+        self._parts = parts
+        self.drive_of: NDArray[np.int64] = np.zeros(0, np.int64)
+
+    def drive(self, numbered: tuple[int, Any]) -> int:
+        """The drive of what is numbered by submap."""
+        return int(self.drive_of[numbered[0]]) if len(self.drive_of) else 0
+
+    def joined(self, key: TileKey, *, note: bool) -> OccupancyPart:
+        """What all drives observed in a tile; ``note`` what each saw through, for `passed`."""
+        drives = self._drives(key)
+        return _outdone(self._noted(key, drives) if note else (part for _, part in drives))
+
+    def passed(self, key: TileKey, drive: int) -> NDArray[np.int64]:
+        """int64 (N,), the `passed_cells` of a drive that were noted in a tile."""
+        found = [tree["keys"] for n, tree in self._parts.read(_PASSED, key) if n == drive]
+        return found[0] if found else np.zeros(0, np.int64)
+
+    def changed(
+        self, key: TileKey, seen: OccupancyVoxels, after: Mapping[int, OccupancyPart]
+    ) -> OccupancyVoxels:
+        """The voxels of a tile, made again where ``after`` the end of submaps more was observed."""
+        blocks = np.unique(np.concatenate([part.rows.blocks for part in after.values()]))
+        # Whether a surface crosses a voxel depends on what hit those that touch it.
+        changed, needed = grown_blocks(blocks, 1), grown_blocks(blocks, 2)
+        joined = _outdone(part for _, part in self._drives(key, after, needed))
+        anew = joined.voxels(seen.resolution_m)
+        return join_voxels(
+            [
+                seen.select(~np.isin(pack_keys(seen.keys >> BLOCK_BITS), changed)),
+                anew.select(np.isin(pack_keys(anew.keys >> BLOCK_BITS), changed)),
+            ],
+            seen.resolution_m,
+        )
+
+    def _noted(
+        self, key: TileKey, drives: Iterable[tuple[int, OccupancyPart]]
+    ) -> Iterator[OccupancyPart]:
+        """The parts of drives, with a note of what each saw through."""
+        for drive, part in drives:
+            self._parts.put(_PASSED, key, {"keys": passed_cells(part)}, drive)
+            yield part
+
+    def _drives(
+        self,
+        key: TileKey,
+        after: Mapping[int, OccupancyPart] | None = None,
+        blocks: NDArray[np.int64] | None = None,
+    ) -> Iterator[tuple[int, OccupancyPart]]:
+        """What each drive observed in a tile, in their order.
+
+        Args:
+            key: The tile.
+            after: What else was observed at the end of submaps, by their numbers.
+            blocks: Packed blocks to look at; None = all.
+        """
+        own = ((n, OccupancyPart.from_tree(tree)) for n, tree in self._parts.read(OCCUPANCY, key))
+        # Of one number, that of the submap comes first.
+        numbered = merge(own, sorted((after or {}).items()), key=itemgetter(0))
+        for drive, parts in groupby(numbered, key=self.drive):
+            # Joined one by one, so that a place passed often takes no more memory than others.
+            yield drive, join_occupancy(_in_blocks(part, blocks) for _, part in parts)
+
+
+def _in_blocks(part: OccupancyPart, blocks: NDArray[np.int64] | None) -> OccupancyPart:
+    return part if blocks is None else part.select(np.isin(part.rows.blocks, blocks))
+
+
+def _outdone(drives: Iterable[OccupancyPart]) -> OccupancyPart:
+    """What drives observed one after the other; little of the older counts for a later one."""
+    return reduce(lambda old, new: join_occupancy([old, new.outdoing(_OLD)]), drives)

@@ -1,0 +1,136 @@
+"""What moved is taken out of the fused cloud; what stands still, far or thin, stays in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from recon.commands.config import load_config
+from recon.core.geometry.se3 import make_transform
+from recon.core.geometry.transform import transform_cloud
+from recon.core.values import PointCloud
+from recon.core.values.arrays import Bool
+from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.joined import join_clouds
+from recon.map.occupancy.rays import thin_rays
+from recon.map.submaps import Submap, SubmapBuilder
+from recon.map.tiles import Tiles
+
+HEIGHT_M, WALL_M, RANGE_M = 1.65, 30.0, 18.0
+T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
+CONFIG = load_config()
+SIGMA_PX, FOCAL_BASELINE = 0.3, 360.0 * 0.54
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+"""Centre of the base (right, above the ground, forward) and size (wide, high, long), metres."""
+CAR, PERSON, POST, WIRE = (1.8, 1.4, 4.2), (0.5, 1.75, 0.4), (0.12, 4.0, 0.12), (12.0, 0.04, 0.04)
+
+
+def _depths(rays: np.ndarray, boxes: Sequence[Box], z_m: float) -> np.ndarray:
+    """Depth of the nearest of ground, end wall and boxes along each ray of unit depth."""
+    with np.errstate(divide="ignore"):
+        depth = np.minimum(WALL_M - z_m, np.where(rays[:, 1] > 0, HEIGHT_M / rays[:, 1], np.inf))
+        for (x, up, z), (wide, high, long) in boxes:
+            low = np.array([x - wide / 2, HEIGHT_M - up - high, z - z_m - long / 2])
+            size = np.array([wide, high, long])
+            ends = np.stack([low / rays, (low + size) / rays])
+            enter, leave = ends.min(axis=0).max(axis=1), ends.max(axis=0).min(axis=1)
+            depth = np.where((enter < leave) & (enter > 0), np.minimum(depth, enter), depth)
+    return depth
+
+
+def _look(boxes: Sequence[Box], z_m: float, seed: int) -> PointCloud:
+    """What a stereo camera at z sees, with the depth error of stereo."""
+    u, v = np.meshgrid(np.linspace(-0.8, 0.8, 340), np.linspace(-0.3, 0.3, 130))
+    rays = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3)
+    depth = _depths(rays, boxes, z_m)
+    sigma = depth**2 * SIGMA_PX / FOCAL_BASELINE
+    seen = depth + np.random.default_rng(seed).normal(size=len(depth)) * sigma
+    cloud = PointCloud((rays * seen[:, None]).astype("f4"), sigma_m=sigma.astype("f4"))
+    return cloud.select(depth < 60.0)
+
+
+def _drive(scenes: Sequence[Sequence[Box]], step_m: float = 0.5, aside: float = 0.0) -> Submap:
+    """A drive through a scene that changes from frame to frame."""
+    builder = SubmapBuilder(CONFIG.submaps, CONFIG.fusion, CONFIG.occupancy, T_MAP_WORLD)
+    for frame, boxes in enumerate(scenes):
+        T = make_transform(np.eye(3), np.array([aside, 0.0, step_m * frame]))
+        shifted = [((x - aside, up, z), size) for (x, up, z), size in boxes]
+        cloud = _look(shifted, step_m * frame, frame)
+        rays = thin_rays(cloud, CONFIG.occupancy)
+        near = cloud.select(cloud.xyz[:, 2] < RANGE_M)
+        builder.integrate(transform_cloud(near, T, frame="world"), rays.cloud(), T)
+    return builder.close()
+
+
+def _cloud(*drives: Submap, remove: bool = True) -> PointCloud:
+    fusion = CONFIG.fusion.model_copy(update={"remove_moving": remove})
+    config = CONFIG.model_copy(update={"fusion": fusion})
+    tiles = Tiles.of_submaps(drives, config, T_MAP_WORLD, drives=[1] * len(drives))
+    return join_clouds(tile.cloud for tile in tiles)
+
+
+def _near(cloud: PointCloud, boxes: Sequence[Box], margin_m: float = 0.25) -> Bool:
+    """Points in a box or near it, higher than the ground reaches."""
+    right, up, forward = -cloud.xyz[:, 1], cloud.xyz[:, 2] + HEIGHT_M, cloud.xyz[:, 0]
+    found = np.zeros(len(cloud), np.bool_)
+    for (x, base, z), (wide, high, long) in boxes:
+        near = np.abs(right - x) < wide / 2 + margin_m
+        near &= np.abs(forward - z) < long / 2 + margin_m
+        near &= forward < WALL_M - 1.0
+        found |= near & (up > max(base - margin_m, 0.25)) & (up < base + high + margin_m)
+    return found
+
+
+def _left(of: Sequence[Box], *drives: Submap) -> float:
+    """Share of the points near boxes that are still there."""
+    before, after = (_cloud(*drives, remove=on) for on in (False, True))
+    assert _near(before, of).sum() > 100
+    return float(_near(after, of).sum() / _near(before, of).sum())
+
+
+FRAMES = 24
+ONCOMING = [[((-3.0, 0.0, 34.0 - 1.5 * n), CAR)] for n in range(FRAMES)]
+CROSSING = [[((-7.0 + 0.6 * n, 0.0, 17.0), CAR)] for n in range(FRAMES)]
+LEADING = [[((0.5, 0.0, 8.0 + 0.9 * n), CAR)] for n in range(FRAMES)]
+WALKING = [[((3.0, 0.0, 12.0 + 0.2 * n), PERSON)] for n in range(FRAMES)]
+STANDING: list[Box] = [
+    ((4.0, 0.0, 14.0), POST),
+    ((-4.0, 0.0, 22.0), POST),
+    ((0.0, 3.8, 18.0), WIRE),
+]
+PARKED: list[Box] = [((3.0, 0.0, 16.0), CAR)]
+
+
+@pytest.mark.parametrize("scenes", [ONCOMING, CROSSING, LEADING, WALKING])
+def test_what_moved_is_gone(scenes: list[list[Box]]) -> None:
+    trail = [box for boxes in scenes for box in boxes]
+    assert _left(trail, _drive(scenes)) <= 0.05
+
+
+def test_what_stands_still_stays_even_if_it_is_thin() -> None:
+    drive = _drive([STANDING] * FRAMES)
+    before, after = (_cloud(drive, remove=on) for on in (False, True))
+    assert len(after) >= 0.99 * len(before)
+    for box in STANDING:
+        assert _near(after, [box], 0.1).sum() >= 0.98 * _near(before, [box], 0.1).sum() > 100
+
+
+def test_a_parked_car_that_a_later_drive_looked_through_is_gone() -> None:
+    older, later = _drive([PARKED] * FRAMES), _drive([[]] * FRAMES, aside=0.5)
+    assert _left(PARKED, older, later) <= 0.05
+    assert _left(PARKED, older) >= 0.95
+
+
+def test_a_car_that_a_later_drive_finds_parked_stays() -> None:
+    older, later = _drive([[]] * FRAMES), _drive([PARKED] * FRAMES, aside=0.5)
+    assert _left(PARKED, older, later) >= 0.95
+
+
+def test_what_was_removed_is_kept_aside() -> None:
+    tiles = Tiles.of_submaps([_drive(CROSSING)], CONFIG, T_MAP_WORLD)
+    removed = join_clouds(tile.removed for tile in tiles)
+    trail = [box for boxes in CROSSING for box in boxes]
+    assert _near(removed, trail).mean() > 0.9
+    assert removed.sigma_m is not None
