@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
@@ -15,7 +15,7 @@ from recon.core.errors import RegistrationError
 from recon.core.geometry.interpolation import pose_between
 from recon.core.geometry.se3 import adjoint, as_step, invert, orthonormalise
 from recon.core.values import Trajectory
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Bool, Float64
 from recon.places.drift import Drift, DriftModel, drift_over
 from recon.places.pose_graph import PoseEdge, optimise_poses
 from recon.places.verify import Loop
@@ -67,43 +67,113 @@ class Closure:
         return orthonormalise(T_new @ invert(T_old))
 
 
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A drive in the graph.
+
+    Attributes:
+        trajectory: By odometry; about where it lies beside the other drives.
+        path_m: float64 (N,), path up to each frame, by `path_lengths`.
+    """
+
+    trajectory: Trajectory
+    path_m: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Tie:
+    """A place that two drives saw, or one drive twice.
+
+    Attributes:
+        drives: Numbers of the drives of the loop's first and last frame.
+        loop: The motion between the two frames, each counted in its own drive.
+    """
+
+    drives: tuple[int, int]
+    loop: Loop
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedDrives:
+    """Paths after all drives were joined by their ties.
+
+    Attributes:
+        trajectories: One for each drive, in the world of the first.
+        kept: bool (T,), ties that the rest of the graph does not contradict.
+    """
+
+    trajectories: tuple[Trajectory, ...]
+    kept: Bool
+
+
 def close_loops(
     trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop], drift: DriftModel
 ) -> Closure:
-    """Correct a path so that its loops close.
-
-    Nodes are spaced along the path; odometry edges link each to the next, loop edges link distant
-    ones. The optimiser may switch loops off. It starts with a tolerance that admits every loop and
-    tightens it step by step, so that a right loop is not refused because of the very drift that it
-    corrects. If the loops deform the odometry more than its drift explains, none is believed.
+    """Correct a path so that its loops close, by `join_drives`.
 
     Args:
         trajectory: By odometry.
         path_m: float64 (N,), path up to each frame, by `path_lengths`.
         loops: Loops between frames of it.
         drift: How far odometry may drift.
+    """
+    ties = [Tie((0, 0), loop) for loop in loops]
+    joined = join_drives([Drive(trajectory, path_m)], ties, drift) if ties else None
+    if joined is None:  # a map by odometry alone is better than none
+        return Closure(trajectory, (), tuple(loops))
+    sides = [
+        [loop for loop, kept in zip(loops, joined.kept, strict=True) if kept == side]
+        for side in (True, False)
+    ]
+    return Closure(joined.trajectories[0], tuple(sides[0]), tuple(sides[1]))
+
+
+def join_drives(
+    drives: Sequence[Drive], ties: Sequence[Tie], drift: DriftModel
+) -> JoinedDrives | None:
+    """Correct the paths of drives so that their ties hold; None = the ties are not believed.
+
+    Nodes are spaced along the paths; odometry edges link each to the next, ties link distant ones.
+    The optimiser may switch ties off. It starts with a tolerance that admits every tie and tightens
+    it step by step, so that a right one is not refused because of the very drift that it corrects.
+    If the ties deform the odometry of a drive more than its drift explains, none is believed.
+
+    Args:
+        drives: The drives; the first pose of the first one is fixed.
+        ties: What holds them together.
+        drift: How far odometry may drift.
 
     Ref:
         Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
     """
-    if not loops:
-        return Closure(trajectory, (), ())
-    nodes = _nodes(path_m)
-    steps = _odometry_edges(trajectory, path_m, nodes, drift)
-    ties = [_loop_edge(loop, trajectory, path_m, nodes, drift) for loop in loops]
+    nodes = _spaced(drives)
+    begins = np.cumsum([0, *map(len, nodes)]).tolist()
+    chains = [
+        _odometry_edges(drive, own, begin, drift)
+        for drive, own, begin in zip(drives, nodes, begins[:-1], strict=True)
+    ]
+    edges = [_tie_edge(tie, drives, nodes, begins, drift) for tie in ties]
+    start = [d.trajectory.T_world_camera[own] for d, own in zip(drives, nodes, strict=True)]
+    steps = [edge for chain in chains for edge in chain]
     try:
-        poses, weights = _solve(trajectory.T_world_camera[nodes], steps, ties)
-    except RegistrationError:  # a map by odometry alone is better than none
-        return Closure(trajectory, (), tuple(loops))
-    bend_chi2 = float(np.mean([misfit(edge, poses) for edge in steps]))
+        poses, weights = _solve(np.concatenate(start), steps, edges)
+    except RegistrationError:
+        return None
+    bends = [np.mean([misfit(edge, poses) for edge in chain]) for chain in chains if chain]
     kept = weights >= _KEPT
-    if bend_chi2 > _MAX_BEND_CHI2 or not kept.any():
-        return Closure(trajectory, (), tuple(loops))
-    return Closure(
-        _bent(trajectory, path_m, nodes, poses),
-        tuple(loop for loop, keep in zip(loops, kept, strict=True) if keep),
-        tuple(loop for loop, keep in zip(loops, kept, strict=True) if not keep),
-    )
+    if max(bends, default=0.0) > _MAX_BEND_CHI2 or not kept.any():
+        return None
+    parts = [poses[a:b] for a, b in pairwise(begins)]
+    paths = [_bent(*each) for each in zip(drives, nodes, parts, strict=True)]
+    paths[0] = _begun_at(drives[0].trajectory.T_world_camera[0], paths[0])
+    return JoinedDrives(tuple(paths), kept)
+
+
+def _begun_at(T_world_camera: Float64, path: Trajectory) -> Trajectory:
+    """Return a path with its first pose put back, which rounding has moved."""
+    poses = path.T_world_camera.copy()
+    poses[0] = T_world_camera
+    return replace(path, T_world_camera=poses)
 
 
 def loop_bias(loop: Loop) -> Drift:
@@ -121,10 +191,17 @@ def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
     return float(step @ edge.information @ step)
 
 
-def _nodes(path_m: Float64) -> NDArray[np.intp]:
+def _spaced(drives: Sequence[Drive]) -> list[NDArray[np.intp]]:
+    """Return the frames of each drive that are nodes."""
+    lengths_m = np.array([drive.path_m[-1] for drive in drives])
+    most = _MAX_NODES * lengths_m / max(float(lengths_m.sum()), 1e-9)
+    return [_nodes(drive.path_m, round(limit)) for drive, limit in zip(drives, most, strict=True)]
+
+
+def _nodes(path_m: Float64, most: int = _MAX_NODES) -> NDArray[np.intp]:
     """Return frames at even distances along the path, including the first and the last."""
     length = float(path_m[-1])
-    count = min(_MAX_NODES, max(2, math.ceil(length / _NODE_M) + 1))
+    count = max(2, min(most, math.ceil(length / _NODE_M) + 1))
     marks = np.searchsorted(path_m, np.linspace(0.0, length, count))
     return np.unique(np.concatenate([[0], marks, [len(path_m) - 1]]))
 
@@ -141,11 +218,12 @@ def _solve(start: Float64, steps: list[PoseEdge], ties: list[PoseEdge]) -> tuple
 
 
 def _odometry_edges(
-    trajectory: Trajectory, path_m: Float64, nodes: NDArray[np.intp], model: DriftModel
+    drive: Drive, nodes: NDArray[np.intp], begin: int, model: DriftModel
 ) -> list[PoseEdge]:
-    poses = trajectory.T_world_camera
+    """Return the edges along a drive, whose nodes are numbered from ``begin``."""
+    poses, path_m = drive.trajectory.T_world_camera, drive.path_m
     edges = []
-    for k, (first, last) in enumerate(pairwise(nodes)):
+    for k, (first, last) in enumerate(pairwise(nodes), begin):
         # Where the camera stands still, 0.1 m keeps the information finite.
         drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1), model)
         T = invert(poses[first]) @ poses[last]
@@ -153,32 +231,34 @@ def _odometry_edges(
     return edges
 
 
-def _loop_edge(
-    loop: Loop,
-    trajectory: Trajectory,
-    path_m: Float64,
-    nodes: NDArray[np.intp],
+def _tie_edge(
+    tie: Tie,
+    drives: Sequence[Drive],
+    nodes: Sequence[NDArray[np.intp]],
+    begins: Sequence[int],
     model: DriftModel,
 ) -> PoseEdge:
-    """Return the loop as an edge between the nodes nearest to its frames."""
-    poses = trajectory.T_world_camera
-    first, last = (_nearest_node(path_m, nodes, frame) for frame in (loop.first, loop.last))
-    to_first = invert(poses[nodes[first]]) @ poses[loop.first]
-    to_last = invert(poses[loop.last]) @ poses[nodes[last]]
-    way_m = abs(float(path_m[nodes[first]] - path_m[loop.first]))
-    way_m += abs(float(path_m[nodes[last]] - path_m[loop.last]))
-    drift, bias = drift_over(way_m, model), loop_bias(loop)
-    other = Drift(
+    """Return a tie as an edge between the nodes nearest to its frames."""
+    loop, (one, other) = tie.loop, tie.drives
+    first, to_first, before_m = _to_node(drives[one], nodes[one], loop.first)
+    last, to_last, after_m = _to_node(drives[other], nodes[other], loop.last)
+    drift, bias = drift_over(before_m + after_m, model), loop_bias(loop)
+    more = Drift(
         math.hypot(drift.position_m, bias.position_m),
         math.hypot(drift.angle_rad, bias.angle_rad),
     )
-    covariance = np.linalg.inv(_turned(loop.information, to_last)) + other.covariance
-    T = orthonormalise(to_first @ loop.T_first_last @ to_last)
-    return PoseEdge(first, last, T, _inverse(covariance), doubtful=True)
+    covariance = np.linalg.inv(_turned(loop.information, invert(to_last))) + more.covariance
+    T = orthonormalise(to_first @ loop.T_first_last @ invert(to_last))
+    ends = begins[one] + first, begins[other] + last
+    return PoseEdge(*ends, T, _inverse(covariance), doubtful=True)
 
 
-def _nearest_node(path_m: Float64, nodes: NDArray[np.intp], frame: int) -> int:
-    return int(np.argmin(np.abs(path_m[nodes] - path_m[frame])))
+def _to_node(drive: Drive, nodes: NDArray[np.intp], frame: int) -> tuple[int, Float64, float]:
+    """Return the node nearest to a frame, ``T_node_frame``, and the path between them."""
+    poses, path_m = drive.trajectory.T_world_camera, drive.path_m
+    node = int(np.argmin(np.abs(path_m[nodes] - path_m[frame])))
+    T = invert(poses[nodes[node]]) @ poses[frame]
+    return node, T, abs(float(path_m[nodes[node]] - path_m[frame]))
 
 
 def _inverse(covariance: Float64) -> Float64:
@@ -193,20 +273,18 @@ def _turned(information: Float64, T_frame_node: Float64) -> Float64:
     return turned
 
 
-def _bent(
-    trajectory: Trajectory, path_m: Float64, nodes: NDArray[np.intp], T_world_node: Float64
-) -> Trajectory:
+def _bent(drive: Drive, nodes: NDArray[np.intp], T_world_node: Float64) -> Trajectory:
     """Return every pose moved with the nodes before and after it, interpolated by distance."""
-    old = trajectory.T_world_camera
-    before = np.clip(np.searchsorted(nodes, np.arange(len(old)), side="right") - 1, 0, None)
-    before = np.minimum(before, len(nodes) - 2)
+    old, path_m = drive.trajectory.T_world_camera, drive.path_m
+    before = np.searchsorted(nodes, np.arange(len(old)), side="right") - 1
+    before = np.clip(before, 0, max(len(nodes) - 2, 0))
+    after = np.minimum(before + 1, len(nodes) - 1)
     new = np.empty_like(old)
-    for frame, k in enumerate(before):
-        a, b = nodes[k], nodes[k + 1]
-        from_a = T_world_node[k] @ invert(old[a]) @ old[frame]
-        from_b = T_world_node[k + 1] @ invert(old[b]) @ old[frame]
+    for frame, (i, j) in enumerate(zip(before, after, strict=True)):
+        a, b = nodes[i], nodes[j]
+        from_a = T_world_node[i] @ invert(old[a]) @ old[frame]
+        from_b = T_world_node[j] @ invert(old[b]) @ old[frame]
         span = float(path_m[b] - path_m[a])
         share = float(path_m[frame] - path_m[a]) / span if span > 0 else 0.0
         new[frame] = orthonormalise(pose_between(from_a, from_b, share))
-    new[0] = old[0]
-    return Trajectory(new, trajectory.timestamps_s)
+    return replace(drive.trajectory, T_world_camera=new)
