@@ -2,32 +2,14 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from recon.cli.options import Config, Json, Quiet, Set, Threads, Verbose
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
-
-
-class Model(str, Enum):
-    """Lens models."""
-
-    radtan = "radtan"
-    rational = "rational"
-    fisheye = "fisheye"
-
-
-class Form(str, Enum):
-    """Formats of calibration files."""
-
-    recon = "recon"
-    opencv = "opencv"
-    ros = "ros"
-    kalibr = "kalibr"
 
 
 def calibrate(
@@ -53,13 +35,13 @@ def calibrate(
         Path | None, typer.Option("--out", "-o", help="Calibration file to write.")
     ] = None,
     form: Annotated[
-        Form,
+        Literal["recon", "opencv", "ros", "kalibr"],
         typer.Option(
             "--format", "-f", help="Format of that file; ros writes two, _left and _right."
         ),
-    ] = Form.recon,
+    ] = "recon",
     model: Annotated[
-        Model | None,
+        Literal["radtan", "rational", "fisheye"] | None,
         typer.Option(
             help="Lens model: radtan, rational (wide angle) or fisheye (150 degrees or more).",
             show_default="radtan",
@@ -104,8 +86,8 @@ def calibrate(
         from recon.rig.calibrate.summary import tell_depths
 
         # kalibr's lens model has two radial terms.
-        fitting = ["calibration.radial_terms=2"] if form is Form.kalibr else []
-        chosen = [] if model is None else [f"calibration.model={model.value}"]
+        fitting = ["calibration.radial_terms=2"] if form == "kalibr" else []
+        chosen = [] if model is None else [f"calibration.model={model}"]
         if distance is not None:
             chosen.append(f"calibration.working_m={distance}")
         settings = load_config(config, [*fitting, *(set_ or ()), *chosen])
@@ -115,7 +97,7 @@ def calibrate(
             parse_board(board),
             settings,
             file=out,
-            form=form.value,
+            form=form,
             out=report,
             threads=threads,
         )

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -46,7 +50,6 @@ def capture(
       recon capture /dev/video4 --out rides/today --set capture.suffix=jpg
     """
     with session(quiet=quiet):
-        from recon.cli.interrupt import until_interrupted
         from recon.commands.capture import run_capture
         from recon.commands.config import capture_overrides, load_config
         from recon.rig.capture import Recording
@@ -58,3 +61,23 @@ def capture(
         with until_interrupted() as stopped:
             summary = run_capture(devices, out, settings, calibration=calib, stopped=stopped)
     print_json(summary) if json else print_figures("", summary)
+
+
+@contextmanager
+def until_interrupted() -> Iterator[Callable[[], bool]]:
+    """Yield a test for SIGINT or SIGTERM; a second signal ends the program at once."""
+    asked = threading.Event()
+    before = {int(n): signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+
+    def note(number: int, frame: object) -> None:
+        del frame
+        asked.set()
+        signal.signal(number, before[number])
+
+    for number in before:
+        signal.signal(number, note)
+    try:
+        yield asked.is_set
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -13,26 +12,13 @@ from recon.cli.session import session
 from recon.cli.show.tables import print_evaluation, print_json
 
 
-class ReferenceFrame(str, Enum):
-    """Axes of a reference cloud."""
-
-    camera = "camera"
-    map = "map"
-
-
-class MapAlignment(str, Enum):
-    """How a cloud is aligned to its reference."""
-
-    none = "none"
-    icp = "icp"
-
-
 def map_(
     run: Annotated[Path, typer.Argument(help="Folder of a run, or a PLY point cloud.")],
     reference: Annotated[Path, typer.Argument(help="Reference point cloud (PLY).")],
     reference_frame: Annotated[
-        ReferenceFrame, typer.Option(help="Frame of REFERENCE: the first left camera, or the map.")
-    ] = ReferenceFrame.camera,
+        Literal["camera", "map"],
+        typer.Option(help="Frame of REFERENCE: the first left camera, or the map."),
+    ] = "camera",
     threshold: Annotated[
         str,
         typer.Option(
@@ -47,8 +33,8 @@ def map_(
         ),
     ] = None,
     align: Annotated[
-        MapAlignment, typer.Option(help="Align the cloud to the reference with ICP.")
-    ] = MapAlignment.none,
+        Literal["none", "icp"], typer.Option(help="Align the cloud to the reference with ICP.")
+    ] = "none",
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for clouds coloured by error.")
     ] = None,
@@ -70,9 +56,9 @@ def map_(
         figures = run_evaluate_map(
             run,
             reference,
-            frame=reference_frame.value,
+            frame=reference_frame,
             align_to=align_to,
-            icp=align is MapAlignment.icp,
+            icp=align == "icp",
             thresholds_m=parse_numbers(threshold, "--threshold") or (),
             out=out,
         )

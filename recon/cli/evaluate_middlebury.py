@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -22,13 +21,6 @@ Matchers = Annotated[
         show_default="matching.matcher, sad unless changed",
     ),
 ]
-
-
-class Range(str, Enum):
-    """Where the disparity range comes from."""
-
-    scene = "scene"
-    auto = "auto"
 
 
 def middlebury(
@@ -56,13 +48,13 @@ def middlebury(
         int, typer.Option(min=1, help="Scenes to process at once. Above 1, the times mean nothing.")
     ] = 1,
     range_: Annotated[
-        Range,
+        Literal["scene", "auto"],
         typer.Option(
             "--range",
             help="Disparity range: published with the scene (before 2014: from its ground "
             "truth), or estimated from each pair.",
         ),
-    ] = Range.scene,
+    ] = "scene",
     out: Out = None,
     config: Config = None,
     set_: Set = None,
@@ -102,7 +94,7 @@ def middlebury(
             out=out,
             threads=threads,
             parallel=parallel,
-            auto_range=range_ is Range.auto,
+            auto_range=range_ == "auto",
             progress=choose_viewer(quiet=quiet, verbose=verbose),
         )
         form = Table.latex if latex else Table.text
@@ -117,7 +109,7 @@ def middlebury(
 
 
 def _names(matcher: str | None) -> list[str] | None:
-    """The matchers of the option; None = the configured one."""
+    """Return the matchers of the option; None = the configured one."""
     if matcher is None:
         return None
     return [] if matcher == _NONE else [name.strip() for name in matcher.split(",")]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -13,25 +12,16 @@ from recon.cli.session import session
 from recon.cli.show.tables import print_evaluation, print_json
 
 
-class Alignment(str, Enum):
-    """How the estimate is aligned before it is compared."""
-
-    none = "none"
-    origin = "origin"
-    se3 = "se3"
-    sim3 = "sim3"
-
-
 def trajectory(
     estimate: Annotated[Path, typer.Argument(help="Estimated trajectory, in KITTI or TUM format.")],
     truth: Annotated[Path, typer.Argument(help="Ground truth, in either format.")],
     align: Annotated[
-        Alignment,
+        Literal["none", "origin", "se3", "sim3"],
         typer.Option(
             help="Alignment of the estimate: none, at the first pose (origin), rigid (se3), or "
             "rigid with scale (sim3)."
         ),
-    ] = Alignment.se3,
+    ] = "se3",
     lengths: Annotated[
         str | None,
         typer.Option(
@@ -75,7 +65,7 @@ def trajectory(
         from recon.evaluation.trajectory import TrajectoryRules
 
         asked = {
-            "alignment": align.value,
+            "alignment": align,
             "lengths_m": parse_numbers(lengths, "--lengths"),
             "step_frames": step,
             "rpe_frames": rpe_frames,

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -35,14 +34,6 @@ from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
 
-class OdometryName(str, Enum):
-    """Odometry methods."""
-
-    fused = "fused"
-    visual = "visual"
-    kiss = "kiss"
-
-
 def map_(
     source: SourceArgument = None,
     out: Out = None,
@@ -55,7 +46,7 @@ def map_(
     end: End = None,
     stride: Stride = None,
     odometry: Annotated[
-        OdometryName | None,
+        Literal["fused", "visual", "kiss"] | None,
         typer.Option(
             help="fused: visual odometry, refined by kiss-icp where that helps; visual or kiss: "
             "one of the two alone.",
@@ -115,7 +106,7 @@ def map_(
         from recon.commands.resume import resumed
         from recon.run.memory import memory_overrides
 
-        method = [] if odometry is None else [f"odometry.method={odometry.value}"]
+        method = [] if odometry is None else [f"odometry.method={odometry}"]
         views = source_overrides(calib, left, right, tolerance, (start, end, stride))
         overrides = [*(set_ or ()), *method, *matching_overrides(matcher), *views]
         request = MapRequest(source, kind, poses, prior, mesh)

@@ -115,7 +115,7 @@ def _escape_what_is_not_unicode(stream: TextIO) -> None:
 
 
 def _interrupted(error: BaseException) -> bool:
-    """Whether an error was caused by Ctrl-C."""
+    """Return whether an error was caused by Ctrl-C."""
     earlier = error.__cause__ or error.__context__
     if earlier is None:
         return isinstance(error, KeyboardInterrupt)

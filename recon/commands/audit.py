@@ -7,7 +7,7 @@ from pathlib import Path
 
 from recon.commands.config import ReconConfig
 from recon.report.audit_page import write_audit_page
-from recon.rig.audit.audit import Audit, audit_source, mend_calibration
+from recon.rig.audit.audit import Audit, audit_source, correct_calibration
 from recon.run import Run
 from recon.sources.protocol import StereoSource
 from recon.stereo.match.registry import make_matcher
@@ -40,7 +40,7 @@ def run_audit(
     """
     audit = audit_source(source, config, quick=quick)
     if mend is not None:
-        audit = replace(audit, corrected=mend_calibration(source, config, audit, mend))
+        audit = replace(audit, corrected=correct_calibration(source, config, audit, mend))
     if out is not None:
         matcher = make_matcher(config.matching.matcher, config.matching, None)
         with Run("audit", out, config) as run:

@@ -13,8 +13,7 @@ from typing import Any
 from recon.core.errors import FormatError
 from recon.io.atomic import write_text
 from recon.rig.capture import Recording, capture_pairs, warm_up
-from recon.rig.capture_folder import CaptureFolder
-from recon.rig.capture_writer import CaptureLog, write_pairs
+from recon.rig.capture_folder import CaptureFolder, CaptureLog, write_pairs
 from recon.sources.opencv_camera import Camera, OpenCvCamera
 
 

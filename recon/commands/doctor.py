@@ -20,7 +20,7 @@ from recon.commands.pair import run_pair
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.kernels.cache import when_compiling
 from recon.core.values import StereoPair
-from recon.io.occupancy.octomap_leaves import octomap_pieces
+from recon.io.occupancy.octomap import octomap_pieces
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.run.finished import OCTOMAP
 from recon.run.installation import (

@@ -82,7 +82,7 @@ class RayScene:
 
 
 def _rays(origins: NDArray[Any], directions: NDArray[Any]) -> Any:
-    """Open3D's (N, 6) single-precision rays."""
+    """Return Open3D's (N, 6) single-precision rays."""
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3] = origins
     rays[:, 3:] = directions

@@ -40,7 +40,7 @@ class Settings(BaseModel):
                 yield name, value
 
     def recorded(self, command: str) -> dict[str, Any]:
-        """What is written beside the results of a command, as plain values; here everything."""
+        """Return what is written beside the results of a command, as plain values; here all."""
         del command
         return self.model_dump(mode="json")
 

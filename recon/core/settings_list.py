@@ -84,7 +84,7 @@ class SettingGroup:
 
 
 def settings_page(groups: Sequence[SettingGroup]) -> str:
-    """The page docs/settings.md."""
+    """Return the page docs/settings.md."""
     lines = [
         "# Settings",
         "<!-- Written by `recon settings --markdown`. -->",
@@ -105,7 +105,7 @@ def _row(entry: SettingEntry) -> str:
 def setting_groups(
     drive: Settings, pair: Settings, prefix: str = "", purpose: str | None = None
 ) -> Iterator[SettingGroup]:
-    """The groups of a model, each before those inside it; ``purpose`` stands for its docstring."""
+    """Yield the groups of a model, each before those inside; ``purpose`` replaces its docstring."""
     own, inside = [], []
     for name, field in type(drive).model_fields.items():
         value, paired = getattr(drive, name), getattr(pair, name)
@@ -141,7 +141,7 @@ def _as_yaml(value: Any) -> str:
 
 
 def _values(field: FieldInfo) -> str:
-    """The values of a field in words: choices, kind or bounds."""
+    """Return the values of a field in words: choices, kind or bounds."""
     kinds = [kind for kind in alternatives(field.annotation) if _is_written(kind)]
     words = [_kind(kind) for kind in kinds]
     bounds = [
@@ -155,7 +155,7 @@ def _values(field: FieldInfo) -> str:
 
 
 def _is_written(kind: Any) -> bool:
-    """Whether a file can hold a value of this kind: not none, and no object."""
+    """Return whether a file can hold a value of this kind: not none, and no object."""
     protocol = getattr(getattr(kind, "__origin__", None), "_is_protocol", False)
     return kind is not type(None) and not protocol
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from recon.core.errors import EvaluationError
-from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import (
     DepthMetrics,
     Disparity,
@@ -150,7 +150,7 @@ def _mean(numbers: Float64) -> float:
 
 
 def _quantile(numbers: Float64, percent: int) -> float:
-    """The smallest number that at least ``percent`` % of them do not exceed; NaN if empty."""
+    """Return the smallest number that ``percent`` % of them do not exceed; NaN if empty."""
     if not len(numbers):
         return float("nan")
     rank = max(1, -(-len(numbers) * percent // 100))

@@ -10,18 +10,25 @@ from recon.core.values import (
     MapMetrics,
     OccupancyGrid,
     OccupancyMetrics,
+    OccupancyTruth,
     SequenceTruth,
     Trajectory,
     TrajectoryMetrics,
 )
+from recon.core.values.arrays import Float64
 from recon.evaluation.map import evaluate_map
-from recon.evaluation.occupancy_truth import compare_with_source
+from recon.evaluation.occupancy import evaluate_occupancy
 from recon.evaluation.trajectory import evaluate_trajectory
 from recon.map.drive.sequence import MappedSequence
-from recon.sources.protocol import StereoSource
+from recon.map.ground.grid import drop_undecided
+from recon.map.settings import DriveSettings
+from recon.sources.protocol import KnowsOccupancy, StereoSource
 
 SURFACE_THRESHOLD_M: Final = 0.2
 """Distance to the true surface below which a map point counts as correct."""
+
+LEAST_FRAMES: Final = 3
+"""Number of frames that must have seen a cell for it to be compared."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +64,7 @@ def compare_with_truth(
     truth = source.truth
     path = None if poses_given else _compare_paths(mapped.trajectory, truth, warnings)
     surface = _compare_surfaces(mapped, truth, warnings)
-    occupancy = compare_with_source(source, mapped.config, mapped, grid, warnings)
+    occupancy = _compare_occupancy(source, mapped, grid, warnings)
     return DriveErrors(path, surface, occupancy, tuple(warnings))
 
 
@@ -84,3 +91,32 @@ def _compare_surfaces(
     except EvaluationError as error:
         warnings.append(f"not compared with the true surface: {error}")
         return None
+
+
+def _compare_occupancy(
+    source: StereoSource, mapped: MappedSequence, grid: OccupancyGrid, warnings: list[str]
+) -> OccupancyMetrics | None:
+    if not isinstance(source, KnowsOccupancy):
+        return None
+    truth = known_occupancy(source, mapped.config, mapped.T_map_world)
+    try:
+        return evaluate_occupancy(drop_undecided(mapped.voxels, mapped.config.grid), grid, truth)
+    except EvaluationError as error:
+        warnings.append(f"not compared with the true occupancy: {error}")
+        return None
+
+
+def known_occupancy(
+    source: KnowsOccupancy,
+    config: DriveSettings,
+    T_map_world: Float64,
+    least_frames: int = LEAST_FRAMES,
+) -> OccupancyTruth:
+    """Return the true occupancy of a source, in the cells, axes and height band of a map."""
+    return source.occupancy_truth(
+        resolution_m=config.occupancy.resolution_m,
+        band_m=(config.grid.min_height_m, config.grid.max_height_m),
+        range_m=config.occupancy.max_range_m,
+        least_frames=least_frames,
+        T_map_world=T_map_world,
+    )

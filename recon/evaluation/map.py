@@ -59,7 +59,7 @@ def evaluate_map(
 
 
 def within_reach(cloud: PointCloud, reference: PointCloud, path: Trajectory) -> Bool:
-    """Which points are within the height range, relative to the path, that the reference covers.
+    """Return which points are within the heights, relative to the path, that the reference covers.
 
     A LiDAR sees little above its own height, a camera sees tree tops: points there can be neither
     confirmed nor refuted. The range is that of the whole reference, so that points floating above

@@ -12,8 +12,8 @@ import numpy as np
 
 from recon.core.errors import EvaluationError, FormatError, SettingsError
 from recon.core.geometry.alignment import fit_paths
+from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import angle_rad, invert
-from recon.core.geometry.transform import transform_cloud
 from recon.core.values import PointCloud, Trajectory
 from recon.core.values.arrays import Float64
 from recon.evaluation.association import TOLERANCE_S, associate
@@ -171,7 +171,7 @@ def doubt_axes(
     *,
     aligned: bool,
 ) -> list[str]:
-    """Warnings if the clouds are in different axes or far apart, so that figures are useless.
+    """Return warnings if the clouds are in different axes or far apart: figures would be useless.
 
     Args:
         mapped: The map, in what should be the axes of the reference.

@@ -8,7 +8,7 @@ counts if enough frames saw a surface in it, not above the height band.
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from recon.core.errors import EvaluationError
 from recon.core.geometry import se3
 from recon.core.geometry.projection import project
+from recon.core.kernels.voxels import pack_keys
 from recon.core.values import (
     FREE,
     OCCUPIED,
@@ -31,7 +32,6 @@ from recon.core.values import (
 from recon.core.values.arrays import Bool, Int32
 
 _TOLERANCE: Final = 1
-_BITS: Final = 21
 
 
 def evaluate_occupancy(
@@ -83,7 +83,7 @@ def _check(voxels: OccupancyVoxels, grid: OccupancyGrid, truth: OccupancyTruth) 
 
 
 def _looked_at(keys: Int32, truth: OccupancyTruth) -> Bool:
-    """Which voxels were in the field of view and in range in enough frames, occluded or not."""
+    """Return which voxels were in view and in range in enough frames, occluded or not."""
     centres = (keys.astype(np.float64) + 0.5) * truth.grid.resolution_m
     frames = np.zeros(len(keys), np.int64)
     width, height = truth.camera.width_px, truth.camera.height_px
@@ -111,17 +111,11 @@ def _compare_voxels(
 def _near(keys: Int32, others: Int32, tolerance: int) -> Bool:
     """Return which voxels have one of the others within ``tolerance`` cells on every axis."""
     steps = np.arange(-tolerance, tolerance + 1)
-    known = np.unique(_pack(others))
+    known = np.unique(pack_keys(others))
     found = np.zeros(len(keys), dtype=np.bool_)
     for offset in np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3):
-        found |= np.isin(_pack(keys + offset), known)
+        found |= np.isin(pack_keys(keys + offset), known)
     return found
-
-
-def _pack(keys: NDArray[Any]) -> NDArray[np.int64]:
-    """Return one number for each voxel key (N, 3)."""
-    wide = keys.astype(np.int64) + (1 << (_BITS - 1))
-    return np.asarray((wide[:, 0] << (2 * _BITS)) | (wide[:, 1] << _BITS) | wide[:, 2])
 
 
 def grid_on_truth(grid: OccupancyGrid, truth: OccupancyTruth) -> NDArray[np.int8]:
@@ -151,7 +145,7 @@ def _compare_grids(
 
 
 def _iou(estimate: Bool, true: Bool, seen: Bool, tolerance: int) -> float:
-    """Found / (true + wrong) over the seen cells; without tolerance, intersection over union."""
+    """Return found / (true + wrong) of seen cells; without tolerance, intersection over union."""
     found = seen & true & _grown(estimate, tolerance)
     wrong = seen & estimate & ~_grown(true, tolerance)
     union = int((seen & true).sum() + wrong.sum())

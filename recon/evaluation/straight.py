@@ -6,8 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.geometry.quaternion import quaternion_from_rotation
-from recon.core.geometry.se3 import exp_so3
+from recon.core.geometry.se3 import exp_so3, quaternion_from_rotation
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 
@@ -18,7 +17,7 @@ _FIXED_RAD: Final = float(np.radians(0.5))
 
 
 def open_roll_axis(estimate: Trajectory, truth: Trajectory) -> Float64 | None:
-    """The direction of a straight path about which an alignment of positions does not fix the roll.
+    """Return the direction of a straight path about which aligned positions do not fix the roll.
 
     Args:
         estimate: The estimate, aligned to the true path by positions.

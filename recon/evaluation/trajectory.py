@@ -223,7 +223,7 @@ def choose_segments(
 
 
 def segments_of(distances_m: Float64, lengths_m: tuple[float, ...], step: int) -> Segments:
-    """Segments of given lengths from every ``step``-th frame, where the path has room for them.
+    """Return segments of given lengths from every ``step``-th frame, where the path has room.
 
     As in the development kit, a segment ends at the first frame whose distance along the path
     exceeds its length.

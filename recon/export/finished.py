@@ -11,7 +11,7 @@ from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.se3 import apply
 from recon.core.values.arrays import Bool, Float64
 from recon.io.models.ply import read_ply_pieces
-from recon.io.occupancy.octomap_leaves import octomap_pieces
+from recon.io.occupancy.octomap import octomap_pieces
 from recon.map.settings import DriveSettings
 from recon.map.store.finished import with_occupancy
 from recon.map.store.map import MAP_FILE, Map

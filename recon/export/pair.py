@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from recon.core.errors import MeshingError
-from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import Disparity, RectifiedPair, TriangleMesh
 from recon.export.mesh import MeshSettings, check_coverage, mesh_coverage, reconstruct_view
 from recon.io.images.disparity_png import fitting_scale, write_disparity_png

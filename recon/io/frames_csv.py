@@ -33,7 +33,7 @@ class CapturedFrame:
     right_s: float
 
     def line(self) -> str:
-        """This frame as a line, with the newline."""
+        """Return this frame as a line, with the newline."""
         return f"{self.left},{self.right},{self.left_s:.6f},{self.right_s:.6f}\n"
 
 

@@ -5,8 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from recon.core.errors import FormatError
-from recon.core.geometry.quaternion import quaternion_from_rotation, rotation_from_quaternion
-from recon.core.geometry.se3 import make_transform, orthonormalise
+from recon.core.geometry.se3 import (
+    make_transform,
+    orthonormalise,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text

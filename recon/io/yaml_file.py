@@ -89,7 +89,7 @@ def write_yaml(path: StrPath, values: Mapping[str, Any]) -> None:
 
 
 def plain_yaml(text: str) -> str:
-    """The text without what makes OpenCV's dialect invalid YAML: its header and matrix tags."""
+    """Return the text without what makes OpenCV's dialect invalid YAML: header and matrix tags."""
     return _OPENCV_TAG.sub("", _OPENCV_HEADER.sub("", text))
 
 

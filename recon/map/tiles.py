@@ -17,8 +17,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import apply
-from recon.core.geometry.transform import transform_cloud
 from recon.core.values import OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64
 from recon.map.drive_chain import OCCUPANCY, DriveChain

@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.geometry.projection import project, unproject
+from recon.core.geometry.projection import depth_from_disparity, project, unproject
 from recon.core.geometry.se3 import apply, invert
-from recon.core.geometry.triangulation import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float64, UInt8
 

@@ -7,8 +7,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from recon.core.geometry.projection import unproject
-from recon.core.geometry.triangulation import depth_from_disparity, depth_sigma
+from recon.core.geometry.projection import depth_from_disparity, depth_sigma, unproject
 from recon.core.values import Disparity, PointCloud
 from recon.core.values.arrays import Bool, Float32, UInt8
 from recon.odometry.protocol import OdometryFrame

@@ -7,9 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.geometry.projection import project, unproject
+from recon.core.geometry.projection import depth_from_disparity, project, unproject
 from recon.core.geometry.se3 import apply, as_step, invert
-from recon.core.geometry.triangulation import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.odometry.corners import find_corners

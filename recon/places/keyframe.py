@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.geometry.projection import unproject
-from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.geometry.projection import depth_from_disparity, unproject
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, Float64, UInt8, freeze
 

@@ -50,7 +50,7 @@ def write_audit_page(
 
 
 def _pair(look: Look, pair: RectifiedPair, matcher: Matcher) -> dict[str, Any]:
-    """What the page shows of one pair."""
+    """Return what the page shows of one pair."""
     disparity = matcher.match(pair)
     return {
         "index": look.index,
@@ -64,7 +64,7 @@ def _pair(look: Look, pair: RectifiedPair, matcher: Matcher) -> dict[str, Any]:
 
 @styled
 def rows_figure(look: Look, pair: RectifiedPair) -> bytes:
-    """PNG of the left image with the row error of each feature."""
+    """Draw the left image with the row error of each feature."""
     height, width = pair.left.shape
     size_in = WIDE_IN if is_wide(pair.left.shape) else WIDE_IN / 2
     figure = bare_figure(size_in, size_in * height / width)
@@ -83,7 +83,7 @@ def rows_figure(look: Look, pair: RectifiedPair) -> bytes:
 
 @styled
 def frames_figure(looks: Sequence[Look]) -> bytes:
-    """PNG of brightness, sharpness and row error of the measured pairs."""
+    """Draw brightness, sharpness and row error of the measured pairs."""
     figure = Figure((WIDE_IN, 6.4))
     brightness, sharpness, rows = figure.subplots(3, 1, sharex=True)
     frames = np.array([look.index for look in looks])

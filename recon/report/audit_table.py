@@ -96,7 +96,7 @@ def _known(text: str, *values: float | None) -> str:
 
 
 def _length(metres: float) -> str:
-    """A length in a readable unit."""
+    """Return a length in a readable unit."""
     for unit, factor, under in (("mm", 1000.0, 0.01), ("cm", 100.0, 1.0)):
         if metres < under:
             return f"{metres * factor:.2g} {unit}"

@@ -1,25 +1,28 @@
-"""The report of a calibration, and its images."""
+"""The report of a calibration, and its figures: coverage, errors of views and of depth."""
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from recon.core.values import StereoPair
 from recon.io.atomic import write_bytes
 from recon.io.images.image import read_image
-from recon.report.calibration_figures import (
-    coverage_figure,
-    depth_error_figure,
-    errors_figure,
-    rows_figure,
-)
 from recon.report.epipolar import EpipolarImage, epipolar_figure, level_lines, spread_points
 from recon.report.page import write_page
-from recon.rig.calibrate.quality import shared_pixels
+from recon.report.style import BAD, ESTIMATE, FAINT, HALF_IN, INK, WIDE_IN, styled, to_png
+from recon.rig.calibrate.bootstrap import CONFIDENCE, MATCH_SIGMA_PX
 from recon.rig.calibrate.result import CalibrationRun
+from recon.rig.calibrate.summary import shared_pixels
 from recon.run.directory import RunDirectory
 from recon.stereo.rectify.epipolar import epipolar_curves
 from recon.stereo.rectify.rectifier import Rectifier
+
+_CELLS: Final = (8, 6)
 
 
 def write_calibration_page(run: CalibrationRun, directory: RunDirectory) -> None:
@@ -52,7 +55,7 @@ def write_calibration_page(run: CalibrationRun, directory: RunDirectory) -> None
 
 
 def epipolar_images(run: CalibrationRun) -> tuple[bytes, bytes]:
-    """PNGs of the view with median error: raw with epipolar curves, rectified with rows."""
+    """Draw the view with median error: raw with epipolar curves, rectified with rows."""
     view = run.fit.views[int(np.argsort(run.fit.errors_px.sum(axis=1))[len(run.fit.views) // 2])]
     left_px, right_px = shared_pixels(view)
     chosen = spread_points(left_px)
@@ -73,3 +76,89 @@ def epipolar_images(run: CalibrationRun) -> tuple[bytes, bytes]:
         EpipolarImage(rectified.right, placed[1], rows, "Right, rectified: rows of the left"),
     )
     return raw, level
+
+
+@styled
+def coverage_figure(run: CalibrationRun) -> bytes:
+    """Draw all corners found in both images, over the cells of the coverage measure."""
+    width, height = run.seen.size_px
+    figure = Figure((WIDE_IN, WIDE_IN / 2 * height / width + 0.5))
+    for side, axes in enumerate(figure.subplots(1, 2)):
+        name = ("left", "right")[side]
+        colours = colormaps["turbo"](np.linspace(0.05, 0.95, len(run.fit.views)))
+        for view, colour in zip(run.fit.views, colours, strict=True):
+            axes.plot(*view.seen[side].pixels.T, ".", color=colour, markersize=3.5, alpha=0.8)
+        share = run.summary[f"coverage_{name}"]
+        axes.set_title(f"{name.capitalize()}: {100 * share:.0f} % of the cells")
+        _frame(axes, width, height)
+    return to_png(figure)
+
+
+@styled
+def errors_figure(run: CalibrationRun) -> bytes:
+    """Draw the RMS error of each view in both images, including dropped views."""
+    names = [*(view.name for view in run.fit.views), *run.fit.dropped]
+    used = len(run.fit.views)
+    figure = Figure((WIDE_IN, 3.4))
+    axes = figure.subplots()
+    place = np.arange(used)
+    axes.bar(place - 0.2, run.fit.errors_px[:, 0], 0.38, label="left")
+    axes.bar(place + 0.2, run.fit.errors_px[:, 1], 0.38, label="right")
+    if run.fit.dropped:
+        gone = np.arange(used, len(names))
+        axes.bar(gone, list(run.fit.dropped.values()), 0.6, color=BAD, label="dropped")
+        axes.set_yscale("log")
+    axes.axhline(run.fit.rms_px, color=INK, linewidth=1, linestyle="--")
+    axes.set_ylabel("rms error, px")
+    axes.set_xticks(np.arange(len(names)), names, rotation=60, ha="right", fontsize=7)
+    axes.legend(ncols=3)
+    return to_png(figure)
+
+
+@styled
+def rows_figure(run: CalibrationRun) -> bytes:
+    """Draw the row differences of the corners after rectification."""
+    figure = Figure((HALF_IN, 3.4))
+    axes = figure.subplots()
+    reach = max(float(np.quantile(np.abs(run.rows_px), 0.999)), 0.05)
+    axes.hist(run.rows_px, bins=list(np.linspace(-reach, reach, 61)))
+    axes.axvline(0, color=INK, linewidth=1)
+    axes.set(xlabel="row left − row right, px", ylabel="corners")
+    return to_png(figure)
+
+
+@styled
+def depth_error_figure(run: CalibrationRun) -> bytes:
+    """Draw the depth error by depth: from matching, and from calibration with its interval."""
+    errors = run.spread.depths
+    known = [each for each in errors if np.isfinite(each.calibration_m)]
+    known_m = [each.depth_m for each in known]
+    matching = [100 * each.matching_m for each in errors]
+    calibration = [100 * each.calibration_m for each in known]
+    reach = [100 * max(abs(each.low_m), abs(each.high_m)) for each in known]
+    figure = Figure((HALF_IN, 3.4))
+    axes = figure.subplots()
+    axes.plot(
+        [each.depth_m for each in errors],
+        matching,
+        "o-",
+        color=FAINT,
+        label=f"matching to {MATCH_SIGMA_PX:g} px",
+    )
+    axes.plot(known_m, calibration, "o-", color=ESTIMATE, label="calibration, over the image")
+    label = f"{100 * CONFIDENCE:.0f} % interval, middle of the image"
+    axes.fill_between(known_m, 1e-3, reach, color=ESTIMATE, alpha=0.15, linewidth=0, label=label)
+    axes.set(xscale="log", yscale="log", xlabel="depth, m", ylabel="depth error, cm")
+    axes.set_ylim(bottom=max(min([*matching, *calibration]) / 3, 1e-3))
+    axes.set_xticks([each.depth_m for each in errors], [f"{each.depth_m:g}" for each in errors])
+    axes.minorticks_off()
+    axes.legend(fontsize=8)
+    return to_png(figure)
+
+
+def _frame(axes: Axes, width: int, height: int) -> None:
+    """Draw the cells of an image, and its border."""
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+    axes.set_xticks(np.linspace(0, width, _CELLS[0] + 1)[1:-1], [])
+    axes.set_yticks(np.linspace(0, height, _CELLS[1] + 1)[1:-1], [])
+    axes.spines[:].set(visible=True, color=FAINT)

@@ -147,7 +147,7 @@ def colour_values(
 def value_range(
     values: NDArray[Any], low: float | None = None, high: float | None = None
 ) -> tuple[float, float]:
-    """Limits of a colour scale: as given, else the 1st and 99th percentile; never empty."""
+    """Return limits of a colour scale: as given, else the 1st and 99th percentile; never empty."""
     finite = np.asarray(values)[np.isfinite(values)]
     if finite.size:
         found_low, found_high = np.percentile(finite, (1.0, 99.0))
@@ -159,6 +159,6 @@ def value_range(
 
 
 def unit_colour(colour: Rgb) -> tuple[float, float, float]:
-    """A colour for matplotlib, with components in [0, 1]."""
+    """Return a colour for matplotlib, with components in [0, 1]."""
     red, green, blue = colour
     return red / 255, green / 255, blue / 255

@@ -62,13 +62,13 @@ def write_epipolar_images(run: RectifyRun, directory: RunDirectory) -> None:
 
 
 def level_lines(pixels: Float64, width_px: int) -> list[Float64]:
-    """The rows of the points, as lines across the image."""
+    """Return the rows of the points, as lines across the image."""
     return [np.array([[0.0, y], [width_px - 1.0, y]]) for _, y in pixels]
 
 
 @styled
 def epipolar_figure(left: EpipolarImage, right: EpipolarImage) -> bytes:
-    """PNG of both images side by side; a point and its line have the same colour in both."""
+    """Draw both images side by side; a point and its line have the same colour in both."""
     height, width = left.image.shape[:2]
     figure = Figure((WIDE_IN, WIDE_IN / 2 * height / width + 0.4))
     for axes, image in zip(figure.subplots(1, 2), (left, right), strict=True):
@@ -77,7 +77,7 @@ def epipolar_figure(left: EpipolarImage, right: EpipolarImage) -> bytes:
 
 
 def spread_points(pixels: Float64, count: int = 10) -> Float64:
-    """int64 (M,), indices of at most ``count`` points, evenly spread by row."""
+    """Return int64 (M,), indices of at most ``count`` points, evenly spread by row."""
     order = np.argsort(pixels[:, 1])
     picked = np.unique(np.linspace(0, len(order) - 1, min(count, len(order))).astype(int))
     return np.asarray(order[picked])

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from recon.core.geometry.triangulation import depth_from_disparity, disparity_from_depth
+from recon.core.geometry.projection import depth_from_disparity, disparity_from_depth
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import UInt8
 from recon.report.colour import (
@@ -45,12 +45,12 @@ _DEPTH_STEPS = ((1.0, 2.0, 5.0), (3.0, 4.0, 6.0, 8.0), (1.5, 2.5, 3.5, 4.5, 7.0,
 
 
 def is_wide(shape: tuple[int, ...]) -> bool:
-    """Whether images of this shape (H, W, …) need the whole width of a page."""
+    """Return whether images of this shape (H, W, …) need the whole width of a page."""
     return shape[1] >= _WIDE_ASPECT * shape[0]
 
 
 def stereo_figures(pair: RectifiedPair, disparity: Disparity) -> dict[str, Any]:
-    """The figures of a pair and of the results for its pixels, and what their captions need."""
+    """Draw a pair and the results for its pixels; also return what their captions need."""
     return {
         "pair": pair_figure(pair),
         "disparity": disparity_figure(disparity, pair.camera),
@@ -64,7 +64,7 @@ def stereo_figures(pair: RectifiedPair, disparity: Disparity) -> dict[str, Any]:
 
 @styled
 def pair_figure(pair: RectifiedPair) -> bytes:
-    """Both rectified images: stacked if they are wide, else side by side."""
+    """Draw both rectified images: stacked if they are wide, else side by side."""
     height, width = pair.left.shape
     rows, columns = (2, 1) if is_wide(pair.left.shape) else (1, 2)
     figure = Figure((WIDE_IN, (WIDE_IN / columns * height / width + 0.3) * rows))
@@ -77,7 +77,7 @@ def pair_figure(pair: RectifiedPair) -> bytes:
 
 @styled
 def disparity_figure(disparity: Disparity, camera: RectifiedCamera) -> bytes:
-    """The disparity map, with a scale in pixels below it and in metres of depth above that."""
+    """Draw the disparity map, with scales in pixels below it and in metres of depth above that."""
     limits = value_range(disparity.values)
     figure = _image(colour_disparity(disparity.values, *limits))
     bar = _colour_bar(figure, DISPARITY_SCALE, limits, "disparity in pixels")
@@ -87,7 +87,7 @@ def disparity_figure(disparity: Disparity, camera: RectifiedCamera) -> bytes:
 
 @styled
 def depth_figure(depth_m: NDArray[Any]) -> bytes:
-    """A depth map (H, W) in metres, NaN = unknown; the scale is logarithmic, near is red."""
+    """Draw a depth map (H, W) in metres, NaN = unknown; the scale is logarithmic, near is red."""
     known_m = np.where(depth_m > 0, depth_m, np.nan)
     low, high = value_range(known_m)
     low = max(low, 1e-3)
@@ -103,7 +103,7 @@ def depth_figure(depth_m: NDArray[Any]) -> bytes:
 
 @styled
 def confidence_figure(disparity: Disparity) -> bytes:
-    """The confidence of each match, from 0 to 1."""
+    """Draw the confidence of each match, from 0 to 1."""
     figure = _image(colour_confidence(disparity.confidence))
     _colour_bar(figure, CONFIDENCE_SCALE, (0.0, 1.0), "confidence (dark: no match)")
     return to_png(figure)
@@ -111,7 +111,7 @@ def confidence_figure(disparity: Disparity) -> bytes:
 
 @styled
 def error_figure(error_px: NDArray[Any], limit_px: float) -> bytes:
-    """Absolute disparity error of each pixel, up to ``limit_px``; NaN = not compared."""
+    """Draw the absolute disparity error of each pixel, up to ``limit_px``; NaN = not compared."""
     figure = _image(colour_error(error_px, limit_px))
     label = "absolute disparity error in pixels (dark: not compared)"
     _colour_bar(figure, ERROR_SCALE, (0.0, limit_px), label, extend="max")
@@ -120,7 +120,7 @@ def error_figure(error_px: NDArray[Any], limit_px: float) -> bytes:
 
 @styled
 def reasons_figure(disparity: Disparity) -> bytes:
-    """Why each pixel has a disparity or not, and the share of each reason."""
+    """Draw why each pixel has a disparity or not, and the share of each reason."""
     figure = _image(colour_reasons(disparity.reason))
     handles = [
         colour_key(f"{REASON_LABELS[reason]} {100 * share:.1f} %", REASON_COLOURS[reason])
@@ -133,14 +133,14 @@ def reasons_figure(disparity: Disparity) -> bytes:
 
 
 def colour_key(label: str, colour: tuple[int, int, int]) -> Patch:
-    """An entry of a legend: what a colour stands for."""
+    """Return an entry of a legend: what a colour stands for."""
     return Patch(facecolor=unit_colour(colour), edgecolor=FAINT, linewidth=0.5, label=label)
 
 
 def depth_marks(
     low_m: float, high_m: float, place: Callable[[float], float], limits: tuple[float, float]
 ) -> list[float]:
-    """Round depths to mark on a scale, as many as there is room for labels.
+    """Return round depths to mark on a scale, as many as there is room for labels.
 
     Args:
         low_m: Smallest depth on the scale, > 0.
@@ -164,7 +164,7 @@ def depth_marks(
 
 
 def reason_shares(reason: UInt8) -> dict[Reason, float]:
-    """Share of the pixels, in [0, 1], for each reason that occurs; the largest first."""
+    """Return share of the pixels, in [0, 1], for each reason that occurs; the largest first."""
     counts = np.bincount(reason.ravel(), minlength=len(Reason))
     total = max(int(counts.sum()), 1)
     order = sorted(Reason, key=lambda code: -int(counts[code]))
@@ -172,7 +172,7 @@ def reason_shares(reason: UInt8) -> dict[Reason, float]:
 
 
 def _image(image: UInt8) -> Figure:
-    """An image that fills the width of its figure, with room for a scale or legend below."""
+    """Return an image that fills the width of its figure, with room for a scale or legend below."""
     height, width = image.shape[:2]
     width_in = WIDE_IN if is_wide(image.shape) else HALF_IN
     height_in = width_in * height / width + _BELOW_IN

@@ -23,7 +23,7 @@ def write_map_page(run: MapRun, directory: RunDirectory) -> None:
 
 
 def map_content(run: MapRun) -> Json:
-    """What the page of a drive shows: map and path first, then the data behind them."""
+    """Return what the page of a drive shows: map and path first, then the data behind them."""
     sample = run.mapped.sample
     return {
         "run": run,

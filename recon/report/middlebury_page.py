@@ -81,7 +81,7 @@ def write_middlebury_page(summary: Mapping[str, Any], directory: RunDirectory) -
 
 @styled
 def reliability_figure(matchers: Mapping[str, Curves]) -> bytes:
-    """Fraction of correct pixels by confidence (reliability diagram).
+    """Draw the fraction of correct pixels by confidence (reliability diagram).
 
     Bins with less than a thousandth of the pixels are left out; the bars show the distribution of
     the pixels over the bins.
@@ -106,7 +106,7 @@ def reliability_figure(matchers: Mapping[str, Curves]) -> bytes:
 
 @styled
 def sparsification_figure(matchers: Mapping[str, Curves]) -> bytes:
-    """Fraction of wrong pixels among the rest as the least confident ones are removed."""
+    """Draw the fraction of wrong pixels left as the least confident ones are removed."""
     figure = Figure((HALF_IN, 5.0))
     axes = figure.subplots()
     for n, (name, curves) in enumerate(matchers.items()):
@@ -124,12 +124,12 @@ def sparsification_figure(matchers: Mapping[str, Curves]) -> bytes:
 
 
 def _floats(values: Any) -> Any:
-    """float64 array, with NaN for None."""
+    """Return float64 array, with NaN for None."""
     return np.array(values, dtype=np.float64)
 
 
 def _scene(scene: str, summary: Mapping[str, Any], directory: RunDirectory) -> dict[str, Any]:
-    """What the page shows of a scene: one row of images per matcher."""
+    """Return what the page shows of a scene: one row of images per matcher."""
     names = [name for name, found in summary["matchers"].items() if scene in found["scenes"]]
     buffer = io.BytesIO()
     rows = [_both_images(directory, name, scene) for name in names]
@@ -138,7 +138,7 @@ def _scene(scene: str, summary: Mapping[str, Any], directory: RunDirectory) -> d
 
 
 def _both_images(directory: RunDirectory, matcher: str, scene: str) -> Image.Image:
-    """Disparity and error side by side."""
+    """Return disparity and error side by side."""
     stem = f"pictures/{matcher}/{scene}"
     found = Image.open(directory.path(f"{stem}_disparity.png"))
     # The error has the size of the ground truth, which is that of no or every matcher's result.
@@ -150,7 +150,7 @@ def _both_images(directory: RunDirectory, matcher: str, scene: str) -> Image.Ima
 
 
 def _joined(images: list[Image.Image], *, down: bool) -> Image.Image:
-    """Images of one size below or beside each other, with white gaps."""
+    """Return images of one size below or beside each other, with white gaps."""
     width, height = images[0].size
     step = (0, height + _GAP_PX) if down else (width + _GAP_PX, 0)
     last = len(images) - 1

@@ -20,7 +20,7 @@ _KINDS: Final = (("nonocc", "dense"), ("nonocc", "sparse"), ("all", "dense"), ("
 
 
 def middlebury_tables(summary: Figures) -> list[Table]:
-    """All tables: weighted means of each mask and filling, then figures of each scene."""
+    """Return all tables: weighted means of each mask and filling, then figures of each scene."""
     matchers, mean = summary["matchers"], _mean_title(summary)
     tables = [
         _weighted_table(f"{mean}, {mask}, {holes}", matchers, mask, holes) for mask, holes in _KINDS
@@ -41,12 +41,12 @@ def middlebury_tables(summary: Figures) -> list[Table]:
 
 
 def scene_names(matchers: Figures) -> list[str]:
-    """Names of the scenes for which any matcher has a result, in order."""
+    """Return names of the scenes for which any matcher has a result, in order."""
     return list(dict.fromkeys(name for found in matchers.values() for name in found["scenes"]))
 
 
 def csv_table(summary: Figures) -> str:
-    """All figures of all matchers: one row per scene, mask and filling.
+    """Return all figures of all matchers: one row per scene, mask and filling.
 
     Figures of the confidence are in the rows they refer to: all pixels that have a value.
     """
@@ -89,7 +89,7 @@ def _confidence_table(title: str, matchers: Figures) -> Table:
 def _scene_table(
     title: str, matchers: Figures, pick: Callable[[Figures], float | None], digits: int = 2
 ) -> Table:
-    """One row per scene, one column per matcher."""
+    """Return one row per scene, one column per matcher."""
     rows: list[Row] = []
     for scene in scene_names(matchers):
         ones = (found["scenes"].get(scene) for found in matchers.values())
@@ -104,12 +104,12 @@ def _bad(limit: str, figures: Figures) -> float | None:
 
 
 def _rated(name: str, figures: Figures) -> float | None:
-    """A figure of the confidence; None if the matcher has no confidence."""
+    """Return a figure of the confidence; None if the matcher has no confidence."""
     return (figures.get("confidence") or {}).get(name)
 
 
 def _cells(figures: Figures, mask: str, holes: str) -> list[Any]:
-    """Cells in the order of the header; the invalid share is that of the unfilled map."""
+    """Return cells in the order of the header; the invalid share is that of the unfilled map."""
     one = figures[mask][holes]
     bad = [one["bad"][limit] for limit in _LIMITS]
     return [*bad, figures[mask]["invalid"], *(one[name] for name in _LENGTHS)]

@@ -59,7 +59,7 @@ def render_page(name: str, **content: Any) -> str:
 
 
 def page_environment() -> Environment:
-    """Jinja with our templates and filters, for one page."""
+    """Make Jinja with our templates and filters, for one page."""
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).with_name("templates")),
         autoescape=True,
@@ -82,7 +82,7 @@ def page_environment() -> Environment:
 
 
 def command_line() -> str:
-    """The command line of this process, or "" if it is not one of recon."""
+    """Return the command line of this process, or "" if it is not one of recon."""
     program = Path(sys.argv[0] if sys.argv else "")
     started = program.name in {"recon", "recon.exe"} or program.parts[-2:] == (
         "recon",
@@ -92,7 +92,7 @@ def command_line() -> str:
 
 
 def summary_rows(summary: Mapping[Any, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Names and texts of a nested mapping, one row per leaf."""
+    """Return names and texts of a nested mapping, one row per leaf."""
     rows: list[tuple[str, str]] = []
     for key, value in summary.items():
         if not prefix and key in _NOT_TABULATED:
@@ -121,23 +121,23 @@ def _text(value: Any) -> str:
 
 
 def _timing(summary: Mapping[str, Any]) -> bytes:
-    """The figure of the time by stage; empty if no stage was measured."""
+    """Draw the time by stage; empty if no stage was measured."""
     stages = {name: s for name, s in (summary.get("stages") or {}).items() if _is_number(s)}
     return timing_figure(stages) if stages else b""
 
 
 def _is_number(value: Any) -> bool:
-    """Whether a value of a summary is a finite number."""
+    """Return whether a value of a summary is a finite number."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _packed_plotly() -> str:
-    """plotly.js, compressed: a third of its size, and no URL of it appears in the file."""
+    """Return plotly.js, compressed: a third of its size, and no URL of it appears in the file."""
     return base64.b64encode(gzip.compress(get_plotlyjs().encode("utf-8"), mtime=0)).decode("ascii")
 
 
 def _embedded(png: bytes) -> str:
-    """The URL of an image, as WebP if that is smaller (a quarter for noisy ones), else as PNG."""
+    """Return the URL of an image, as WebP if that is smaller (a quarter if noisy), else as PNG."""
     buffer = io.BytesIO()
     with Image.open(io.BytesIO(png)) as image:
         image.convert("RGB").save(buffer, "WEBP", quality=_WEBP_QUALITY)
@@ -146,5 +146,5 @@ def _embedded(png: bytes) -> str:
 
 
 def _words(name: str) -> list[str]:
-    """The words of the name of a figure, between which a line may break."""
+    """Return the words of the name of a figure, between which a line may break."""
     return re.split(r"(?<=[._])(?=[a-z])", name)

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.geometry.projection import depth_from_disparity
 from recon.io.images.image import write_image
 from recon.report.colour import colour_confidence, colour_disparity, colour_reasons
 from recon.report.images import error_figure, stereo_figures
@@ -44,7 +44,7 @@ def write_disparity_images(run: PairRun, directory: RunDirectory) -> None:
 
 
 def pair_content(run: PairRun) -> Json:
-    """What the page of a pair shows: disparity, accuracy and 3-D view."""
+    """Return what the page of a pair shows: disparity, accuracy and 3-D view."""
     scene = Scene(T_UPRIGHT_CAMERA, run.cloud, run.mesh, eye_m=_beside_camera(run))
     error: bytes | None = None
     if run.truth is not None and run.truth.values.shape == run.disparity.values.shape:
@@ -60,7 +60,7 @@ def pair_content(run: PairRun) -> Json:
 
 
 def _beside_camera(run: PairRun) -> tuple[float, float, float]:
-    """A viewpoint slightly behind, left of and above the camera, from which depth is visible."""
+    """Return a viewpoint behind, left of and above the camera, from which depth is visible."""
     depth_m = depth_from_disparity(run.disparity.values, run.pair.camera)
     known = depth_m[np.isfinite(depth_m)]
     far = float(np.median(known)) if known.size else 1.0

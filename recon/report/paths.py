@@ -50,7 +50,7 @@ def path_figure(
     T_map_world: NDArray[Any],
     health: Sequence[OdometryHealth] = (),
 ) -> bytes:
-    """Top view of the path in map axes; poses that are not trusted are marked.
+    """Draw the path in map axes from above; poses that are not trusted are marked.
 
     Args:
         estimate: The estimated path.
@@ -75,7 +75,7 @@ def loops_figure(
     loops: Sequence[tuple[int, int]],
     T_map_world: NDArray[Any],
 ) -> bytes:
-    """The path before and after loop closure, and the gaps that were closed.
+    """Draw the path before and after loop closure, and the gaps that were closed.
 
     Args:
         before: The path by odometry.
@@ -96,7 +96,7 @@ def loops_figure(
 
 
 def compared_paths_figure(comparison: TrajectoryComparison) -> bytes:
-    """Both paths, projected on the two world axes along which the true one extends farthest."""
+    """Draw both paths on the two world axes along which the true one extends farthest."""
     axes = list(widest_axes(comparison.truth.positions_m))
     truth, estimate = (
         path.positions_m[:, axes] for path in (comparison.truth, comparison.estimate)
@@ -123,7 +123,7 @@ def _top_view(lines: Sequence[Line], path: Float64, labels: tuple[str, str]) -> 
 def drift_figure(
     estimate: Trajectory, truth: Trajectory, health: Sequence[OdometryHealth] = ()
 ) -> bytes:
-    """Drift of position and rotation from ground truth, with both paths starting at the identity.
+    """Draw the drift of position and rotation, with both paths starting at the identity.
 
     Args:
         estimate: The estimated path.
@@ -148,7 +148,7 @@ def drift_figure(
 
 @styled
 def pose_errors_figure(comparison: TrajectoryComparison) -> bytes:
-    """Position and rotation error of each aligned pose, along the true path."""
+    """Draw position and rotation error of each aligned pose, along the true path."""
     degrees = np.degrees(comparison.rotation_errors_rad)
     figure, (upper, _) = _errors_along(comparison.truth, comparison.position_errors_m, degrees)
     upper.axhline(comparison.metrics.ate_m, color=FAINT, linestyle="--", label="root mean square")
@@ -171,7 +171,7 @@ def _errors_along(
 
 @styled
 def errors_by_length_figure(comparison: TrajectoryComparison, *, rotation: bool) -> bytes:
-    """Relative error of the segments by length: mean and interquartile range."""
+    """Draw the relative error of the segments by length: mean and interquartile range."""
     values = comparison.segment_deg_per_100m if rotation else comparison.segment_percent
     lengths = np.unique(comparison.segments.length_m)
     groups = [values[comparison.segments.length_m == length] for length in lengths]
@@ -189,7 +189,7 @@ def errors_by_length_figure(comparison: TrajectoryComparison, *, rotation: bool)
 
 
 def widest_axes(positions_m: Float64) -> tuple[int, int]:
-    """The two axes along which a path extends farthest, in order of the axes."""
+    """Return the two axes along which a path extends farthest, in order of the axes."""
     first, second = sorted(np.argsort(-np.ptp(positions_m, axis=0), kind="stable")[:2].tolist())
     return first, second
 
@@ -198,7 +198,7 @@ def widest_axes(positions_m: Float64) -> tuple[int, int]:
 def grid_figure(
     grid: OccupancyGrid, trajectory: Trajectory | None, T_map_world: NDArray[Any]
 ) -> bytes:
-    """The occupancy grid with the path; axes in metres, cropped to the known cells.
+    """Draw the occupancy grid with the path; axes in metres, cropped to the known cells.
 
     Args:
         grid: The map.
@@ -244,7 +244,7 @@ def timing_figure(stages: Mapping[str, float]) -> bytes:
 
 @styled
 def health_figure(health: Sequence[OdometryHealth]) -> bytes:
-    """Odometry health of each frame; frames whose pose is not trusted are shaded red."""
+    """Draw the odometry health of each frame; frames with an untrusted pose are shaded red."""
     rows = (
         ("inlier tracks", [float(record.inliers) for record in health]),
         ("overlap with\nthe map (share)", [record.overlap for record in health]),
@@ -268,12 +268,12 @@ def health_figure(health: Sequence[OdometryHealth]) -> bytes:
 
 
 def seen_from_above(trajectory: Trajectory, T_map_world: NDArray[Any]) -> Float64:
-    """float64 (N, 2): x and y of the camera in map axes."""
+    """Return float64 (N, 2): x and y of the camera in map axes."""
     return np.asarray(apply(T_map_world, trajectory.positions_m)[:, :2])
 
 
 def _height_in(points: NDArray[Any]) -> float:
-    """Height in inches of a wide figure that shows these (N, 2) points with equal axes."""
+    """Return the height in inches of a wide figure that shows points (N, 2) with equal axes."""
     extent = np.nanmax(points, axis=0) - np.nanmin(points, axis=0) if len(points) else np.ones(2)
     ratio = float(extent[1]) / max(float(extent[0]), 1e-9)
     return float(np.clip((WIDE_IN - 0.8) * ratio + 1.1, 3.0, 9.0))
@@ -298,7 +298,7 @@ def _mark_ends(axes: Axes, path: NDArray[Any]) -> None:
 
 
 def _bad_frames(health: Sequence[OdometryHealth], poses: int) -> NDArray[np.intp]:
-    """Indices of the poses that are not trusted."""
+    """Return indices of the poses that are not trusted."""
     return np.flatnonzero([not record.ok for record in health[:poses]])
 
 
@@ -308,7 +308,7 @@ def _shade(axes: Axes, places: NDArray[Any], width: float) -> None:
 
 
 def _crop_to_known(grid: OccupancyGrid) -> OccupancyGrid:
-    """The part of a grid with all known cells, and a margin."""
+    """Return the part of a grid with all known cells, and a margin."""
     known = np.argwhere(grid.cells != UNKNOWN)
     if not len(known):
         return grid

@@ -85,7 +85,7 @@ class Scene:
 def plot_scene(
     scene: Scene, max_points: int = MAX_POINTS, max_faces: int = MAX_FACES
 ) -> Json | None:
-    """The ``data`` and ``layout`` that plotly.js draws, as plain JSON values.
+    """Return the ``data`` and ``layout`` that plotly.js draws, as plain JSON values.
 
     ``layout.meta`` lists the colourings of the cloud, the first trace: a ``label``, and the
     ``marker`` that it gets when that one is chosen.
@@ -176,7 +176,7 @@ def _xyz(points: NDArray[Any]) -> Json:
 
 
 def _colourings(cloud: PointCloud, xyz: Float32) -> list[Json]:
-    """By the image if the points have colours, and by height."""
+    """Return colours by the image if the points have them, and by height."""
     low, high = value_range(xyz[:, 2])
     height = np.clip((xyz[:, 2] - low) / (high - low) * 255.0, 0, 255).astype(np.uint8)
     scale = {"color": height, "colorscale": _TURBO, "cmin": 0, "cmax": 255}
@@ -187,7 +187,7 @@ def _colourings(cloud: PointCloud, xyz: Float32) -> list[Json]:
 
 
 def _palette_scale(rgb: UInt8) -> Json:
-    """A scale with one colour per palette entry, and the index of each point in it."""
+    """Return a scale with one colour per palette entry, and the index of each point in it."""
     palette, index = quantise_colours(rgb)
     colours = palette if len(palette) > 1 else np.repeat(palette, 2, axis=0)
     last = len(colours) - 1
@@ -206,7 +206,7 @@ def _without_outliers(cloud: PointCloud) -> PointCloud:
 
 
 def _visible_points(cloud: PointCloud | None, scene: Scene) -> Float64:
-    """float64 (N, 3): the initially visible points, view axes."""
+    """Return float64 (N, 3): the initially visible points, view axes."""
     parts = [np.zeros((0, 3)), *(path for _, path in scene.paths)]
     if cloud is not None and len(cloud):
         parts.append(cloud.xyz.astype(np.float64))
@@ -240,7 +240,7 @@ def _named(values: Float64) -> dict[str, float]:
 
 
 def _bounding_box(seen: Float64) -> Float64:
-    """float64 (2, 3): bounds of points, with a small margin."""
+    """Return float64 (2, 3): bounds of points, with a small margin."""
     if not len(seen):
         return np.array([[-1.0] * 3, [1.0] * 3])
     middle, half = (seen.max(axis=0) + seen.min(axis=0)) / 2, np.ptp(seen, axis=0) / 2
@@ -249,7 +249,7 @@ def _bounding_box(seen: Float64) -> Float64:
 
 
 def _whole_view(seen: Float64) -> tuple[Float64, Float64]:
-    """The viewpoint that sees all points, and in which they fill most of the view.
+    """Return the viewpoint that sees all points, and in which they fill most of the view.
 
     Args:
         seen: float64 (N, 3), in units of plotly relative to the centre of the box.
@@ -264,7 +264,7 @@ def _whole_view(seen: Float64) -> tuple[Float64, Float64]:
 
 
 def _view_from(points: Float64, turn_rad: float, above_rad: float) -> tuple[int, Float64, Float64]:
-    """The nearest view of all points from one direction: cells filled, viewpoint, look-at point."""
+    """Return the nearest view of all points from one direction: filled cells, eye, look-at."""
     level = -np.array([np.cos(turn_rad), np.sin(turn_rad), 0.0])
     towards = np.cos(above_rad) * level + [0.0, 0.0, np.sin(above_rad)]
     across = np.array([-level[1], level[0], 0.0])

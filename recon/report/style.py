@@ -27,7 +27,7 @@ styled = matplotlib.style.context(Path(__file__).with_name("figures.mplstyle"))
 
 
 def bare_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure whose axes are placed by hand."""
+    """Return an empty figure whose axes are placed by hand."""
     figure = Figure((width_in, height_in))
     figure.set_layout_engine("none")
     return figure
@@ -53,6 +53,6 @@ def write_note(axes: Axes, text: str) -> None:
 
 
 def nice_length(target: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is at most ``target`` (> 0)."""
+    """Return the largest of 1, 2, 5 times a power of ten that is at most ``target`` (> 0)."""
     power = 10.0 ** math.floor(math.log10(target))
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= target * (1 + 1e-9))

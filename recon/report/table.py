@@ -65,7 +65,7 @@ class Table:
         return "\n".join([*lines, r"\end{tabular}"])
 
     def best_cells(self) -> set[tuple[int, int]]:
-        """Row and column of the smallest number, as it is shown, of each line of several."""
+        """Return row and column of the smallest number, as it is shown, of each line of several."""
         lines: dict[int, dict[tuple[int, int], float]] = {}
         for r, row in enumerate(self.rows if self.best != "nowhere" else ()):
             for c, cell in enumerate(row):

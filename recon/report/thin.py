@@ -12,7 +12,7 @@ from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
 
 
 def thin_cloud(cloud: PointCloud, limit: int) -> PointCloud:
-    """At most ``limit`` points, evenly spread: the first one of each cell of a coarse grid."""
+    """Return at most ``limit`` points, evenly spread: the first of each cell of a coarse grid."""
     kept = np.arange(len(cloud))
     longest_m = float(np.ptp(cloud.xyz, axis=0).max()) if len(cloud) else 0.0
     # At first more than ``limit`` cells on a face of the bounding cube.
@@ -24,7 +24,7 @@ def thin_cloud(cloud: PointCloud, limit: int) -> PointCloud:
 
 
 def thin_mesh(mesh: TriangleMesh, limit: int) -> TriangleMesh:
-    """At most about ``limit`` triangles, by merging vertices that share a cell.
+    """Return at most about ``limit`` triangles, by merging vertices that share a cell.
 
     Degenerate triangles are removed. For display, not for measurement.
     """
@@ -40,7 +40,7 @@ def thin_mesh(mesh: TriangleMesh, limit: int) -> TriangleMesh:
 
 
 def thin_grid(grid: OccupancyGrid, limit: int) -> OccupancyGrid:
-    """A grid of larger cells, at most ``limit`` per side, for figures of large maps.
+    """Return a grid of larger cells, at most ``limit`` per side, for figures of large maps.
 
     A larger cell is occupied if any of its cells is, else free if any is, so that no obstacle is
     lost.
@@ -55,7 +55,7 @@ def thin_grid(grid: OccupancyGrid, limit: int) -> OccupancyGrid:
 
 
 def _cell_numbers(xyz: NDArray[Any], cell_m: float) -> NDArray[np.int64]:
-    """int64 (N,): the number of the cell of each point."""
+    """Return int64 (N,): the number of the cell of each point."""
     cells = np.floor((xyz - xyz.min(axis=0)) / cell_m).astype(np.int64)
     return np.asarray(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)))
 

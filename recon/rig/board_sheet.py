@@ -105,7 +105,7 @@ def write_board(
 
 
 def choose_sheet(board: CalibrationBoard, paper: str | None = None) -> Sheet:
-    """The paper for a board, in portrait or landscape orientation.
+    """Return the paper for a board, in portrait or landscape orientation.
 
     Raises:
         SettingsError: The paper is unknown, or the board does not fit.
@@ -140,7 +140,7 @@ def _turned(name: str, board: CalibrationBoard) -> Sheet:
 
 
 def _scale_to_fit(board: CalibrationBoard, sheet: Sheet) -> float:
-    """The factor by which the squares could grow (above 1) or must shrink on a sheet."""
+    """Return the factor by which the squares could grow (above 1) or must shrink on a sheet."""
     scales = []
     sides = zip((sheet.width_mm, sheet.height_mm), board.squares, strict=True)
     for paper_mm, squares in sides:
@@ -151,7 +151,7 @@ def _scale_to_fit(board: CalibrationBoard, sheet: Sheet) -> float:
 
 
 def _whole_pixels(board: CalibrationBoard, dpi: float) -> float:
-    """The resolution nearest to ``dpi`` at which a square has a whole number of pixels."""
+    """Return the resolution nearest to ``dpi`` at which a square has a whole number of pixels."""
     square_in = 1e3 * board.square_m / _MM_PER_IN
     return max(round(square_in * dpi), 1) / square_in
 
@@ -188,7 +188,7 @@ def _draw(board: CalibrationBoard, sheet: Sheet, kind: str, dpi: float) -> bytes
 
 
 def _page(figure: Figure, sheet: Sheet) -> Axes:
-    """Axes over the whole sheet, in millimetres from its upper left corner."""
+    """Return axes over the whole sheet, in millimetres from its upper left corner."""
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set_axis_off()
     axes.set_xlim(0, sheet.width_mm)
@@ -197,7 +197,7 @@ def _page(figure: Figure, sheet: Sheet) -> Axes:
 
 
 def _outline(boxes_mm: Float64) -> Outline:
-    """All boxes (N, 4) as one path, so that neighbours are filled without a seam."""
+    """Return all boxes (N, 4) as one path, so that neighbours are filled without a seam."""
     x0, y0, x1, y1 = boxes_mm.T
     corners = np.stack([x0, y0, x1, y0, x1, y1, x0, y1, x0, y0], axis=1).reshape(-1, 2)
     one = [Outline.MOVETO, Outline.LINETO, Outline.LINETO, Outline.LINETO, Outline.CLOSEPOLY]
@@ -205,7 +205,7 @@ def _outline(boxes_mm: Float64) -> Outline:
 
 
 def _note(axes: Axes, board: CalibrationBoard, sheet: Sheet, margin_mm: float) -> None:
-    """A description of the board, and a ruler to check the scale of a print."""
+    """Draw a description of the board, and a ruler to check the scale of a print."""
     size_mm = min(2.5, 0.2 * margin_mm)
     y = sheet.height_mm - max(0.4 * margin_mm, 5.0)
     ruler_mm = min(_RULER_MM, 10 * (sheet.width_mm // 25))

@@ -16,13 +16,13 @@ from recon.core.values import SequenceTruth, StereoPair, check_size
 from recon.core.values.arrays import Float64, UInt8
 from recon.io.images.image import decode_image
 from recon.io.images.ros_image import pixels_of_ros_image
-from recon.sources.bag_rig import rig_of_messages
 from recon.sources.bag_topics import (
     camera_info_topic,
     choose_topics,
     list_others,
     list_topics,
     names_rectified,
+    rig_of_messages,
 )
 from recon.sources.files import join_pair
 from recon.sources.pairing import Roll, StampPairs, check_increasing, check_most, pair_stamps
@@ -173,7 +173,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
 
 
 def find_bags(folder: Path) -> list[Path]:
-    """The recording in a folder: the folder itself, split ROS 1 bags, or the only ROS 2 file."""
+    """Return the recording in a folder: itself, split ROS 1 bags, or the only ROS 2 file."""
     if (folder / "metadata.yaml").is_file():
         return [folder]
     parts = sorted(folder.glob("*.bag"))
@@ -215,7 +215,7 @@ def _find_files(path: Path) -> list[Path]:
 def _stamps(
     times: dict[str, NDArray[np.int64]], topics: tuple[str, str], path: Path
 ) -> tuple[tuple[Float64, Float64], str]:
-    """Timestamps of the messages of both cameras; recording times if the headers have none."""
+    """Return the times of the messages of both cameras; of recording if the headers have none."""
     empty = next((topic for topic in topics if not len(times[topic])), None)
     if empty is not None:
         raise SourceError("topic has no message", where=path, got=empty)

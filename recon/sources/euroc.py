@@ -28,8 +28,7 @@ from recon.sources.images import ImageSource, image_size, pair_listed
 from recon.sources.pairing import check_increasing
 from recon.sources.rig import Rig, as_rectified, find_calibration, read_rig
 from recon.sources.settings import SourceSettings
-from recon.sources.times import read_stamped_names
-from recon.sources.truth import truth_at
+from recon.sources.times import read_stamped_names, truth_at
 
 _TRUTH: Final = "state_groundtruth_estimate0"
 
@@ -92,7 +91,7 @@ def _with_calibration(root: Path) -> Path:
 
 
 def _read_truth(root: Path, left: Path, stamps_s: Float64) -> tuple[SequenceTruth | None, str]:
-    """Ground truth at the timestamps of the frames, and a note if it does not cover them all."""
+    """Return the truth at the times of the frames, and a note if it does not cover them all."""
     path, sensor = root / _TRUTH / "data.csv", left / "sensor.yaml"
     if not (path.is_file() and sensor.is_file()):
         return None, ""

@@ -43,8 +43,7 @@ from recon.sources.pairing import (
 )
 from recon.sources.rig import read_rig
 from recon.sources.settings import SourceSettings
-from recon.sources.times import read_times_of_pairs
-from recon.sources.truth import read_tum_truth
+from recon.sources.times import read_times_of_pairs, read_tum_truth
 
 DEFAULT_RATE_HZ: Final = 10.0
 _TIMES: Final = "times.txt"

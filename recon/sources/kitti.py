@@ -22,8 +22,7 @@ from recon.core.errors import SourceError
 from recon.core.geometry.se3 import invert
 from recon.core.values import SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
-from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset
-from recon.io.cameras.kitti_raw import read_kitti_rig
+from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset, read_kitti_rig
 from recon.io.files import StrPath
 from recon.io.trajectory import read_kitti_poses
 from recon.sources.images import (

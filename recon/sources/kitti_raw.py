@@ -17,7 +17,7 @@ from typing import Final
 
 from recon.core.errors import SourceError
 from recon.core.values import RectifiedCamera
-from recon.io.cameras.kitti_raw import read_kitti_rig
+from recon.io.cameras.kitti import read_kitti_rig
 from recon.sources.images import ImageSource, image_size, list_images, pair_listed
 from recon.sources.kitti import choose_cameras
 from recon.sources.pairing import check_increasing

@@ -108,7 +108,7 @@ def read_pair_input(
 
 
 def _with_camera(given: PairInput, known: KnownCamera) -> PairInput:
-    """The pair with a camera from what is known of it, and from the EXIF data of its image."""
+    """Return the pair with a camera from what is known of it, and from EXIF data."""
     height_px, width_px = given.pair.left.shape[:2]
     focal_px, basis = known.focal_px, ""
     if focal_px is None:

@@ -175,7 +175,7 @@ def _bounded(mark: str) -> str:
 
 
 def split_sides(names: Iterable[str]) -> tuple[list[str], list[str]]:
-    """Names of the left and of the right camera among some names, also those without a partner."""
+    """Return names of the left and of the right camera, also those without a partner."""
     known = sorted(names, key=natural_key)
     pairs = find_partners(known)
     if not pairs:
@@ -305,7 +305,7 @@ def pair_stamps(left_s: Float64, right_s: Float64, tolerance_s: float, where: st
 
 
 def _nearest(of_s: Float64, among_s: Float64) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """For each timestamp, the index of the nearest of the others; both series increase."""
+    """Return for each timestamp the index of the nearest of the others; both series increase."""
     after = np.clip(np.searchsorted(among_s, of_s), 1, max(1, len(among_s) - 1))
     before = after - 1
     after = np.minimum(after, len(among_s) - 1)

@@ -10,8 +10,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import FormatError, SourceError
-from recon.core.geometry.quaternion import rotation_from_quaternion
-from recon.core.geometry.se3 import invert, make_transform
+from recon.core.geometry.se3 import invert, make_transform, rotation_from_quaternion
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.trajectory import read_tum
@@ -113,7 +112,7 @@ def _transform(pose: BagPose) -> Float64:
 
 
 def _static_transform(bag: Bag, start: str, goal: str) -> Float64 | None:
-    """T_start_goal by the static transforms of a recording; None = they do not connect them."""
+    """Return T_start_goal by the static transforms of a recording; None = they do not connect."""
     topics = [t.name for t in bag.topics.values() if t.kind in TRANSFORMS and _STATIC in t.name]
     steps: dict[str, dict[str, Float64]] = defaultdict(dict)
     for pose in (pose for topic in topics for pose in bag.poses(topic)):

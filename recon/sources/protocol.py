@@ -79,7 +79,7 @@ class KnowsOccupancy(Protocol):
         least_frames: int,
         T_map_world: Float64 | None,
     ) -> OccupancyTruth:
-        """True obstacles, and which of them the drive saw, in the cells and axes of a map."""
+        """Return true obstacles, and which the drive saw, in the cells and axes of a map."""
         ...
 
 

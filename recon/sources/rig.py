@@ -59,7 +59,7 @@ def read_rig(
 
 
 def find_calibration(folder: Path) -> Path | None:
-    """The calibration file of a folder, recognised by name; the first in alphabetical order."""
+    """Return the calibration file of a folder, recognised by name; the first in the alphabet."""
     if not folder.is_dir():
         return None
     found = [path for path in folder.iterdir() if _NAME.fullmatch(path.name.lower())]
@@ -86,7 +86,7 @@ def as_rectified(rig: Rig) -> Rig:
 
 
 def _is_rectified(rig: StereoCalibration) -> bool:
-    """No distortion or rotation, a baseline along x only, and equal focal length and rows."""
+    """Return whether there is no distortion or rotation, and rows and focal lengths are equal."""
     left, right = rig.left, rig.right
     step_m = rig.T_right_left[:3, 3]
     near = _DIGITS_TOLERANCE

@@ -211,7 +211,7 @@ class Bag:
         raise FormatError("topic has no message", where=self.paths[0], got=topic)
 
     def frame_id(self, topic: str) -> str:
-        """The coordinate frame that the first message of an image topic names; empty if none."""
+        """Return the coordinate frame that the first image of a topic names; empty if none."""
         for _, _, content in self._messages([topic]):
             return str(self._parse(content, topic).header.frame_id).lstrip("/")
         return ""

@@ -97,7 +97,7 @@ class SyntheticSource:
         return self.camera.render(index)
 
     def disparity_truth(self, index: int) -> DisparityTruth:
-        """Return True disparity of one frame; NaN = sky.
+        """Return the true disparity of one frame; NaN = sky.
 
         Raises:
             SettingsError: There is no such frame.
@@ -113,7 +113,7 @@ class SyntheticSource:
         least_frames: int = 3,
         T_map_world: Float64 | None = None,
     ) -> OccupancyTruth:
-        """Return True obstacles, and which of them were seen; see `true_occupancy`."""
+        """Return the true obstacles, and which of them were seen; see `true_occupancy`."""
         return true_occupancy(
             self.camera,
             resolution_m=resolution_m,

@@ -20,8 +20,7 @@ from recon.sources.images import ImageSource, image_size, is_image, pair_listed
 from recon.sources.pairing import check_increasing, find_partners
 from recon.sources.rig import read_rig
 from recon.sources.settings import SourceSettings
-from recon.sources.times import read_stamped_names
-from recon.sources.truth import read_tum_truth
+from recon.sources.times import read_stamped_names, read_tum_truth
 
 
 def open_tum(folder: Path, settings: SourceSettings) -> ImageSource:

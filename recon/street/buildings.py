@@ -154,7 +154,7 @@ def _leaf(door: Float64, paint: Paint) -> TriangleSoup:
 
 
 def _windows(holes: Float64, rng: np.random.Generator) -> TriangleSoup:
-    """Glass behind frames with one mullion and one transom; each window is its own object."""
+    """Return glass behind frames with a mullion and a transom; each window is an object."""
     parts = rng.integers(1, 2**30, len(holes))
     x0, z0, x1, z1 = holes.T
     w, h, f = x1 - x0, z1 - z0, np.full(len(holes), _FRAME_M)

@@ -1,15 +1,16 @@
-"""From radiance to pixels: antialiasing, tone curve, sensor."""
+"""From radiance to pixels: the view of a camera, antialiasing, tone curve, sensor."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, UInt8
 from recon.street.materials import GAMMA
 from recon.street.stage import Sample, Stage
-from recon.street.view import View
 
 _QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 _CREASE: Final = 0.92  # cosine of the angle between normals, below which there is an edge
@@ -70,7 +71,7 @@ def _four_rays(stage: Stage, view: View, pixels: Float64) -> Float64:
 
 
 def _edges(sample: Sample, size: tuple[int, int]) -> Bool:
-    """bool (H·W,), pixels that differ from a neighbour in object, material, shadow or normal."""
+    """Return bool (H·W,), pixels that differ from a neighbour in object, material or normal."""
     label = sample.label.reshape(size)
     normal = sample.normal.reshape(*size, 3)
     edge = np.zeros(size, dtype=np.bool_)
@@ -83,3 +84,61 @@ def _edges(sample: Sample, size: tuple[int, int]) -> Bool:
         edge[a] |= differs
         edge[b] |= differs
     return edge.ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A pinhole camera in a scene.
+
+    Attributes:
+        T_scene_camera: float64 (4, 4).
+        focal_px: Focal length.
+        centre_px: Principal point, column and row.
+        width_px: Image width.
+        height_px: Image height.
+    """
+
+    T_scene_camera: Float64
+    focal_px: float
+    centre_px: tuple[float, float]
+    width_px: int
+    height_px: int
+
+    @property
+    def origin(self) -> Float64:
+        """float64 (3,), the camera centre in the scene."""
+        return self.T_scene_camera[:3, 3]
+
+    def pixels(self) -> Float64:
+        """Return float64 (H·W, 2), column and row of each pixel, row by row."""
+        v, u = np.mgrid[0 : self.height_px, 0 : self.width_px]
+        return np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
+
+    def directions(self, pixels: Float64) -> Float64:
+        """Return rays (N, 3) through pixels (N, 2), scene axes, of unit depth."""
+        sight = np.ones((len(pixels), 3))
+        sight[:, :2] = (pixels - self.centre_px) / self.focal_px
+        return np.asarray(sight @ self.T_scene_camera[:3, :3].T)
+
+    def project(self, xyz: Float64) -> Float64:
+        """Return pixels (N, 2) of points in the scene; NaN behind the camera."""
+        local = (xyz - self.origin) @ self.T_scene_camera[:3, :3]
+        depth = np.where(local[:, 2:] > 0, local[:, 2:], np.nan)
+        return np.asarray(self.focal_px * local[:, :2] / depth + self.centre_px)
+
+    def inside(self, pixels: Float64) -> Bool:
+        """Return bool (N,), True where a position lies within the image."""
+        u, v = pixels[:, 0], pixels[:, 1]
+        with np.errstate(invalid="ignore"):
+            in_u = (u >= -0.5) & (u < self.width_px - 0.5)
+            return np.asarray(in_u & (v >= -0.5) & (v < self.height_px - 0.5))
+
+
+def stereo_views(camera: RectifiedCamera, T_scene_left: Float64) -> tuple[View, View]:
+    """Return the left and right view of a rig with its left camera at ``T_scene_left``."""
+    T_scene_right = T_scene_left.copy()
+    T_scene_right[:3, 3] += camera.baseline_m * T_scene_left[:3, 0]
+    size = camera.width_px, camera.height_px
+    left = View(T_scene_left, camera.focal_px, (camera.cx_px, camera.cy_px), *size)
+    right = View(T_scene_right, camera.focal_px, (camera.cx_right_px, camera.cy_px), *size)
+    return left, right

@@ -132,7 +132,7 @@ def _variation(patch: Patch, channel: int) -> Float64:
 
 
 def _asphalt(p: Patch) -> Float64:
-    """Wheel tracks, patches, joints and worn markings; u is along the road, v to the left."""
+    """Return tracks, patches, joints and worn markings; u is along the road, v to the left."""
     v, spread_v = p.v, p.spread[:, 1]
     tracks = sum(np.exp(-(((v - c) / 0.35) ** 2)) for c in (-2.3, -0.8, 0.8, 2.3))
     repairs = tile_tone(p.uv, (5.3, 2.1), p.spread, np.zeros(len(v), dtype=int))
@@ -168,7 +168,7 @@ def _kerb(p: Patch) -> Float64:
 
 
 def _weather(p: Patch) -> Float64:
-    """Splash marks at the foot of walls, and vertical rain streaks."""
+    """Return splash marks at the foot of walls, and vertical rain streaks."""
     foot = np.exp(-np.maximum(p.height_m, 0.0) / 0.5)
     cell = np.stack([p.u, np.zeros_like(p.u)], axis=1)
     narrow = np.stack([p.spread[:, 0], np.zeros_like(p.u)], axis=1)
@@ -247,7 +247,7 @@ def _leaves(p: Patch) -> Float64:
 
 
 def _metal(p: Patch) -> Float64:
-    """Seams, so that poles have some texture."""
+    """Return seams, so that poles have some texture."""
     seams = stripes(p.v, 0.9, 0.05, p.spread[:, 1])
     return _blend(p.rgb, (0.75, 0.74, 0.7), 0.5 * seams)
 

@@ -49,7 +49,7 @@ class CentreLine:
         return float(np.interp(self._in_lap(along_m), self.along_m, self.heading_rad))
 
     def points(self, along_m: NDArray[np.float64], lateral_m: NDArray[np.float64]) -> Float64:
-        """Points (N, 2) at distances along the centre line and offsets to its left (positive)."""
+        """Return points (N, 2) at distances along the centre line and offsets to its left."""
         s = self._in_lap(along_m)
         x = np.interp(s, self.along_m, self.xy_m[:, 0])
         y = np.interp(s, self.along_m, self.xy_m[:, 1])
@@ -75,7 +75,7 @@ class CentreLine:
 
 
 def centre_line(settings: StreetScene, length_m: float) -> CentreLine:
-    """The road from 60 m before the start to ``length_m`` after it, or once around a block."""
+    """Return the road from 60 m before the start to ``length_m`` after it, or around a block."""
     if settings.path == "block":
         return _block(*settings.block_m)
     along = np.arange(-_BEFORE_M, length_m + _STEP_M, _STEP_M)

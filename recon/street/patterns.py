@@ -17,14 +17,14 @@ _NARROW = 1e-6
 
 
 def stripe(x: Float64, low: float | Float64, high: float, spread: Float64) -> Float64:
-    """Fraction (N,) of the interval ``x ± spread / 2`` that lies between ``low`` and ``high``."""
+    """Return the fraction (N,) of ``x ± spread / 2`` that lies between ``low`` and ``high``."""
     half = 0.5 * np.maximum(spread, _NARROW)
     inside = np.minimum(x + half, high) - np.maximum(x - half, low)
     return np.asarray(np.maximum(inside, 0.0) / (2.0 * half))
 
 
 def stripes(x: Float64, period: float, width: float, spread: Float64) -> Float64:
-    """Fraction (N,) of ``x ± spread / 2`` covered by stripes ``[k·period, k·period + width]``."""
+    """Return the fraction (N,) of ``x ± spread / 2`` in stripes ``k·period + [0, width]``."""
     half = 0.5 * np.maximum(spread, _NARROW)
 
     def covered(t: Float64) -> Float64:

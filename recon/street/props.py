@@ -88,7 +88,7 @@ def _wheel(x: float, y: float, part: int) -> TriangleSoup:
 
 
 def _lamps(length: float, width: float, part: int) -> list[TriangleSoup]:
-    """Head and tail lamps and number plates, 1 cm proud of the bumpers."""
+    """Return head and tail lamps and number plates, 1 cm proud of the bumpers."""
     white = Paint(Material.PLAIN, (0.85, 0.85, 0.80), part + 3)
     red = Paint(Material.PLAIN, (0.55, 0.06, 0.05), part + 4)
     plate = Paint(Material.POSTER, (0.80, 0.80, 0.72), part + 5)
@@ -181,5 +181,5 @@ def _at(x: float, y: float, z: float) -> Float64:
 
 
 def _flip() -> Float64:
-    """Half a turn about x, for shapes that narrow towards the base instead of the top."""
+    """Return half a turn about x, for shapes that narrow towards the base instead of the top."""
     return se3.make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))

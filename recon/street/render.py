@@ -10,13 +10,12 @@ from functools import cached_property
 import numpy as np
 
 from recon.core.errors import SettingsError
-from recon.core.geometry.triangulation import disparity_from_depth
+from recon.core.geometry.projection import disparity_from_depth
 from recon.core.values import DisparityTruth, StereoPair
 from recon.core.values.arrays import Float32, Float64, UInt8, freeze
-from recon.street.image import record, take_image
+from recon.street.image import View, record, stereo_views, take_image
 from recon.street.stage import Stage, make_stage
 from recon.street.street import StreetWorld
-from recon.street.view import View, stereo_views
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,7 @@ class StreetCamera:
         return depth.reshape(view.height_px, view.width_px).astype(np.float32)
 
     def disparity_truth(self, index: int) -> DisparityTruth:
-        """Return True disparity of the left image, without rendering the images.
+        """Return the true disparity of the left image, without rendering the images.
 
         Raises:
             SettingsError: There is no such frame.

@@ -78,7 +78,7 @@ def frustum(low: Any, high: Any, inset: tuple[float, float, float], paint: Paint
 def cylinder(
     radii_m: tuple[float, float], height_m: float, paint: Paint, sides: int = 10
 ) -> TriangleSoup:
-    """The lateral surface of an upright cone frustum standing at the origin, without caps."""
+    """Return the lateral surface of an upright cone frustum at the origin, without caps."""
     angle = np.linspace(0.0, 2.0 * np.pi, sides + 1)
     ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(sides + 1)], axis=1)
     rise = np.array([0.0, 0.0, height_m])
@@ -101,7 +101,7 @@ def disc(radius_m: float, paint: Paint, sides: int = 14) -> TriangleSoup:
 
 
 def extrusion(profile: Any, width_m: float, paint: Paint) -> TriangleSoup:
-    """A star-shaped profile (K, 2) of (x, z) extruded along y, centred on y = 0, with both caps."""
+    """Return a star-shaped profile (K, 2) of (x, z), extruded along y about y = 0, with caps."""
     outline = np.asarray(profile, dtype=np.float64)
     closed = np.vstack([outline, outline[:1]])
     left = np.stack([closed[:, 0], np.full(len(closed), width_m / 2), closed[:, 1]], axis=1)
@@ -151,7 +151,7 @@ def _smooth_normals(corners: Float64, places: NDArray[np.int64]) -> Float64:
 
 @cache
 def _icosphere_corners(splits: int) -> tuple[Float64, NDArray[np.int64]]:
-    """The different corners (N, 3) of a unit sphere, and the one of each corner of its faces."""
+    """Return the different corners (N, 3) of a unit sphere, and which its faces have."""
     flat, places = np.unique(icosphere(splits).reshape(-1, 3), axis=0, return_inverse=True)
     return flat, places.ravel()
 

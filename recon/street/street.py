@@ -117,7 +117,7 @@ def _repeated(period: TriangleSoup, repeat_m: float, length_m: float) -> Triangl
 
 
 def rig(settings: StreetSettings) -> RectifiedCamera:
-    """The rectified cameras of the settings, with both principal points at the image centre."""
+    """Return the rectified cameras of the settings, with principal points at the centre."""
     return RectifiedCamera(
         focal_px=settings.focal_px,
         cx_px=(settings.width_px - 1) / 2,
@@ -140,7 +140,7 @@ def _sun(seed: int) -> Float64:
 
 
 def _ground(road: CentreLine) -> TriangleSoup:
-    """Road, kerbs and pavements in strips of one metre, and the ground beside them."""
+    """Return road, kerbs and pavements in strips of one metre, and the ground beside them."""
     a, top = ROAD_HALF_M, KERB_M
     grey = Paint(Material.ASPHALT, (0.40, 0.40, 0.41))
     strips = [_strip(road, ((-a, 0.0), (a, 0.0)), grey)]
@@ -175,7 +175,7 @@ def _strip(road: CentreLine, edges: tuple[tuple[float, float], ...], paint: Pain
 
 
 def _stations(road: CentreLine) -> Float64:
-    """Distances at which the strips of the ground are divided: every metre, and at the ends."""
+    """Return where the strips of the ground are divided: every metre, and at the ends."""
     first, last = road.span_m
     if first < 0.0:  # an open road, whose ground continues beyond the last objects
         return np.arange(first, float(road.along_m[-1]) - 10.0, 1.0)
@@ -217,7 +217,7 @@ def _houses(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator
 
 
 def _backdrop(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Houses behind the first row, visible through its gaps."""
+    """Return houses behind the first row, visible through its gaps."""
     at, end = road.span_m
     end += 30.0 * (at < 0.0)
     while at < end:
@@ -253,7 +253,7 @@ def _stand(
 
 
 def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Parked cars in about half of the bays, most facing in the direction of their lane."""
+    """Return parked cars in about half of the bays, most facing in the direction of their lane."""
     first, end = road.span_m
     for bay in np.arange(max(first, -18.0), end, 6.0):
         if rng.random() < 0.45:
@@ -266,7 +266,7 @@ def _parked_cars(road: CentreLine, side: float, rng: np.random.Generator) -> Ite
 
 
 def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Trees along the kerb, copied from a few models, and a row at the far end."""
+    """Return trees along the kerb, copied from a few models, and a row at the far end."""
     seedlings = [props.tree(rng) for _ in range(_SEEDLINGS)]
 
     def grow(at_m: float, lateral_m: float) -> TriangleSoup:
@@ -284,7 +284,7 @@ def _trees(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[
 
 
 def _furniture(road: CentreLine, side: float, rng: np.random.Generator) -> Iterator[TriangleSoup]:
-    """Lamp posts at regular distances; signs, bollards, bins and pillars at random."""
+    """Return lamp posts at regular distances; signs, bollards, bins and pillars at random."""
     kerb = side * (ROAD_HALF_M + 0.45)
     # Separate random streams, as the number of posts must not change the objects between them.
     lamps, rng = rng.spawn(2)

@@ -32,7 +32,7 @@ def surface_table(soup: TriangleSoup) -> SurfaceTable:
 def plane_distance(
     table: SurfaceTable, faces: Int32, origin: Float64, directions: Float64
 ) -> Float64:
-    """Distances (N,) of rays to the planes of their triangles, in units of the directions."""
+    """Return distances (N,) of rays to the planes of their triangles, in their units."""
     normal = table.normal[faces]
     height = np.einsum("nx,nx->n", table.anchor[faces] - origin, normal)
     return np.asarray(height / np.einsum("nx,nx->n", directions, normal))

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.core.geometry.quaternion import quaternion_from_rotation
-from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.geometry.se3 import exp_so3, make_transform, quaternion_from_rotation
 from recon.core.values import Trajectory
 from recon.evaluation.association import associate
 from recon.evaluation.trajectory import TrajectoryRules, align, compare_paths, evaluate_trajectory

@@ -11,8 +11,8 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.core.errors import MappingError, OutputError
+from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import apply
-from recon.core.geometry.transform import transform_cloud
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, PointCloud
 from recon.export.cloud import CloudSample
 from recon.export.grid import export_grid

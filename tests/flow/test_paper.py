@@ -16,7 +16,7 @@ from recon.core.values import RectifiedCamera
 from recon.io.images.image import write_image
 from recon.io.images.pfm import read_pfm, write_pfm
 from recon.io.models.ply import read_ply
-from recon.report import paper_figures
+from recon.report import paper_page
 from tests.hostile import refusals
 from tests.scenery.planes import PlanePair, slanted_pair, step_pair
 
@@ -51,7 +51,7 @@ def write_scene(folder: Path, scene: PlanePair) -> None:
 def coarse_surfaces() -> Iterator[None]:
     """Draw few facets: matplotlib takes most of the time of these tests for them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paper_figures, "_SURFACE_COLUMNS", 30)
+        patch.setattr(paper_page, "_SURFACE_COLUMNS", 30)
         yield
 
 

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 from recon.core.errors import CalibrationError, FormatError
-from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.geometry.projection import depth_from_disparity
 from recon.evaluation.middlebury.scenes import find_scenes, read_scored_scene
 from recon.io.images.image import write_image
 from recon.io.images.pfm import write_pfm
 from recon.io.middlebury.calib import nominal_camera_2005, read_middlebury_calib
 from recon.io.middlebury.layout import Layout, find_layout, full_size_factor
-from recon.io.middlebury.scene import read_middlebury_scene, stand_in_camera
-from recon.io.middlebury.truth import cross_check
+from recon.io.middlebury.scene import cross_check, read_middlebury_scene, stand_in_camera
 
 CALIB = """cam0=[999.421 0 294.182; 0 999.421 252.932; 0 0 1]
 cam1=[999.421 0 326.96; 0 999.421 252.932; 0 0 1]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.core.errors import MappingError
-from recon.core.geometry.triangulation import depth_sigma
+from recon.core.geometry.projection import depth_sigma
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.map.fusion import part
 from recon.map.fusion.builder import FusionSettings, MapBuilder, fusion_range_m

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
+from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import make_transform
-from recon.core.geometry.transform import transform_cloud
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Bool
 from recon.map.ground.axes import AXES_MAP_WORLD

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from recon.core.geometry.projection import project, unproject
+from recon.core.geometry.projection import depth_from_disparity, project, unproject
 from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
-from recon.core.geometry.triangulation import depth_from_disparity
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.odometry.pose import REPROJECTION_PX, locate_camera

@@ -15,7 +15,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from recon.core.geometry.quaternion import quaternion_from_rotation
+from recon.core.geometry.se3 import quaternion_from_rotation
 from recon.core.values import RectifiedCamera, StereoPair
 from tests.sources.drives import EPOCH_S, projections
 

@@ -15,7 +15,7 @@ from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibrati
 from recon.io.cameras.kalibr import write_kalibr
 from recon.io.images.image import write_image
 from recon.io.images.ros_image import pixels_of_ros_image
-from recon.sources.bag_rig import rig_of_messages
+from recon.sources.bag_topics import rig_of_messages
 from recon.sources.pairing import find_partners, natural_key, pair_stamps, stamp_of_name
 from recon.sources.registry import open_source
 from recon.sources.rosbags import BagCameraInfo

@@ -1,4 +1,7 @@
-"""Rigid transforms as 4×4 matrices. ``T_a_b`` maps points of frame b to frame a."""
+"""Rigid transforms as 4×4 matrices, rotations as matrices, vectors and quaternions (x, y, z, w).
+
+``T_a_b`` maps points of frame b to frame a.
+"""
 
 from __future__ import annotations
 
@@ -75,7 +78,7 @@ def exp_so3(w: NDArray[Any]) -> Float64:
 
 
 def log_so3(R: NDArray[Any]) -> Float64:
-    """Rotation vector (3,), radians, of a rotation matrix; inverse of `exp_so3` up to an angle π.
+    """Return the rotation vector (3,), radians, of a rotation matrix; inverse of `exp_so3` up to π.
 
     At π the sign of the axis is ambiguous; either may be returned.
     """
@@ -92,7 +95,7 @@ def log_so3(R: NDArray[Any]) -> Float64:
 
 
 def as_step(T: NDArray[Any]) -> Float64:
-    """A rigid transform as a step: translation and rotation vector, radians; float64 (6,)."""
+    """Return a rigid transform as a step, float64 (6,): translation and rotation vector."""
     return np.concatenate([T[:3, 3], log_so3(T[:3, :3])])
 
 
@@ -148,3 +151,32 @@ def check_rigid(name: str, T: Float64, where: Path | None = None) -> None:
             got=T.tolist(),
             expected=f"a rotation and at most {_FARTHEST_M:g} m",
         )
+
+
+def rotation_from_quaternion(xyzw: NDArray[Any]) -> Float64:
+    """Return the rotation matrix (3, 3) of a quaternion (4,) of any nonzero norm."""
+    x, y, z, w = np.asarray(xyzw, dtype=np.float64) / np.linalg.norm(xyzw)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_from_rotation(rotation: NDArray[Any]) -> Float64:
+    """Return the unit quaternion (4,) of a rotation matrix (3, 3), with ``w ≥ 0``.
+
+    The eigenvector method used is accurate at all angles; the formula based on the trace divides
+    by almost zero near 180 degrees.
+
+    Ref: Bar-Itzhack, New method for extracting the quaternion from a rotation matrix, 2000.
+    """
+    R = np.asarray(rotation, dtype=np.float64)
+    K = np.zeros((4, 4))
+    K[:3, :3] = R + R.T - np.trace(R) * np.eye(3)
+    K[3, :3] = K[:3, 3] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    K[3, 3] = np.trace(R)
+    xyzw: Float64 = np.linalg.eigh(K)[1][:, -1]
+    return -xyzw if xyzw[3] < 0 else xyzw

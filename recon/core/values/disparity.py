@@ -107,7 +107,7 @@ class Disparity:
         return np.isfinite(self.values)
 
     def reject(self, mask: Bool, reason: Reason) -> Disparity:
-        """A copy with the pixels of ``mask`` invalidated; those that had a value get ``reason``."""
+        """Return a copy without the pixels of ``mask``; those that had a value get ``reason``."""
         drop = mask & self.valid
         return Disparity(
             values=np.where(drop, np.float32(np.nan), self.values),

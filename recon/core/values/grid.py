@@ -42,7 +42,7 @@ class OccupancyVoxels:
         return len(self.keys)
 
     def select(self, which: Bool) -> OccupancyVoxels:
-        """The voxels of a boolean mask (N,)."""
+        """Return the voxels of a boolean mask (N,)."""
         return OccupancyVoxels(self.keys[which], self.log_odds[which], self.resolution_m)
 
     @property

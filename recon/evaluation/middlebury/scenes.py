@@ -102,7 +102,7 @@ def read_scored_scene(name: str, path: Path, truth: Path | None) -> ScoredScene 
 def _matching_camera(
     scene: MiddleburyScene, truth: DisparityTruth, factor: float
 ) -> RectifiedCamera:
-    """The camera with a disparity range; if none is published, the range of the ground truth.
+    """Return the camera with a disparity range; if none is published, that of the ground truth.
 
     Scenes before 2014 are thus matched with the same prior knowledge as later ones, which publish
     a range, and the range is the same for all matchers.

@@ -54,7 +54,7 @@ class SceneDone:
 
 
 def check_names(matchers: Sequence[str | Matcher]) -> list[str]:
-    """The names of the matchers, which are also those of their folders.
+    """Return the names of the matchers, which are also those of their folders.
 
     Raises:
         SettingsError: A matcher is unknown or named twice, or has no name for a folder.
@@ -72,7 +72,7 @@ def check_names(matchers: Sequence[str | Matcher]) -> list[str]:
 
 
 def result_figures(result: SceneResult) -> Figures:
-    """The figures of one result, with its time and what its scene counts for in means."""
+    """Return the figures of one result, with its time and what its scene counts for in means."""
     scene, seconds = result.scene, result.seconds
     return {
         **result.figures,
@@ -90,7 +90,7 @@ def summarise_scenes(
     results: Sequence[ResultFolder],
     folder: Path,
 ) -> Figures:
-    """The content of ``summary.json``: the figures of each matcher, and its means.
+    """Return the content of ``summary.json``: the figures of each matcher, and its means.
 
     Args:
         found: Figures of each scene; None without ground truth.
@@ -124,7 +124,7 @@ def _common(
     folder: Path,
     skipped: Sequence[str],
 ) -> list[str]:
-    """The scenes for which all have a result, so that means can be compared."""
+    """Return the scenes for which all have a result, so that means can be compared."""
     if not scenes:
         raise SourceError(
             "no scene has ground truth to compare with",
@@ -143,7 +143,7 @@ def _common(
 def _missing(
     scenes: Mapping[str, SceneFigures], results: Sequence[ResultFolder], common: Sequence[str]
 ) -> Iterator[str]:
-    """A line for each folder of results that lacks scenes."""
+    """Return a line for each folder of results that lacks scenes."""
     for result in results:
         lacking = [name for name in scenes if name not in result.files]
         if lacking:
@@ -154,7 +154,7 @@ def _missing(
 
 
 def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str, common: Sequence[str]) -> Figures:
-    """The entry of one matcher in ``summary.json``."""
+    """Return the entry of one matcher in ``summary.json``."""
     own = {name: figures[matcher] for name, figures in scenes.items() if matcher in figures}
     meant = {name: own[name] for name in common}
     masked = {name: {mask: figures[mask] for mask in MASKS} for name, figures in meant.items()}

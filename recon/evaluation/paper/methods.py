@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import (
     Disparity,
     DisparityMetrics,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.geometry.projection import depth_from_disparity
 from recon.evaluation.paper.methods import (
     MethodResult,
     PatchFigure,
@@ -92,7 +92,7 @@ def _table_1_depth_error(experiment: Experiment) -> float | None:
 
 
 def paper_figures(results: Sequence[ExperimentResult], config: PaperConfig) -> dict[str, Any]:
-    """The figures of ``summary.json``: Table 1, then each experiment by method and patch size."""
+    """Return the figures of ``summary.json``: Table 1, then each experiment."""
     return {
         "as_printed": config.paper.as_printed,
         "table_1": [_table_1_summary(result) for result in results],
@@ -101,7 +101,7 @@ def paper_figures(results: Sequence[ExperimentResult], config: PaperConfig) -> d
 
 
 def _table_1_summary(result: ExperimentResult) -> dict[str, Any]:
-    """A row of Table 1 as printed, and the corrected values."""
+    """Return a row of Table 1 as printed, and the corrected values."""
     experiment, camera = result.experiment, result.experiment.camera
     both = {"baseline_mm": round(1000 * camera.baseline_m, 6), "ndisp": camera.ndisp}
     return {

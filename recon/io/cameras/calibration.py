@@ -9,8 +9,7 @@ from recon.core.errors import CalibrationError, FormatError
 from recon.core.values import RectifiedCamera, StereoCalibration, check_size
 from recon.io.cameras.camera_info import read_camera_info
 from recon.io.cameras.kalibr import read_kalibr
-from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras
-from recon.io.cameras.kitti_raw import read_kitti_rig
+from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
 from recon.io.cameras.opencv_yaml import read_opencv_calibration
 from recon.io.cameras.recon_yaml import MARK, read_recon_calibration
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader

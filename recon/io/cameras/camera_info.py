@@ -24,7 +24,7 @@ _SIDES: Final = ("left", "right")
 
 
 def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
-    """Paths of the left and right file: ``left`` or ``right`` in the name is swapped, or added."""
+    """Return both paths: ``left`` or ``right`` in the name is swapped, or added."""
     given = Path(path)
     for side in _SIDES:
         if re.search(side, given.stem):

@@ -6,8 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.geometry.quaternion import rotation_from_quaternion
-from recon.core.geometry.se3 import make_transform
+from recon.core.geometry.se3 import make_transform, rotation_from_quaternion
 from recon.core.values import CameraIntrinsics, Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.cameras.lens_models import Models, lens_of, pinhole_matrix

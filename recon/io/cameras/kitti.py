@@ -1,4 +1,7 @@
-"""KITTI calibration: projection matrices ``P0`` … ``P3`` of the rectified cameras."""
+"""KITTI calibration: projection matrices ``P0`` … ``P3`` of the rectified cameras.
+
+``calib_cam_to_cam.txt`` of a raw drive has four cameras, each raw and rectified.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,14 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import CalibrationError, FormatError
-from recon.core.values import RectifiedCamera, check_unsized
+from recon.core.geometry.se3 import invert, make_transform
+from recon.core.values import (
+    CameraIntrinsics,
+    RectifiedCamera,
+    StereoCalibration,
+    check_unsized,
+    other_size,
+)
 from recon.core.values.arrays import Float64
 from recon.io.fields import Fields
 from recon.io.files import StrPath, read_text, reader
@@ -18,6 +28,7 @@ GREY_CAMERAS: Final = (0, 1)
 COLOUR_CAMERAS: Final = (2, 3)
 _FOLDER: Final = re.compile(r"image_0?([0-3])")
 _LINE: Final = re.compile(r"^P(?:_rect_0)?(\d):(.*)$", re.MULTILINE)
+_RAW_LINE: Final = re.compile(r"^([A-Z](?:_rect)?_\d\d):(.*)$", re.MULTILINE)
 
 
 @reader
@@ -84,7 +95,7 @@ def read_kitti_offset(path: StrPath, camera: int) -> Float64:
 
 
 def kitti_cameras_of(left: Path) -> tuple[int, int] | None:
-    """Left and right camera, if the path of a left image names KITTI's folder of one of them."""
+    """Return left and right camera, if the path of a left image names KITTI's folder of one."""
     for part in reversed(left.parts):
         found = _FOLDER.fullmatch(part)
         if found:
@@ -128,3 +139,53 @@ def _projection(path: StrPath, camera: int) -> Float64:
 def _centre_m(projection: Float64) -> Float64:
     """Return ``t`` of ``P = K·[I | t]``, float64 (3,)."""
     return np.asarray(np.linalg.solve(projection[:, :3], projection[:, 3]), dtype=np.float64)
+
+
+@reader
+def read_kitti_rig(
+    path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int]
+) -> RectifiedCamera | StereoCalibration:
+    """Read the cameras of one stereo pair, rectified or raw according to the image size.
+
+    Rectified images (``_sync`` drives) are smaller than raw ones (``_extract`` drives). A file
+    without sizes is of rectified images.
+
+    Args:
+        path: ``calib_cam_to_cam.txt`` of a raw drive, or ``calib.txt`` of an odometry sequence.
+        width_px: Image width.
+        height_px: Image height.
+        cameras: Left and right camera: (0, 1) grey, (2, 3) colour.
+
+    Raises:
+        FormatError: The file is missing or lacks a line.
+        CalibrationError: The calibration cannot give depth, or the image size is neither of the
+            two.
+
+    Ref: Geiger et al., "Vision meets Robotics: The KITTI Dataset", IJRR 2013, section 4.
+    """
+    fields = Fields(dict(_RAW_LINE.findall(read_text(path))), path)
+    if f"S_rect_{cameras[0]:02d}" not in fields:
+        return read_kitti_calib(path, width_px, height_px, cameras)
+    recorded, rectified = (
+        tuple(int(n) for n in fields.numbers(f"{key}_{cameras[0]:02d}", (2,)))
+        for key in ("S", "S_rect")
+    )
+    if (width_px, height_px) == rectified:
+        return read_kitti_calib(path, width_px, height_px, cameras)
+    if (width_px, height_px) != recorded:
+        expected = f"{rectified[0]}x{rectified[1]} rectified, or {recorded[0]}x{recorded[1]} raw"
+        raise other_size(width_px, height_px, expected, path)
+    T_left_0, T_right_0 = (_pose(fields, camera) for camera in cameras)
+    left, right = (_camera(fields, camera, recorded) for camera in cameras)
+    return StereoCalibration(left, right, T_right_0 @ invert(T_left_0))
+
+
+def _camera(fields: Fields, camera: int, size: tuple[int, ...]) -> CameraIntrinsics:
+    matrix = fields.numbers(f"K_{camera:02d}", (3, 3))
+    return CameraIntrinsics(matrix, fields.numbers(f"D_{camera:02d}", (5,)), size[0], size[1])
+
+
+def _pose(fields: Fields, camera: int) -> Float64:
+    """Return ``T_camera_camera0``."""
+    rotation = fields.numbers(f"R_{camera:02d}", (3, 3))
+    return make_transform(rotation, fields.numbers(f"T_{camera:02d}", (3,)))

@@ -57,7 +57,7 @@ def lens_of(
 
 
 def name_lens(models: Models, camera: CameraIntrinsics, form: str) -> tuple[str, Float64]:
-    """A format's name for the lens model of a camera, and the coefficients padded as it needs.
+    """Return a format's name for the lens of a camera, and the coefficients padded as it needs.
 
     Args:
         models: The models of the format.

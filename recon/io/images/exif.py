@@ -36,7 +36,7 @@ class ExifFocal:
 
 
 def read_focal_length(path: StrPath, width_px: int, height_px: int) -> ExifFocal | None:
-    """The focal length of a photograph, from its sensor data, else from the 35 mm equivalent.
+    """Read the focal length of a photograph: from its sensor data, or else the 35 mm equivalent.
 
     Args:
         path: The image.
@@ -74,7 +74,7 @@ def _by_35mm(tags: Mapping[int, Any], width_px: int, height_px: int) -> ExifFoca
 
 
 def _number(value: Any) -> float | None:
-    """A positive finite number, or None; EXIF writes 0, or a fraction over 0, for unknown."""
+    """Return a positive finite number, or None; EXIF writes 0 or a fraction over 0 for unknown."""
     try:
         number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):

@@ -87,7 +87,7 @@ def read_levels(path: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> NDArra
 
 
 def decode_image(content: bytes, where: StrPath) -> UInt8:
-    """Like `read_image`, from bytes in memory.
+    """Read an image like `read_image`, from bytes in memory.
 
     Raises:
         FormatError: As in `read_image`.
@@ -98,7 +98,7 @@ def decode_image(content: bytes, where: StrPath) -> UInt8:
 def decode_levels(
     content: bytes, path: StrPath, max_megapixels: float = MAX_MEGAPIXELS
 ) -> NDArray[Any]:
-    """Like `read_levels`, from the bytes of a file.
+    """Read an image like `read_levels`, from the bytes of a file.
 
     Raises:
         FormatError: As in `read_image`.
@@ -136,7 +136,7 @@ def _check_size(size: tuple[int, int] | None, path: StrPath, max_megapixels: flo
 
 
 def read_grey_levels(path: StrPath) -> NDArray[Any]:
-    """Like `read_levels`, but always (H, W); three equal channels count as grey.
+    """Read an image like `read_levels`, but always (H, W); three equal channels count as grey.
 
     Raises:
         FormatError: As in `read_image`, or the image is in colour.

@@ -75,7 +75,7 @@ _EVAL3: Final = Layout("im0", "im1", "disp0GT", "disp1GT", calibrated=True)
 
 
 def find_layout(folder: Path) -> Layout | None:
-    """The layout that matches the files of a folder, or None; one of the two images suffices."""
+    """Return the layout that matches the files of a folder, or None; one of the images suffices."""
     marks = ("calib.txt", "disp0GT.pfm", "disp0.pfm")
     if any((folder / mark).is_file() for mark in marks):
         eval3 = (folder / "disp0GT.pfm").is_file()
@@ -103,7 +103,7 @@ def generation_of(layout: Layout, width_px: int) -> Generation:
 
 
 def levels_per_pixel(layout: Layout, width_px: int, height_px: int) -> float | None:
-    """Grey levels per pixel of disparity in the ground truth; None = PFM."""
+    """Return grey levels per pixel of disparity in the ground truth; None = PFM."""
     generation = generation_of(layout, width_px)
     if generation == "2014":
         return None

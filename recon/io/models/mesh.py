@@ -132,7 +132,7 @@ def read_mesh(path: StrPath) -> TriangleMesh:
 
 
 def _tables(mesh: TriangleMesh, start: int = 0) -> dict[str, Table]:
-    """The two tables of a PLY mesh, with ``start`` added to the vertex indices of its faces."""
+    """Return the two tables of a PLY mesh, with ``start`` added to the indices of its faces."""
     fields = vertex_dtype(normals=mesh.normals is not None, colours=mesh.rgb is not None)
     vertices = np.zeros(len(mesh.vertices), fields)
     fill_vertices(vertices, mesh.vertices, mesh.normals, mesh.rgb)

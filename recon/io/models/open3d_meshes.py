@@ -85,7 +85,7 @@ def decimate(
 
 
 def _surface(vertices: NDArray[Any], faces: NDArray[Any]) -> Any:
-    """Open3D mesh of copies; it accepts neither read-only nor float32 arrays."""
+    """Return an Open3D mesh of copies; it accepts neither read-only nor float32 arrays."""
     return o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(np.array(vertices, dtype=np.float64)),
         o3d.utility.Vector3iVector(np.array(faces, dtype=np.int32)),

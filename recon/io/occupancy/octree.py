@@ -79,7 +79,7 @@ def encode_branch(keys: Int32, log_odds: Float32, depth: int) -> Branch:
 
 
 def join_branches(children: dict[int, Branch]) -> Branch:
-    """The parent node of some branches: its own bytes only; those of the branches follow in order.
+    """Return the parent node of some branches: its own bytes only; theirs follow in order.
 
     Args:
         children: Branches by their index, 0 to 7: bit 0 is x, bit 1 y, bit 2 z.
@@ -97,7 +97,7 @@ def join_branches(children: dict[int, Branch]) -> Branch:
 
 
 def _parents_kind(kinds: _Index, begin: _Index) -> _Index:
-    """Kinds of the parents: eight equal leaves become a leaf; any other node has children."""
+    """Return kinds of the parents: eight equal leaves become a leaf; others have children."""
     low, high = np.minimum.reduceat(kinds, begin), np.maximum.reduceat(kinds, begin)
     size = np.diff(np.r_[begin, len(kinds)])
     return np.where((size == 8) & (low == high) & (low != INNER), low, INNER)

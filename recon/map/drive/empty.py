@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from recon.core.errors import MappingError
-from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera
 from recon.map.drive.sequence import MappedSequence
 from recon.map.fusion.builder import fusion_range_m

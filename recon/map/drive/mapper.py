@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from recon.core.errors import FormatError
-from recon.core.geometry.transform import transform_cloud
+from recon.core.geometry.axes import transform_cloud
 from recon.core.values import PointCloud, RayCloud, RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.map.drive.frame_result import FrameResult

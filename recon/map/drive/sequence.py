@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from recon.core.errors import RegistrationError
+from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import invert
-from recon.core.geometry.transform import transform_cloud
 from recon.core.values import OccupancyVoxels, PointCloud, RectifiedCamera, StereoPair, Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch

@@ -122,7 +122,7 @@ def count_aligned(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) 
     return int(_consensus(*_linear(left_uv, right_uv, camera), camera.focal_px).sum())
 
 
-def mend_rig(
+def correct_rig(
     rig: RectifiedCamera | StereoCalibration, alignment: RowAlignment, R_rect_left: Float64
 ) -> StereoCalibration:
     """Return the calibration with the right camera rotated in place so that rows are aligned.
@@ -173,7 +173,7 @@ def _solve(basis: Float64, rows: Float64) -> Float64:
 
 
 def _consensus(basis: Float64, rows: Float64, focal_px: float) -> Bool:
-    """bool (N,): the largest set of features that agree with one rotation (RANSAC, pairs)."""
+    """Return bool (N,), the largest set of features that agree with one rotation (RANSAC)."""
     rng = np.random.default_rng(0)
     pick = rng.integers(0, len(rows), (_TRIALS, 2))
     a, b = basis[pick[:, 0]], basis[pick[:, 1]]

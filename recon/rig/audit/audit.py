@@ -9,11 +9,11 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import CalibrationError
-from recon.core.geometry.triangulation import depth_sigma
+from recon.core.geometry.projection import depth_sigma
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.io.cameras.recon_yaml import write_recon_calibration
-from recon.rig.audit.alignment import RowAlignment, mend_rig
+from recon.rig.audit.alignment import RowAlignment, correct_rig
 from recon.rig.audit.findings import (
     Finding,
     Verdict,
@@ -121,7 +121,7 @@ def quick_warnings(source: StereoSource, config: AuditedSettings) -> tuple[str, 
     return tuple(f"{finding.text} [quick audit]" for finding in audit.findings)
 
 
-def mend_calibration(
+def correct_calibration(
     source: StereoSource, config: AuditedSettings, audit: Audit, path: Path
 ) -> dict[str, Any]:
     """Write the calibration with the right camera rotated so that rows correspond.
@@ -150,7 +150,7 @@ def mend_calibration(
         "roll_deg": float(np.degrees(alignment.roll_rad)),
         "row_error_before_px": alignment.rms_px,
     }
-    write_recon_calibration(path, mend_rig(rig, alignment, left), figures)
+    write_recon_calibration(path, correct_rig(rig, alignment, left), figures)
     return {**figures, "calibration": str(path)}
 
 

@@ -143,7 +143,7 @@ def track(now: UInt8, then: UInt8, uv: Float32) -> tuple[Float32, Bool]:
 def measure_speed(
     left_uv: Float32, right_uv: Float32, later_uv: Float32, camera: RectifiedCamera
 ) -> float | None:
-    """Distance in metres that the rig moves between two frames, if the calibration is correct.
+    """Return how far the rig moves between two frames, metres, if the calibration is correct.
 
     Args:
         left_uv: float32 (N, 2), features in the left image.
@@ -176,7 +176,7 @@ def measure_speed(
 
 
 def measure_time_skew(row_error_px: Float64, row_flow_px: Float64) -> tuple[float, float] | None:
-    """Delay of the right camera in frames, from the vertical motion of features.
+    """Return delay of the right camera in frames, from the vertical motion of features.
 
     A camera that is s frames late sees a feature whose row moves by v per frame v·s rows lower:
     the slope of row error over row flow is the skew.

@@ -135,7 +135,7 @@ def take_sample(
 
 
 def plan_stretches(frames: int, read: int, *, quick: bool) -> list[tuple[int, int]]:
-    """First frame and end of each stretch: the whole drive, or stretches evenly spread over it.
+    """Return first frame and end of each stretch: the whole drive, or stretches spread over it.
 
     A quick audit stays near the start.
 

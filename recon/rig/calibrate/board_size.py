@@ -144,7 +144,7 @@ def probe_size(grey: UInt8) -> Inner | None:
 
 
 def _spread(numbers: Sequence[int], count: int) -> list[int]:
-    """At most ``count`` of the numbers, evenly spaced from first to last."""
+    """Return at most ``count`` of the numbers, evenly spaced from first to last."""
     at = np.unique(np.linspace(0, len(numbers) - 1, min(count, len(numbers))).astype(int))
     return [numbers[place] for place in at]
 
@@ -174,7 +174,7 @@ def _continue(grey: UInt8, grid: Float64, axis: int, usual: float) -> Float64 | 
 
 
 def _contrast(grey: UInt8, grid: Float64) -> Float64:
-    """float64 (R, C), brightness difference of the two diagonal pairs of quadrants of each corner.
+    """Return float64 (R, C), how the diagonal pairs of quadrants of each corner differ.
 
     Differences within a pair count against it. NaN where a quadrant is outside the image.
     """

@@ -116,6 +116,6 @@ def _apart(first: Float32, second: Float32) -> Float64:
 
 
 def _still_frames(steps: Float64, limit: float) -> Bool:
-    """bool (N,): whether nothing moves before and after each of N frames, from N - 1 steps."""
+    """Return bool (N,), whether nothing moves before and after each frame, from N - 1 steps."""
     calm = steps <= limit
     return np.concatenate([calm[:1], calm[:-1] & calm[1:], calm[-1:]])

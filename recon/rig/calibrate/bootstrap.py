@@ -133,7 +133,7 @@ def working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> f
 
 
 def measure_depth(rig: StereoCalibration, left_px: Float64, right_px: Float64) -> Float64:
-    """float64 (N,), depth along the left optical axis, triangulated from matched raw pixels."""
+    """Return float64 (N,), depth along the left optical axis, from matched raw pixels."""
     T_left_right = invert(rig.T_right_left)
     a = unproject(rig.left, left_px)
     b = unproject(rig.right, right_px) @ T_left_right[:3, :3].T
@@ -145,7 +145,7 @@ def measure_depth(rig: StereoCalibration, left_px: Float64, right_px: Float64) -
 
 
 def _jackknife_vectors(fit: StereoFit) -> Float64:
-    """float64 (V, P), each view's gradient, corrected for the view's own effect on the solution.
+    """Return float64 (V, P), each view's gradient, corrected for its own effect on the solution.
 
     Ref: Bell and McCaffrey 2002, "Bias reduction in standard errors" (their jackknife form).
     """

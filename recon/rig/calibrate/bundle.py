@@ -150,7 +150,7 @@ def shared_size(state: RigState) -> int:
 
 
 def moved(state: RigState, step: Float64) -> RigState:
-    """The state with ``step`` (P,) added to its shared parameters; board poses do not change.
+    """Return the state with ``step`` (P,) added to its shared parameters; board poses stay.
 
     Raises:
         CalibrationError: A focal length would not be positive.
@@ -207,7 +207,7 @@ def _view_blocks(view: View, state: RigState, number: int) -> _Blocks:
 
 
 def _by_motion(xyz: Float64) -> Float64:
-    """float64 (N, 3, 6), Jacobian of points for a small rotation and translation after a pose."""
+    """Return float64 (N, 3, 6), Jacobian of points for a small rotation and translation."""
     J = np.zeros((len(xyz), 3, _POSE))
     x, y, z = xyz.T
     J[:, 0, 1], J[:, 0, 2] = z, -y
@@ -218,7 +218,7 @@ def _by_motion(xyz: Float64) -> Float64:
 
 
 def _prior(state: RigState) -> Float64:
-    """float64 (P, P), information that keeps the coefficients of rational lenses near zero."""
+    """Return float64 (P, P), information that keeps coefficients of rational lenses near zero."""
     diagonal, at = np.zeros(shared_size(state)), 0
     for camera in state.cameras:
         if camera.distortion.size >= 8:
@@ -234,7 +234,7 @@ def _shared_numbers(state: RigState) -> Float64:
 
 
 def _cost(views: Sequence[View], state: RigState, weights: Float64) -> float:
-    """Weighted sum of squared pixel errors and of the prior; NaN for a point behind a camera."""
+    """Return the sum of squared errors and of the prior; NaN for a point behind a camera."""
     numbers = _shared_numbers(state)
     total = float(numbers @ _prior(state) @ numbers)
     for number, (view, w) in enumerate(zip(views, weights, strict=True)):

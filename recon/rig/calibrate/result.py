@@ -17,10 +17,9 @@ from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.bootstrap import Spread
 from recon.rig.calibrate.bundle import View
-from recon.rig.calibrate.quality import shared_pixels
 from recon.rig.calibrate.settings import CalibratedSettings
 from recon.rig.calibrate.stereo import StereoFit
-from recon.rig.calibrate.summary import summarise
+from recon.rig.calibrate.summary import shared_pixels, summarise
 from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
 
 CalibrationForm = Literal["recon", "opencv", "ros", "kalibr"]
@@ -92,7 +91,7 @@ def write_calibration(path: Path, run: CalibrationRun, form: CalibrationForm) ->
 
 
 def _rows_apart(turns: RectifyingTurns, fit: StereoFit, view: View) -> Float64:
-    """float64 (N,), row of each corner in the rectified left image minus that in the right one."""
+    """Return float64 (N,), row of each corner in the rectified left image minus the right."""
     left_px, right_px = shared_pixels(view)
     left = turns.place(fit.calibration, left_px)
     right = turns.place(fit.calibration, right_px, right=True)

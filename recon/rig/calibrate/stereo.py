@@ -12,7 +12,7 @@ import numpy as np
 from recon.core.errors import CalibrationError
 from recon.core.values import StereoCalibration
 from recon.core.values.arrays import Bool, Float64
-from recon.rig.calibrate.bundle import Information, RigState, View, solve
+from recon.rig.calibrate.bundle import Information, RigState, Sighting, View, solve
 from recon.rig.calibrate.initial import (
     Size,
     calibrate_one,
@@ -20,13 +20,11 @@ from recon.rig.calibrate.initial import (
     solve_robustly,
     view_errors,
 )
-from recon.rig.calibrate.repeats import group_views
 from recon.rig.calibrate.settings import CalibrationSettings
 
 _DROPPING_ROUNDS: Final = 4
 # An rms error this many times that of each camera alone: the images were not taken together.
 _MISMATCH: Final = 3.0
-
 
 _OUTLIER_RATIO: Final = 3.0
 """Views whose error exceeds this multiple of the median of all views are dropped …"""
@@ -39,6 +37,12 @@ _MAX_RMS_PX: Final = 2.0
 
 _MIN_VIEWS: Final = 5
 """Minimum number of views with the board."""
+
+# A view repeats another if the corners moved by less than this share of the board's own size (rms
+# distance of its corners from their mean, in the image). A hand that holds a board still moves it
+# by that much (8 mm on a board of 9 by 6 squares of 25 mm); it is a roll of 6 degrees, or a tenth
+# of the distance.
+_STILL: Final = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,3 +187,51 @@ def _no_fit(rms_px: float, alone_px: tuple[float, float]) -> CalibrationError:
         expected=f"at most {_MAX_RMS_PX:g} px",
         hint=hint,
     )
+
+
+def group_views(views: Sequence[View]) -> list[list[View]]:
+    """Group the views by pose of the board: those of one group show the board where it was.
+
+    Errors of corners on a still board are mostly the same in every image (flatness, lens, blur), so
+    a repeated view is hardly a new measurement, and it never adds a pose.
+
+    Args:
+        views: The views, in any order.
+
+    Returns:
+        The groups in order of their first view. The first of each group represents it: the one
+        that is nearest to the others.
+    """
+    groups: list[list[View]] = []
+    for view in views:
+        same = next((group for group in groups if _moved(group[0], view) < _STILL), None)
+        if same is None:
+            groups.append([view])
+        else:
+            same.append(view)
+    return [_middle_first(group) for group in groups]
+
+
+def _moved(first: View, second: View) -> float:
+    """Return how far corners moved between two views, relative to the board; the larger."""
+    return max(_shift(*both) for both in zip(first.seen, second.seen, strict=True))
+
+
+def _shift(first: Sighting, second: Sighting) -> float:
+    a, b = first.pixels, second.pixels
+    if not np.array_equal(first.numbers, second.numbers):  # a board that is seen in part
+        _, here, there = np.intersect1d(first.numbers, second.numbers, return_indices=True)
+        if 2 * len(here) < max(len(a), len(b)):
+            return np.inf
+        a, b = a[here], b[there]
+    # A chessboard turned by 180 degrees looks the same, and its corners may begin at either end.
+    return min(_length_rms(a - b), _length_rms(a - b[::-1])) / _length_rms(a - a.mean(axis=0))
+
+
+def _middle_first(group: list[View]) -> list[View]:
+    """Return the group with the view first that is nearest to a few of the others."""
+    if len(group) < 3:
+        return group
+    some = group[:: max(1, len(group) // 8)]
+    middle = int(np.argmin([max(_moved(view, other) for other in some) for view in group]))
+    return [group[middle], *group[:middle], *group[middle + 1 :]]

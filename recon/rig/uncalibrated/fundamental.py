@@ -191,7 +191,7 @@ def _facing(H: Float64, size: tuple[int, int]) -> Float64:
 
 
 def _normalising(pixels: Float64) -> Float64:
-    """float64 (3, 3), centres pixels on the origin and scales them to a mean distance of √2."""
+    """Return float64 (3, 3) that centres pixels and scales them to a mean distance of √2."""
     middle = pixels.mean(axis=0)
     scale = np.sqrt(2) / max(float(np.linalg.norm(pixels - middle, axis=1).mean()), 1e-12)
     return np.array([[scale, 0, -scale * middle[0]], [0, scale, -scale * middle[1]], [0, 0, 1.0]])

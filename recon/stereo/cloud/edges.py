@@ -46,7 +46,7 @@ def remove_flying_edges(disparity: Disparity) -> Disparity:
 
 
 def _support(values: Float32) -> UInt8:
-    """uint8 (H, W): number of pixels in each window that support its centre, itself included."""
+    """Return uint8 (H, W), how many pixels of each window support its centre, with itself."""
     r = _RADIUS_PX
     height, width = values.shape
     padded = cv2.copyMakeBorder(values, r, r, r, r, cv2.BORDER_REFLECT_101)

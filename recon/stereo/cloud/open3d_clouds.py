@@ -88,7 +88,7 @@ def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float) -> Bool:
 
 
 def estimate_normals(xyz: NDArray[Any], neighbours: int) -> Float32:
-    """Unit normals of the planes fitted to each point's nearest neighbours, of arbitrary sign.
+    """Return unit normals of the planes fitted to each point's neighbours, of arbitrary sign.
 
     Args:
         xyz: (N, 3), metres, finite.
@@ -124,7 +124,7 @@ def agree_normals(xyz: NDArray[Any], normals: NDArray[Any], neighbours: int) -> 
 
 
 def _orient(cloud: Any, normals: NDArray[Any], neighbours: int) -> Float32:
-    """Open3D's own flipping."""
+    """Let Open3D flip the normals."""
     cloud.normals = o3d.utility.Vector3dVector(np.array(normals, dtype=np.float64))
     with _quiet():
         cloud.orient_normals_consistent_tangent_plane(min(neighbours, len(cloud.points) - 1))
@@ -182,7 +182,7 @@ def nearest(
 
 
 def _voxelised(cloud: Any, voxel_m: float) -> Any:
-    """Open3D's voxel downsampling."""
+    """Let Open3D thin a cloud."""
     try:
         with _quiet():
             return cloud.voxel_down_sample(voxel_m)
@@ -193,7 +193,7 @@ def _voxelised(cloud: Any, voxel_m: float) -> Any:
 
 
 def _legacy(xyz: NDArray[Any]) -> Any:
-    """Open3D cloud of a copy of the points; it accepts neither read-only nor float32 arrays."""
+    """Return an Open3D cloud of a copy: it accepts neither read-only nor float32 arrays."""
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(_finite(xyz).copy()))
 
 

@@ -67,7 +67,7 @@ def check_object(matcher: object) -> Matcher:
 
 
 def name_of(matcher: str | Matcher) -> str:
-    """The name that results have: of an object its attribute ``name``, else that of its class."""
+    """Return the name that results have: an object's attribute ``name``, else that of its class."""
     if isinstance(matcher, str):
         return matcher
     name = getattr(matcher, "name", None)

@@ -35,7 +35,7 @@ SUPPORT: Final = Support(margin_x=8, margin_y=8, margin=3, matched=0.15, share=0
 
 
 def halve(image: UInt8) -> UInt8:
-    """Means of two by two pixels; the last row and column count twice where they are left over."""
+    """Return means of two by two pixels; a last row or column that is left over counts twice."""
     rows, columns = image.shape
     even = image
     if rows % 2 or columns % 2:

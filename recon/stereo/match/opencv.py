@@ -131,7 +131,7 @@ class _Margins:
 
     @classmethod
     def around(cls, settings: OpencvSettings, block_px: int, ndisp: int) -> _Margins:
-        """As many as OpenCV leaves out, half a window and the range, or none."""
+        """Return as many as OpenCV leaves out, half a window and the range, or none."""
         if not settings.pad:
             return cls(0, 0, 0)
         margin = block_px // 2 + 1

@@ -81,7 +81,7 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
 
 
 def _smaller(pair: RectifiedPair, factor: int) -> RectifiedPair:
-    """The pair, ``factor`` times smaller, with a range of half its width; odd rims are cut off."""
+    """Return the pair, ``factor`` times smaller, with a range of half its width; without rims."""
     width, height = pair.left.shape[1] // factor, pair.left.shape[0] // factor
     camera = replace(pair.camera.resized(width, height), ndisp=width // 2)
     left, right = (_shrunk(image, factor, (width, height)) for image in (pair.left, pair.right))

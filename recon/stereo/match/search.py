@@ -168,7 +168,7 @@ def finish(
 
 
 def _averaged(values: Float32, pool: Executor, threads: int) -> Float32:
-    """float32 (H, W), the values without the noise that they do not share with neighbours."""
+    """Return float32 (H, W), values without the noise that neighbours do not share."""
     averages, radius = np.empty_like(values), _AVERAGE_PX // 2
 
     def average(rows: range) -> None:

@@ -107,7 +107,7 @@ def sees_all(camera: CameraIntrinsics) -> bool:
 def rectifying_maps(
     camera: CameraIntrinsics, rotation: Float64, matrix: Float64, size: tuple[int, int]
 ) -> tuple[Float32, Float32]:
-    """Remap tables of a rotated pinhole view: columns and rows in the raw image, float32 (H, W).
+    """Return remap tables of a rotated pinhole view: columns and rows of the raw image, float32.
 
     Args:
         camera: The raw camera.
@@ -136,7 +136,7 @@ def rectifying_maps(
 def _without_folds(
     camera: CameraIntrinsics, rotation: Float64, matrix: Float64, size: tuple[int, int]
 ) -> tuple[Float32, Float32]:
-    """Remap tables that are (-1, -1) where the lens model folds back into the image."""
+    """Return remap tables that are (-1, -1) where the lens model folds back into the image."""
     x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
     rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]).astype(np.float64)
     xyz = (np.linalg.inv(rotation) @ np.linalg.inv(matrix[:, :3]) @ rays).T

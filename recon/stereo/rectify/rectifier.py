@@ -177,7 +177,7 @@ class RectifyingTurns:
     def place(
         self, calibration: StereoCalibration, pixels: Float64, *, right: bool = False
     ) -> Float64:
-        """float64 (N, 2), rectified positions of raw pixels (N, 2) of one camera; NaN = none."""
+        """Return rectified positions, float64 (N, 2), of raw pixels of one camera; NaN = none."""
         camera = calibration.right if right else calibration.left
         rays = unproject(camera, pixels) @ (self.R_right if right else self.R_left).T
         flat = (rays / rays[:, 2:]) @ self.matrices[int(right)].T

@@ -74,7 +74,7 @@ def _boxes(camera: CameraIntrinsics, rotation: Float64) -> tuple[Box, Box]:
 
 
 def _flat(camera: CameraIntrinsics, rotation: Float64, pixels: Float64) -> Float64:
-    """Border pixels projected onto the plane z = 1 of the view, clipped to the widest angle."""
+    """Return border pixels on the plane z = 1 of the view, clipped to the widest angle."""
     plane = unproject(camera, pixels)
     # Rays at 90 degrees or more do not meet z = 1: they are placed at the clipping limit.
     centre = np.array([camera.matrix[0, 2], camera.matrix[1, 2]])

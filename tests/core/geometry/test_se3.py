@@ -4,7 +4,6 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.core.geometry.quaternion import quaternion_from_rotation, rotation_from_quaternion
 from recon.core.geometry.se3 import (
     angle_rad,
     apply,
@@ -15,7 +14,9 @@ from recon.core.geometry.se3 import (
     invert,
     make_transform,
     orthonormalise,
+    quaternion_from_rotation,
     rotate,
+    rotation_from_quaternion,
     step_jacobian,
 )
 

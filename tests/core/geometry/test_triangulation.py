@@ -7,11 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.core.geometry.projection import project, unproject
-from recon.core.geometry.triangulation import (
+from recon.core.geometry.projection import (
     depth_from_disparity,
     depth_sigma,
     disparity_from_depth,
+    project,
+    unproject,
 )
 from recon.core.values import RectifiedCamera
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon.core.errors import CalibrationError, SettingsError, SourceError
-from recon.core.geometry.triangulation import depth_from_disparity
+from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import DisparityTruth, RectifiedCamera
 from recon.evaluation.paper.methods import compare_depth
 from recon.evaluation.paper.scenes import (

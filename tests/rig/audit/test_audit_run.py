@@ -11,7 +11,7 @@ import pytest
 from recon.commands.config import load_config
 from recon.core.values import StereoCalibration, StereoPair
 from recon.io.cameras.calibration import read_calibration
-from recon.rig.audit.audit import audit_source, mend_calibration
+from recon.rig.audit.audit import audit_source, correct_calibration
 from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
@@ -82,7 +82,7 @@ def assert_aligned(spoiled: faults.Spoiled, folder: Path) -> None:
     before = audit_source(spoiled, CONFIG)
     assert "rows" in {finding.code for finding in before.findings}
     path = folder / "mended.yaml"
-    mend_calibration(spoiled, CONFIG, before, path)
+    correct_calibration(spoiled, CONFIG, before, path)
     height_px, width_px = spoiled.take(0).left.shape[:2]
     mended = read_calibration(path, width_px, height_px)
     assert isinstance(mended, StereoCalibration)

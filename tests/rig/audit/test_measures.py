@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from recon.core.geometry.se3 import exp_so3
 from recon.core.values import RectifiedCamera
-from recon.rig.audit.alignment import align_rows, count_aligned, mend_rig, turn_features
+from recon.rig.audit.alignment import align_rows, correct_rig, count_aligned, turn_features
 from recon.rig.audit.findings import Finding, verdict_of
 from recon.rig.audit.measures import (
     RepeatCounter,
@@ -84,7 +84,7 @@ def test_a_mended_rig_projects_to_the_same_rows() -> None:
     left, right = features(np.random.default_rng(3), *turn)
     alignment = align_rows(left, right, CAMERA)
     assert alignment is not None
-    rig = mend_rig(CAMERA, alignment, np.eye(3))
+    rig = correct_rig(CAMERA, alignment, np.eye(3))
     # Where the mended calibration says that a point lies is where the turned camera saw it.
     xyz = np.array([[0.4, -0.3, 6.0], [-1.0, 0.8, 9.0], [2.0, 0.1, 20.0]])
     seen = xyz @ rig.T_right_left[:3, :3].T + rig.T_right_left[:3, 3]

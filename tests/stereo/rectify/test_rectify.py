@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from recon.core.errors import CalibrationError, SettingsError
-from recon.core.geometry.projection import unproject
+from recon.core.geometry.projection import disparity_from_depth, unproject
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
-from recon.core.geometry.triangulation import disparity_from_depth
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
 from recon.io.cameras.calibration import read_calibration
 from recon.io.images.image import read_image
