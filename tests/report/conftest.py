@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from recon.core.values import (
     Disparity,
+    DisparityMetrics,
+    DisparityTruth,
     OccupancyGrid,
     PointCloud,
     Reason,
     RectifiedCamera,
     RectifiedPair,
     Trajectory,
+    TrajectoryMetrics,
     TriangleMesh,
 )
 from recon.core.values.arrays import Float64
 from recon.odometry.protocol import OdometryHealth
 
 HEIGHT_PX, WIDTH_PX = 24, 60
+METRICS = TrajectoryMetrics(0.62, 0.7, 0.41, 0.01, 0.03, 10.0, 11, (5.0,), 3)
 
 
 @pytest.fixture
@@ -94,3 +100,51 @@ def mesh() -> TriangleMesh:
     a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
     faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
     return TriangleMesh(vertices, faces, rgb=np.full((400, 3), 90, dtype=np.uint8))
+
+
+@pytest.fixture
+def drive(
+    pair: RectifiedPair,
+    disparity: Disparity,
+    trajectory: Trajectory,
+    T_map_world: Float64,
+    health: list[OdometryHealth],
+    grid: OccupancyGrid,
+    cloud: PointCloud,
+    mesh: TriangleMesh,
+) -> SimpleNamespace:
+    """A `MapRun` with everything but loops."""
+    mapped = SimpleNamespace(
+        trajectory=trajectory,
+        T_map_world=T_map_world,
+        health=health,
+        sample=SimpleNamespace(pair=pair, disparity=disparity),
+        loops=None,
+    )
+    return SimpleNamespace(
+        name="drives/drive <1>",
+        mapped=mapped,
+        cloud=cloud,
+        grid=grid,
+        mesh=mesh,
+        truth=SimpleNamespace(trajectory=trajectory),
+        metrics=METRICS,
+        summary={"fps": 4.25, "points": 2000, "stages": {"match": 1.0}, "nested": {"a": [1, None]}},
+        warnings=("frame 5: lost",),
+    )
+
+
+@pytest.fixture
+def view(pair: RectifiedPair, disparity: Disparity, cloud: PointCloud) -> SimpleNamespace:
+    """A `PairRun`."""
+    return SimpleNamespace(
+        name="scenes/bike/im0.png",
+        pair=pair,
+        disparity=disparity,
+        cloud=cloud,
+        mesh=None,
+        truth=DisparityTruth(disparity.values + 1, disparity.valid),
+        metrics=DisparityMetrics({2.0: 10.0}, 25.0, 1.0, 1.0, 1440),
+        summary={"points": 2000},
+        warnings=("a warning",),
+    )

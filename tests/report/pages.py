@@ -5,7 +5,12 @@ from __future__ import annotations
 import re
 from html import unescape
 from html.parser import HTMLParser
+from types import SimpleNamespace
 from typing import ClassVar
+
+from recon.report.map_page import map_content
+from recon.report.page import render_page
+from recon.report.pair_page import pair_content
 
 LOADING = {"src", "href", "data", "action", "poster", "srcset", "xlink:href"}
 
@@ -66,3 +71,11 @@ def rows(block: str) -> list[tuple[str, ...]]:
     body = re.findall(r"<tr>(.*?)</tr>", block.rpartition("<tbody>")[2], re.DOTALL)
     cells = [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row, re.DOTALL) for row in body]
     return [tuple(unescape(cell.replace("<wbr>", "")) for cell in row) for row in cells]
+
+
+def map_html(run: SimpleNamespace) -> str:
+    return render_page("map", **map_content(run))  # type: ignore[arg-type]
+
+
+def pair_html(run: SimpleNamespace) -> str:
+    return render_page("pair", **pair_content(run))  # type: ignore[arg-type]

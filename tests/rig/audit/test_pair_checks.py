@@ -19,6 +19,8 @@ from recon.run.progress import Silent
 from recon.sources.pair_input import PairInput
 from recon.stereo.pair_run import PairRun
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 CAMERA = RectifiedCamera(300.0, 160.0, 120.0, 160.0, 0.1, 320, 240)
 
 
