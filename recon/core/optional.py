@@ -11,10 +11,6 @@ from recon.core.errors import MissingDependencyError
 def require(module: str, *, extra: str) -> ModuleType:
     """Import an optional package.
 
-    Args:
-        module: Name to import, such as ``"rosbags"``.
-        extra: The extra of this project that provides it.
-
     Returns:
         The imported module.
 

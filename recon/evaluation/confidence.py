@@ -100,12 +100,6 @@ def measure_sparsification(
 
     Among pixels of equal confidence, correct and wrong ones are removed in proportion.
 
-    Args:
-        estimate: The disparity, with its confidence.
-        truth: Ground truth at the same size.
-        limit_px: Pixels with a larger error are wrong.
-        steps: Number of points of the curves.
-
     Raises:
         EvaluationError: The sizes differ, or no pixel has both a value and a known truth.
 
@@ -127,11 +121,6 @@ def share_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float
     """Return the share of the pixels, in [0, 1], whose error is within some standard deviations.
 
     For a normal distribution, it is 0.683 within one and 0.954 within two.
-
-    Args:
-        estimate: The disparity, with its standard deviation.
-        truth: Ground truth at the same size.
-        sigmas: Number of standard deviations.
 
     Raises:
         EvaluationError: The sizes differ, or no pixel has both a value and a known truth.

@@ -171,15 +171,7 @@ def doubt_axes(
     *,
     aligned: bool,
 ) -> list[str]:
-    """Return warnings if the clouds are in different axes or far apart: figures would be useless.
-
-    Args:
-        mapped: The map, in what should be the axes of the reference.
-        reference: The reference.
-        figures: What the comparison of the two gave.
-        frame: Axes of the reference, as given.
-        aligned: Whether the map was aligned to the reference.
-    """
+    """Return warnings if the clouds are in different axes or far apart: useless figures."""
     best = max(figures["precision"], figures["recall"])
     if best >= _FITS:
         return []

@@ -20,9 +20,6 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     format by the suffix chooses the same one. Missing folders are created. If the block raises,
     the temporary file is removed and an existing file at ``path`` is left untouched.
 
-    Args:
-        path: The file to write or replace.
-
     Yields:
         The temporary path, which does not exist yet.
 

@@ -22,10 +22,6 @@ _BRACKET: Final = re.compile(r"[\[\]{}]")
 def parse_yaml(text: str, where: StrPath) -> Any:
     """Parse YAML into plain values.
 
-    Args:
-        text: The text.
-        where: The file or option it comes from, for the error message.
-
     Raises:
         FormatError: The text is not YAML, or has aliases that expand without bound.
     """

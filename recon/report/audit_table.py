@@ -11,9 +11,6 @@ _UNKNOWN = "not known"
 def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
     """Describe the measurements of an audit.
 
-    Args:
-        summary: The output of `recon audit --json`.
-
     Returns:
         Subject and text of each line, in display order.
     """

@@ -54,10 +54,6 @@ def draw_result(result: SceneResult, directory: RunDirectory) -> None:
 def write_middlebury_page(summary: Mapping[str, Any], directory: RunDirectory) -> None:
     """Write the tables as text, Markdown, LaTeX and CSV, and ``report.html``.
 
-    Args:
-        summary: The content of ``summary.json``.
-        directory: The run, with the images of all results.
-
     Raises:
         OutputError: A file cannot be written.
     """

@@ -75,14 +75,7 @@ def loops_figure(
     loops: Sequence[tuple[int, int]],
     T_map_world: NDArray[Any],
 ) -> bytes:
-    """Draw the path before and after loop closure, and the gaps that were closed.
-
-    Args:
-        before: The path by odometry.
-        after: The corrected path of the same frames.
-        loops: The two frames of each loop.
-        T_map_world: (4, 4), from world to map axes.
-    """
+    """Draw the path before and after loop closure, and the gaps that were closed."""
     odometry, closed = (seen_from_above(path, T_map_world) for path in (before, after))
     gaps = [np.concatenate([odometry[list(pair)], [[np.nan, np.nan]]]) for pair in loops]
     joined = np.concatenate([np.zeros((0, 2)), *gaps])
@@ -123,13 +116,7 @@ def _top_view(lines: Sequence[Line], path: Float64, labels: tuple[str, str]) -> 
 def drift_figure(
     estimate: Trajectory, truth: Trajectory, health: Sequence[OdometryHealth] = ()
 ) -> bytes:
-    """Draw the drift of position and rotation, with both paths starting at the identity.
-
-    Args:
-        estimate: The estimated path.
-        truth: The true path, with one pose per pose of ``estimate``.
-        health: One record per pose, or none.
-    """
+    """Draw the drift of position and rotation, with both paths starting at the identity."""
     if len(estimate) != len(truth):
         figure = Figure((WIDE_IN, 4.6))
         note = f"{len(estimate)} poses, but {len(truth)} true ones: not compared"

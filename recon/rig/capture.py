@@ -88,11 +88,6 @@ def capture_pairs(
 
     If one camera loses a frame, the other drops its frame too, so that pairs are nearest in time.
 
-    Args:
-        cameras: Left and right camera, or one with both views.
-        settings: Includes the limits.
-        stopped: Called before every pair.
-
     Raises:
         SourceError: A live camera gives no more frames, or the cameras differ in frame size.
     """

@@ -29,10 +29,6 @@ _GAP_PERIODS: Final = 1.5
 class CaptureFolder:
     """Appends pairs; a pair that cannot be written completely is removed again.
 
-    Args:
-        folder: Output folder, created if missing.
-        suffix: Suffix of the image files, without the dot.
-
     Raises:
         OutputError: The folder is not empty, or cannot be written.
     """

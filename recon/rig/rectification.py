@@ -205,12 +205,7 @@ def read_pairs(images: ImagePairs) -> Iterator[tuple[StereoPair, tuple[Path, Pat
 
 
 def measure_rows(plan: RectifyPlan, pair: StereoPair) -> RectifyRun:
-    """Rectify a pair, and measure the row errors that are left by its feature matches.
-
-    Args:
-        plan: The way to rectify.
-        pair: The images as recorded.
-    """
+    """Rectify a pair, and measure the row errors that are left by its feature matches."""
     found = match_exactly(to_grey(pair.left), to_grey(pair.right))
     raw = (found.left_uv.astype(np.float64), found.right_uv.astype(np.float64))
     left, right = plan.place(*raw)

@@ -147,16 +147,10 @@ def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rect
 
 def _rectified(left: BagCameraInfo, right: BagCameraInfo, where: Path) -> RectifiedCamera:
     check_shift(right.P, float(left.P[0, 3]), where)
+    baseline_m = (left.P[0, 3] - right.P[0, 3]) / left.P[0, 0]
+    size = (left.width_px, left.height_px)
     with reading(where):
-        return RectifiedCamera(
-            focal_px=float(left.P[0, 0]),
-            cx_px=float(left.P[0, 2]),
-            cy_px=float(left.P[1, 2]),
-            cx_right_px=float(right.P[0, 2]),
-            baseline_m=float((left.P[0, 3] - right.P[0, 3]) / left.P[0, 0]),
-            width_px=left.width_px,
-            height_px=left.height_px,
-        )
+        return RectifiedCamera.from_matrices(left.P, right.P, baseline_m, *size)
 
 
 def _camera(info: BagCameraInfo, where: Path) -> CameraIntrinsics:

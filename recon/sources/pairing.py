@@ -120,9 +120,6 @@ class Roll:
         counters give the line, so that it stays the right one where images are missing; else the
         position does, and further lines are ignored.
 
-        Args:
-            count: Number of lines of the file.
-
         Returns:
             Indices from 0; None = the file has too few lines.
         """

@@ -74,15 +74,8 @@ def as_rectified(rig: Rig) -> Rig:
     if isinstance(rig, RectifiedCamera) or not _is_rectified(rig):
         return rig
     left, right = rig.left, rig.right
-    return RectifiedCamera(
-        focal_px=float(left.matrix[0, 0]),
-        cx_px=float(left.matrix[0, 2]),
-        cy_px=float(left.matrix[1, 2]),
-        cx_right_px=float(right.matrix[0, 2]),
-        baseline_m=rig.baseline_m,
-        width_px=left.width_px,
-        height_px=left.height_px,
-    )
+    size = (left.width_px, left.height_px)
+    return RectifiedCamera.from_matrices(left.matrix, right.matrix, rig.baseline_m, *size)
 
 
 def _is_rectified(rig: StereoCalibration) -> bool:

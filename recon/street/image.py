@@ -20,11 +20,6 @@ _EXPOSURE: Final = 0.9
 def take_image(stage: Stage, view: View, smooth_edges: bool) -> Float64:
     """Render one view.
 
-    Args:
-        stage: The lit scene.
-        view: The camera.
-        smooth_edges: Cast four rays per pixel at edges.
-
     Returns:
         float64 (H, W, 3), display values in [0, 1].
     """

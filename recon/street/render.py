@@ -44,11 +44,7 @@ class SyntheticFrame:
 
 
 class StreetCamera:
-    """The rig in a street; renders frames in any order.
-
-    Args:
-        world: The street.
-    """
+    """The rig in a street; renders frames in any order."""
 
     def __init__(self, world: StreetWorld) -> None:
         self.world = world

@@ -66,11 +66,7 @@ class JsonLines:
 
 
 class ProgressBar:
-    """Shows a bar with the number of items, their rate, and the state of the last one.
-
-    Args:
-        console: The console to draw on.
-    """
+    """Shows a bar with the number of items, their rate, and the state of the last one."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

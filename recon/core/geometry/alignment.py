@@ -68,10 +68,6 @@ def fit_paths(from_path: Trajectory, to_path: Trajectory) -> Similarity:
     Each pose contributes its camera centre and the ends of its axes, whose length is the typical
     distance of mapped points. On a nearly straight street, the centres alone would leave the
     rotation about it to noise, and the map would rotate with it.
-
-    Args:
-        from_path: N ≥ 1 poses.
-        to_path: N corresponding poses of the same camera.
     """
     return fit_points(_axes_m(from_path), _axes_m(to_path))
 

@@ -135,6 +135,21 @@ class RectifiedCamera:
         if min(self.width_px, self.height_px) < 1:
             raise CalibrationError("image size is empty", got=f"{self.width_px}x{self.height_px}")
 
+    @classmethod
+    def from_matrices(
+        cls, left: Float64, right: Float64, baseline_m: float, width_px: int, height_px: int
+    ) -> RectifiedCamera:
+        """Return the camera of the pinhole matrices, (3, 3) or (3, 4), of both views."""
+        return cls(
+            focal_px=float(left[0, 0]),
+            cx_px=float(left[0, 2]),
+            cy_px=float(left[1, 2]),
+            cx_right_px=float(right[0, 2]),
+            baseline_m=float(baseline_m),
+            width_px=width_px,
+            height_px=height_px,
+        )
+
     @property
     def doffs_px(self) -> float:
         """``cx_right - cx_left``: the disparity of a point at infinity, negated."""
@@ -151,6 +166,13 @@ class RectifiedCamera:
         """float64 (3, 3) pinhole matrix of the left view."""
         f, cx, cy = self.focal_px, self.cx_px, self.cy_px
         return np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def right_matrix(self) -> Float64:
+        """float64 (3, 3) pinhole matrix of the right view."""
+        matrix = self.matrix
+        matrix[0, 2] = self.cx_right_px
+        return matrix
 
     def resized(self, width_px: int, height_px: int) -> RectifiedCamera:
         """Return the camera of the same view at another image size; the baseline does not change.
@@ -179,12 +201,6 @@ def check_size(
     where: str | PathLike[str] | None,
 ) -> None:
     """Check that images have the size of their calibration; every use of a calibration does.
-
-    Args:
-        calibration: The calibration.
-        width_px: Width of the images.
-        height_px: Height of the images.
-        where: Calibration file or image, for the error message.
 
     Raises:
         CalibrationError: They have another size.

@@ -53,11 +53,6 @@ def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | 
 def curve_figures(estimate: Disparity, truth: DisparityTruth, limit_px: float) -> Figures:
     """Return the same for the confidence alone, of maps of equal size.
 
-    Args:
-        estimate: The result; its ``sigma_px`` is not read.
-        truth: The ground truth.
-        limit_px: Largest error of a correct pixel.
-
     Raises:
         EvaluationError: The sizes differ, or no pixel can be compared.
     """

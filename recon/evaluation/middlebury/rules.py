@@ -134,9 +134,6 @@ def evaluate_middlebury(
 def weighted_mean(figures: Mapping[str, float]) -> float:
     """Return the mean over scenes, weighted as in the table; NaN if any value is NaN.
 
-    Args:
-        figures: One value for each scene, by the scene's name.
-
     Raises:
         EvaluationError: There is no scene.
     """

@@ -69,15 +69,7 @@ def read_kitti_calib(
             expected="> 0 m",
             hint="check that left and right are not swapped",
         )
-    return RectifiedCamera(
-        focal_px=float(left[0, 0]),
-        cx_px=float(left[0, 2]),
-        cy_px=float(left[1, 2]),
-        cx_right_px=float(right[0, 2]),
-        baseline_m=baseline_m,
-        width_px=width_px,
-        height_px=height_px,
-    )
+    return RectifiedCamera.from_matrices(left, right, baseline_m, width_px, height_px)
 
 
 @reader

@@ -30,10 +30,6 @@ def check_image_bytes(content: bytes, path: StrPath) -> None:
 
     For TIFF only the format is checked: its decoder does reject truncated files.
 
-    Args:
-        content: The whole file.
-        path: The file, for the error message.
-
     Raises:
         FormatError: The file is not an image, or is truncated or damaged.
     """

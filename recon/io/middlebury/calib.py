@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -55,16 +55,10 @@ def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
     cam0, cam1 = (fields.numbers(key, (3, 3)) for key in ("cam0", "cam1"))
     doffs_px = fields.number("doffs")
     _check_views(cam0, cam1, doffs_px, path)
-    camera = RectifiedCamera(
-        focal_px=float(cam0[0, 0]),
-        cx_px=float(cam0[0, 2]),
-        cy_px=float(cam0[1, 2]),
-        cx_right_px=float(cam1[0, 2]),
-        baseline_m=fields.number("baseline") / 1000,
-        width_px=fields.count("width"),
-        height_px=fields.count("height"),
-        ndisp=fields.count("ndisp") if "ndisp" in fields else None,
-    )
+    size = (fields.count("width"), fields.count("height"))
+    camera = RectifiedCamera.from_matrices(cam0, cam1, fields.number("baseline") / 1000, *size)
+    if "ndisp" in fields:
+        camera = replace(camera, ndisp=fields.count("ndisp"))
     vmin, vmax = (fields.number(k) if k in fields else None for k in ("vmin", "vmax"))
     isint = "isint" in fields and fields.number("isint") != 0
     return MiddleburyCalib(camera, isint, vmin, vmax, doffs_px)

@@ -124,12 +124,6 @@ def full_size_factor(layout: Layout, width_px: int, height_px: int, folder: Path
 
     MiddEval3 gives the size by the last letter of the collection (``trainingQ``); in other
     folders its scenes are recognised by name.
-
-    Args:
-        layout: The layout.
-        width_px: Width of the images.
-        height_px: Height of the images.
-        folder: Folder of the scene.
     """
     generation = generation_of(layout, width_px)
     if generation == "2003":

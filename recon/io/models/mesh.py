@@ -62,10 +62,7 @@ def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) ->
 
 
 def check_mesh_formats(formats: Sequence[str]) -> None:
-    """Refuse unknown formats before the work is done.
-
-    Args:
-        formats: Suffixes without the dot.
+    """Refuse unknown formats, given as suffixes without the dot, before the work is done.
 
     Raises:
         SettingsError: One is not a suffix that `write_mesh` knows.

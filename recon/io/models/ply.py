@@ -89,9 +89,6 @@ def read_ply(path: StrPath) -> PointCloud:
     Points with a non-finite coordinate are dropped; organised clouds mark their gaps that way.
     ``quality`` (or ``confidence``) becomes the confidence if all values lie in [0, 1].
 
-    Args:
-        path: The file.
-
     Returns:
         The cloud, in the frame named in the file, else ``camera``. It may be empty.
 
@@ -117,10 +114,6 @@ def read_ply_pieces(path: StrPath, points_each: int = _PIECE_POINTS) -> Iterator
     """Read positions, normals and colours like `read_ply`, one piece at a time.
 
     Other fields are left out, as the meaning of ``quality`` depends on all its values.
-
-    Args:
-        path: The file.
-        points_each: Points per piece, before non-finite ones are dropped.
 
     Raises:
         FormatError: As in `read_ply`, at the piece where the fault is found.

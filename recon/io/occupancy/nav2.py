@@ -57,10 +57,7 @@ def write_nav2(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
 
 @reader
 def read_nav2(path: StrPath) -> OccupancyGrid:
-    """Read a map as Nav2 does in mode ``trinary``.
-
-    Args:
-        path: The YAML file.
+    """Read a map, given by its YAML file, as Nav2 does in mode ``trinary``.
 
     Raises:
         FormatError: A file is missing or damaged, the mode is not ``trinary``, or the map is

@@ -188,10 +188,6 @@ def octomap_pieces(path: Path, nodes_each: int = 1 << 19) -> Iterator[OccupancyV
 
     Leaves that cover several cells are expanded.
 
-    Args:
-        path: The file.
-        nodes_each: Number of tree nodes to read at a time.
-
     Raises:
         FormatError: The file is missing, truncated, damaged or not an ``.ot`` file.
     """

@@ -144,11 +144,9 @@ def correct_rig(
 def _as_raw(rig: RectifiedCamera | StereoCalibration) -> StereoCalibration:
     if isinstance(rig, StereoCalibration):
         return rig
-    right = rig.matrix.copy()
-    right[0, 2] = rig.cx_right_px
     cameras = [
         CameraIntrinsics(matrix, np.zeros(0), rig.width_px, rig.height_px)
-        for matrix in (rig.matrix, right)
+        for matrix in (rig.matrix, rig.right_matrix)
     ]
     T_right_left = make_transform(np.eye(3), np.array([-rig.baseline_m, 0.0, 0.0]))
     return StereoCalibration(cameras[0], cameras[1], T_right_left)

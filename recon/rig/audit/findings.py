@@ -79,12 +79,7 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
 
 
 def find_image_faults(sample: Sample, matcher: str | Matcher) -> Iterator[Finding]:
-    """Yield problems of single images: unreadable, black, blurred, of unequal brightness.
-
-    Args:
-        sample: The sampled images.
-        matcher: The matcher that will be used, or its name.
-    """
+    """Yield problems of single images: unreadable, black, blurred, of unequal brightness."""
     if sample.broken is not None:
         code = "size" if "size" in sample.broken.what else "unreadable"
         yield Finding(code, True, str(sample.broken))

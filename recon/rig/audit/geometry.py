@@ -54,12 +54,7 @@ class Geometry:
 
 
 def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
-    """Measure the geometry from the features of all pairs.
-
-    Args:
-        sample: The sampled pairs.
-        camera: The rectified camera.
-    """
+    """Measure the geometry from the features of all pairs."""
     features = pool_features(sample.features)
     matched = len(features)
     alignment = _align(features, camera)

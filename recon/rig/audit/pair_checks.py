@@ -50,11 +50,6 @@ def check_found(
 ) -> tuple[str, ...]:
     """Return warnings about the share of pixels with a disparity.
 
-    Args:
-        disparity: The disparity map.
-        pair: The images it was computed from.
-        faults: Known problems of the images.
-
     Raises:
         MatchingError: No pixel has a disparity.
     """

@@ -79,11 +79,6 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
     repeat each other, one is used. Views whose error exceeds three
     times the median are dropped.
 
-    Args:
-        views: Each with a sighting of the left and of the right camera.
-        size: (width, height) of the images.
-        settings: Lens model and limits.
-
     Raises:
         CalibrationError: There are too few views, or no rig fits them.
 
@@ -194,9 +189,6 @@ def group_views(views: Sequence[View]) -> list[list[View]]:
 
     Errors of corners on a still board are mostly the same in every image (flatness, lens, blur), so
     a repeated view is hardly a new measurement, and it never adds a pose.
-
-    Args:
-        views: The views, in any order.
 
     Returns:
         The groups in order of their first view. The first of each group represents it: the one

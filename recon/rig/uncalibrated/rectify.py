@@ -99,11 +99,6 @@ def rectify_uncalibrated(
     to homographies (Hartley). Their remaining degrees of freedom are chosen for little distortion
     and positive disparities.
 
-    Args:
-        features: Matches of one pair, or of several pairs of one rig.
-        size: (width, height) of the images.
-        min_features: Fewest matches that must agree on one geometry.
-
     Raises:
         CalibrationError: Too few matches agree, the scene is flat, one camera is in the view of
             the other, or a row error remains.

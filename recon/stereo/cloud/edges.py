@@ -33,9 +33,6 @@ def remove_flying_edges(disparity: Disparity) -> Disparity:
     ramp between the sides keep little more than their own column. Pixels without a disparity
     support none; the image is mirrored at its border.
 
-    Args:
-        disparity: The disparity from a matcher.
-
     Returns:
         The disparity without those pixels; their reason is `Reason.EDGE`.
 

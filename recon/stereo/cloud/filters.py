@@ -54,10 +54,6 @@ def filter_cloud(cloud: PointCloud, settings: FilterSettings) -> PointCloud:
 
     Downsampling comes first, which makes the neighbour searches cheap and evenly spaced.
 
-    Args:
-        cloud: Any cloud.
-        settings: The filters and their settings.
-
     Returns:
         A cloud in the same frame. In a voxel every attribute is averaged (``sigma_m`` too: the
         errors of neighbouring pixels are not independent), and normals are renormalised.

@@ -20,10 +20,6 @@ class CheckedMatcher:
     """Checks what a matcher that is not ours returns; a `Matcher`.
 
     Pixels for which rectification found no image have no match, whatever the matcher says.
-
-    Args:
-        matcher: The matcher.
-        name: What messages call it.
     """
 
     def __init__(self, matcher: Matcher, name: str) -> None:
@@ -81,9 +77,6 @@ def registered_names() -> set[str]:
 
 def load_registered(name: str) -> Matcher:
     """Make a matcher that a package registers.
-
-    Args:
-        name: One of `registered_names`.
 
     Raises:
         SettingsError: The package does not load, or what it registers makes no matcher; or two

@@ -59,10 +59,6 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
     The small pair is searched up to half its width. Its trusted disparities show how near the scene
     is; a tenth and one pixel of the small pair are added, because small objects may be nearer.
 
-    Args:
-        pair: The rectified pair.
-        minimum_px: The first disparity that will be searched.
-
     Returns:
         A multiple of 16: at least `usual_ndisp`, which it is where too little can be trusted, and
         at most the image's width (rounded up).

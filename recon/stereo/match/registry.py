@@ -106,11 +106,6 @@ def searched_ndisp(
 ) -> int | None:
     """Return how many disparities a matcher searches in a pair, before it rounds them.
 
-    Args:
-        matcher: The matcher, or its name.
-        settings: The settings of all matchers.
-        pair: The pair.
-
     Returns:
         Their number, or None of a matcher that searches no range, or is not ours.
     """

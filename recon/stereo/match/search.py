@@ -119,15 +119,7 @@ def rules_of(
     min_texture: float = 0.0,
     odds: float = ODDS,
 ) -> Rules:
-    """Return what the checks ask for, by the settings.
-
-    Args:
-        settings: Of the matcher.
-        ndisp: Number of disparities searched.
-        window_pixels: As in `Rules`.
-        min_texture: `Rules.texture`.
-        odds: As in `Rules`.
-    """
+    """Return what the checks ask for, by the settings."""
     return Rules(
         ndisp=ndisp,
         minimum=settings.min_disparity_px,

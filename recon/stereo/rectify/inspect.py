@@ -87,10 +87,6 @@ def inspect_features(
 def check_inspection(inspection: PairInspection, where: str | None = None) -> tuple[str, ...]:
     """Return warnings about a pair; none if it is good or has too few features.
 
-    Args:
-        inspection: Result of `inspect_pair`.
-        where: Name of the frame or drive, for the message.
-
     Raises:
         CalibrationError: Left and right are swapped, so no depth is possible.
     """

@@ -170,9 +170,7 @@ class RectifyingTurns:
     @property
     def matrices(self) -> tuple[Float64, Float64]:
         """float64 (3, 3) pinhole matrices of the left and the right view."""
-        right = self.camera.matrix
-        right[0, 2] = self.camera.cx_right_px
-        return self.camera.matrix, right
+        return self.camera.matrix, self.camera.right_matrix
 
     def place(
         self, calibration: StereoCalibration, pixels: Float64, *, right: bool = False
@@ -202,7 +200,7 @@ def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) 
             R1, R2, P1, P2 = _plan_pinholes(calibration, size, settings.alpha)
     except cv2.error as error:
         raise CalibrationError("cameras cannot be rectified", got=error.err) from error
-    camera = _camera_of(P1, P2, size)
+    camera = RectifiedCamera.from_matrices(P1, P2, -P2[0, 3] / P2[0, 0], *size)
     _check_focal(camera, left)
     return RectifyingTurns(R1, R2, _with_field(camera, settings.field_of_view_deg))
 
@@ -244,18 +242,6 @@ def _plan_pinholes(
         alpha=-1 if alpha is None else alpha,
     )
     return R1, R2, P1, P2
-
-
-def _camera_of(P1: Float64, P2: Float64, size: tuple[int, int]) -> RectifiedCamera:
-    return RectifiedCamera(
-        focal_px=float(P1[0, 0]),
-        cx_px=float(P1[0, 2]),
-        cy_px=float(P1[1, 2]),
-        cx_right_px=float(P2[0, 2]),
-        baseline_m=float(-P2[0, 3] / P2[0, 0]),
-        width_px=size[0],
-        height_px=size[1],
-    )
 
 
 def _with_field(camera: RectifiedCamera, field_of_view_deg: float | None) -> RectifiedCamera:
