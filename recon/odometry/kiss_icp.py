@@ -132,6 +132,17 @@ class KissIcp:
             _, frame = self._icp.voxelize(self._icp.clip(points))
             self._icp.correct(frame, pose)
 
+    def set_map(self, xyz_world: NDArray[np.floating]) -> None:
+        """Replace the map by points (M, 3), of which there may be none.
+
+        Raises:
+            RegistrationError: kiss-icp fails.
+        """
+        with _our_errors():
+            self._icp.local_map.clear()
+            if len(xyz_world):
+                self._icp.local_map.add_points(_points(xyz_world))
+
     def map_points(self) -> Float64:
         """Return float64 (M, 3), the points of the local map, world axes, in ascending order."""
         with _our_errors():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -97,6 +98,18 @@ def camera_of_pair(folder: Path) -> RectifiedCamera:
             expected=", ".join(names),
             hint="run recon pair again",
         ) from error
+
+
+def camera_height_of(folder: Path) -> float | None:
+    """How high the camera of a run is above the ground, from its summary; None = it is not known.
+
+    Raises:
+        FormatError: The folder does not contain a finished run, or its summary is damaged.
+    """
+    height_m = _read_record(folder / SUMMARY).get("camera_height_m")
+    if height_m is None or (type(height_m) in (int, float) and math.isfinite(height_m)):
+        return height_m
+    raise FormatError("the summary of the run has no valid camera_height_m", where=folder / SUMMARY)
 
 
 def refuse_as_target(run: Path, out: Path | None) -> None:

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import TracebackType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from typing_extensions import Self
 
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import invert
+from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair
 from recon.core.values.arrays import Float64
 from recon.map.store.records import CACHE_BYTES, Store
 from recon.map.store.session import Session, SessionInfo
+
+if TYPE_CHECKING:
+    from recon.map.localize.localizer import Located
+    from recon.map.settings import DriveSettings
 
 MAP_FILE: Final = "map/map.recon"
 """Where a finished run keeps its map."""
@@ -93,6 +98,32 @@ class Map:
             FormatError: The axes are not known.
         """
         return invert(self.sessions[0].T_map_world) @ session.T_map_world
+
+    def localize(
+        self,
+        pair: StereoPair,
+        calibration: RectifiedCamera | StereoCalibration | None = None,
+        config: DriveSettings | None = None,
+    ) -> Located:
+        """Find where a single pair was taken, without knowing anything else.
+
+        A drive is found more surely, and faster, by `recon.run_localize`.
+
+        Args:
+            pair: The images.
+            calibration: Of the cameras that took them; None = those of the map, rectified.
+            config: How to match them; None = the defaults.
+
+        Returns:
+            State ``tracking`` with the pose in the world of the map, or ``searching``.
+
+        Raises:
+            ReconError: The map has no keyframes or is damaged, or images and calibration do not
+                fit together.
+        """
+        from recon.map.localize.single import locate_pair  # noqa: PLC0415 - it needs a `Map`
+
+        return locate_pair(self, pair, calibration, config)
 
     def begin(self, info: SessionInfo) -> Session:
         """Add a drive.

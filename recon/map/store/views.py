@@ -5,10 +5,28 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from typing import overload
 
+from recon.core.errors import MappingError
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.map.store.map import Map
-from recon.places.known import KnownView
+from recon.places.known import KnownPlaces, KnownView
+
+
+def known_places(map_: Map) -> KnownPlaces:
+    """Return all places of a map, to recognise them.
+
+    Raises:
+        FormatError: The map is damaged.
+        MappingError: It has no keyframes.
+    """
+    views = MapViews(map_)
+    if not views:
+        raise MappingError(
+            "the map has no keyframes to be recognised by",
+            where=map_.store.name,
+            hint="map the drive again with this version",
+        )
+    return KnownPlaces(views)
 
 
 class MapViews(Sequence[KnownView]):

@@ -1,0 +1,206 @@
+"""Localisation frame by frame: search until a place is recognised, then track against the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+import numpy as np
+
+from recon.core.geometry.se3 import invert
+from recon.core.values.arrays import Bool, Float64
+from recon.map.localize.belief import Belief
+from recon.map.localize.search import Search
+from recon.map.localize.surroundings import Surroundings
+from recon.odometry.covariance import covariance_of, step_covariance
+from recon.odometry.protocol import OdometryFrame
+from recon.odometry.visual import VisualEstimate, VisualOdometry
+from recon.places.drift import path_lengths
+from recon.places.graph import loop_bias
+from recon.places.keyframe import Keyframe, make_keyframe
+from recon.places.known import KnownPlaces
+from recon.places.verify import Loop
+
+_VIEWS: Final = 2
+"""Nearest views of the map that each frame is compared with."""
+
+_SURFACES_EVERY: Final = 3
+"""Frames between two corrections by surfaces, where features confirm the pose."""
+
+_MAX_SIGMA_M: Final = 0.15
+"""Poses less certain than this are not told: an error of 0.5 m is then beyond three sigmas."""
+
+_MAX_SIGMA_DEG: Final = 1.0
+"""The same of the rotation."""
+
+_LOST_SIGMA_M: Final = 0.05
+"""Standard deviation of a motion without features, beside the drift over it."""
+
+_LOST_SIGMA_DEG: Final = 0.3
+"""That of its rotation."""
+
+
+class State(str, Enum):
+    """What is known of a frame's place.
+
+    Attributes:
+        SEARCHING: Nothing; no place has been recognised for certain.
+        TRACKING: Its pose.
+        LOST: Nothing any more; the pose of the frame before was the last one.
+    """
+
+    SEARCHING = "searching"
+    TRACKING = "tracking"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Where a frame is in a map.
+
+    Attributes:
+        state: What is known.
+        T_world_camera: float64 (4, 4), in the world of the map; None unless it is tracked.
+        covariance: float64 (6, 6) of a step (translation in metres, rotation vector in radians)
+            in camera axes; None unless it is tracked.
+        views: Views of the map that confirm the pose.
+        inliers: Features that agree with them.
+        surfaces: Whether the surfaces of the map corrected the pose.
+        note: Why nothing is known.
+    """
+
+    state: State
+    T_world_camera: Float64 | None = None
+    covariance: Float64 | None = None
+    views: int = 0
+    inliers: int = 0
+    surfaces: bool = False
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class _Confirmed:
+    """A belief after what the map shows in a frame, with the loops that confirm it."""
+
+    belief: Belief
+    loops: tuple[Loop, ...] = ()
+    refused: str = ""
+    surfaces: bool = False
+
+
+class Localizer:
+    """Finds the frames of a drive in a map, which it does not change.
+
+    Visual odometry predicts each pose; features of the nearest views of the map, and its surfaces,
+    correct it, by their covariances. A pose is told only while it is certain.
+
+    Args:
+        known: The places of the map.
+        surroundings: The surfaces of the map; None = they are not used.
+        frames: Least number of frames that must agree on the first fix.
+        among: bool (N,), the views that the first fix may use; None = all.
+    """
+
+    def __init__(
+        self,
+        known: KnownPlaces,
+        surroundings: Surroundings | None = None,
+        *,
+        frames: int = 2,
+        among: Bool | None = None,
+    ) -> None:
+        self._known = known
+        self._surroundings = surroundings
+        self._among = among
+        self._search = Search(known, frames)
+        self._visual = VisualOdometry()
+        self._belief: Belief | None = None
+        self._T_odometry = np.eye(4)
+        self._path_m = 0.0
+        self._frames = 0
+
+    def add(self, frame: OdometryFrame) -> Located:
+        """Locate the next frame."""
+        visual = self._visual.track(frame)
+        self._advance(visual)
+        keyframe = make_keyframe(self._frames, frame.pair, frame.disparity)
+        self._frames += 1
+        if self._belief is None:
+            self._belief = self._first_fix(keyframe, frame)
+        if self._belief is None:
+            return Located(State.SEARCHING, note="no place is recognised for certain")
+        confirmed = self._confirm(self._belief, keyframe, frame)
+        return self._told(confirmed)
+
+    def _advance(self, visual: VisualEstimate) -> None:
+        """Move on by the motion since the last frame."""
+        T_now = visual.result.T_world_camera
+        seen = visual.information is not None
+        steps = np.stack([self._T_odometry, T_now])
+        step_m = float(path_lengths(steps, np.array([True, seen or not self._frames]))[-1])
+        if self._belief is not None:
+            covariance = (
+                step_covariance(_LOST_SIGMA_M, _LOST_SIGMA_DEG)
+                if visual.information is None
+                else covariance_of(visual.information)
+            )
+            T_before_now = invert(self._T_odometry) @ T_now
+            self._belief = self._belief.moved(T_before_now, covariance, step_m)
+        self._T_odometry, self._path_m = T_now, self._path_m + step_m
+
+    def _first_fix(self, keyframe: Keyframe, frame: OdometryFrame) -> Belief | None:
+        camera = frame.pair.camera
+        loops = self._search.add(keyframe, camera, self._T_odometry, self._path_m, self._among)
+        if not loops:
+            return None
+        self._search.forget()
+        self._among = None
+        best = max(loops, key=lambda loop: loop.inliers)
+        return Belief(*self._measured(best))
+
+    def _measured(self, loop: Loop) -> tuple[Float64, Float64]:
+        """Return the pose by a loop from a view of the map, and its covariance."""
+        T = self._known.T_world_camera[loop.first] @ loop.T_first_last
+        return T, covariance_of(loop.information) + loop_bias(loop).covariance
+
+    def _confirm(self, belief: Belief, keyframe: Keyframe, frame: OdometryFrame) -> _Confirmed:
+        """Return the belief, corrected by the nearest views of the map and its surfaces."""
+        loops, refused = [], ""
+        for number in self._known.near(belief.T_world_camera, _VIEWS):
+            verdict = self._known.compare(number, keyframe, frame.pair.camera)
+            if verdict.loop is None:
+                refused = verdict.refused
+                continue
+            corrected = belief.corrected_to(*self._measured(verdict.loop))
+            if corrected is None:
+                refused = "the map contradicts the odometry"
+                continue
+            belief = corrected
+            loops.append(verdict.loop)
+        by_surfaces = self._by_surfaces(belief, frame, seen=bool(loops))
+        return _Confirmed(by_surfaces or belief, tuple(loops), refused, by_surfaces is not None)
+
+    def _by_surfaces(self, belief: Belief, frame: OdometryFrame, *, seen: bool) -> Belief | None:
+        """Return the belief corrected by the surfaces of the map; None = not."""
+        due = not seen or self._frames % _SURFACES_EVERY == 0
+        if self._surroundings is None or not due:
+            return None
+        return self._surroundings.correct(belief, frame, learn=seen)
+
+    def _told(self, confirmed: _Confirmed) -> Located:
+        """Return what is told of a belief; one that is not certain is given up."""
+        belief = confirmed.belief
+        if belief.sigma_m > _MAX_SIGMA_M or belief.sigma_deg > _MAX_SIGMA_DEG:
+            self._belief = None
+            why = confirmed.refused or "no view of the map is near"
+            return Located(State.LOST, note=why)
+        self._belief = belief
+        return Located(
+            State.TRACKING,
+            belief.T_world_camera,
+            belief.covariance,
+            len(confirmed.loops),
+            sum(loop.inliers for loop in confirmed.loops),
+            confirmed.surfaces,
+        )

@@ -1,0 +1,251 @@
+"""A whole drive, located in a map frame by frame."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from recon.core.errors import MappingError, RegistrationError
+from recon.core.values import StereoPair, Trajectory
+from recon.core.values.arrays import Bool, Float64
+from recon.map.drive.workspace import Workspace
+from recon.map.localize.localizer import Localizer, Located, State
+from recon.map.localize.surroundings import Surroundings
+from recon.map.settings import DriveSettings
+from recon.map.store.map import Map
+from recon.map.store.views import known_places
+from recon.odometry import OdometryFrame
+from recon.run.lookahead import look_ahead
+from recon.run.machine import serial_algebra
+from recon.run.progress import SILENT, Progress
+from recon.sources import StereoSource
+from recon.stereo.frame import FrameReconstructor
+
+START_WITHIN_M: Final = 10.0
+"""How far from the start that is given the first fix may be."""
+
+START_WITHIN_DEG: Final = 60.0
+"""How far its heading may be from the one that is given."""
+
+
+@dataclass(frozen=True)
+class StartPose:
+    """Roughly where a drive begins, in map axes.
+
+    Attributes:
+        x_m: Position.
+        y_m: Position.
+        yaw_deg: Heading, from the x axis to the y axis.
+    """
+
+    x_m: float
+    y_m: float
+    yaw_deg: float
+
+    def near(self, T_map_camera: Float64) -> Bool:
+        """Return bool (N,), which of these poses (N, 4, 4) are near."""
+        off = T_map_camera[:, :2, 3] - (self.x_m, self.y_m)
+        ahead = T_map_camera[:, :2, 2] @ _turned_back(self.yaw_deg)
+        turned = np.abs(np.arctan2(ahead[:, 1], ahead[:, 0]))
+        near_m = np.hypot(off[:, 0], off[:, 1])
+        return np.asarray((near_m <= START_WITHIN_M) & (turned <= math.radians(START_WITHIN_DEG)))
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizedFrame:
+    """Where one frame is; a `Step` of the progress of a run.
+
+    Attributes:
+        index: Number of the frame in the drive.
+        time_s: Its time.
+        seconds: Time that locating it took, without matching.
+        located: Its state, pose and covariance.
+    """
+
+    index: int
+    time_s: float
+    seconds: float
+    located: Located
+
+    @property
+    def ok(self) -> bool:
+        """Whether its pose is known."""
+        return self.located.state is State.TRACKING
+
+    @property
+    def event(self) -> dict[str, Any]:
+        """The frame for programs."""
+        T = self.located.T_world_camera
+        return {
+            "event": "frame",
+            "index": self.index,
+            "seconds": round(self.seconds, 4),
+            "state": self.located.state.value,
+            "position_m": None if T is None else T[:3, 3].round(6).tolist(),
+            "views": self.located.views,
+            "inliers": self.located.inliers,
+            "note": self.located.note,
+        }
+
+    @property
+    def state(self) -> str:
+        """The frame for people."""
+        found = self.located
+        if found.T_world_camera is None:
+            return f"{found.state.value}: {found.note}"
+        return f"{found.state.value}, {found.inliers} inliers in {found.views} views"
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizedDrive:
+    """A drive in a map.
+
+    Attributes:
+        frames: One for each frame of the drive, in order.
+        T_map_world: float64 (4, 4), from the world of the map to its axes.
+        seconds: Time from the first frame to the last.
+    """
+
+    frames: tuple[LocalizedFrame, ...]
+    T_map_world: Float64
+    seconds: float
+
+    @property
+    def tracked(self) -> list[LocalizedFrame]:
+        """The frames whose pose is known."""
+        return [frame for frame in self.frames if frame.ok]
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Their poses, in the world of the map; perhaps none."""
+        poses = [
+            f.located.T_world_camera for f in self.tracked if f.located.T_world_camera is not None
+        ]
+        times_s = np.array([frame.time_s for frame in self.tracked])
+        return Trajectory(np.array(poses).reshape(-1, 4, 4), times_s)
+
+    def figures(self) -> dict[str, Any]:
+        """The figures for ``summary.json``."""
+        states = [frame.located.state for frame in self.frames]
+        seconds = np.array([frame.seconds for frame in self.frames])
+        sigmas_m = [_sigma_m(frame.located) for frame in self.tracked]
+        return {
+            "frames": len(states),
+            **{f"frames_{state.value}": states.count(state) for state in State},
+            "first_fix_frame": self.tracked[0].index if self.tracked else None,
+            "median_sigma_m": float(np.median(sigmas_m)) if sigmas_m else None,
+            "fps": len(states) / self.seconds if self.seconds > 0 else None,
+            "seconds_per_frame": {
+                "median": float(np.median(seconds)),
+                "p95": float(np.percentile(seconds, 95)),
+                "max": float(seconds.max()),
+            },
+        }
+
+    def warnings(self) -> list[str]:
+        """What the user should know."""
+        states = [frame.located.state for frame in self.frames]
+        lost = states.count(State.LOST)
+        if not self.tracked:
+            return ["the drive was not found in the map: no frame has a pose"]
+        if lost:
+            times = "once" if lost == 1 else f"{lost} times"
+            return [f"the drive was lost {times}; frames without a pose are not in the trajectory"]
+        return []
+
+
+def open_localizer(
+    map_: Map, config: DriveSettings, *, start: StartPose | None = None
+) -> Localizer:
+    """Make ready to find a drive in a map.
+
+    Args:
+        map_: The map.
+        config: The settings of the drive.
+        start: Where it begins, roughly; None = anywhere.
+
+    Raises:
+        FormatError: The map is damaged.
+        MappingError: It has no keyframes, or none near the start.
+    """
+    known = known_places(map_)
+    among = None
+    if start is not None:
+        among = start.near(map_.sessions[0].T_map_world @ known.T_world_camera)
+        if not among.any():
+            raise MappingError(
+                "no keyframe of the map is near the start pose",
+                got=f"{start.x_m:g},{start.y_m:g},{start.yaw_deg:g}",
+                expected=f"one within {START_WITHIN_M:g} m and {START_WITHIN_DEG:g}°",
+                hint="x and y in metres and the heading in degrees, in map axes",
+            )
+    return Localizer(known, Surroundings(map_, config.odometry.max_range_m), among=among)
+
+
+def localize_sequence(
+    source: StereoSource,
+    workspace: Workspace,
+    config: DriveSettings,
+    *,
+    start: StartPose | None = None,
+    progress: Progress = SILENT,
+) -> LocalizedDrive:
+    """Find all frames of a source in a map, which is not changed.
+
+    Args:
+        source: The drive; its rig may be another than that of the map.
+        workspace: The map, threads and stopwatch.
+        config: The settings of the drive.
+        start: Where it begins, roughly; None = anywhere.
+        progress: Shown each frame.
+
+    Raises:
+        ReconError: The map cannot be used, or a frame cannot be read or matched.
+    """
+    map_, watch = workspace.map, workspace.stopwatch
+    localizer = open_localizer(map_, config, start=start)
+    reconstructor = FrameReconstructor(
+        source.calibration, config, threads=workspace.threads, stopwatch=watch
+    )
+
+    def match(pair: StereoPair) -> OdometryFrame:
+        return OdometryFrame(*reconstructor.match(pair))
+
+    frames: list[LocalizedFrame] = []
+    progress.on_start(source.name, len(source))
+    begun = time.perf_counter()
+    try:
+        with serial_algebra():
+            for frame in look_ahead(match, source.frames()):
+                with watch.stage("localize"):
+                    frames.append(_located(localizer, frame, len(frames)))
+                progress.on_step(frames[-1])
+                config.memory.check(f"frame {len(frames) - 1}")
+    finally:
+        progress.on_finish()
+    if not frames:
+        raise RegistrationError("the source has no frame", where=source.name)
+    T_map_world = map_.sessions[0].T_map_world
+    return LocalizedDrive(tuple(frames), T_map_world, time.perf_counter() - begun)
+
+
+def _located(localizer: Localizer, frame: OdometryFrame, index: int) -> LocalizedFrame:
+    begun = time.perf_counter()
+    located = localizer.add(frame)
+    return LocalizedFrame(index, frame.pair.timestamp_s, time.perf_counter() - begun, located)
+
+
+def _sigma_m(located: Located) -> float:
+    """Standard deviation of a position: the root of the sum of those along three axes."""
+    covariance = np.zeros((6, 6)) if located.covariance is None else located.covariance
+    return float(np.sqrt(np.trace(covariance[:3, :3])))
+
+
+def _turned_back(yaw_deg: float) -> Float64:
+    """float64 (2, 2), that turns rows (x, y) back by a heading."""
+    c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
+    return np.array([[c, -s], [s, c]])

@@ -1,0 +1,157 @@
+"""The surfaces of a map around a pose, and how kiss-icp would correct the pose by them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from recon.core.geometry.se3 import adjoint, apply, as_step, as_transform, invert
+from recon.core.values.arrays import Float64
+from recon.io.files import reading
+from recon.map.localize.belief import Belief
+from recon.map.store.map import Map
+from recon.map.store.session import Session
+from recon.odometry.gate import Correction, icp_covariance, judge
+from recon.odometry.kiss_icp import KissIcp, KissIcpOptions
+from recon.odometry.points import select_points
+from recon.odometry.protocol import OdometryFrame
+from recon.odometry.surfaces import Fit, Surfaces, describe_surfaces, fit_surfaces
+
+_VOXEL_M: Final = 0.3
+"""Edge of a voxel of the map of ICP."""
+
+_THRESHOLD_M: Final = 0.3
+"""Scale of the robust kernel; points pair up to thrice as far."""
+
+_SURFACE_M: Final = 1.0
+"""Edge of the cells in which surfaces are fitted to the map."""
+
+_RELOAD_M: Final = 10.0
+"""Way after which the points around the camera are read again."""
+
+_MIN_POINTS: Final = 300
+"""Frames with fewer points are not corrected."""
+
+_OFFSET_FRAMES: Final = 30
+"""Corrections of poses that features confirm are averaged over as many frames and subtracted: their
+mean is the bias of stereo depth, not an error of the pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A submap, and from where it was seen.
+
+    Attributes:
+        session: Its drive.
+        index: Its number there.
+        T_map_submap: float64 (4, 4), from the world of the odometry to that of the map.
+        cameras_m: float64 (N, 3), where its frames were taken, in the world of the map.
+    """
+
+    session: Session
+    index: int
+    T_map_submap: Float64
+    cameras_m: Float64
+
+    def points(self) -> Float64:
+        """float64 (M, 3), the fused points in the world of the map."""
+        with reading(self.session.where):
+            fusion = self.session.info.config["fusion"]
+            voxel_m, least = float(fusion["voxel_m"]), int(fusion["min_count"])
+        fused = self.session.submaps.get(self.index).fused
+        cloud = fused.cloud(voxel_m, min(least, len(self.session)))
+        return apply(self.T_map_submap, cloud.xyz.astype(np.float64))
+
+
+class Surroundings:
+    """The fused points of a map around a camera, as a map for kiss-icp.
+
+    Args:
+        map_: The map.
+        max_range_m: Farther points are not used.
+
+    Raises:
+        FormatError: The map is damaged.
+    """
+
+    def __init__(self, map_: Map, max_range_m: float) -> None:
+        self._range_m = max_range_m
+        self._parts = [part for session in map_.sessions for part in _parts(map_, session)]
+        options = KissIcpOptions(max_range_m, max_range_m, _VOXEL_M, iterations=50)
+        self._icp = KissIcp(replace(options, convergence=1e-3))
+        self._loaded_at = np.full(3, np.inf)
+        self._surfaces = describe_surfaces(np.zeros((0, 3)), _SURFACE_M)
+        self._offset = np.zeros(6)
+        self._measured = 0
+
+    def correct(self, belief: Belief, frame: OdometryFrame, *, learn: bool) -> Belief | None:
+        """Return a belief corrected by the surfaces around it; None where they tell nothing.
+
+        Args:
+            belief: Where the camera is.
+            frame: What it sees.
+            learn: Whether the belief is good enough to learn the bias of the correction from.
+        """
+        self._load(belief.T_world_camera[:3, 3])
+        points = select_points(frame, self._range_m)
+        if len(points) < _MIN_POINTS or not len(self._surfaces.keys):
+            return None
+        correction = self._measure(belief, points.xyz.astype(np.float64))
+        verdict = judge(correction, self._offset, belief.covariance)
+        if learn:
+            self._learn(correction.step)
+        if not verdict.accepted:
+            return None
+        T = belief.T_world_camera @ as_transform(correction.step - self._offset)
+        return belief.corrected_to(T, icp_covariance(correction.after))
+
+    def _measure(self, belief: Belief, xyz: Float64) -> Correction:
+        T_prior = belief.T_world_camera
+        alignment = self._icp.align(xyz, T_prior, _THRESHOLD_M)
+        T_icp = alignment.T_world_camera
+        return Correction(
+            step=as_step(invert(T_prior) @ T_icp),
+            before=_fit(alignment.source, T_prior, self._surfaces),
+            after=_fit(alignment.source, T_icp, self._surfaces),
+        )
+
+    def _learn(self, step: Float64) -> None:
+        self._measured += 1
+        share = 1.0 / min(self._measured, _OFFSET_FRAMES)
+        self._offset = (1.0 - share) * self._offset + share * step
+
+    def _load(self, camera_m: Float64) -> None:
+        """Take the points around a position into the map of ICP, unless they are there."""
+        if np.linalg.norm(camera_m - self._loaded_at) <= _RELOAD_M:
+            return
+        self._loaded_at = np.array(camera_m)
+        reach_m = self._range_m + _RELOAD_M
+        near = [p for p in self._parts if _distance_m(p.cameras_m, camera_m) <= reach_m]
+        xyz = np.concatenate([np.zeros((0, 3)), *(part.points() for part in near)])
+        xyz = xyz[np.linalg.norm(xyz - camera_m, axis=1) <= reach_m]
+        self._icp.set_map(xyz)
+        self._surfaces = describe_surfaces(xyz, _SURFACE_M)
+
+
+def _parts(map_: Map, session: Session) -> Iterator[_Part]:
+    """The submaps of a drive."""
+    corrections, T_map_session = session.corrections(), map_.T_world_session(session)
+    cameras_m = apply(T_map_session, session.trajectory.positions_m)
+    for entry in session.submaps.entries:
+        T = T_map_session if corrections is None else T_map_session @ corrections[entry.index]
+        seen_from = cameras_m[entry.first_frame : entry.first_frame + entry.frames]
+        yield _Part(session, entry.index, T, seen_from)
+
+
+def _distance_m(positions_m: Float64, place_m: Float64) -> float:
+    return float(np.linalg.norm(positions_m - place_m, axis=1).min(initial=np.inf))
+
+
+def _fit(xyz_camera: Float64, T_world_camera: Float64, surfaces: Surfaces) -> Fit:
+    """Return how points of a frame fit; the information is that of a step in camera axes."""
+    fit = fit_surfaces(apply(T_world_camera, xyz_camera), surfaces)
+    turn = adjoint(T_world_camera)
+    return replace(fit, information=turn.T @ fit.information @ turn)

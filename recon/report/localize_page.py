@@ -1,0 +1,68 @@
+"""The report of a drive located in a map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from recon.map.localize.localize_run import LocalizeRun
+from recon.map.localize.localizer import State
+from recon.map.localize.sequence import LocalizedDrive
+from recon.report.page import write_page
+from recon.report.paths import grid_figure, path_figure
+from recon.report.style import BAD, FAINT, WIDE_IN, styled, to_png
+from recon.run.directory import RunDirectory
+
+_SHADES: Final = {State.SEARCHING: FAINT, State.LOST: BAD}
+
+
+def write_localize_page(run: LocalizeRun, directory: RunDirectory) -> None:
+    """Write ``report.html`` of a drive in a map.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    figures = {"path": _path(run), "certainty": certainty_figure(run.drive)}
+    write_page("localize", directory, run=run, figures=figures, warnings=run.summary["warnings"])
+
+
+def _path(run: LocalizeRun) -> bytes | None:
+    """The path on the grid, or alone if the map has none; None where there is neither."""
+    path, T_map_world = run.drive.trajectory, run.drive.T_map_world
+    if run.grid is not None:
+        return grid_figure(run.grid, path, T_map_world)
+    return path_figure(path, None, T_map_world) if len(path) else None
+
+
+@styled
+def certainty_figure(drive: LocalizedDrive) -> bytes:
+    """Standard deviations of each pose, and what confirms it; other frames are shaded."""
+    known = [frame.located for frame in drive.frames]
+    sigmas_m = [
+        np.nan if x.covariance is None else np.sqrt(np.trace(x.covariance[:3, :3])) for x in known
+    ]
+    inliers = [float(x.inliers) if x.covariance is not None else np.nan for x in known]
+    figure = Figure((WIDE_IN, 4.4))
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    upper.plot(sigmas_m, marker=".")
+    lower.plot(inliers, marker=".")
+    upper.set(ylabel="standard deviation\nof the position (m)")
+    lower.set(ylabel="features that\nagree", xlabel="frame")
+    for axes in (upper, lower):
+        axes.set_ylim(bottom=0)
+        axes.set_xlim(-0.5, len(known) - 0.5)
+        _shade(axes, [located.state for located in known])
+    figure.align_ylabels()
+    return to_png(figure)
+
+
+def _shade(axes: Axes, states: Sequence[State]) -> None:
+    """Mark the frames without a pose."""
+    for number, state in enumerate(states):
+        if state in _SHADES:
+            ends = (number - 0.5, number + 0.5)
+            axes.axvspan(*ends, color=_SHADES[state], alpha=0.2, linewidth=0)

@@ -1,0 +1,223 @@
+"""A drive is found in the map of its street, frame by frame, and in no other one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recon.core.errors import FormatError, MappingError
+from recon.core.geometry import se3
+from recon.core.values import RectifiedCamera, StereoPair, Trajectory
+from recon.map.drive.sequence import map_sequence
+from recon.map.drive.workspace import Workspace
+from recon.map.localize.localizer import State
+from recon.map.localize.sequence import (
+    LocalizedDrive,
+    StartPose,
+    localize_sequence,
+    open_localizer,
+)
+from recon.map.settings import DriveSettings
+from recon.map.store.map import Map
+from recon.map.store.session import SessionInfo
+from recon.sources.synthetic import SyntheticSource
+from recon.street import StreetScene
+
+RIG = {"width_px": 400, "height_px": 150, "focal_px": 225.0, "smooth_edges": False}
+STREET = StreetScene(frames=24, seed=1, **RIG)
+SETTINGS = DriveSettings()
+
+
+class Film:
+    """Some frames of a rendered drive, in any order, perhaps changed; each is rendered once."""
+
+    description, truth, files = "a rendered street", None, ()
+
+    def __init__(self, pairs: list[StereoPair], camera: RectifiedCamera) -> None:
+        self.name, self.calibration, self.pairs = "film", camera, pairs
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return self.frames()
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        times = enumerate(self.pairs[start:], start)
+        return (replace(pair, timestamp_s=0.1 * n, index=n) for n, pair in times)
+
+    def taken(self, which: slice, change: Callable[[np.ndarray], np.ndarray] | None = None) -> Film:
+        """Return some of its frames, each image changed."""
+        chosen = self.pairs[which]
+        if change is not None:
+            chosen = [replace(p, left=change(p.left), right=change(p.right)) for p in chosen]
+        return Film(chosen, self.calibration)
+
+
+def film(scene: StreetScene) -> Film:
+    source = SyntheticSource(scene)
+    return Film(list(source), source.calibration)
+
+
+@pytest.fixture(scope="module")
+def street() -> Film:
+    return film(STREET)
+
+
+@pytest.fixture(scope="module")
+def truth() -> np.ndarray:
+    return SyntheticSource(STREET).trajectory.T_world_camera
+
+
+@pytest.fixture(scope="module")
+def street_map(street: Film, truth: np.ndarray) -> Map:
+    """Made of the even frames, at their true poses."""
+    made = Map.temporary()
+    even = street.taken(slice(0, None, 2))
+    poses = Trajectory(truth[::2], 0.1 * np.arange(len(even)))
+    map_sequence(even, SETTINGS, known_poses=poses, workspace=Workspace(made))
+    return made
+
+
+def _localized(source: Film, map_: Map, start: StartPose | None = None) -> LocalizedDrive:
+    return localize_sequence(source, Workspace(map_), SETTINGS, start=start)
+
+
+def _errors(drive: LocalizedDrive, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of the tracked frames: metres and degrees."""
+    tracked = [frame.index for frame in drive.tracked]
+    off = se3.invert(truth[tracked]) @ drive.trajectory.T_world_camera
+    return np.linalg.norm(off[:, :3, 3], axis=1), np.degrees(se3.angle_rad(off))
+
+
+def test_frames_between_those_of_the_map_are_found_to_centimetres(street, street_map, truth):
+    drive = _localized(street.taken(slice(1, None, 2)), street_map)
+
+    error_m, error_deg = _errors(drive, truth[1::2])
+    assert [frame.located.state for frame in drive.frames[1:]] == [State.TRACKING] * 11
+    assert np.median(error_m) < 0.05
+    assert error_m.max() < 0.2
+    assert np.median(error_deg) < 0.15
+    assert drive.figures()["first_fix_frame"] <= 1
+
+
+def test_errors_are_as_large_as_the_covariance_says(street, street_map, truth):
+    drive = _localized(street.taken(slice(1, None, 2)), street_map)
+
+    for frame in drive.tracked:
+        off = se3.as_step(se3.invert(truth[2 * frame.index + 1]) @ frame.located.T_world_camera)
+        assert off @ np.linalg.solve(frame.located.covariance, off) < 22.5  # 0.1 %, six freedoms
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda image: np.clip(0.6 * image.astype(float) + 10, 0, 255).astype(np.uint8),
+        lambda image: (255 * (image / 255.0) ** 1.5).astype(np.uint8),
+    ],
+    ids=["darker", "gamma"],
+)
+def test_another_light_makes_no_difference(street, street_map, truth, change):
+    drive = _localized(street.taken(slice(1, None, 2), change), street_map)
+
+    error_m, _ = _errors(drive, truth[1::2])
+    assert len(drive.tracked) >= 10
+    assert error_m.max() < 0.3
+
+
+def test_a_drive_backwards_from_the_middle_is_found(street, street_map, truth):
+    drive = _localized(street.taken(slice(15, None, -2)), street_map)
+
+    error_m, _ = _errors(drive, truth[15::-2])
+    assert len(drive.tracked) >= len(drive.frames) - 1
+    assert error_m.max() < 0.2
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_in_another_street_nothing_is_found(street_map, seed):
+    drive = _localized(film(STREET.model_copy(update={"seed": seed, "frames": 8})), street_map)
+
+    assert {frame.located.state for frame in drive.frames} == {State.SEARCHING}
+    assert len(drive.trajectory) == 0
+    assert drive.figures()["first_fix_frame"] is None
+    assert "not found in the map" in drive.warnings()[0]
+
+
+def test_a_drive_that_leaves_the_map_is_lost_and_then_searched(street, truth):
+    """The map ends after half of the drive; what lies beyond is not made up."""
+    made = Map.temporary()
+    first = street.taken(slice(0, 8))
+    poses = Trajectory(truth[:8], 0.1 * np.arange(8))
+    map_sequence(first, SETTINGS, known_poses=poses, workspace=Workspace(made))
+
+    drive = _localized(street, made)
+
+    states = [frame.located.state for frame in drive.frames]
+    assert states[7] is State.TRACKING
+    assert states.count(State.LOST) == 1
+    lost = states.index(State.LOST)
+    assert set(states[lost + 1 :]) == {State.SEARCHING}
+    assert _errors(drive, truth)[0].max() < 0.5
+    assert "lost once" in drive.warnings()[0]
+
+
+def test_a_blinded_camera_is_lost_and_found_again(street, street_map, truth):
+    odd = street.taken(slice(1, None, 2))
+    black = replace(odd.pairs[0], left=0 * odd.pairs[0].left, right=0 * odd.pairs[0].right)
+    odd.pairs[4] = odd.pairs[5] = black
+
+    drive = _localized(odd, street_map)
+
+    states = [frame.located.state for frame in drive.frames]
+    assert states[3] is State.TRACKING
+    assert State.TRACKING not in states[4:6]
+    assert states[-1] is State.TRACKING
+    assert _errors(drive, truth[1::2])[0].max() < 0.3
+
+
+def test_a_start_pose_narrows_the_search(street, street_map, truth):
+    odd = street.taken(slice(1, 6, 2))
+    T_map_camera = street_map.session().T_map_world @ truth[1]
+    x_m, y_m = T_map_camera[:2, 3]
+    yaw_deg = np.degrees(np.arctan2(T_map_camera[1, 2], T_map_camera[0, 2]))
+
+    assert _localized(odd, street_map, StartPose(x_m, y_m, yaw_deg)).tracked
+    beyond = StartPose(x_m + 19.0, y_m, yaw_deg)
+    assert not _localized(odd, street_map, beyond).tracked
+    for wrong in (StartPose(x_m + 200.0, y_m, yaw_deg), StartPose(x_m, y_m, yaw_deg + 180.0)):
+        with pytest.raises(MappingError, match="no keyframe of the map is near the start"):
+            _localized(odd, street_map, wrong)
+
+
+def test_a_single_pair_is_found(street, street_map, truth):
+    found = street_map.localize(street.pairs[9])
+
+    off = se3.invert(truth[9]) @ found.T_world_camera
+    assert found.state is State.TRACKING
+    assert np.linalg.norm(off[:3, 3]) < 0.3
+
+
+def test_a_single_pair_of_another_street_is_not_found(street_map):
+    other = film(STREET.model_copy(update={"seed": 5, "frames": 1}))
+
+    assert street_map.localize(other.pairs[0]).state is State.SEARCHING
+
+
+def test_a_map_without_keyframes_is_refused():
+    empty = Map.temporary()
+    empty.begin(SessionInfo())
+    with pytest.raises(MappingError, match="no keyframes"):
+        open_localizer(empty, SETTINGS)
+
+
+def test_a_damaged_map_is_refused_in_one_line(street, street_map):
+    damaged = Map.temporary()
+    for kind in street_map.store.kinds():
+        street_map.store.copy(kind, damaged.store)
+    damaged.store.put("keyframe", (0, 4), {"keyframe": {}})
+
+    with pytest.raises(FormatError):
+        _localized(street.taken(slice(1, 4, 2)), Map(damaged.store))
