@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from recon.commands.config import ReconConfig, load_config
     from recon.commands.evaluate_middlebury import run_middlebury
     from recon.commands.export import run_export
+    from recon.commands.localize import run_localize
     from recon.commands.map import run_map
     from recon.commands.map_options import MapOptions
     from recon.commands.occupancy import run_occupancy
@@ -84,6 +85,7 @@ _HOMES = {
     "recon.rig.audit.audit": ("Audit",),
     "recon.commands.audit": ("run_audit",),
     "recon.commands.config": ("ReconConfig", "load_config"),
+    "recon.commands.localize": ("run_localize",),
     "recon.commands.map": ("run_map",),
     "recon.commands.map_options": ("MapOptions",),
     "recon.commands.evaluate_middlebury": ("run_middlebury",),
@@ -165,6 +167,7 @@ __all__ = [
     "run_audit",
     "run_disparity",
     "run_export",
+    "run_localize",
     "run_map",
     "run_middlebury",
     "run_occupancy",

@@ -87,7 +87,7 @@ def localize(
         from recon.commands.localize import run_localize
         from recon.commands.map_options import MapOptions
         from recon.run.memory import memory_overrides
-        from recon.sources import open_source
+        from recon.sources.registry import open_source
 
         pose, first = _read_start(start)
         views = source_overrides(calib, left, right, tolerance, (first, end, stride))

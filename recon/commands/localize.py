@@ -16,7 +16,7 @@ from recon.map.store.map import MAP_FILE, Map
 from recon.report.localize_page import write_localize_page
 from recon.run import Run
 from recon.run.finished import GRID, camera_height_of, refuse_as_target
-from recon.sources import StereoSource
+from recon.sources.protocol import StereoSource
 
 
 def run_localize(

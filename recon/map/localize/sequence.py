@@ -22,7 +22,7 @@ from recon.odometry import OdometryFrame
 from recon.run.lookahead import look_ahead
 from recon.run.machine import serial_algebra
 from recon.run.progress import SILENT, Progress
-from recon.sources import StereoSource
+from recon.sources.protocol import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
 START_WITHIN_M: Final = 10.0
