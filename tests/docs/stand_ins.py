@@ -241,7 +241,6 @@ STAND_INS = (
     StandIn("~/kitti/sequences/06", drive),
     StandIn("~/kitti/poses/06.txt", poses),
     StandIn("~/long", drive),
-    StandIn("rides/today", drive),
     StandIn("DRIVE", drive_with_truth),
     StandIn("recon audit drive --calib rig.yaml", drive_of_that_rig, "drive"),
     StandIn("recon map drive ", recording, "drive"),
