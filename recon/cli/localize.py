@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -85,18 +86,17 @@ def localize(
         from recon.cli.show.progress import choose_viewer
         from recon.commands.config import load_config, matching_overrides, source_overrides
         from recon.commands.localize import run_localize
-        from recon.commands.map_options import MapOptions
+        from recon.commands.map_options import MapRequest
         from recon.run.memory import memory_overrides
-        from recon.sources.registry import open_source
 
         pose, first = _read_start(start)
         views = source_overrides(calib, left, right, tolerance, (first, end, stride))
         overrides = [*(set_ or ()), *matching_overrides(matcher), *views]
         settings = load_config(config, [*overrides, *memory_overrides(memory_limit)])
-        drive = open_source(source, kind, settings.source)
+        drive, options = MapRequest(source, kind).open(settings)
         announce(drive, quiet=quiet, verbose=verbose)
         viewer = choose_viewer(quiet=quiet, verbose=verbose)
-        options = MapOptions(command="localize", out=out, threads=threads, progress=viewer)
+        options = replace(options, command="localize", out=out, threads=threads, progress=viewer)
         run = run_localize(drive, map_, settings, options, start=pose)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)
 

@@ -7,8 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.geometry.quaternion import quaternion_from_rotation
-from recon.core.geometry.se3 import invert
+from recon.core.geometry.se3 import invert, quaternion_from_rotation
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
 from recon.io.trajectory import write_tum
