@@ -261,7 +261,8 @@ class Tiles:
         if self.edge_m < 2 * _LEAST_TILE_M or self.edge_cells == BLOCK_EDGE:
             limit = None
         known, frames, size = set(KNOWABLE), [0], Counter[tuple[str, TileKey]]()
-        for number, submap in enumerate(submaps):
+        for submap in submaps:
+            number = len(frames) - 1
             T = None if T_corrected_world is None else T_corrected_world[number]
             nothing = submap.fused.select(np.zeros(0, np.intp))
             moved = self._moved(submap if fuse else replace(submap, fused=nothing), T)
@@ -273,6 +274,7 @@ class Tiles:
                 size[kind, key] += nbytes
                 if limit is not None and size[kind, key] > limit:
                     return False
+            del submap, moved  # before the next one is read
         self.submap_of_frame = np.repeat(np.arange(-1, len(frames) - 1), frames)
         # Attributes missing in one submap are dropped, so that all tiles have the same fields.
         self._known = tuple(name for name in KNOWABLE if name in known)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import FormatError
 
-Bytes = bytes | memoryview
+Bytes = bytes | bytearray | memoryview
 _RAW: Final = "raw"
 _ZLIB: Final = "zlib"
 _ARRAY: Final = "array"
@@ -61,24 +61,33 @@ def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, list[Byte
     return json.dumps(plain(tree)), content
 
 
-def from_bytes(text: str, content: bytes) -> dict[str, Any]:
+def from_bytes(text: str, read: Callable[[int], bytearray]) -> dict[str, Any]:
     """The tree of `to_bytes`. Tuples are lists now.
+
+    Args:
+        text: The JSON.
+        read: Gives the next bytes, as many as it is asked for. Each array takes over its own, so
+            that a tree takes no more memory than its arrays.
 
     Raises:
         FormatError: The bytes are no such arrays; other exceptions where the text is no tree.
     """
+    position = 0
 
     def restored(value: Any) -> Any:
+        nonlocal position
         if isinstance(value, list):
             return [restored(item) for item in value]
         if not isinstance(value, dict):
             return value
         if _ARRAY in value:
             *head, begin, end = value[_ARRAY]
-            return _unpack(head, view[begin:end])
+            if begin != position:
+                raise FormatError("the arrays of a record of the map are not in order")
+            position = end
+            return _unpack(head, read(end - begin))
         return {name: restored(item) for name, item in value[_TREE].items()}
 
-    view = memoryview(content)
     tree = restored(json.loads(text))
     if not isinstance(tree, dict):
         raise FormatError("a record of the map is no tree")
@@ -104,8 +113,8 @@ def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | me
     return [little.dtype.str, list(array.shape), layout, codec], content
 
 
-def _unpack(head: Sequence[Any], packed: memoryview) -> NDArray[Any]:
-    """The array of these bytes.
+def _unpack(head: Sequence[Any], packed: bytearray) -> NDArray[Any]:
+    """The array of these bytes, which it takes over where they are not compressed.
 
     Raises:
         FormatError: They are no such array.
@@ -115,13 +124,11 @@ def _unpack(head: Sequence[Any], packed: memoryview) -> NDArray[Any]:
         raise FormatError("an array of the map has an impossible type or shape")
     axes = shape[::-1] if layout == "F" else shape
     wanted = math.prod(shape) * dtype.itemsize
-    content: bytes | bytearray
+    content: bytes | bytearray = packed  # compiled kernels take only arrays that can be written
     if codec == _ZLIB:
         if wanted > _MOST_INFLATED * (len(packed) + 1):
             raise FormatError("an array of the map is truncated")
         content = zlib.decompressobj().decompress(packed, wanted + 1)
-    else:
-        content = bytearray(packed)  # compiled kernels take only arrays that can be written
     if len(content) != wanted:
         raise FormatError("an array of the map is truncated")
     numbers: NDArray[Any] = np.frombuffer(content, np.uint8)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import sqlite3
 import sys
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +21,7 @@ _TABLE: Final = """CREATE TABLE record (
     kind TEXT NOT NULL, key TEXT NOT NULL, tree TEXT NOT NULL, checksum INTEGER NOT NULL,
     content BLOB NOT NULL, PRIMARY KEY (kind, key)
 )"""
+_PIECE_BYTES: Final = 1 << 18
 _ROOM: Final = "check that the folder is writable and the disk is not full"
 
 
@@ -74,6 +77,53 @@ def insert_record(
                     blob.write(piece)
     else:
         database.execute(insert.format("?"), (*head, b"".join(content)))
+
+
+class Content:
+    """The bytes of a record, read piece by piece, and their checksum so far.
+
+    Read as one value, they would exist three times: in the database, as bytes, and as arrays.
+
+    Args:
+        database: The file.
+        row: Number of the row.
+        size: Number of bytes.
+        checksum: Checksum of what comes before the bytes.
+
+    Attributes:
+        checksum: Checksum of all so far.
+        left: Number of bytes that are not read.
+    """
+
+    def __init__(self, database: sqlite3.Connection, row: int, size: int, checksum: int) -> None:
+        self.checksum, self.left = checksum, size
+        if sys.version_info >= (3, 11):
+            self._file = database.blobopen("record", "content", row, readonly=True)
+        else:
+            query = "SELECT content FROM record WHERE rowid = ?"
+            self._file = BytesIO(database.execute(query, (row,)).fetchone()[0])
+
+    def read(self, size: int) -> bytearray:
+        """The next bytes, exactly as many.
+
+        Raises:
+            FormatError: There are not so many.
+        """
+        if not 0 <= size <= self.left:
+            raise FormatError("a record of the map is truncated")
+        self.left -= size
+        found = bytearray(size)
+        for begin in range(0, size, _PIECE_BYTES):
+            piece = self._file.read(min(_PIECE_BYTES, size - begin))
+            found[begin : begin + len(piece)] = piece
+            self.checksum = zlib.crc32(piece, self.checksum)
+        return found
+
+    def close(self) -> None:
+        """Read the rest, so that the checksum is that of all bytes."""
+        while self.left:
+            self.read(min(_PIECE_BYTES, self.left))
+        self._file.close()
 
 
 def begin_to_write(database: sqlite3.Connection) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -53,8 +52,10 @@ def keep_map(mapped: Map, path: Path, settings: DriveSettings) -> None:
             for number, T_world_camera in enumerate(session.odometry.T_world_camera):
                 time_s = float(session.odometry.timestamps_s[number])
                 new.add_frame(T_world_camera, time_s, session.health[number])
-            for submap in _compact(session, settings):
-                new.submaps.add(submap, compress=True)
+            where = _Places(session, settings.fusion.voxel_m)
+            least = min(settings.fusion.min_count, len(session)) - 1  # where a voxel is precise
+            for index in range(len(session.submaps)):
+                new.submaps.add(_compact(session.submaps.get(index), least, where), compress=True)
         for kind in (AXES, LOOPS, KEYFRAME, RAYS):
             mapped.store.copy(kind, kept.store)
         kept.commit()
@@ -81,20 +82,19 @@ def with_occupancy(session: Session, settings: DriveSettings) -> Submaps:
     return made
 
 
-def _compact(session: Session, settings: DriveSettings) -> Iterator[Submap]:
-    """The submaps of a session as they are kept."""
-    fusion = settings.fusion
-    least = min(fusion.min_count, len(session)) - 1  # enough where a voxel is precise
-    where = _Places(session, fusion.voxel_m)
-    for index, submap in enumerate(session.submaps):
-        few = submap.fused.frames < least
-        fused = submap.fused.select(~few | where.shared(index))
-        sums = fused.sums.copy()
-        sums[:, _PLACED] = _rounded(sums[:, _PLACED], _PLACE_BITS)
-        sums[:, _PLACED.stop :] = _rounded(sums[:, _PLACED.stop :], _VALUE_BITS)
-        information = _rounded(fused.information, _INFORMATION_BITS)
-        fused = replace(fused, sums=sums, information=information)
-        yield replace(submap, fused=fused, occupancy=_nothing())
+def _compact(submap: Submap, least: int, where: _Places) -> Submap:
+    """A submap as it is kept: without voxels that fewer frames saw and no other submap can add to.
+
+    The caller names no submap, so that one at a time is in memory.
+    """
+    few = submap.fused.frames < least
+    fused = submap.fused.select(~few | where.shared(submap.index))
+    sums = fused.sums
+    sums[:, _PLACED] = _rounded(sums[:, _PLACED], _PLACE_BITS)
+    sums[:, _PLACED.stop :] = _rounded(sums[:, _PLACED.stop :], _VALUE_BITS)
+    information = _rounded(fused.information, _INFORMATION_BITS)
+    fused = replace(fused, sums=sums, information=information)
+    return replace(submap, fused=fused, occupancy=_nothing())
 
 
 class _Places:

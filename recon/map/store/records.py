@@ -19,6 +19,7 @@ from recon.io.files import reading
 from recon.map.store.arrays import Bytes, from_bytes, to_bytes
 from recon.map.store.cache import Cache
 from recon.map.store.database import (
+    Content,
     begin_to_read,
     begin_to_write,
     beside,
@@ -139,11 +140,14 @@ class Store:
             FormatError: It is missing or damaged.
         """
         name = _name(key)
-        with self._reading():
-            text, checksum, content = self._row(kind, name)
-            if _checksum(kind, name, text, content) != checksum:
-                raise FormatError("a record of the map is damaged", got=f"{kind} {name}")
-            return from_bytes(text, content)
+        with self._lock, self._reading():
+            text, content, checksum = self._row(kind, name)
+            try:
+                return from_bytes(text, content.read)
+            finally:
+                content.close()
+                if content.checksum != checksum:
+                    raise FormatError("a record of the map is damaged", got=f"{kind} {name}")
 
     def delete(self, kind: str, key: Key | None = None) -> None:
         """Delete a record, or all of a kind; it need not exist.
@@ -209,9 +213,11 @@ class Store:
             OutputError: The other one cannot be written.
         """
         for key in self.keys(kind) if keys is None else keys:
-            with self._reading():
-                text, _, content = self._row(kind, _name(key))
-            other._insert(kind, _name(key), text, [content])
+            with self._lock, self._reading():
+                text, content, _ = self._row(kind, _name(key))
+                whole = content.read(content.left)
+                content.close()
+            other._insert(kind, _name(key), text, [whole])
 
     def commit(self) -> None:
         """Make everything so far permanent, all of it or, after an error, nothing.
@@ -262,15 +268,16 @@ class Store:
             insert_record(self._database, (kind, name, text, checksum), content)
             self.cache.drop((kind, _key(name)))
 
-    def _row(self, kind: str, name: str) -> tuple[str, int, bytes]:
-        """Text, checksum and content of a record."""
-        query = "SELECT tree, checksum, content FROM record WHERE kind = ? AND key = ?"
-        with self._lock:
-            found: tuple[str, int, bytes] | None
-            found = self._database.execute(query, (kind, name)).fetchone()
+    def _row(self, kind: str, name: str) -> tuple[str, Content, int]:
+        """Text, content and checksum of a record."""
+        query = "SELECT rowid, length(content), tree, checksum FROM record"
+        query += " WHERE kind = ? AND key = ?"
+        found = self._database.execute(query, (kind, name)).fetchone()
         if found is None:
             raise FormatError("the map lacks a record", got=f"{kind} {name}")
-        return found
+        row, size, text, checksum = found
+        content = Content(self._database, row, size, _checksum(kind, name, text))
+        return text, content, checksum
 
     @contextmanager
     def _reading(self) -> Iterator[None]:

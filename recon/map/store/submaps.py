@@ -89,18 +89,14 @@ class Submaps:
         self._entries.append(entry)
 
     def get(self, index: int) -> Submap:
-        """A submap, read unless it was read lately.
+        """A submap, read from the map: it is large, and used once.
 
         Raises:
             FormatError: It is missing or damaged.
         """
-        key = (SUBMAP, self._session, index, "submap")
-        return self.store.cache.get(key, lambda: self._read(index))
+        with reading(self.store.name):
+            return Submap.from_tree(self.store.read(SUBMAP, (self._session, index)))
 
     def __iter__(self) -> Iterator[Submap]:
         """The submaps in order, read one at a time."""
-        return (self._read(index) for index in range(len(self)))
-
-    def _read(self, index: int) -> Submap:
-        with reading(self.store.name):
-            return Submap.from_tree(self.store.read(SUBMAP, (self._session, index)))
+        return map(self.get, range(len(self)))
