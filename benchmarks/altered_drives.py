@@ -6,6 +6,9 @@ disparity error common to all frames, and grows with the speed of the drive.
 
 Without DRIVE, a rendered street is altered.
 
+A peer is another program on the same frames: ``--write`` gives it the altered drives, ``--peer``
+reads its poses, which are evaluated like ours; or its figures, if only these are known.
+
 Example: python benchmarks/altered_drives.py DRIVE --json
 """
 
@@ -27,6 +30,8 @@ from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
 from recon.evaluation.trajectory import evaluate_trajectory
+from recon.io.images.image import write_image
+from recon.io.trajectory import read_kitti_poses, write_kitti_poses
 from recon.map.drive.sequence import map_sequence
 from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source
@@ -95,7 +100,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     drive = rendered if options.drive is None else open_source(options.drive)
     cases = alterations(drive)
     chosen = options.only or list(cases)
+    if options.write is not None:
+        for name in chosen:
+            write_kitti(cases[name], options.write / file_name(name))
+        return
     result = {name: figures(cases[name], options) for name in chosen}
+    if options.peer is not None:
+        for name in chosen:
+            result[name].update(peer_figures(options.peer, name, cases[name]))
     print(json.dumps(result, indent=2) if options.json else table(result))
 
 
@@ -108,6 +120,13 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--odometry", default="fused", help="fused, visual or kiss")
     parser.add_argument("--only", nargs="+", help="names of alterations")
     parser.add_argument("--set", action="append", default=[], help="a setting of recon map")
+    parser.add_argument("--write", type=Path, help="only write the altered drives there (KITTI)")
+    parser.add_argument(
+        "--peer",
+        type=Path,
+        help="results of another program: a folder of poses (KITTI), every_3rd_frame.txt and so "
+        'on, or a JSON file of figures, {"every 3rd frame": {"t_rel_percent": …, "scale": …}}',
+    )
     return parser.parse_args(arguments)
 
 
@@ -248,10 +267,14 @@ def nodding(plain: Altered) -> Altered:
 def figures(altered: Altered, options: argparse.Namespace) -> dict[str, float]:
     """Errors of the path of an altered drive."""
     config = load_config(None, [f"odometry.method={options.odometry}", *options.set])
-    path, truth = map_sequence(altered, config).trajectory, true_path(altered)
+    return {"frames": len(altered), **errors_of(map_sequence(altered, config).trajectory, altered)}
+
+
+def errors_of(path: Trajectory, altered: Altered) -> dict[str, float]:
+    """Errors of a path, and its length relative to the true one."""
+    truth = true_path(altered)
     found = evaluate_trajectory(path, truth)
     return {
-        "frames": len(altered),
         "t_rel_percent": round(found.t_rel_percent, 3),
         "r_rel_deg_per_100m": round(found.r_rel_deg_per_100m, 3),
         "ate_m": round(found.ate_m, 3),
@@ -259,14 +282,58 @@ def figures(altered: Altered, options: argparse.Namespace) -> dict[str, float]:
     }
 
 
+def peer_figures(peer: Path, name: str, altered: Altered) -> dict[str, float]:
+    """What another program reached, by the same evaluator; empty where it has no such row."""
+    if peer.is_file():
+        found = json.loads(peer.read_text()).get(name, {})
+    else:
+        poses = peer / f"{file_name(name)}.txt"
+        times = true_path(altered).timestamps_s
+        found = errors_of(read_kitti_poses(poses, times), altered) if poses.is_file() else {}
+    return {f"peer_{key}": value for key, value in found.items()}
+
+
+def file_name(name: str) -> str:
+    return name.replace(" ", "_")
+
+
+def write_kitti(altered: Altered, folder: Path) -> None:
+    """Write an altered drive in the layout of KITTI's odometry benchmark."""
+    for side in ("image_0", "image_1"):
+        (folder / side).mkdir(parents=True, exist_ok=True)
+    for pair in altered.frames():
+        for side, image in (("image_0", pair.left), ("image_1", pair.right)):
+            write_image(folder / side / f"{pair.index:06d}.png", image)
+    camera = altered.calibration
+    for number, (cx, shift) in enumerate(
+        ((camera.cx_px, 0.0), (camera.cx_right_px, -camera.focal_px * camera.baseline_m))
+    ):
+        P = np.array([[camera.focal_px, 0, cx, shift], [0, camera.focal_px, camera.cy_px, 0]])
+        rows = np.vstack([P, [0, 0, 1, 0]]).ravel()
+        with (folder / "calib.txt").open("a" if number else "w") as file:
+            file.write(f"P{number}: {' '.join(f'{value:.9e}' for value in rows)}\n")
+    np.savetxt(folder / "times.txt", altered.stamps_s, fmt="%.9e")
+    write_kitti_poses(folder / "poses.txt", altered.truth.trajectory)
+
+
 def table(result: dict[str, dict[str, Any]]) -> str:
-    head = f"{'':18s}{'t_rel %':>10s}{'r_rel deg/100 m':>18s}{'ATE m':>8s}{'scale':>9s}"
-    lines = [
-        f"{name:18s}{row['t_rel_percent']:10.2f}{row['r_rel_deg_per_100m']:18.2f}"
-        f"{row['ate_m']:8.3f}{row['scale']:9.4f}"
-        for name, row in result.items()
-    ]
-    return "\n".join([head, *lines])
+    """One line per row; columns of a peer where there is one."""
+    columns = {
+        "t_rel %": "t_rel_percent",
+        "r_rel deg/100 m": "r_rel_deg_per_100m",
+        "ATE m": "ate_m",
+        "scale": "scale",
+        "peer t_rel %": "peer_t_rel_percent",
+        "peer scale": "peer_scale",
+    }
+    shown = {
+        head: key for head, key in columns.items() if any(key in row for row in result.values())
+    }
+    lines = [f"{'':18s}" + "".join(f"{head:>17s}" for head in shown)]
+    for name, row in result.items():
+        cells = (f"{row[key]:.4g}" if key in row else "-" for key in shown.values())
+        lines.append(f"{name:18s}" + "".join(f"{cell:>17s}" for cell in cells))
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

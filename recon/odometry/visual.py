@@ -14,7 +14,8 @@ from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.odometry.corners import find_corners
 from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.motion import Motion
-from recon.odometry.pose import MIN_INLIERS, enough_agree, locate_camera
+from recon.odometry.patches import find_again, surface_slopes, warp_of
+from recon.odometry.pose import MIN_INLIERS, REPROJECTION_PX, enough_agree, locate_camera
 from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in, tree_of
 from recon.odometry.tracking import follow, sample_disparity
@@ -172,10 +173,19 @@ class VisualOdometry:
     def _by_tracking(
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
-        """Return the frame, registered by tracking; None = that fails."""
-        return self._register(
-            state.window, self._observe(state, frame, predicted), frame, predicted
-        )
+        """Return the frame, registered by tracking; None = that fails.
+
+        The features that are followed give a pose, and the pose says where all of them are and how
+        they look from there: those that were lost are found, and the others more closely.
+        """
+        window = state.window
+        uv = self._follow(state, frame, predicted)
+        tracks = np.flatnonzero(np.isfinite(uv[:, 0]))
+        rough = locate_camera(window.xyz_world[tracks], uv[tracks], frame.pair.camera, predicted)
+        if rough is None:
+            return None
+        uvd = self._observe(state, frame, uv, rough.T_world_camera)
+        return self._register(window, uvd, frame, rough.T_world_camera)
 
     def _by_matching(
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
@@ -233,18 +243,45 @@ class VisualOdometry:
         information = np.asarray(np.linalg.inv(step_covariance(sigma_m, sigma_deg)), np.float64)
         return VisualEstimate(OdometryResult(motion.T_world_camera, health), information)
 
-    def _observe(self, state: VisualState, frame: OdometryFrame, predicted: Float64) -> Float64:
-        """Return column, row and disparity (N, 3) in the new frame of the points of the window."""
+    def _follow(self, state: VisualState, frame: OdometryFrame, predicted: Float64) -> Float64:
+        """Return column and row (N, 2) in the new frame of the points of the window, tracked."""
         window = state.window
-        uvd = np.full((len(window.xyz_world), 3), np.nan)
+        there = np.full((len(window.xyz_world), 2), np.nan)
         alive = np.flatnonzero(window.seen[-1])
         uv = window.uvd[-1, alive, :2].astype(np.float32)
-        u, v, _ = project(apply(invert(predicted), window.xyz_world[alive]), frame.pair.camera)
-        guess = np.stack([u, v], axis=1)
-        guess = np.where(np.isfinite(guess), guess, uv).astype(np.float32)
-        there, found = follow(state.left, frame.pair.left, uv, guess)
-        uvd[alive[found], :2] = there[found]
-        uvd[alive[found], 2] = self._disparity(frame.disparity, frame.pair.camera, there[found])
+        expected = _seen_from(predicted, window.xyz_world[alive], frame.pair.camera)
+        guess = np.where(np.isfinite(expected), expected, uv).astype(np.float32)
+        followed, found = follow(state.left, frame.pair.left, uv, guess)
+        there[alive[found]] = followed[found]
+        return there
+
+    def _observe(
+        self, state: VisualState, frame: OdometryFrame, followed: Float64, T_world_camera: Float64
+    ) -> Float64:
+        """Return column, row and disparity (N, 3) in a frame of known pose of the window's points.
+
+        Args:
+            state: The frames before.
+            frame: The frame.
+            followed: float64 (N, 2), where tracking has found the points; NaN = nowhere.
+            T_world_camera: float64 (4, 4), about its pose.
+        """
+        window, camera = state.window, frame.pair.camera
+        uvd = np.full((len(window.xyz_world), 3), np.nan)
+        alive = np.flatnonzero(window.seen[-1])
+        uv, xyz_world = window.uvd[-1, alive, :2], window.xyz_world[alive]
+        T_then_world = invert(window.T_world_camera[-1])
+        T_now_then = invert(T_world_camera) @ window.T_world_camera[-1]
+        slope = surface_slopes(state.disparity, uv)
+        warp = warp_of(uv, apply(T_then_world, xyz_world), slope, T_now_then, camera)
+        expected = _seen_from(T_world_camera, xyz_world, camera)
+        with np.errstate(invalid="ignore"):
+            near = np.abs(followed[alive] - expected).max(axis=1) <= REPROJECTION_PX
+        guess = np.where(near[:, None], followed[alive], expected)
+        uvd[alive, :2] = find_again(state.left, frame.pair.left, uv, warp, guess)
+        there = alive[np.isfinite(uvd[alive, 0])]
+        uv_now = uvd[there, :2].astype(np.float32)
+        uvd[there, 2] = self._disparity(frame.disparity, camera, uv_now)
         return uvd
 
     def _disparity(self, disparity: Disparity, camera: RectifiedCamera, uv: Float32) -> Float64:
@@ -282,6 +319,12 @@ class VisualOdometry:
 def _information(window: TrackWindow, camera: RectifiedCamera) -> Float64:
     """Return information (6, 6) of the newest pose, scaled because errors of tracks correlate."""
     return _INDEPENDENCE * pose_information(window, camera)
+
+
+def _seen_from(T_world_camera: Float64, xyz_world: Float64, camera: RectifiedCamera) -> Float64:
+    """Return column and row (N, 2) of points seen from a pose; NaN behind the camera."""
+    u, v, _ = project(apply(invert(T_world_camera), xyz_world), camera)
+    return np.stack([u, v], axis=1)
 
 
 def _points(uvd: Float64, T_world_camera: Float64, camera: RectifiedCamera) -> Float64:

@@ -7,7 +7,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from recon.core.geometry.se3 import invert
+from recon.core.geometry.se3 import invert, make_transform
 from recon.map.store.records import Store
 from recon.odometry import fused, gate
 from recon.odometry.fused import FusedOdometry
@@ -42,7 +42,7 @@ def test_the_street_is_followed(results: list[OdometryResult], street_poses: np.
 def test_health_measures_every_frame_but_the_first(results: list[OdometryResult]) -> None:
     for result in results[1:]:
         health = result.health
-        assert 0.8 < health.overlap <= 1.0
+        assert 0.7 < health.overlap <= 1.0
         # Exact disparity on planes: far less than the 0.3 m voxel.
         assert 0.0 < health.residual_m < 0.02
         assert 0.0 <= health.correction_m < 0.2
@@ -123,17 +123,19 @@ def test_a_drive_that_begins_blind_begins_where_it_sees(
 
 
 def test_icp_takes_over_where_vision_is_lost(
+    see: See,
     street: tuple[OdometryFrame, ...],
     street_poses: np.ndarray,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Without tracks, but with a disparity map, the map still tells where the camera is."""
+    """Without tracks, but with a disparity map, the map still tells that the car swerves."""
     odometry = FusedOdometry(OdometrySettings())
     results = [odometry.register(frame) for frame in street[:6]]
     monkeypatch.setattr("recon.odometry.visual.locate_camera", lambda *_: None)
-    results += [odometry.register(frame) for frame in street[6:9]]
+    swerved = street_poses[6:9] @ make_transform(np.eye(3), np.array([0.2, 0.0, 0.0]))
+    results += [odometry.register(see(T, index)) for index, T in enumerate(swerved, 6)]
     lost = results[6:]
     assert any(result.health.accepted and result.health.ok for result in lost)
     assert all("lost" in result.health.notes[0] for result in lost)
     # Along the street the walls hardly tell; extrapolation stands in.
-    assert error_m(lost[-1], street_poses[8]) < 0.15
+    assert error_m(lost[-1], swerved[-1]) < 0.15

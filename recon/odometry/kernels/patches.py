@@ -1,0 +1,193 @@
+"""Patches of one image, found again in another that shows them larger, smaller or leaning.
+
+Where a camera drives up to a feature its patch grows, and one on the road leans too. A motion and a
+depth say how; with the patch warped accordingly, only its place is left to be found.
+
+The reference implementation in plain numpy is `recon.odometry.kernels.patches_reference`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.core.kernels.compiled import kernel
+
+Float64 = NDArray[np.float64]
+UInt8 = NDArray[np.uint8]
+
+LEAST_POWER: Final = 1.0
+"""Least mean squared deviation of the grey values of a patch from their mean."""
+
+_FLAT: Final = 1e-9
+"""Share of the squared gradients below which a patch has gradients in one direction alone."""
+
+
+class Placing(NamedTuple):
+    """How patches are placed.
+
+    Attributes:
+        radius: Half width of a patch, pixels.
+        steps: Gauss-Newton steps at most.
+        close: Length of a step, pixels, below which it is the last.
+        reach: Largest distance between the guess and the place, pixels, along either axis.
+    """
+
+    radius: int
+    steps: int
+    close: float
+    reach: float
+
+
+def place_patches(
+    source: UInt8, target: UInt8, uv: Float64, warp: Float64, guess: Float64, placing: Placing
+) -> tuple[Float64, Float64]:
+    """Find where patches of one image are in another.
+
+    Brightness and contrast may differ: patches are compared without their mean, at equal power.
+
+    Args:
+        source: uint8 (H, W), the image that the patches are cut from.
+        target: uint8 (H, W), the image in which they are looked for.
+        uv: float64 (N, 2), column and row of their centres in ``source``; NaN = left out.
+        warp: float64 (N, 2, 2), what becomes of a small offset from the centre in ``target``.
+        guess: float64 (N, 2), where the centres should be; NaN = left out.
+        placing: Size of the patches, and how far and how closely they are placed.
+
+    Returns:
+        float64 (N, 2), their places, and float64 (N,), the correlation of the two patches there;
+        NaN where a patch leaves an image or its reach, or has too little texture.
+
+    Ref:
+        Baker and Matthews, "Lucas-Kanade 20 years on", IJCV 2004, section 3.2 (inverse
+        compositional).
+    """
+    place, correlation = np.full((len(uv), 2), np.nan), np.full(len(uv), np.nan)
+    radius, steps, close, reach = placing
+    plain = (radius, steps, close, reach)  # numba's cache on disk would remember the class by name
+    _place_all(source, target, uv, warp, guess, plain, place, correlation)
+    return place, correlation
+
+
+@kernel
+def _place_all(
+    source: UInt8,
+    target: UInt8,
+    uv: Float64,
+    warp: Float64,
+    guess: Float64,
+    placing: tuple[int, int, float, float],
+    place: Float64,
+    correlation: Float64,
+) -> None:
+    side = 2 * placing[0] + 1
+    wide, there = np.empty((side + 2, side + 2)), np.empty((side, side))
+    patch, by_u, by_v = np.empty((side, side)), np.empty((side, side)), np.empty((side, side))
+    upright = np.eye(2)
+    for n in range(len(uv)):
+        if not (np.isfinite(uv[n, 0]) and np.isfinite(guess[n, 0])):
+            continue
+        if not _cut(source, uv[n, 0], uv[n, 1], upright, wide):
+            continue
+        _differentiate(wide, patch, by_u, by_v)
+        _place(
+            target, warp[n], guess[n], placing, (patch, by_u, by_v, there), n, place, correlation
+        )
+
+
+@kernel
+def _place(
+    target: UInt8,
+    warp: Float64,
+    guess: Float64,
+    placing: tuple[int, int, float, float],
+    patches: tuple[Float64, Float64, Float64, Float64],
+    n: int,
+    place: Float64,
+    correlation: Float64,
+) -> None:
+    """Move one patch until it fits; its place stays NaN where it does not."""
+    _, steps, close, reach = placing
+    patch, by_u, by_v, there = patches
+    power, uu, vv, uv = _dot(patch, patch), _dot(by_u, by_u), _dot(by_v, by_v), _dot(by_u, by_v)
+    determinant = uu * vv - uv * uv
+    if power < LEAST_POWER * patch.size or not determinant > _FLAT * uu * vv:
+        return
+    u, v, found = guess[0], guess[1], np.nan
+    for _ in range(steps):
+        if not _cut(target, u, v, warp, there):
+            return
+        _centre(there)
+        gain = math.sqrt(power / max(_dot(there, there), LEAST_POWER))
+        found = gain * _dot(there, patch) / power
+        right = gain * _dot(by_u, there) - _dot(by_u, patch)
+        down = gain * _dot(by_v, there) - _dot(by_v, patch)
+        step_u = (vv * right - uv * down) / determinant
+        step_v = (uu * down - uv * right) / determinant
+        u -= warp[0, 0] * step_u + warp[0, 1] * step_v
+        v -= warp[1, 0] * step_u + warp[1, 1] * step_v
+        if not (abs(u - guess[0]) <= reach and abs(v - guess[1]) <= reach):
+            return
+        if step_u * step_u + step_v * step_v < close * close:
+            break
+    place[n, 0], place[n, 1], correlation[n] = u, v, found
+
+
+@kernel
+def _cut(image: UInt8, u: float, v: float, warp: Float64, patch: Float64) -> bool:
+    """Interpolate a warped patch around a place; False where it leaves the image."""
+    side, height, width = len(patch), image.shape[0], image.shape[1]
+    radius = side // 2
+    reach_u = radius * (abs(warp[0, 0]) + abs(warp[0, 1]))
+    reach_v = radius * (abs(warp[1, 0]) + abs(warp[1, 1]))
+    if not (u - reach_u >= 0 and u + reach_u < width - 1):
+        return False
+    if not (v - reach_v >= 0 and v + reach_v < height - 1):
+        return False
+    for i in range(side):
+        for j in range(side):
+            column = u + warp[0, 0] * (j - radius) + warp[0, 1] * (i - radius)
+            row = v + warp[1, 0] * (j - radius) + warp[1, 1] * (i - radius)
+            x, y = int(column), int(row)
+            right, down = column - x, row - y
+            above = image[y, x] * (1.0 - right) + image[y, x + 1] * right
+            below = image[y + 1, x] * (1.0 - right) + image[y + 1, x + 1] * right
+            patch[i, j] = above * (1.0 - down) + below * down
+    return True
+
+
+@kernel
+def _differentiate(wide: Float64, patch: Float64, by_u: Float64, by_v: Float64) -> None:
+    """Take a patch and its gradients from one that is a pixel wider, all without their mean."""
+    side = len(patch)
+    for i in range(side):
+        for j in range(side):
+            patch[i, j] = wide[i + 1, j + 1]
+            by_u[i, j] = 0.5 * (wide[i + 1, j + 2] - wide[i + 1, j])
+            by_v[i, j] = 0.5 * (wide[i + 2, j + 1] - wide[i, j + 1])
+    _centre(patch)
+    _centre(by_u)
+    _centre(by_v)
+
+
+@kernel
+def _centre(patch: Float64) -> None:
+    total = 0.0
+    for value in patch.flat:
+        total += value
+    mean = total / patch.size
+    for i in range(patch.shape[0]):
+        for j in range(patch.shape[1]):
+            patch[i, j] -= mean
+
+
+@kernel
+def _dot(one: Float64, other: Float64) -> float:
+    total = 0.0
+    for i in range(one.shape[0]):
+        for j in range(one.shape[1]):
+            total += one[i, j] * other[i, j]
+    return total
