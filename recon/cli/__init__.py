@@ -13,6 +13,7 @@ import typer
 from recon import __version__
 from recon.cli import datasets, evaluate
 from recon.cli.audit import audit
+from recon.cli.batch import batch
 from recon.cli.board import board
 from recon.cli.calibrate import calibrate
 from recon.cli.capture import capture
@@ -51,6 +52,7 @@ app.command(rich_help_panel=_RECONSTRUCT)(localize)
 app.command(rich_help_panel=_RECONSTRUCT)(export)
 app.command(rich_help_panel=_RECONSTRUCT)(mesh)
 app.command(rich_help_panel=_RECONSTRUCT)(occupancy)
+app.command(rich_help_panel=_RECONSTRUCT)(batch)
 app.command(rich_help_panel=_CAMERAS)(board)
 app.command(rich_help_panel=_CAMERAS)(calibrate)
 app.command(rich_help_panel=_CAMERAS)(rectify)

@@ -14,6 +14,7 @@
     ├── MeshingError             a surface cannot be reconstructed
     ├── EvaluationError          an estimate cannot be compared with ground truth
     ├── DownloadError            a data set cannot be fetched
+    ├── ClusterError             jobs cannot be run on workers
     ├── OutputError              a result cannot be written
     ├── MemoryLimitError         a run exceeds its memory limit
     └── MissingDependencyError   an optional package is not installed
@@ -123,6 +124,10 @@ class EvaluationError(ReconError):
 
 class DownloadError(ReconError):
     """A data set cannot be fetched."""
+
+
+class ClusterError(ReconError):
+    """Jobs cannot be run on workers."""
 
 
 class OutputError(ReconError):

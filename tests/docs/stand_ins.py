@@ -207,6 +207,17 @@ def board_videos(left: Path) -> None:
     drives.write_video(left.with_name("both.mp4"), [np.hstack(pair) for pair in views], "mp4v")
 
 
+def scene(folder: Path) -> None:
+    scenes(folder.with_name(".scenes"))
+    (folder.with_name(".scenes") / SCENES[0]).rename(folder)
+
+
+def job_file(path: Path) -> None:
+    """The first of the page."""
+    page = (ROOT / "docs" / "many-drives.md").read_text()
+    path.write_text(re.findall(r"```toml\n(.*?)```", page, re.DOTALL)[0])
+
+
 @dataclass(frozen=True)
 class StandIn:
     """A file or folder that a page needs.
@@ -255,6 +266,9 @@ STAND_INS = (
     StandIn("results/baseline", results),
     StandIn("pip install ./block-matcher", plugin, "site"),
     StandIn("rides/today", recording),
+    StandIn("drives/*", drive, "drives/monday"),
+    StandIn("recon batch jobs.toml", scene, "scene"),
+    StandIn("recon batch jobs.toml", job_file, "jobs.toml"),
     StandIn(
         "recon occupancy outputs/kitti06 --resolution 0.1 --max", finished_run, "outputs/kitti06"
     ),

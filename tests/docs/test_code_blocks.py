@@ -28,6 +28,8 @@ NOT_RUN = {
     r"source .venv/bin/activate": "the tests run in an environment that is active",
     r"pip install": "changes the environment; tests/docs/stand_ins.py installs the package",
     r"recon datasets (fetch|verify)": "needs a network; tests/commands/test_datasets.py has one",
+    r"python benchmarks/": "measures on a machine that does nothing else",
+    r"dask |for host in |sbatch |kubectl |recon batch .* --scheduler": "needs a cluster",
     r"recon capture 0 2": "needs two cameras; tests/commands/test_capture.py records from videos",
 }
 """Beginnings of shell lines that are checked but not run, and why."""

@@ -65,6 +65,21 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
     typer.echo(f"results: {summary['out']}")
 
 
+def print_batch(summary: Mapping[str, Any]) -> None:
+    """Print one line per job, an error for each that failed, and the folder of the batch."""
+    table = Table(show_edge=False, pad_edge=False)
+    for title in ("job", "state", "tries", "seconds", "what is unusual"):
+        table.add_column(title)
+    for job in summary["jobs"]:
+        cells = (job["name"], job["state"], str(job["tries"]), f"{job['seconds']:.1f}")
+        table.add_row(*map(Text, (*cells, job.get("remark", ""))))
+    Console().print(table)
+    for job in summary["jobs"]:
+        if job["state"] == "failed":
+            typer.echo(f"error: {job['name']}: {job['error']}", err=True)
+    typer.echo(f"results: {summary['out']}")
+
+
 def print_datasets(found: Mapping[str, Any]) -> None:
     """Print data sets or the parts of one: name, size, what is there, and what else is known."""
     table = Table(show_edge=False, pad_edge=False, show_header=False)

@@ -1,0 +1,201 @@
+"""What a batch costs: throughput of workers on this machine, and of the scheduler with many.
+
+``pairs`` runs rendered pairs as a batch with one and with two workers of one thread each, and with
+one worker of two threads.
+
+``scheduler`` runs jobs that only sleep on workers that are threads of one other process: the
+scheduler and all its messages are real. What a job costs the scheduler is its processor time
+divided by the number of jobs; the time of the whole run is that of the crowded process of the
+workers, and says nothing. Smaller numbers (``--workers``, ``--jobs``) give the cost per job nearly
+as well; the output says what was run.
+
+Examples:
+    python benchmarks/fleet.py pairs --jobs 12
+    python benchmarks/fleet.py scheduler --workers 1000 --jobs 100000
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import psutil
+from distributed import Client, get_worker
+
+from recon.batch.cluster import Cluster, local_cluster
+from recon.batch.job import Job, Outcome
+from recon.core.values import RectifiedCamera
+from recon.io.images.image import write_image
+from recon.run.machine import available_cores
+from tests.scenery.planes import slanted_pair
+
+CAMERA = RectifiedCamera(700.0, 310.0, 180.0, 310.0, 0.2, 620, 360, 96)
+FARM = """
+import asyncio, sys
+from distributed import Worker
+
+async def main(address, count, folder):
+    options = dict(nthreads=1, memory_limit=0, dashboard=False, local_directory=folder)
+    workers = [Worker(address, **options) for _ in range(int(count))]
+    for worker in workers:
+        await worker
+    await asyncio.gather(*(worker.finished() for worker in workers))
+
+asyncio.run(main(*sys.argv[1:]))
+"""
+"""Many workers as threads of one process."""
+SHAPES = ((1, 1), (2, 1), (1, 2))
+"""Workers and threads of each."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    options = parse(arguments)
+    result = pairs(options) if options.what == "pairs" else scheduler(options)
+    print(json.dumps(result, indent=2))
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("what", choices=["pairs", "scheduler"])
+    parser.add_argument("--jobs", type=int, default=12)
+    parser.add_argument("--workers", type=int, default=1000, help="simulated workers")
+    parser.add_argument("--seconds", type=float, default=0.0, help="that a simulated job sleeps")
+    return parser.parse_args(arguments)
+
+
+def pairs(options: argparse.Namespace) -> dict[str, Any]:
+    """Throughput of a batch of pairs, for each number of workers and threads."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        words = write_pair(folder)
+        rows = [measure(folder, words, options.jobs, *shape) for shape in SHAPES]
+    one = rows[0]["jobs_per_hour"]
+    ratios = {f"{r['workers']}x{r['threads']}": round(r["jobs_per_hour"] / one, 2) for r in rows}
+    return {"cores": available_cores(), "rows": rows, "ratio to one worker": ratios}
+
+
+def write_pair(folder: Path) -> list[str]:
+    """Render a pair; returns the words of its command."""
+    pair = slanted_pair(CAMERA, 2.0, (0.1, -0.1), noise_dn=1.0).pair
+    for side in ("left", "right"):
+        write_image(folder / f"{side}.png", getattr(pair, side))
+    camera = ["--focal", str(CAMERA.focal_px), "--baseline", str(CAMERA.baseline_m)]
+    return ["pair", str(folder / "left.png"), str(folder / "right.png"), *camera]
+
+
+def measure(
+    folder: Path, words: list[str], jobs: int, workers: int, threads: int
+) -> dict[str, Any]:
+    """Run the jobs; the first of each worker, which waits for the disk, is not counted."""
+    line = (*words, "--threads", str(threads))
+    out = folder / f"{workers}x{threads}"
+    with local_cluster(workers) as cluster:
+        warm = [Job(f"w{n}", "pair", "", line, True, str(folder)) for n in range(workers)]
+        check(cluster, warm, out)
+        begun = time.perf_counter()
+        todo = [Job(f"j{n}", "pair", "", line, True, str(folder)) for n in range(jobs)]
+        seconds = check(cluster, todo, out)
+        took = time.perf_counter() - begun
+    return {
+        "workers": workers,
+        "threads": threads,
+        "jobs": jobs,
+        "seconds": round(took, 1),
+        "seconds_of_a_job": round(seconds / jobs, 2),
+        "jobs_per_hour": round(3600 * jobs / took, 1),
+    }
+
+
+def check(cluster: Cluster, jobs: list[Job], out: Path) -> float:
+    """Run jobs that must succeed; returns the sum of their times."""
+    outcomes = [outcome for _, outcome in cluster.run(jobs, out)]
+    failed = [outcome.error for outcome in outcomes if outcome.state != "succeeded"]
+    if failed:
+        sys.exit(failed[0])
+    return sum(outcome.seconds for outcome in outcomes)
+
+
+def scheduler(options: argparse.Namespace) -> dict[str, Any]:
+    """Processor time of the scheduler for each of many jobs that sleep."""
+    with crowd(options.workers) as (address, process), Client(address) as client:
+        client.wait_for_workers(options.workers)
+        jobs = [
+            Job(f"j{n}", "sleep", "", (str(options.seconds),), True, "")
+            for n in range(options.jobs)
+        ]
+        idle = idle_share(process)
+        before, begun = process_s(process), time.perf_counter()
+        own = time.process_time()
+        done = sum(1 for _ in Cluster(client, sleep).run(jobs, Path()))
+        took = time.perf_counter() - begun
+        spent = process_s(process) - before
+        own = time.process_time() - own
+        memory = process.memory_info().rss / 1e6
+    per_job = spent / done
+    return {
+        "workers": options.workers,
+        "jobs": done,
+        "seconds": round(took, 1),
+        "scheduler_ms_per_job": round(1e3 * per_job, 3),
+        "client_ms_per_job": round(1e3 * own / done, 3),
+        "scheduler_share_when_idle": round(idle, 3),
+        "scheduler_mb": round(memory),
+        "jobs_per_second_at_most": round((1 - idle) / per_job),
+        "workers_busy_with_jobs_of_60_s": round(60 * (1 - idle) / per_job),
+    }
+
+
+def sleep(job: Job, folder: str, anew: bool, every_s: float) -> Outcome:
+    """What a simulated worker does: it says that it begins, as a real one does, and sleeps."""
+    del folder, anew, every_s
+    event = {"event": "job", "name": job.name, "state": "running"}
+    get_worker().log_event("recon-jobs", event)
+    time.sleep(float(job.words[0]))
+    return Outcome("succeeded")
+
+
+def idle_share(process: psutil.Process, seconds: float = 10.0) -> float:
+    """Share of a core that the heartbeats of the workers take."""
+    before = process_s(process)
+    time.sleep(seconds)
+    return (process_s(process) - before) / seconds
+
+
+def process_s(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+@contextmanager
+def crowd(workers: int) -> Iterator[tuple[str, psutil.Process]]:
+    """A scheduler in a process of its own, and all workers in another; its address and process."""
+    with tempfile.TemporaryDirectory() as name:
+        place, root = Path(name) / "scheduler.json", Path(__file__).parents[1]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": root}
+        dask = [sys.executable, "-m", "dask"]
+        started: list[subprocess.Popen[bytes]] = []
+        try:
+            head = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file"]
+            started.append(subprocess.Popen([*dask, "scheduler", *head, str(place)], **quiet))
+            while not place.is_file() or not place.read_text():
+                time.sleep(0.1)
+            address = json.loads(place.read_text())["address"]
+            farm = [sys.executable, "-c", FARM, address, str(workers), name]
+            started.append(subprocess.Popen(farm, **quiet))
+            yield address, psutil.Process(started[0].pid)
+        finally:
+            for process in reversed(started):
+                process.kill()
+                process.wait()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Many commands as jobs, on this machine or on a cluster."""

@@ -1,0 +1,225 @@
+"""Workers for jobs: Dask on this machine, or a cluster that is there. Nothing else touches Dask."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, Final
+
+from recon.batch.job import Job, Outcome
+from recon.batch.process import Tell, run_job
+from recon.core.errors import ClusterError
+from recon.core.optional import require
+
+EXTRA: Final = "cluster"
+_TOPIC: Final = "recon-jobs"
+_REACH_S: Final = 20.0
+_WORKERS_S: Final = 120.0
+_LOOK_S: Final = 30.0
+
+
+Work = Callable[[Job, str, bool, float], Outcome]
+"""Runs a job in the folder of its batch, perhaps anew, and tells how far it is every so often."""
+
+
+@dataclass(frozen=True)
+class Try:
+    """One try of a job, from 0."""
+
+    job: Job
+    number: int = 0
+    anew: bool = False
+
+
+class Cluster:
+    """Workers that run jobs; from `local_cluster` or `join_cluster`.
+
+    Args:
+        client: Dask's client of it.
+        work: What a worker does for a job; None = what the job says.
+        final: Whether no other workers will come when all are gone.
+    """
+
+    def __init__(self, client: Any, work: Work | None = None, *, final: bool = False) -> None:
+        self._client, self._work, self._final = client, work or _work, final
+
+    @property
+    def dashboard(self) -> str:
+        """Address of Dask's page that shows what the workers do."""
+        return str(self._client.dashboard_link)
+
+    @property
+    def workers(self) -> dict[str, Any]:
+        """The workers by address, with their threads and what they declare to have."""
+        return dict(self._client.scheduler_info(n_workers=-1)["workers"])
+
+    def run(
+        self, jobs: Sequence[Job], folder: Path, tell: Tell = lambda event: None
+    ) -> Iterator[tuple[Try, Outcome]]:
+        """Run jobs, and yield how each ended.
+
+        A job that broke (its worker died, it was killed or late) is tried again, and yielded when
+        it succeeded or its retries are used up.
+
+        Args:
+            jobs: The jobs.
+            folder: Folder of the batch, seen by all workers.
+            tell: Told how far each is, in another thread.
+
+        Raises:
+            ClusterError: The scheduler or all workers are gone.
+        """
+        every_s = max(1.0, len(self.workers) / 50)
+        self._client.subscribe_topic(_TOPIC, lambda event: tell(event[1]))
+        ended, tries = SimpleQueue[Any](), dict[str, Try]()
+        for job in jobs:
+            self._submit(Try(job), folder, every_s, ended, tries)
+        while tries:
+            future = self._next(ended)
+            done = tries.pop(future.key)
+            outcome = _outcome(future)
+            if outcome.state == "broken" and done.number < done.job.retries:
+                last = done.number + 1 == done.job.retries
+                again = Try(done.job, done.number + 1, anew=last and outcome.resumed)
+                self._submit(again, folder, every_s, ended, tries)
+            else:
+                yield done, outcome
+
+    def _next(self, ended: SimpleQueue[Any]) -> Any:
+        """Return the next future that has ended."""
+        while True:
+            with suppress(Empty):
+                return ended.get(timeout=_LOOK_S)
+            if self._final and not self.workers:
+                raise ClusterError("all workers of this machine have died")
+
+    def _submit(
+        self,
+        one: Try,
+        folder: Path,
+        every_s: float,
+        ended: SimpleQueue[Any],
+        tries: dict[str, Try],
+    ) -> None:
+        workers = self.workers if one.job.needs else {}
+        declared = [worker["resources"] for worker in workers.values()]
+        needs = {
+            name: amount
+            for name, amount in one.job.needs.items()
+            if declared and all(name in have for have in declared)
+        }
+        future = self._client.submit(
+            self._work,
+            one.job,
+            str(folder),
+            one.anew,
+            every_s,
+            key=f"{one.job.name}-{one.number}",
+            pure=False,
+            # Not tied to other workers than the last: when those die, Dask never starts it.
+            resources=needs or None,
+        )
+        tries[future.key] = one
+        future.add_done_callback(ended.put)
+
+
+@contextmanager
+def local_cluster(workers: int) -> Iterator[Cluster]:
+    """Start workers on this machine, each of which runs one job at a time.
+
+    Raises:
+        MissingDependencyError: Dask is not installed.
+        ClusterError: The workers do not start.
+    """
+    distributed = require("distributed", extra=EXTRA)
+    _be_quiet()
+    try:
+        local = distributed.LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            memory_limit=0,  # the jobs are processes of their own
+            silence_logs=logging.CRITICAL,
+        )
+    except RuntimeError as error:
+        raise ClusterError("the workers of this machine do not start", got=error) from error
+    with local, distributed.Client(local) as client:
+        yield Cluster(client, final=True)
+
+
+@contextmanager
+def join_cluster(address: str) -> Iterator[Cluster]:
+    """Use the workers of a scheduler.
+
+    Args:
+        address: Its address, or the file that it was told to write it to.
+
+    Raises:
+        MissingDependencyError: Dask is not installed.
+        ClusterError: The scheduler cannot be reached, or has no workers.
+    """
+    distributed = require("distributed", extra=EXTRA)
+    _be_quiet()
+    try:
+        where = {"scheduler_file" if Path(address).is_file() else "address": address}
+        client = distributed.Client(**where, timeout=_REACH_S)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise ClusterError(
+            "the scheduler cannot be reached", where=address, got=error, expected="tcp://host:8786"
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_WORKERS_S)
+        except TimeoutError as error:
+            raise ClusterError(
+                "the scheduler has no workers",
+                where=address,
+                hint="start some: dask worker ADDRESS",
+            ) from error
+        yield Cluster(client)
+
+
+def connect(scheduler: str | None, workers: int) -> Any:
+    """Return the workers of a scheduler, or else new ones on this machine, for ``with``."""
+    return local_cluster(workers) if scheduler is None else join_cluster(scheduler)
+
+
+def _work(job: Job, folder: str, anew: bool, every_s: float) -> Outcome:
+    """Run a job on a worker."""
+    distributed = require("distributed", extra=EXTRA)
+    worker = distributed.get_worker()
+    key = distributed.worker.thread_state.key
+    tell: Callable[[dict[str, Any]], None] = lambda event: worker.log_event(_TOPIC, event)  # noqa: E731
+
+    def stopped() -> bool:
+        """Whether the task was cancelled, or its client is gone."""
+        task = worker.state.tasks.get(key)
+        return task is None or task.state in ("cancelled", "released")
+
+    tell({"event": "job", "name": job.name, "state": "running", "worker": worker.address})
+    outcome = run_job(job, Path(folder), anew=anew, tell=tell, stopped=stopped, every_s=every_s)
+    return Outcome(**{**vars(outcome), "worker": worker.address})
+
+
+def _outcome(future: Any) -> Outcome:
+    """Return how a try ended; a worker that died with it broke it."""
+    if future.status == "finished":
+        return Outcome(**vars(future.result()))
+    if future.status == "error":
+        error = future.exception()
+        return Outcome("broken", f"its worker died ({type(error).__name__})")
+    raise ClusterError("the scheduler is gone", got=future.status)
+
+
+def _be_quiet() -> None:
+    """Keep the messages of Dask from standard error: what matters of them is told by us."""
+    for name in ("distributed", "tornado", "bokeh"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    with suppress(AttributeError):
+        require("dask", extra=EXTRA).config.set({"logging.distributed": "critical"})

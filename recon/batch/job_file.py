@@ -1,0 +1,228 @@
+"""The file that lists the jobs of a batch, in TOML or YAML.
+
+::
+
+    [sweep]                                  optional: every job with each of these values
+    "matching.sad.window_px" = [9, 11, 13]
+
+    [[job]]
+    name = "monday"                          the folder of its result
+    command = "map"                          any command that writes results
+    source = "drives/monday"                 or several: ["left.png", "right.png"]
+    options = ["--no-mesh"]                  optional, like all below
+    set = ["odometry.method=visual"]
+    threads = 2
+    memory = "4G"                            of `recon map`: its --memory-limit
+    timeout_s = 3600
+    retries = 2
+
+Relative paths begin in the folder of the file.
+"""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Final
+
+from recon.core.errors import SettingsError
+from recon.io.toml_file import read_toml
+from recon.io.yaml_file import read_yaml
+
+SUFFIXES: Final = (".toml", ".yaml", ".yml")
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.=+-]{0,119}")
+_MOST_JOBS: Final = 1_000_000
+_KEYS: Final = ("job", "sweep")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A job as it is asked for.
+
+    Attributes:
+        name: Its name.
+        command: The command, such as ``map`` or ``evaluate trajectory``.
+        source: What the command works on, in the order of its arguments.
+        options: Further words of the command line.
+        set: Settings, as ``key=value``.
+        threads: Threads of its process; None = as the batch says.
+        memory: Memory limit, such as ``4G``; None = as the batch says.
+        timeout_s: Longest time of one try; None = as the batch says.
+        retries: Tries after the first that broke; None = as the batch says.
+        swept: Settings that a sweep adds.
+    """
+
+    name: str
+    command: str
+    source: tuple[str, ...]
+    options: tuple[str, ...] = ()
+    set: tuple[str, ...] = ()
+    threads: int | None = None
+    memory: str | None = None
+    timeout_s: float | None = None
+    retries: int | None = None
+    swept: Mapping[str, Any] = field(default_factory=dict)
+
+
+_JOB_KEYS: Final = tuple(one.name for one in fields(Entry) if one.name != "swept")
+
+
+def read_jobs(path: Path, settings: Sequence[str] = (), options: Sequence[str] = ()) -> list[Entry]:
+    """Read a job file, with its sweep spread out.
+
+    Args:
+        path: The file.
+        settings: Further settings of each job, before its own.
+        options: Further options of each job.
+
+    Raises:
+        FormatError: The file cannot be read.
+        SettingsError: A key is unknown or missing, a value is of a wrong kind, or a name is no
+            name of a folder or stands there twice.
+    """
+    content = read_toml(path) if path.suffix.lower() == ".toml" else read_yaml(path)
+    _check_keys(content, _KEYS, str(path))
+    listed = content.get("job")
+    if not isinstance(listed, list) or not listed:
+        raise SettingsError(
+            "there is no job", where=path, expected="[[job]] with name, command, source"
+        )
+    entries = [_entry(one, f"{path}: job {n}") for n, one in enumerate(listed, start=1)]
+    entries = [
+        replace(one, set=(*settings, *one.set), options=(*options, *one.options)) for one in entries
+    ]
+    spread = spread_sweep(entries, content.get("sweep", {}), str(path))
+    check_names(spread, str(path))
+    return spread
+
+
+def jobs_of_sources(
+    command: str, sources: Sequence[str], options: Sequence[str], settings: Sequence[str]
+) -> list[Entry]:
+    """Return one job for each source, named by its last part.
+
+    Raises:
+        SettingsError: There is no source, or two have one name.
+    """
+    if not sources:
+        raise SettingsError("there is no source", where=f"recon batch {command}")
+    entries = [
+        Entry(_name_of(source), command, (source,), tuple(options), tuple(settings))
+        for source in sources
+    ]
+    check_names(entries, f"recon batch {command}")
+    return entries
+
+
+def spread_sweep(entries: Sequence[Entry], sweep: Any, where: str) -> list[Entry]:
+    """Return each job with each combination of the values of a sweep.
+
+    Args:
+        entries: The jobs.
+        sweep: Lists of values, by the name of the setting.
+        where: The file, for error messages.
+
+    Raises:
+        SettingsError: It is not a table of lists, or gives too many jobs.
+    """
+    plain = (str, int, float, bool)
+    if not isinstance(sweep, Mapping) or not all(
+        isinstance(values, list) and values and all(isinstance(v, plain) for v in values)
+        for values in sweep.values()
+    ):
+        expected = '"matching.sad.window_px" = [9, 11, 13]'
+        raise SettingsError("sweep is not a table of lists", where=where, expected=expected)
+    combinations = 1
+    for values in sweep.values():
+        combinations *= len(values)
+    if combinations * len(entries) > _MOST_JOBS:
+        raise SettingsError("too many jobs", where=where, got=combinations * len(entries))
+    return list(_spread(entries, sweep))
+
+
+def check_names(entries: Sequence[Entry], where: str) -> None:
+    """Check that each job has a folder of its own, below that of the batch.
+
+    Raises:
+        SettingsError: A name is none, or stands there twice.
+    """
+    seen: dict[str, str] = {}
+    for entry in entries:
+        if not _NAME.fullmatch(entry.name):
+            expected = "letters, digits and _ . = + -, beginning with a letter or digit"
+            raise SettingsError(
+                "name of a job is not a name of a folder",
+                where=where,
+                got=repr(entry.name),
+                expected=expected,
+            )
+        # On some file systems, capital and small letters are the same.
+        if entry.name.lower() in seen:
+            raise SettingsError("two jobs have one name", where=where, got=entry.name)
+        seen[entry.name.lower()] = entry.name
+
+
+def _entry(content: Any, where: str) -> Entry:
+    if not isinstance(content, Mapping):
+        raise SettingsError("job is not a table", where=where, got=type(content).__name__)
+    _check_keys(content, _JOB_KEYS, where)
+    for key in ("name", "command", "source"):
+        if key not in content:
+            raise SettingsError(f"job has no {key}", where=where)
+    values = {key: _value(key, value, where) for key, value in content.items()}
+    return Entry(**values)
+
+
+def _value(key: str, value: Any, where: str) -> Any:
+    """Return the value of a key, checked; lists become tuples."""
+    many, number = key in ("source", "options", "set"), key in ("threads", "retries", "timeout_s")
+    if many and isinstance(value, list) and all(isinstance(one, str) for one in value):
+        right = bool(value) or key != "source"
+        value = tuple(value)
+    elif number:
+        kinds = (int, float) if key == "timeout_s" else (int,)
+        right = type(value) in kinds and value >= (0 if key == "retries" else 1e-3)
+    else:
+        right = isinstance(value, str) and (key == "source" or not many)
+        value = (value,) if many else value
+    if not right:
+        expected = "a list of texts" if many else "a number" if number else "a text"
+        raise SettingsError(f"{key} is not {expected}", where=where, got=repr(value))
+    return value
+
+
+def _check_keys(content: Mapping[str, Any], known: Sequence[str], where: str) -> None:
+    for key in content:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else None
+            raise SettingsError(
+                "unknown key", where=where, got=key, expected=", ".join(known), hint=hint
+            )
+
+
+def _spread(entries: Sequence[Entry], sweep: Mapping[str, Sequence[Any]]) -> Iterator[Entry]:
+    for entry in entries:
+        for values in itertools.product(*sweep.values()):
+            swept = dict(zip(sweep, values, strict=True))
+            texts = [f"{key}={json.dumps(value)}" for key, value in swept.items()]
+            ends = [f"_{key.rpartition('.')[2]}={_plain(value)}" for key, value in swept.items()]
+            yield replace(
+                entry, name=entry.name + "".join(ends), set=(*entry.set, *texts), swept=swept
+            )
+
+
+def _plain(value: Any) -> str:
+    """A value as part of the name of a folder."""
+    return re.sub(r"[^A-Za-z0-9_.+-]", "-", str(value))
+
+
+def _name_of(source: str) -> str:
+    """The last part of a path, without what a folder cannot be named by."""
+    name = _plain(Path(source).resolve().name)
+    return re.sub(r"^[^A-Za-z0-9]+", "", name) or "job"

@@ -1,0 +1,90 @@
+"""Jobs on workers: what breaks is tried again, what fails is told, nothing is lost."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from recon.batch.cluster import Cluster, Try, join_cluster, local_cluster
+from recon.batch.job import Job, Outcome
+from recon.core.errors import ClusterError, MissingDependencyError
+from tests.batch.jobs import job, stand_in, tries
+
+distributed = pytest.importorskip("distributed")
+__all__ = ["stand_in"]
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """Two workers in threads of this process."""
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
+        ) as local,
+        distributed.Client(local) as client,
+    ):
+        yield Cluster(client)
+
+
+def run(cluster: Cluster, jobs: list[Job], folder: Path) -> dict[str, tuple[Try, Outcome]]:
+    ended = [(done.job.name, (done, outcome)) for done, outcome in cluster.run(jobs, folder)]
+    assert sorted(name for name, _ in ended) == sorted(one.name for one in jobs)
+    return dict(ended)
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_a_poisoned_job_among_fifty_is_told_and_the_rest_goes_on(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    jobs = [job(f"j{n}", "bad" if n == 17 else "good") for n in range(50)]
+    ended = run(cluster, jobs, tmp_path)
+    states = [outcome.state for _, outcome in ended.values()]
+    assert (states.count("succeeded"), states.count("failed")) == (49, 1)
+    assert ended["j17"][1].error == "nowhere: folder does not exist"
+    assert all(tries(tmp_path, one.name) == ["begun"] for one in jobs)
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_a_broken_job_goes_on_and_its_retries_have_a_limit(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    jobs = [job("a", "killed once"), job("b", "always killed", retries=3), job("c", "full")]
+    ended = run(cluster, jobs, tmp_path)
+    assert ended["a"][1].state == "succeeded"
+    assert tries(tmp_path, "a") == ["begun", "resumed"]
+    assert (ended["b"][0].number, ended["b"][1].state) == (3, "broken")
+    assert tries(tmp_path, "b") == ["begun"] * 4
+    # The last try does without what the ones before have left, which may be damaged.
+    assert tries(tmp_path, "c") == ["begun", "resumed", "begun"]
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_events_of_running_jobs_arrive(cluster: Cluster, tmp_path: Path) -> None:
+    told: list[Any] = []
+    list(cluster.run([job("a")], tmp_path, told.append))
+    assert {"event": "job", "name": "a", "state": "running"}.items() <= told[0].items()
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_needs_that_no_worker_declares_do_not_keep_a_job_waiting(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    ended = run(cluster, [job("a", needs={"threads": 64.0})], tmp_path)
+    assert ended["a"][1].state == "succeeded"
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recon.batch.cluster._REACH_S", 0.5)
+    with pytest.raises(ClusterError, match="scheduler cannot be reached"):
+        join_cluster("tcp://127.0.0.1:9").__enter__()
+
+
+def test_without_dask_the_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    for there in (join_cluster("tcp://127.0.0.1:9"), local_cluster(1)):
+        with pytest.raises(MissingDependencyError, match=r"pip install 'recon\[cluster\]'"):
+            there.__enter__()

@@ -1,0 +1,73 @@
+"""Table, plot and report of a batch."""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from recon.batch.figures import JobResult, compare
+from recon.report.batch_page import write_batch_page
+from recon.run.directory import RunDirectory
+from tests.batch.jobs import job
+
+
+def results() -> list[JobResult]:
+    def one(n: int, w: int) -> JobResult:
+        drift = 0.5 + 0.01 * n + 0.1 * w
+        figures = {"frames": 40, "trajectory.t_rel_percent": drift, "seconds": 10.0 + w}
+        swept = job(f"drive{n}_w={w}", swept={"window": w})
+        return JobResult(swept, "succeeded", 1, "", 10.0, "host", figures)
+
+    done = [one(n, w) for n in range(5) for w in (9, 11)]
+    odd = {"frames": 40, "trajectory.t_rel_percent": 99.0, "seconds": 10.0}
+    done[6] = JobResult(**{**vars(done[6]), "figures": odd})
+    failed = JobResult(job("bad"), "failed", 3, "<b>no images</b>", 1.0, "host")
+    return compare([*done, failed, JobResult(job("later"), "not run", 0, "", 0.0, "")])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("batch") / "out"
+    summary = {
+        "jobs": [{}] * 12, "succeeded": 10, "failed": 1, "seconds": 60.0, "workers": 2,
+        "jobs_per_hour": 600.0,
+    }  # fmt: skip
+    with RunDirectory(out) as directory:
+        write_batch_page(results(), summary, directory)
+    return out
+
+
+def test_the_report_shows_outliers_first_and_links_to_the_runs(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    rows = re.findall(r'<tr><th scope="row">(.*?)</th>', page)
+    names = [re.sub("<[^>]+>", "", row) for row in rows][:3]
+    assert names[:2] == ["bad", "drive3_w=9"]
+    assert 'href="drive3_w%3D9/report.html"' in page
+    assert 'href="bad' not in page
+    assert 'href="later' not in page
+    assert "trajectory.t_rel_percent 99 (usually" in page
+    assert "&lt;b&gt;no images" in page
+
+
+def test_the_csv_has_every_figure_and_swept_setting(folder: Path) -> None:
+    rows = list(csv.DictReader((folder / "table.csv").open()))
+    assert len(rows) == 12
+    assert rows[0]["window"] == "9"
+    assert float(rows[6]["trajectory.t_rel_percent"]) == 99.0
+    assert rows[10]["error"] == "<b>no images</b>"
+
+
+def test_the_table_for_people_leaves_out_columns_that_no_job_has(folder: Path) -> None:
+    head = (folder / "table.md").read_text().splitlines()[1]
+    assert "trajectory.t_rel_percent" in head
+    assert "map.f_score" not in head
+
+
+def test_a_sweep_is_drawn(folder: Path) -> None:
+    picture = np.asarray(Image.open(folder / "sweep.png").convert("L"))
+    assert picture.std() > 5
