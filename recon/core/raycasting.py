@@ -62,22 +62,19 @@ class RayScene:
         found = self._scene.compute_distance(wanted, nthreads=self._threads)
         return np.asarray(found.numpy(), dtype=np.float32)
 
-    def blocked(
-        self, origins: NDArray[Any], reaches: NDArray[Any], near: float = 0.0, far: float = 1.0
-    ) -> Bool:
+    def blocked(self, origins: NDArray[Any], reaches: NDArray[Any], far: float = 1.0) -> Bool:
         """Return whether a triangle intersects the segment from ``origin`` to ``origin + reach``.
 
         Args:
             origins: (3,) or (N, 3), metres.
             reaches: (N, 3), metres.
-            near: Fraction of the reach at which the segment begins.
-            far: Fraction of the reach at which it ends; below 1 ignores the surface it ends on.
+            far: Fraction of the reach at which it ends; below 1 ignores the surface there.
 
         Returns:
             bool (N,).
         """
         rays = _rays(origins, reaches)
-        hit = self._scene.test_occlusions(rays, tnear=near, tfar=far, nthreads=self._threads)
+        hit = self._scene.test_occlusions(rays, tfar=far, nthreads=self._threads)
         return np.asarray(hit.numpy(), dtype=np.bool_)
 
 

@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import EvaluationError
+from recon.core.geometry.interpolation import nearest_times
 from recon.core.values import Trajectory
-from recon.core.values.arrays import Float64, Int32
 
 TOLERANCE_S: Final = 0.01
 """Largest time difference of two associated poses, unless another is given."""
@@ -42,14 +42,6 @@ def associate(
             hint="raise --tolerance, or make sure that both use the same clock",
         )
     return _part(estimate, np.flatnonzero(mutual)), _part(truth, there[mutual])
-
-
-def nearest_times(times_s: Float64, others_s: Float64) -> Int32:
-    """Return int32 (N,): for each time, the index of the nearest of the others (M ≥ 1, sorted)."""
-    after = np.clip(np.searchsorted(others_s, times_s), 0, len(others_s) - 1)
-    before = np.maximum(after - 1, 0)
-    earlier = np.abs(times_s - others_s[before]) <= np.abs(others_s[after] - times_s)
-    return np.where(earlier, before, after).astype(np.int32)
 
 
 def _part(path: Trajectory, index: np.ndarray) -> Trajectory:

@@ -9,6 +9,7 @@ import numpy as np
 from recon.core.errors import EvaluationError
 from recon.core.values import Disparity, DisparityTruth
 from recon.core.values.arrays import Bool, Float32, Float64, freeze
+from recon.evaluation.disparity import compared_pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,13 +147,7 @@ def _pixels(estimate: Disparity, truth: DisparityTruth) -> tuple[Float32, Float6
 
 def _compared(estimate: Disparity, truth: DisparityTruth) -> Bool:
     """Return bool (H, W), the pixels that have a value and a known truth."""
-    if estimate.values.shape != truth.values.shape:
-        raise EvaluationError(
-            "disparity and truth differ in size",
-            got=f"disparity {estimate.values.shape}",
-            expected=f"{truth.values.shape}",
-        )
-    both = estimate.valid & np.isfinite(truth.values)
+    both = estimate.valid & compared_pixels(estimate.values, truth, occluded=True)
     if not both.any():
         raise EvaluationError("no pixel has both a disparity and a known truth")
     return both

@@ -127,12 +127,16 @@ def _compared(
 ) -> tuple[Float64, Float64]:
     """Return float64 (N,) twice, values and truth of the compared pixels."""
     values, known = values_of(estimate), truth_of(truth)
-    counted = _counted(values, known, occluded=occluded)
+    counted = compared_pixels(values, known, occluded=occluded)
     return values[counted].astype(np.float64), known.values[counted].astype(np.float64)
 
 
-def _counted(values: Float32, truth: DisparityTruth, *, occluded: bool) -> Bool:
-    """Return bool (H, W), the compared pixels."""
+def compared_pixels(values: Float32, truth: DisparityTruth, *, occluded: bool) -> Bool:
+    """Return bool (H, W), the pixels that are compared: those whose truth is known.
+
+    Raises:
+        EvaluationError: The sizes differ, or there are none.
+    """
     if values.shape != truth.values.shape:
         raise EvaluationError(
             "disparity and truth differ in size",

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -113,6 +114,23 @@ class TrajectoryComparison:
         if axis is not None:
             estimate = without_roll(estimate, self.truth, axis)
         return angle_rad(invert(self.truth.T_world_camera) @ estimate.T_world_camera)
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryRun:
+    """The result of a comparison.
+
+    Attributes:
+        estimate: File of the estimate.
+        truth: File of the ground truth.
+        comparison: The two paths, aligned, and their differences.
+        summary: The figures of ``summary.json``.
+    """
+
+    estimate: Path
+    truth: Path
+    comparison: TrajectoryComparison
+    summary: dict[str, Any]
 
 
 def evaluate_trajectory(

@@ -135,11 +135,9 @@ def colour_grid_errors(grid: OccupancyGrid, truth: OccupancyTruth) -> UInt8:
     return np.asarray(image[::-1].repeat(side, axis=0).repeat(side, axis=1))
 
 
-def colour_values(
-    values: NDArray[Any], scale: str, limits: tuple[float, float], missing: Rgb = MISSING
-) -> UInt8:
-    """Colour values of any shape by a matplotlib colormap; NaN gets ``missing``."""
-    colormap = colormaps[scale].with_extremes(bad=unit_colour(missing))
+def colour_values(values: NDArray[Any], scale: str, limits: tuple[float, float]) -> UInt8:
+    """Colour values of any shape by a matplotlib colormap; NaN gets `MISSING`."""
+    colormap = colormaps[scale].with_extremes(bad=unit_colour(MISSING))
     shown = Normalize(*limits, clip=True)(np.ma.masked_invalid(values))
     return np.asarray(colormap(shown, bytes=True)[..., :3])
 

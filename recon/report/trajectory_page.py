@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from recon.evaluation.trajectory_run import TrajectoryRun
+from recon.evaluation.trajectory import TrajectoryRun
 from recon.io.atomic import write_bytes
 from recon.report.page import write_page
 from recon.report.paths import compared_paths_figure, errors_by_length_figure, pose_errors_figure

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import FormatError, SourceError
-from recon.core.values import SequenceTruth, StereoPair, check_size
+from recon.core.values import Rig, StereoPair, check_size
 from recon.core.values.arrays import Float64, UInt8
 from recon.io.images.image import decode_image
 from recon.io.images.ros_image import pixels_of_ros_image
@@ -26,7 +26,8 @@ from recon.sources.bag_topics import (
 )
 from recon.sources.files import join_pair
 from recon.sources.pairing import Roll, StampPairs, check_increasing, check_most, pair_stamps
-from recon.sources.rig import Rig, as_rectified, read_rig
+from recon.sources.protocol import Recording
+from recon.sources.rig import as_rectified, read_rig
 from recon.sources.rosbags import CAMERA_INFO, Bag, BagImage
 from recon.sources.settings import SourceSettings
 
@@ -34,40 +35,25 @@ BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
 _S: Final = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
-class BagSource:
-    """A drive in a recording; messages are read one at a time.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BagSource(Recording):
+    """A drive in a bag, which does not say which poses are true; messages are read one at a time.
 
     Attributes:
-        name: Name of the file or folder.
-        description: Recognised kind, and the chosen topics.
-        calibration: The rectified camera, or the two raw ones.
         bag: The recording.
         topics: Left and right image topic.
         pairs: Pairs of left and right messages.
-        roll: Which left messages are in pairs.
         left_s: float64 (M,), timestamps of all left messages.
         recorded_ns: int64 (M,) and (K,), recording times of the left and right messages.
-        texts: The calibration file, if one was given.
         stamped: Whether timestamps are those of the headers, not of the recording.
     """
 
-    name: str
-    description: str
-    calibration: Rig
     bag: Bag
     topics: tuple[str, str]
     pairs: StampPairs
-    roll: Roll
     left_s: Float64
     recorded_ns: tuple[NDArray[np.int64], NDArray[np.int64]]
-    texts: tuple[Path, ...]
     stamped: bool = True
-
-    @property
-    def truth(self) -> SequenceTruth | None:
-        """None: a bag does not say which of its poses are ground truth."""
-        return None
 
     @property
     def files(self) -> Sequence[Path]:
@@ -79,24 +65,9 @@ class BagSource:
         return [*self.texts, *(file for files in inside for file in files)]
 
     @property
-    def left_out(self) -> int:
-        """Number of images without a partner."""
-        return sum(self.roll.alone)
-
-    def lines(self, count: int) -> list[int] | None:
-        """Return the line of each pair in a file with one line per frame; see `Roll.lines`."""
-        return self.roll.lines(count)
-
-    @property
     def stamps_s(self) -> Float64:
         """float64 (N,), times of the left images of the pairs."""
         return self.left_s[list(self.pairs.left)]
-
-    def __len__(self) -> int:
-        return len(self.pairs.left)
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Read the pairs from number ``start`` on, without reading the messages before.

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Final
 
 from recon.core.errors import CalibrationError, SourceError
-from recon.core.values import SequenceTruth, StereoPair
+from recon.core.values import Rig, SequenceTruth, StereoPair
 from recon.core.values.arrays import UInt8
 from recon.io.files import StrPath
 from recon.io.images.image import MAX_MEGAPIXELS, eight_bits, find_white, read_levels
 from recon.io.middlebury.scene import read_middlebury_scene
 from recon.sources.pairing import Roll
-from recon.sources.rig import Rig
 from recon.sources.settings import SourceSettings
 
 LEAST_SIDE_PX: Final = 16

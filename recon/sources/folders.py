@@ -26,6 +26,7 @@ from recon.io.frames_csv import FRAMES, read_frames
 from recon.sources.images import (
     ImageFrame,
     ImageSource,
+    existing,
     image_size,
     is_image,
     list_images,
@@ -170,16 +171,12 @@ def _pair_as_listed(folder: Path, settings: SourceSettings) -> _Pairing:
     frames = read_frames(folder / FRAMES)
     check_increasing(np.array([frame.left_s for frame in frames]), str(folder / FRAMES))
     pairs, roll = pair_named(
-        [(_existing(folder / frame.left), _existing(folder / frame.right)) for frame in frames],
+        [(existing(folder / frame.left), existing(folder / frame.right)) for frame in frames],
         folder,
     )
     pairs, roll = _choose(pairs, roll, settings, folder)
     stamps_s = np.array([frames[k].left_s for k in roll.kept])
     return _Pairing(pairs, roll, stamps_s, f"paired according to {FRAMES}", (folder / FRAMES,))
-
-
-def _existing(path: Path) -> Path | None:
-    return path if path.is_file() else None
 
 
 def _stamps(left: list[Path], right: list[Path]) -> tuple[Float64, Float64] | None:

@@ -13,8 +13,6 @@ import numpy as np
 from recon.core.errors import SourceError
 from recon.core.values import (
     RectifiedCamera,
-    SequenceTruth,
-    StereoCalibration,
     StereoPair,
     check_size,
 )
@@ -22,6 +20,7 @@ from recon.core.values.arrays import Float64, UInt8
 from recon.io.images.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
 from recon.sources.files import join_pair
 from recon.sources.pairing import Roll, check_most, natural_key, pair_stamps
+from recon.sources.protocol import Recording
 from recon.sources.settings import SourceSettings
 
 IMAGES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
@@ -45,27 +44,15 @@ class ImageFrame:
     timestamp_s: float
 
 
-@dataclass(frozen=True, eq=False)
-class ImageSource:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ImageSource(Recording):
     """A drive in image files, read one pair at a time.
 
     Attributes:
-        name: Name of the folder.
-        description: Recognised kind and layout, in one line.
-        calibration: The rectified camera, or the two raw ones.
         images: The files of each frame, in order.
-        roll: Which frames of the recording are pairs.
-        truth: Ground truth trajectory, if known.
-        texts: Files other than images that were read.
     """
 
-    name: str
-    description: str
-    calibration: RectifiedCamera | StereoCalibration
     images: Sequence[ImageFrame]
-    roll: Roll
-    truth: SequenceTruth | None = None
-    texts: tuple[Path, ...] = ()
 
     @property
     def files(self) -> Sequence[Path]:
@@ -74,24 +61,9 @@ class ImageSource:
         return [*self.texts, *images]
 
     @property
-    def left_out(self) -> int:
-        """Number of images without a partner."""
-        return sum(self.roll.alone)
-
-    def lines(self, count: int) -> list[int] | None:
-        """Return the line of each pair in a file with one line per frame; see `Roll.lines`."""
-        return self.roll.lines(count)
-
-    @property
     def stamps_s(self) -> Float64:
         """float64 (N,), times of the left images."""
         return np.array([frame.timestamp_s for frame in self.images])
-
-    def __len__(self) -> int:
-        return len(self.images)
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Read the pairs from number ``start`` on.
@@ -154,7 +126,7 @@ def pair_listed(
     partner = dict(zip(pairs.left, pairs.right, strict=True))
     taken = set(pairs.right)
     frames = [
-        (stamp, _existing(path), _existing(lists[1][partner[k]][1]) if k in partner else None)
+        (stamp, existing(path), existing(lists[1][partner[k]][1]) if k in partner else None)
         for k, (stamp, path) in enumerate(lists[0])
     ]
     frames += [(stamp, None, path) for k, (stamp, path) in enumerate(lists[1]) if k not in taken]
@@ -191,7 +163,8 @@ def pair_named(
     return pairs, Roll(names, kept, (alone_left, alone_right))
 
 
-def _existing(path: Path) -> Path | None:
+def existing(path: Path) -> Path | None:
+    """Return the file, or None if it is missing."""
     return path if path.is_file() else None
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from recon.core.errors import SourceError
 from recon.core.geometry.se3 import invert
-from recon.core.values import SequenceTruth, Trajectory
+from recon.core.values import Rig, SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset, read_kitti_rig
 from recon.io.files import StrPath
@@ -33,7 +33,7 @@ from recon.sources.images import (
     pair_named,
 )
 from recon.sources.pairing import Roll, natural_key
-from recon.sources.rig import Rig, as_rectified, read_rig
+from recon.sources.rig import as_rectified, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_times_of_pairs
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import CalibrationError, FormatError, SettingsError
-from recon.core.values import DisparityTruth, RectifiedCamera, StereoCalibration, StereoPair
+from recon.core.values import DisparityTruth, RectifiedCamera, Rig, StereoPair
 from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.images.disparity_png import read_disparity
@@ -35,7 +35,7 @@ class PairInput:
     """
 
     pair: StereoPair
-    calibration: RectifiedCamera | StereoCalibration
+    calibration: Rig
     files: tuple[Path, ...] = ()
     truth: DisparityTruth | None = None
     notes: tuple[str, ...] = ()

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import SourceError
+from recon.core.geometry.interpolation import nearest_times
 from recon.core.values.arrays import Float64
 from recon.sources.settings import SourceSettings
 
@@ -285,7 +286,7 @@ def pair_stamps(left_s: Float64, right_s: Float64, tolerance_s: float, where: st
     Raises:
         SourceError: No two are close enough.
     """
-    to_right, to_left = _nearest(left_s, right_s), _nearest(right_s, left_s)
+    to_right, to_left = nearest_times(left_s, right_s), nearest_times(right_s, left_s)
     mutual = to_left[to_right] == np.arange(len(left_s))
     apart_s = np.abs(right_s[to_right] - left_s)
     chosen = np.flatnonzero(mutual & (apart_s <= tolerance_s))
@@ -299,12 +300,3 @@ def pair_stamps(left_s: Float64, right_s: Float64, tolerance_s: float, where: st
         )
     alone = (len(left_s) - len(chosen), len(right_s) - len(chosen))
     return StampPairs(chosen.tolist(), to_right[chosen].tolist(), alone)
-
-
-def _nearest(of_s: Float64, among_s: Float64) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Return for each timestamp the index of the nearest of the others; both series increase."""
-    after = np.clip(np.searchsorted(among_s, of_s), 1, max(1, len(among_s) - 1))
-    before = after - 1
-    after = np.minimum(after, len(among_s) - 1)
-    nearer = np.abs(among_s[after] - of_s) < np.abs(among_s[before] - of_s)
-    return np.where(nearer, after, before)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from recon.core.values import (
     OccupancyTruth,
-    RectifiedCamera,
+    Rig,
     SequenceTruth,
-    StereoCalibration,
     StereoPair,
 )
 from recon.core.values.arrays import Float64
+from recon.sources.pairing import Roll
 
 
 @runtime_checkable
@@ -31,7 +33,7 @@ class StereoSource(Protocol):
         ...
 
     @property
-    def calibration(self) -> RectifiedCamera | StereoCalibration:
+    def calibration(self) -> Rig:
         """A `RectifiedCamera` if the images are already rectified."""
         ...
 
@@ -109,3 +111,43 @@ class IncompleteSource(Protocol):
             Indices from 0; None = the file has too few lines.
         """
         ...
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recording(ABC):
+    """A recorded drive, of which frames may lack a partner.
+
+    Attributes:
+        name: Name of the file or folder.
+        description: Recognised kind and how it is read, in one line.
+        calibration: The rectified camera, or the two raw ones.
+        roll: Which frames of the recording are pairs.
+        texts: Calibration and other text files that were read.
+        truth: Ground truth trajectory, if known.
+    """
+
+    name: str
+    description: str
+    calibration: Rig
+    roll: Roll
+    texts: tuple[Path, ...]
+    truth: SequenceTruth | None = None
+
+    @property
+    def left_out(self) -> int:
+        """Number of images without a partner."""
+        return sum(self.roll.alone)
+
+    def lines(self, count: int) -> list[int] | None:
+        """Return the line of each pair in a file with one line per frame; see `Roll.lines`."""
+        return self.roll.lines(count)
+
+    def __len__(self) -> int:
+        return len(self.roll.kept)
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return self.frames()
+
+    @abstractmethod
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """Read the pairs from number ``start`` on."""

@@ -9,11 +9,9 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import SourceError
-from recon.core.values import RectifiedCamera, StereoCalibration
+from recon.core.values import RectifiedCamera, Rig, StereoCalibration
 from recon.io.cameras.calibration import read_calibration
 from recon.sources.settings import SourceSettings
-
-Rig = RectifiedCamera | StereoCalibration
 
 _NAME: Final = re.compile(
     r"(calib|calibration|stereo|cam_?chain|intrinsics|cameras?)([._-].*)?\.(txt|ya?ml|xml|json)"

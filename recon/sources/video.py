@@ -10,11 +10,12 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import FormatError, SourceError
-from recon.core.values import SequenceTruth, StereoPair, check_size
+from recon.core.values import StereoPair, check_size
 from recon.core.values.arrays import UInt8
 from recon.io.images.video import VIDEOS, VideoFile, open_video
 from recon.sources.pairing import Roll, find_partners
-from recon.sources.rig import Rig, read_rig
+from recon.sources.protocol import Recording
+from recon.sources.rig import read_rig
 from recon.sources.settings import SourceSettings
 
 _STACKED: Final = frozenset({"top-bottom", "bottom-top"})
@@ -22,52 +23,22 @@ _LONGER: Final = 0.05
 """Share of a video that may have no partner, as one camera was stopped later than the other."""
 
 
-@dataclass(frozen=True, eq=False)
-class VideoSource:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VideoSource(Recording):
     """A drive in one or two video files.
 
     Attributes:
-        name: Name of the file or folder.
-        description: Recognised kind and frame rate.
-        calibration: The rectified camera, or the two raw ones.
         videos: One file with both views, or left and right.
         settings: Arrangement of the views, and the frame rate if that of the file is overridden.
-        texts: The calibration file.
-        roll: Which frames are used.
     """
 
-    name: str
-    description: str
-    calibration: Rig
     videos: tuple[VideoFile, ...]
     settings: SourceSettings
-    texts: tuple[Path, ...]
-    roll: Roll
-
-    @property
-    def truth(self) -> SequenceTruth | None:
-        """None: videos contain no ground truth."""
-        return None
 
     @property
     def files(self) -> Sequence[Path]:
         """The calibration, then the videos."""
         return [*self.texts, *(video.path for video in self.videos)]
-
-    @property
-    def left_out(self) -> int:
-        """Frames at the end of the longer video."""
-        return sum(self.roll.alone)
-
-    def lines(self, count: int) -> list[int] | None:
-        """Return the line of each frame in a file with one line per frame; see `Roll.lines`."""
-        return self.roll.lines(count)
-
-    def __len__(self) -> int:
-        return len(self.roll.kept)
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Decode the pairs from number ``start`` on.

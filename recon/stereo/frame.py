@@ -11,7 +11,7 @@ from recon.core.values import (
     RayCloud,
     RectifiedCamera,
     RectifiedPair,
-    StereoCalibration,
+    Rig,
     StereoPair,
 )
 from recon.run.stopwatch import Stopwatch
@@ -59,7 +59,7 @@ class FrameReconstructor:
 
     def __init__(
         self,
-        calibration: RectifiedCamera | StereoCalibration,
+        calibration: Rig,
         config: StereoSettings,
         *,
         threads: int | None = None,

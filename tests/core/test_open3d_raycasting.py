@@ -38,7 +38,6 @@ def test_triangles_are_hit_from_behind(scene):
 def test_a_segment_is_blocked_only_between_its_ends(scene):
     reach = np.array([[0.0, 0.1, 1.9], [0.0, 0.1, 2.1], [0.0, 0.1, 4.0]])
     assert scene.blocked(np.zeros(3), reach).tolist() == [False, True, True]
-    assert scene.blocked(np.zeros(3), reach, near=0.6).tolist() == [False, True, False]
     assert scene.blocked(np.zeros(3), reach, far=0.45).tolist() == [False, False, False]
 
 

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.core.errors import EvaluationError
+from recon.core.geometry.interpolation import nearest_times
 from recon.core.values import Trajectory
-from recon.evaluation.association import associate, nearest_times
+from recon.evaluation.association import associate
 
 TIMES = st.lists(st.floats(0, 100), min_size=1, max_size=30).map(np.sort)
 

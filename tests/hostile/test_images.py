@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from recon.io.images.image import read_image, write_image
-from recon.io.images.image_header import image_size
+from recon.io.images.image_integrity import image_size
 from recon.io.images.pfm import read_pfm, write_pfm
 from tests.hostile.calibrations import OURS
 from tests.hostile.refusals import assert_refused, refusal, run

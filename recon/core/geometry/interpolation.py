@@ -1,4 +1,4 @@
-"""Interpolation of poses."""
+"""Poses between others, and the nearest of times."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import exp_so3, log_so3, make_transform
 from recon.core.values import Trajectory
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Float64, Int32
 
 
 def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
@@ -40,3 +40,11 @@ def pose_between(first: Float64, second: Float64, share: float) -> Float64:
     turn = log_so3(first[:3, :3].T @ second[:3, :3])
     position = (1 - share) * first[:3, 3] + share * second[:3, 3]
     return make_transform(first[:3, :3] @ exp_so3(share * turn), position)
+
+
+def nearest_times(times_s: Float64, others_s: Float64) -> Int32:
+    """Return int32 (N,): for each time, the index of the nearest of the others (M ≥ 1, sorted)."""
+    after = np.clip(np.searchsorted(others_s, times_s), 0, len(others_s) - 1)
+    before = np.maximum(after - 1, 0)
+    earlier = np.abs(times_s - others_s[before]) <= np.abs(others_s[after] - times_s)
+    return np.where(earlier, before, after).astype(np.int32)

@@ -90,13 +90,13 @@ def size_text(image: NDArray[Any]) -> str:
     return f"{image.shape[1]}x{image.shape[0]}"
 
 
-def map_text(values: Float32, unit: str = "px") -> str:
-    """Return the range and share of the finite values of a map, for a ``repr``."""
+def map_text(values: Float32) -> str:
+    """Return the range and share of the finite values of a map in pixels, for a ``repr``."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return "0 %"
     share = 100 * finite.size / values.size
-    return f"{finite.min():.4g} to {finite.max():.4g} {unit}, {share:.1f} %"
+    return f"{finite.min():.4g} to {finite.max():.4g} px, {share:.1f} %"
 
 
 def extent_text(xyz: NDArray[Any]) -> str:

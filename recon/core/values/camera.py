@@ -194,8 +194,12 @@ class RectifiedCamera:
         )
 
 
+Rig = RectifiedCamera | StereoCalibration
+"""Calibration of a pair of cameras: of rectified images, or of raw ones."""
+
+
 def check_size(
-    calibration: RectifiedCamera | StereoCalibration,
+    calibration: Rig,
     width_px: int,
     height_px: int,
     where: str | PathLike[str] | None,

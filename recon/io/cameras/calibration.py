@@ -6,7 +6,7 @@ import re
 from typing import Final
 
 from recon.core.errors import CalibrationError, FormatError
-from recon.core.values import RectifiedCamera, StereoCalibration, check_size
+from recon.core.values import Rig, check_size
 from recon.io.cameras.camera_info import read_camera_info
 from recon.io.cameras.kalibr import read_kalibr
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
@@ -32,7 +32,7 @@ def read_calibration(
     *,
     metres_per_unit: float = 1.0,
     cameras: tuple[int, int] | None = None,
-) -> RectifiedCamera | StereoCalibration:
+) -> Rig:
     """Read the calibration of images of one size from a file of any supported format.
 
     Supported are our own YAML, KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt`` (its rectified or
@@ -67,7 +67,7 @@ def _read(
     size: tuple[int, int] | None,
     metres_per_unit: float,
     cameras: tuple[int, int] | None,
-) -> RectifiedCamera | StereoCalibration:
+) -> Rig:
     """Recognise the format; ``size`` is for files that do not state one, or more than one."""
     text = read_text(path, SMALL_FILE_BYTES)
     if _OURS.search(text):

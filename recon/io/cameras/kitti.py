@@ -16,6 +16,7 @@ from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import (
     CameraIntrinsics,
     RectifiedCamera,
+    Rig,
     StereoCalibration,
     check_unsized,
     other_size,
@@ -134,9 +135,7 @@ def _centre_m(projection: Float64) -> Float64:
 
 
 @reader
-def read_kitti_rig(
-    path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int]
-) -> RectifiedCamera | StereoCalibration:
+def read_kitti_rig(path: StrPath, width_px: int, height_px: int, cameras: tuple[int, int]) -> Rig:
     """Read the cameras of one stereo pair, rectified or raw according to the image size.
 
     Rectified images (``_sync`` drives) are smaller than raw ones (``_extract`` drives). A file

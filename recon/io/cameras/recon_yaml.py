@@ -10,7 +10,7 @@ import yaml
 
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import make_transform
-from recon.core.values import CameraIntrinsics, LensModel, RectifiedCamera, StereoCalibration
+from recon.core.values import CameraIntrinsics, LensModel, RectifiedCamera, Rig, StereoCalibration
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
 from recon.io.cameras.lens_models import pinhole_matrix
@@ -33,7 +33,7 @@ _RECTIFIED: Final = ("focal_px", "cx_px", "cy_px", "cx_right_px", "baseline_m")
 
 def write_recon_calibration(
     path: StrPath,
-    calibration: StereoCalibration | RectifiedCamera,
+    calibration: Rig,
     quality: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a calibration atomically; `read_recon_calibration` restores it bit by bit.
@@ -54,7 +54,7 @@ def write_recon_calibration(
 
 
 @reader
-def read_recon_calibration(path: StrPath) -> StereoCalibration | RectifiedCamera:
+def read_recon_calibration(path: StrPath) -> Rig:
     """Read what `write_recon_calibration` wrote.
 
     Raises:
@@ -77,7 +77,7 @@ def read_recon_calibration(path: StrPath) -> StereoCalibration | RectifiedCamera
     return _read_rectified(fields) if kind == "rectified" else _read_stereo(fields)
 
 
-def _content(calibration: StereoCalibration | RectifiedCamera) -> dict[str, Any]:
+def _content(calibration: Rig) -> dict[str, Any]:
     if isinstance(calibration, RectifiedCamera):
         numbers = {name: float(getattr(calibration, name)) for name in _RECTIFIED}
         size = {"width_px": calibration.width_px, "height_px": calibration.height_px}

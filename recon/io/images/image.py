@@ -16,8 +16,7 @@ from recon.core.errors import FormatError, OutputError, ShapeError
 from recon.core.values.arrays import UInt8
 from recon.io.atomic import write_bytes
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_bytes, reader, reading
-from recon.io.images.image_header import image_size
-from recon.io.images.image_integrity import check_image_bytes, is_tiff
+from recon.io.images.image_integrity import check_image_bytes, image_size, is_tiff
 
 FULL_WHITE: Final = 65535
 MAX_MEGAPIXELS: Final = 100.0

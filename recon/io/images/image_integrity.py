@@ -1,4 +1,4 @@
-"""Detects truncated and damaged image files, which decoders fill in silently.
+"""Sizes in headers of image files, and detection of damage, which decoders fill in silently.
 
 Ref:
     PNG: ISO/IEC 15948, section 5 (chunks). JPEG: ITU-T T.81, annex B (markers).
@@ -10,7 +10,15 @@ from __future__ import annotations
 import re
 import struct
 import zlib
+from io import BytesIO
 from typing import Final
+
+from PIL.BmpImagePlugin import BmpImageFile
+from PIL.ImageFile import ImageFile
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
+from PIL.PpmImagePlugin import PpmImageFile
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from recon.core.errors import FormatError
 from recon.io.files import StrPath
@@ -22,6 +30,13 @@ _PNM_HEADER: Final = re.compile(
     rb"P([2356])(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)\s"
 )
 _BMP_HEADER: Final = struct.Struct("<2xI4xI4xiiHHII")
+_READERS: Final[dict[bytes, type[ImageFile]]] = {
+    b"\x89PNG": PngImageFile,
+    b"\xff\xd8": JpegImageFile,
+    b"BM": BmpImageFile,
+    b"P": PpmImageFile,
+}
+_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 UNDERSTOOD: Final = "PNG, JPEG, PGM, PPM, BMP or TIFF"
 
 
@@ -110,3 +125,29 @@ def _check_bmp(content: bytes, path: StrPath) -> None:
     needed = offset + (stored if run_lengths else rows)
     if len(content) < needed:
         raise _truncated("BMP", path, f"{len(content)} of {needed} bytes")
+
+
+def image_size(content: bytes) -> tuple[int, int] | None:
+    """Return the width and height that the header of an image states; None if it states none.
+
+    The readers of Pillow are called directly: `PIL.Image.open` has a limit of its own.
+    """
+    reader = next((kind for start, kind in _READERS.items() if content.startswith(start)), None)
+    try:
+        if is_tiff(content):
+            width, height = _tiff_size(content)
+        elif reader is not None:
+            width, height = reader(BytesIO(content)).size
+        else:
+            return None
+    except Exception:  # noqa: BLE001 - a damaged header, which the check of the content reports
+        return None
+    return int(width), int(height)
+
+
+def _tiff_size(content: bytes) -> tuple[int, int]:
+    """Read the first directory alone: Pillow's reader knows fewer kinds of pixels than ours."""
+    directory, stream = ImageFileDirectory_v2(content[:8]), BytesIO(content)
+    stream.seek(directory.next)
+    directory.load(stream)
+    return directory[_TIFF_WIDTH], directory[_TIFF_HEIGHT]

@@ -29,16 +29,12 @@ class MiddleburyCalib:
         camera: The rectified camera, in metres.
         isint: True if the ground truth is in whole pixels, so that results are rounded before
             comparison.
-        vmin_px: Smallest true disparity, or None.
-        vmax_px: Largest true disparity, or None.
         doffs_px: ``doffs`` as in the file; that of the camera is the difference of its rounded
             principal points. None = not in the file.
     """
 
     camera: RectifiedCamera
     isint: bool = False
-    vmin_px: float | None = None
-    vmax_px: float | None = None
     doffs_px: float | None = None
 
 
@@ -59,9 +55,8 @@ def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
     camera = RectifiedCamera.from_matrices(cam0, cam1, fields.number("baseline") / 1000, *size)
     if "ndisp" in fields:
         camera = replace(camera, ndisp=fields.count("ndisp"))
-    vmin, vmax = (fields.number(k) if k in fields else None for k in ("vmin", "vmax"))
     isint = "isint" in fields and fields.number("isint") != 0
-    return MiddleburyCalib(camera, isint, vmin, vmax, doffs_px)
+    return MiddleburyCalib(camera, isint, doffs_px)
 
 
 def nominal_camera_2005(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -115,8 +113,6 @@ def _colours(mesh: Any) -> NDArray[np.uint8] | None:
     return np.asarray(np.rint(np.asarray(mesh.vertex_colors) * 255), dtype=np.uint8)
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
+def _quiet() -> Any:
     """Keep Open3D's warnings off standard output; errors that matter are checked and raised."""
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        yield
+    return o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.geometry.se3 import exp_so3, make_transform
-from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
+from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig, StereoCalibration
 from recon.core.values.arrays import Bool, Float32, Float64
 
 _NEAR_PX: Final = 1.5
@@ -122,9 +122,7 @@ def count_aligned(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) 
     return int(_consensus(*_linear(left_uv, right_uv, camera), camera.focal_px).sum())
 
 
-def correct_rig(
-    rig: RectifiedCamera | StereoCalibration, alignment: RowAlignment, R_rect_left: Float64
-) -> StereoCalibration:
+def correct_rig(rig: Rig, alignment: RowAlignment, R_rect_left: Float64) -> StereoCalibration:
     """Return the calibration with the right camera rotated in place so that rows are aligned.
 
     Args:
@@ -141,7 +139,7 @@ def correct_rig(
     return replace(raw, T_right_left=make_transform(turned, -turned @ centre))
 
 
-def _as_raw(rig: RectifiedCamera | StereoCalibration) -> StereoCalibration:
+def _as_raw(rig: Rig) -> StereoCalibration:
     if isinstance(rig, StereoCalibration):
         return rig
     cameras = [

@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, StereoCalibration
+from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
 from recon.rig.audit.geometry import MIN_FEATURES, Geometry
 from recon.rig.audit.measures import Gaps
 from recon.rig.audit.sample import BLANK_DN, Sample
@@ -253,7 +253,7 @@ def find_range_faults(
 
 def find_calibration_faults(
     sample: Sample,
-    rig: RectifiedCamera | StereoCalibration,
+    rig: Rig,
     camera: RectifiedCamera,
     baseline_m: tuple[float, float],
 ) -> Iterator[Finding]:
@@ -283,7 +283,7 @@ def find_calibration_faults(
 
 
 def _centres(
-    rig: RectifiedCamera | StereoCalibration,
+    rig: Rig,
 ) -> list[tuple[str, tuple[float, float], tuple[int, int]]]:
     if isinstance(rig, RectifiedCamera):
         size = (rig.width_px, rig.height_px)

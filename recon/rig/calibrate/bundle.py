@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import CalibrationError
-from recon.core.geometry.se3 import apply, exp_so3, make_transform, orthonormalise
+from recon.core.geometry.se3 import apply, exp_so3, make_transform, orthonormalise, step_jacobian
 from recon.core.least_squares import Problem, minimise
 from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64, Int32
@@ -208,13 +208,7 @@ def _view_blocks(view: View, state: RigState, number: int) -> _Blocks:
 
 def _by_motion(xyz: Float64) -> Float64:
     """Return float64 (N, 3, 6), Jacobian of points for a small rotation and translation."""
-    J = np.zeros((len(xyz), 3, _POSE))
-    x, y, z = xyz.T
-    J[:, 0, 1], J[:, 0, 2] = z, -y
-    J[:, 1, 0], J[:, 1, 2] = -z, x
-    J[:, 2, 0], J[:, 2, 1] = y, -x
-    J[:, [0, 1, 2], [3, 4, 5]] = 1.0
-    return J
+    return np.roll(step_jacobian(xyz), 3, axis=2)
 
 
 def _prior(state: RigState) -> Float64:

@@ -8,7 +8,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from recon.core.geometry.se3 import exp_so3
+from recon.core.geometry.se3 import exp_so3, hat
 from recon.core.least_squares import Problem, minimise
 from recon.core.values.arrays import Bool, Float64
 
@@ -178,8 +178,7 @@ def level_homographies(F: Float64, size: tuple[int, int]) -> tuple[Float64, Floa
     # H_right @ [e]x @ F gives the rows of the left image; its first row affects columns alone and
     # may be replaced by any other.
     e = epipoles(F)[1]
-    cross = np.array([[0, -e[2], e[1]], [e[2], 0, -e[0]], [-e[1], e[0], 0]])
-    _, second, third = H_right @ cross @ F
+    _, second, third = H_right @ hat(e) @ F
     first = np.cross(second, third)
     H_left = np.stack([first * (np.linalg.norm(second) / np.linalg.norm(first)), second, third])
     return _facing(H_left, size), _facing(H_right, size)

@@ -90,9 +90,7 @@ def rectify_images(
     return rectify_uncalibrated(again, (width, height))
 
 
-def rectify_uncalibrated(
-    features: PairFeatures, size: Size, min_features: int = _MIN_FEATURES
-) -> UncalibratedRectification:
+def rectify_uncalibrated(features: PairFeatures, size: Size) -> UncalibratedRectification:
     """Find homographies that align the rows of matches of uncalibrated cameras.
 
     The fundamental matrix is estimated robustly (MAGSAC++), refined on its inliers, and converted
@@ -107,10 +105,10 @@ def rectify_uncalibrated(
     """
     used = np.arange(len(features)) % _HELD_OUT != 0
     held_out_px = float("nan")
-    if used.sum() >= 2 * min_features:
-        trial = _fit(features.select(used), size, min_features)
+    if used.sum() >= 2 * _MIN_FEATURES:
+        trial = _fit(features.select(used), size, _MIN_FEATURES)
         held_out_px = _held_out(trial[:2], features.select(~used))
-    H_left, H_right, F, agreeing = _fit(features, size, min_features)
+    H_left, H_right, F, agreeing = _fit(features, size, _MIN_FEATURES)
     left, right = (
         map_pixels(H, uv) for H, uv in ((H_left, agreeing.left_uv), (H_right, agreeing.right_uv))
     )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, Final
 
 import numpy as np
@@ -219,8 +217,6 @@ def _mask(index: Any, length: int) -> Bool:
     return mask
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
+def _quiet() -> Any:
     """Keep Open3D's warnings off standard output; errors that matter are checked and raised."""
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        yield
+    return o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)

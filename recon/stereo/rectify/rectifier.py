@@ -17,6 +17,7 @@ from recon.core.values import (
     CameraIntrinsics,
     RectifiedCamera,
     RectifiedPair,
+    Rig,
     StereoCalibration,
     StereoPair,
     check_size,
@@ -103,7 +104,7 @@ class Rectifier:
 
     def __init__(
         self,
-        calibration: RectifiedCamera | StereoCalibration,
+        calibration: Rig,
         settings: RectificationSettings | None = None,
     ) -> None:
         self.settings = settings or RectificationSettings()
