@@ -37,7 +37,7 @@ from recon.map.ground.grid import flatten
 from recon.map.ground.surface import estimate_ground_surface
 from recon.odometry import Odometry, OdometryFrame, OdometryResult, make_odometry
 from recon.places.drift import DriftModel
-from recon.report.paths import grid_figure, loops_figure
+from recon.report.paths import grid_figure, loops_figure, seen_from_above
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from recon.street.truth import true_surface
@@ -253,7 +253,8 @@ def draw(folder: Path, name: str, before: MappedSequence, after: MappedSequence)
     path = loops_figure(before.trajectory, after.trajectory, pairs, after.T_map_world)
     (folder / f"{name}_path.png").write_bytes(path)
     for moment, mapped in (("before", before), ("after", after)):
-        grid = grid_figure(flat_grid(mapped), mapped.trajectory, mapped.T_map_world)
+        path = seen_from_above(mapped.trajectory, mapped.T_map_world)
+        grid = grid_figure(flat_grid(mapped), {"path": path})
         (folder / f"{name}_grid_{moment}.png").write_bytes(grid)
 
 

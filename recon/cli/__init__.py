@@ -22,6 +22,7 @@ from recon.cli.doctor import doctor
 from recon.cli.export import export
 from recon.cli.localize import localize
 from recon.cli.map import map_
+from recon.cli.merge import merge
 from recon.cli.mesh import mesh
 from recon.cli.occupancy import occupancy
 from recon.cli.pair import disparity, pair
@@ -49,6 +50,7 @@ app.command(rich_help_panel=_RECONSTRUCT)(pair)
 app.command(rich_help_panel=_RECONSTRUCT)(disparity)
 app.command("map", rich_help_panel=_RECONSTRUCT)(map_)
 app.command(rich_help_panel=_RECONSTRUCT)(localize)
+app.command(rich_help_panel=_RECONSTRUCT)(merge)
 app.command(rich_help_panel=_RECONSTRUCT)(export)
 app.command(rich_help_panel=_RECONSTRUCT)(mesh)
 app.command(rich_help_panel=_RECONSTRUCT)(occupancy)

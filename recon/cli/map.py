@@ -70,6 +70,19 @@ def map_(
         Path | None,
         typer.Option(help="Continue the interrupted run in this folder; without SOURCE."),
     ] = None,
+    into: Annotated[
+        Path | None,
+        typer.Option(
+            help="Add the drive to the map of this finished run, which is replaced when all is "
+            "done; settings are those of the run."
+        ),
+    ] = None,
+    remove: Annotated[
+        int | None,
+        typer.Option(
+            metavar="SESSION", help="With --into, without SOURCE: take a drive out of its map."
+        ),
+    ] = None,
     memory_limit: MemoryLimit = None,
     config: Config = None,
     set_: Set = None,
@@ -90,19 +103,24 @@ def map_(
       recon map rides/today --prior wheels.txt
       recon map drive.bag --prior /odom
       recon map --resume outputs/kitti06
+      recon map rides/tomorrow --into outputs/map/latest
+      recon map --into outputs/map/latest --remove 1
     """
-    if source is None and resume is None:
-        raise typer.BadParameter("give SOURCE, or --resume FOLDER")
     if poses is not None and prior is not None:
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
-    if out is not None and resume is not None and out.resolve() != resume.resolve():
-        raise typer.BadParameter("--out and --resume name different folders")
+    _check_folders(source, out, resume, into, remove)
     with session(quiet=quiet):
         from recon.cli.show.announce import announce, warn
         from recon.cli.show.progress import choose_viewer
-        from recon.commands.config import load_config, matching_overrides, source_overrides
+        from recon.commands.config import (
+            load_config,
+            matching_overrides,
+            run_settings,
+            source_overrides,
+        )
         from recon.commands.map import run_map
-        from recon.commands.map_options import MapRequest
+        from recon.commands.map_options import MapOptions, MapRequest
+        from recon.commands.merge import run_map_into, run_remove
         from recon.commands.resume import resumed
         from recon.run.memory import memory_overrides
 
@@ -110,19 +128,48 @@ def map_(
         views = source_overrides(calib, left, right, tolerance, (start, end, stride))
         overrides = [*(set_ or ()), *method, *matching_overrides(matcher), *views]
         request = MapRequest(source, kind, poses, prior, mesh)
-        if resume is None:
-            settings = load_config(config, [*overrides, *memory_overrides(memory_limit)])
+        limit = memory_overrides(memory_limit)
+        if into is not None:
+            settings = run_settings(into, config, [*overrides, *limit], without=["source"])
+        elif resume is None:
+            settings = load_config(config, [*overrides, *limit])
         else:
             request, settings = resumed(resume, request, config, overrides, memory_limit)
-        drive, options = request.open(settings)
-        announce(drive, quiet=quiet, verbose=verbose)
-        options = replace(
-            options,
-            out=resume or out,
-            threads=threads,
-            resume=resume is not None,
-            progress=choose_viewer(quiet=quiet, verbose=verbose),
-            tell=partial(warn, quiet=quiet, verbose=verbose),
-        )
-        run = run_map(drive, settings, options)
-    print_json(run.summary) if json else print_run(run.summary, stages=verbose)
+        viewer = choose_viewer(quiet=quiet, verbose=verbose)
+        if into is not None and remove is not None:
+            options = MapOptions(threads=threads, mesh=mesh, progress=viewer)
+            summary = run_remove(into, remove, settings, options)
+        else:
+            drive, options = request.open(settings)
+            announce(drive, quiet=quiet, verbose=verbose)
+            options = replace(
+                options,
+                out=resume or out,
+                threads=threads,
+                resume=resume is not None,
+                progress=viewer,
+                tell=partial(warn, quiet=quiet, verbose=verbose),
+            )
+            if into is None:
+                summary = run_map(drive, settings, options).summary
+            else:
+                summary = run_map_into(into, drive, settings, options)
+    print_json(summary) if json else print_run(summary, stages=verbose)
+
+
+def _check_folders(
+    source: Path | None,
+    out: Path | None,
+    resume: Path | None,
+    into: Path | None,
+    remove: int | None,
+) -> None:
+    """Refuse options that say nothing together."""
+    if out is not None and resume is not None and out.resolve() != resume.resolve():
+        raise typer.BadParameter("--out and --resume name different folders")
+    if into is not None and (resume is not None or out is not None):
+        raise typer.BadParameter("--into changes RUN, whole or not at all: no --out, no --resume")
+    if remove is not None and (into is None or source is not None):
+        raise typer.BadParameter("--remove takes a session out of --into RUN, and maps no SOURCE")
+    if source is None and resume is None and remove is None:
+        raise typer.BadParameter("give SOURCE, or --resume FOLDER")

@@ -130,7 +130,10 @@ def load_config(
 
 
 def run_settings(
-    folder: Path, file: Path | None = None, overrides: Sequence[str] = ()
+    folder: Path,
+    file: Path | None = None,
+    overrides: Sequence[str] = (),
+    without: Collection[str] = (),
 ) -> ReconConfig:
     """The settings of a finished run of map, demo or pair, with changes.
 
@@ -138,6 +141,7 @@ def run_settings(
         folder: Folder of the run.
         file: YAML file of settings, applied before the overrides; None = none.
         overrides: ``key=value`` settings.
+        without: Sections that are the defaults again, since they are of its source.
 
     Raises:
         FormatError: The folder does not contain such a run.
@@ -154,7 +158,7 @@ def run_settings(
             got=error.got,
             hint="map the drive again",
         ) from error
-    return load_config(file, overrides, own.model_dump(mode="json"))
+    return load_config(file, overrides, own.model_dump(mode="json", exclude=set(without)))
 
 
 def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[str]) -> None:

@@ -58,7 +58,7 @@ def export_grid(tiles: Tiles, path_m: Float64, trusted: Bool, stem: Path) -> Wri
 
     Args:
         tiles: The map, cut from submaps.
-        path_m: float64 (N, 3), camera positions in map axes.
+        path_m: float64 (N, 3), camera positions in map axes; a row of NaN between two drives.
         trusted: bool (N,), which of them are to be trusted.
         stem: The common path without suffix.
 
@@ -159,7 +159,8 @@ class _Flattening:
     def _crossed(self, margin_m: float) -> list[TileKey]:
         """The tiles that the path touches, or comes near to at one of its poses."""
         corners = [np.array(side) * margin_m for side in product((-1, 1), repeat=2)]
-        near = np.concatenate([self._path_m[:, :2] + corner for corner in corners])
+        path_m = self._path_m[np.isfinite(self._path_m[:, 0]), :2]
+        near = np.concatenate([path_m + corner for corner in corners])
         return [
             (x, y) for x, y in np.unique((near // self._tiles.edge_m).astype(int), axis=0).tolist()
         ]

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-import numpy as np
+from typing import Protocol
 
 from recon.core.errors import MeshingError
-from recon.core.geometry.se3 import apply
 from recon.core.values import OccupancyGrid, PointCloud
+from recon.core.values.arrays import Bool, Float64
 from recon.export.cloud import export_cloud
 from recon.export.grid import export_grid
 from recon.export.mesh import MeshSettings
 from recon.export.mesh.pieces import WrittenMesh, export_mesh
 from recon.export.octomap import export_octomap
-from recon.map.drive.sequence import MappedSequence
+from recon.map.tiles import Tiles
 from recon.run.directory import RunDirectory
 from recon.run.progress import SILENT, Progress
 from recon.run.stopwatch import Stopwatch
@@ -45,8 +44,27 @@ class Products:
     warnings: tuple[str, ...]
 
 
+class Placed(Protocol):
+    """What products are made of: a mapped drive, or the drives of a finished map."""
+
+    @property
+    def tiles(self) -> Tiles:
+        """The map."""
+        ...
+
+    @property
+    def path_m(self) -> Float64:
+        """float64 (N, 3), positions of the camera, map axes; a row of NaN between two drives."""
+        ...
+
+    @property
+    def trusted(self) -> Bool:
+        """bool (N,), which of them are to be trusted."""
+        ...
+
+
 def write_products(
-    mapped: MappedSequence,
+    mapped: Placed,
     directory: RunDirectory,
     watch: Stopwatch,
     *,
@@ -57,7 +75,7 @@ def write_products(
     """Write ``map/cloud.ply``, ``removed.ply``, ``octomap.*`` and ``grid.*``, and ``mesh/``.
 
     Args:
-        mapped: The mapped drive.
+        mapped: The mapped drives.
         directory: Result folder of the run.
         watch: Times each stage.
         mesh: Settings of the mesh; None = no mesh.
@@ -69,22 +87,21 @@ def write_products(
         OutputError: A file cannot be written.
     """
     progress.on_stage("map")
-    path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
-    trusted = np.array([record.ok for record in mapped.health])
+    tiles = mapped.tiles
     with watch.stage("cloud"):
         files = [directory.path(f"map/{name}.ply") for name in ("cloud", "removed")]
-        cloud = export_cloud(mapped.tiles, *files)
+        cloud = export_cloud(tiles, *files)
     with watch.stage("octomap"):
-        voxels, warnings = export_octomap(mapped.tiles, directory.path("map/octomap"))
+        voxels, warnings = export_octomap(tiles, directory.path("map/octomap"))
     with watch.stage("grid"):
-        flat = export_grid(mapped.tiles, path_m, trusted, directory.path("map/grid"))
+        flat = export_grid(tiles, mapped.path_m, mapped.trusted, directory.path("map/grid"))
     warnings += flat.warnings
     surface = None
     if mesh is not None:
         progress.on_stage("mesh")
         with watch.stage("mesh"):
-            surface = _mesh(mapped, mesh, directory, threads, warnings)
-        mapped.config.memory.check("mesh")
+            surface = _mesh(tiles, mesh, directory, threads, warnings)
+        tiles.config.memory.check("mesh")
     return Products(
         cloud.sample,
         cloud.points,
@@ -98,7 +115,7 @@ def write_products(
 
 
 def _mesh(
-    mapped: MappedSequence,
+    tiles: Tiles,
     settings: MeshSettings,
     directory: RunDirectory,
     threads: int | None,
@@ -106,10 +123,10 @@ def _mesh(
 ) -> WrittenMesh | None:
     """Write the surface; failure is only a warning, since the map is usable without one."""
     # Each piece being meshed takes memory of its own.
-    at_once = threads if mapped.config.memory.limit_mb is None else 1
+    at_once = threads if tiles.config.memory.limit_mb is None else 1
     layer = directory.path("map/cloud.ply")
     try:
-        written = export_mesh(mapped.tiles, settings, directory, layer, at_once)
+        written = export_mesh(tiles, settings, directory, layer, at_once)
     except MeshingError as error:
         warnings.append(f"no mesh: {error}")
         return None

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import secrets
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
+from typing import Final
 
 from recon.core.errors import OutputError
+
+_RENAME_EXCHANGE: Final = 2
+"""Flag of Linux's renameat2; with absolute paths its folders do not matter."""
 
 
 @contextmanager
@@ -38,6 +44,28 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
         raise _output_error(target, error) from error
     finally:
         _remove(temporary)
+
+
+def exchange(new: Path, old: Path) -> None:
+    """Exchange two folders in one step, so that ``old`` is at no moment missing or half new.
+
+    Where the system cannot, the old one is moved aside first.
+
+    Raises:
+        OSError: A folder is missing, or cannot be moved.
+    """
+    done = -1
+    if sys.platform == "linux":
+        rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+        if rename is not None:
+            ends = os.fsencode(new.absolute()), os.fsencode(old.absolute())
+            done = rename(0, ends[0], 0, ends[1], _RENAME_EXCHANGE)
+    if done != 0:
+        aside = old.with_name(f".{secrets.token_hex(6)}-{old.name}")
+        old.replace(aside)
+        new.replace(old)
+        aside.replace(new)
+    _sync(old.parent)
 
 
 def write_text(path: str | PathLike[str], text: str) -> None:

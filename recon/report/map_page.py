@@ -8,7 +8,14 @@ from recon.core.geometry.se3 import apply
 from recon.map.drive.map_run import MapRun
 from recon.report.images import stereo_figures
 from recon.report.page import write_page
-from recon.report.paths import drift_figure, grid_figure, health_figure, loops_figure, path_figure
+from recon.report.paths import (
+    drift_figure,
+    grid_figure,
+    health_figure,
+    loops_figure,
+    path_figure,
+    seen_from_above,
+)
 from recon.report.scene import Json, Scene, plot_scene
 from recon.run.directory import RunDirectory
 
@@ -38,7 +45,7 @@ def _figures(run: MapRun) -> dict[str, bytes | None]:
     path, health, T_map_world = run.mapped.trajectory, run.mapped.health, run.mapped.T_map_world
     truth = None if run.truth is None else run.truth.trajectory
     return {
-        "grid": None if run.grid is None else grid_figure(run.grid, path, T_map_world),
+        "grid": grid_figure(run.grid, {"path": seen_from_above(path, T_map_world)}),
         "path": path_figure(path, truth, T_map_world, health),
         "loops": _loops(run),
         "drift": None if truth is None else drift_figure(path, truth, health),

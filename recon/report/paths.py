@@ -182,35 +182,34 @@ def widest_axes(positions_m: Float64) -> tuple[int, int]:
 
 
 @styled
-def grid_figure(
-    grid: OccupancyGrid, trajectory: Trajectory | None, T_map_world: NDArray[Any]
-) -> bytes:
-    """Draw the occupancy grid with the path; axes in metres, cropped to the known cells.
+def grid_figure(grid: OccupancyGrid, paths: Mapping[str, Float64]) -> bytes:
+    """Draw the occupancy grid with paths; axes in metres, cropped to the known cells.
 
     Args:
         grid: The map.
-        trajectory: The path of the camera, or None.
-        T_map_world: (4, 4), from world to map axes.
+        paths: Paths of the camera seen from above, (N, 2), by their names.
     """
     grid = thin_grid(_crop_to_known(grid), _MOST_CELLS)
     near = np.asarray(grid.origin_m)
     far = near + np.asarray(grid.cells.shape[::-1]) * grid.resolution_m
-    path = np.zeros((0, 2)) if trajectory is None else seen_from_above(trajectory, T_map_world)
+    path = np.concatenate([np.zeros((0, 2)), *paths.values()])
     corners = np.concatenate([[near, far], path - _PATH_MARGIN_M, path + _PATH_MARGIN_M])
     low, high = corners.min(axis=0), corners.max(axis=0)
     figure = Figure((WIDE_IN, _height_in(corners)))
     axes = figure.subplots()
     axes.set_facecolor(unit_colour(GRID_UNKNOWN))
     axes.imshow(colour_grid(grid), extent=(near[0], far[0], near[1], far[1]))
-    axes.plot(*path.T, linewidth=1.6)
-    _mark_ends(axes, path)
+    lines = [axes.plot(*way.T, linewidth=1.6, label=name)[0] for name, way in paths.items()]
+    for way in paths.values():
+        _mark_ends(axes, way)
     axes.grid(visible=False)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set(xlabel=_MAP_LABELS[0], ylabel=_MAP_LABELS[1])
     _draw_scale_bar(axes, low, high - low)
     keys = (("free", GRID_FREE), ("occupied", GRID_OCCUPIED), ("unknown", GRID_UNKNOWN))
     handles = [colour_key(*key) for key in keys]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3)
+    named = lines if len(lines) > 1 else []
+    figure.legend(handles=[*handles, *named], loc="outside lower center", ncols=3)
     return to_png(figure)
 
 

@@ -15,12 +15,12 @@ from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 from typing_extensions import Self
 
 from recon.core.errors import MemoryLimitError, OutputError
-from recon.io.atomic import write_text
+from recon.io.atomic import exchange, write_text
 from recon.io.lock import take_lock
 
 RECORD: Final = "run.json"
@@ -52,10 +52,16 @@ class RunDirectory:
         latest: Keep a link ``latest`` beside the folder (for the default folders).
         resume: Resume the unfinished run in the folder.
 
+    Attributes:
+        whole: Write beside the folder, and put the new one in its place in one step: whoever
+            looks finds the old run or the new one, never some files of each.
+
     Raises:
         OutputError: The folder cannot be written, holds files that are not of a run, or another
             run is writing to it.
     """
+
+    whole: ClassVar[bool] = False
 
     def __init__(self, folder: Path, *, latest: bool = False, resume: bool = False) -> None:
         self.folder = folder
@@ -66,19 +72,19 @@ class RunDirectory:
 
     def path(self, name: str) -> Path:
         """Return the path to write the file ``name`` to; its parent folder is created."""
-        target = self._partial / name
+        target = self._content / name
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
 
     def state(self, name: str) -> Path:
         """Return the path of the state file ``name``, which is deleted when the run is done."""
-        target = self._partial / _STATE / name
+        target = self._content / _STATE / name
         target.parent.mkdir(parents=True, exist_ok=True)
         return target
 
     def files(self) -> list[str]:
         """Return sorted names of the files written so far, without those of the state."""
-        written = (p.relative_to(self._partial) for p in self._partial.rglob("*") if p.is_file())
+        written = (p.relative_to(self._content) for p in self._content.rglob("*") if p.is_file())
         return sorted(p.as_posix() for p in written if p.parts[0] not in (_STATE, _LOCK))
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
@@ -131,6 +137,8 @@ class RunDirectory:
 
     def _clear(self) -> None:
         """Remove partial files of an earlier run; a resumed run keeps its state."""
+        if self.whole:
+            shutil.rmtree(self._content, ignore_errors=True)  # of one that was killed
         kept = {_LOCK, _STATE} if self.resumes else {_LOCK}
         for path in self._partial.iterdir():
             if path.name in kept:
@@ -144,7 +152,18 @@ class RunDirectory:
     def _partial(self) -> Path:
         return self.folder / _PARTIAL
 
+    @property
+    def _content(self) -> Path:
+        """Where the files of this run are written."""
+        if self.whole:
+            folder = self.folder.resolve()
+            return folder.with_name(f".{folder.name}{_PARTIAL}")
+        return self._partial
+
     def _publish(self) -> None:
+        if self.whole:
+            self._swap()
+            return
         files = [Path(name) for name in self.files()]
         for stale in set(_earlier_files(self.folder)) - set(files):
             (self.folder / stale).unlink(missing_ok=True)
@@ -158,8 +177,22 @@ class RunDirectory:
         if self._latest:
             _link_latest(self.folder)
 
+    def _swap(self) -> None:
+        """Put the new folder in the place of the old one, with files in it that are of no run."""
+        shutil.rmtree(self._content / _STATE, ignore_errors=True)
+        ours = {self.folder / name for name in _earlier_files(self.folder)}
+        for path in self.folder.rglob("*"):
+            target = self._content / path.relative_to(self.folder)
+            if path.is_file() and path not in ours and self._partial not in path.parents:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(path, target)
+        new = self._content
+        exchange(new, self.folder.resolve())
+        shutil.rmtree(new, ignore_errors=True)
+
     def _withdraw(self) -> None:
-        shutil.rmtree(self._partial, ignore_errors=True)
+        for partial in {self._partial, self._content}:
+            shutil.rmtree(partial, ignore_errors=True)
         for folder in self._made:
             with suppress(OSError):  # not empty: files of others, which stay
                 folder.rmdir()

@@ -135,3 +135,9 @@ class Run(RunDirectory):
             "stages": {name: round(value, 3) for name, value in self.watch.seconds.items()},
             "peak_memory_mb": round(peak_memory_mb(), 1),
         }
+
+
+class ReplacingRun(Run):
+    """A run that takes the place of an earlier one in its folder in one step."""
+
+    whole = True

@@ -12,6 +12,7 @@ from recon.report.paths import (
     grid_figure,
     health_figure,
     path_figure,
+    seen_from_above,
     timing_figure,
 )
 from recon.report.style import nice_length
@@ -47,9 +48,9 @@ def test_grid_is_drawn_with_and_without_path_and_without_any_known_cell(
     grid: OccupancyGrid, trajectory: Trajectory, T_map_world: Float64
 ) -> None:
     unknown = OccupancyGrid(np.full((4, 5), -1, dtype=np.int8), 0.1, (0.0, 0.0))
-    assert is_png(grid_figure(grid, trajectory, T_map_world))
-    assert is_png(grid_figure(grid, None, T_map_world))
-    assert is_png(grid_figure(unknown, None, T_map_world))
+    assert is_png(grid_figure(grid, {"path": seen_from_above(trajectory, T_map_world)}))
+    assert is_png(grid_figure(grid, {}))
+    assert is_png(grid_figure(unknown, {}))
 
 
 @pytest.mark.parametrize(

@@ -52,11 +52,14 @@ def print_evaluation(title: str, figures: Mapping[str, Any]) -> None:
 def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
     """Print a run's figures, its warnings and its folder."""
     shown = {key: value for key, value in summary.items() if key != "out"}
-    for group in ("prior", "loops", "trajectory", "map", "disparity"):
+    for group in ("prior", "loops", "links", "trajectory", "map", "disparity"):
         shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
     for part in ("voxels", "grid"):
         figures = summary.get("occupancy", {}).get(part, {})
         shown |= {f"occupancy.{part}.{key}": value for key, value in figures.items()}
+    for drive in summary.get("sessions", ()):
+        place = "" if drive["linked"] else ", apart"
+        shown[f"session {drive['number']}"] = f"{drive['name']}, {drive['frames']} frames{place}"
     if stages:
         shown |= {f"seconds.{key}": value for key, value in summary["stages"].items()}
     print_figures("", shown)

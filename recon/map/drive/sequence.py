@@ -12,9 +12,9 @@ import numpy as np
 
 from recon.core.errors import RegistrationError
 from recon.core.geometry.axes import transform_cloud
-from recon.core.geometry.se3 import invert
+from recon.core.geometry.se3 import apply, invert
 from recon.core.values import OccupancyVoxels, PointCloud, RectifiedCamera, StereoPair, Trajectory
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Bool, Float64
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.frame_result import FrameResult
 from recon.map.drive.mapper import Mapper
@@ -98,6 +98,16 @@ class MappedSequence:
     def __repr__(self) -> str:
         trusted = sum(record.ok for record in self.health)
         return f"MappedSequence({self.trajectory}, {trusted} of them trusted, {self.seconds:.4g} s)"
+
+    @property
+    def path_m(self) -> Float64:
+        """float64 (N, 3), positions of the camera, map axes."""
+        return apply(self.T_map_world, self.trajectory.positions_m)
+
+    @property
+    def trusted(self) -> Bool:
+        """bool (N,), which poses are to be trusted."""
+        return np.array([record.ok for record in self.health])
 
     @cached_property
     def tiles(self) -> Tiles:

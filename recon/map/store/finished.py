@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.errors import FormatError
+from recon.core.errors import FormatError, SettingsError
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud
-from recon.core.values.arrays import Bool, Float32, Int32
+from recon.core.values.arrays import Bool, Float32, Float64, Int32
 from recon.map.kernels import clamped
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
@@ -61,8 +61,19 @@ def keep_map(mapped: Map, path: Path, settings: DriveSettings) -> None:
         kept.commit()
 
 
-def with_occupancy(session: Session, settings: DriveSettings) -> Submaps:
-    """The submaps of a finished map, with occupancy made from its rays, in a temporary store.
+def with_occupancy(
+    session: Session,
+    settings: DriveSettings,
+    T_map_world: Float64 | None = None,
+    T_world_camera: Float64 | None = None,
+) -> Submaps:
+    """The submaps of a finished drive, with occupancy made from its rays, in a temporary store.
+
+    Args:
+        session: The drive.
+        settings: How to make it.
+        T_map_world: float64 (4, 4), from world to the axes of the occupancy; None = its own.
+        T_world_camera: float64 (N, 4, 4), from where rays are cast; None = the path by odometry.
 
     Raises:
         FormatError: The map is damaged.
@@ -71,15 +82,52 @@ def with_occupancy(session: Session, settings: DriveSettings) -> Submaps:
     if session.submaps.frames != len(session):
         raise FormatError("the map lacks submaps", where=session.where)
     made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
-    T_map_world = session.T_map_world
+    T_map_world = session.T_map_world if T_map_world is None else T_map_world
     builder = SubmapBuilder(settings.submaps, settings.fusion, settings.occupancy, T_map_world)
     unfused = PointCloud(np.zeros((0, 3), np.float32), frame="world")
-    poses = session.odometry.T_world_camera
+    poses = session.odometry.T_world_camera if T_world_camera is None else T_world_camera
     for kept in session.submaps:
         for frame in range(kept.first_frame, kept.first_frame + kept.frames):
             builder.integrate(unfused, session.rays(frame)[0].cloud(), poses[frame])
         made.add(replace(kept, occupancy=builder.close().occupancy))
     return made
+
+
+def check_rays(session: Session, settings: DriveSettings) -> None:
+    """Refuse a cell size or range that the kept rays of a session do not support.
+
+    Raises:
+        FormatError: It kept no rays, or is damaged.
+        SettingsError: The settings need finer or longer rays than it kept.
+    """
+    if not session.ray_frames:
+        raise FormatError(
+            "the run kept no rays to build occupancy from",
+            where=session.where,
+            hint="map the drive again with --set occupancy.keep_rays=true",
+        )
+    if session.ray_frames != len(session):
+        raise FormatError(
+            "the run has different numbers of ray frames and poses",
+            where=session.where,
+            got=f"{session.ray_frames} and {len(session)}",
+        )
+    grain, wanted = session.rays(0)[1], settings.occupancy
+    # The 0.05 % tolerance is for rounded input, such as 0.3333 for a third.
+    if wanted.resolution_m < grain.cell_m * 0.9995:
+        raise SettingsError(
+            "the rays kept by the run are too coarse for these voxels",
+            got=f"{wanted.resolution_m:g} m",
+            expected=f"at least {grain.cell_m:g} m",
+            hint="map the drive again with --set occupancy.rays_per_voxel= or resolution_m=",
+        )
+    if wanted.max_range_m > grain.max_range_m * (1 + 1e-9):
+        raise SettingsError(
+            "the rays kept by the run do not reach that far",
+            got=f"{wanted.max_range_m:g} m",
+            expected=f"at most {grain.max_range_m:g} m",
+            hint="map the drive again with --set occupancy.max_range_m=",
+        )
 
 
 def _compact(submap: Submap, least: int, where: _Places) -> Submap:

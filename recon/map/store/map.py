@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Final
@@ -12,8 +13,14 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import invert
 from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair
 from recon.core.values.arrays import Float64
+from recon.io.files import reading
+from recon.map.store.links import LINKS, Link
 from recon.map.store.records import CACHE_BYTES, Store
-from recon.map.store.session import Session, SessionInfo
+from recon.map.store.session import SESSION, Session, SessionInfo
+
+if TYPE_CHECKING:
+    from recon.map.settings import DriveSettings
+    from recon.map.tiles import Tiles
 
 if TYPE_CHECKING:
     from recon.map.localize.localizer import Located
@@ -21,7 +28,6 @@ if TYPE_CHECKING:
 
 MAP_FILE: Final = "map/map.recon"
 """Where a finished run keeps its map."""
-_SESSION: Final = "session"
 
 
 class Map:
@@ -39,7 +45,7 @@ class Map:
 
     def __init__(self, store: Store) -> None:
         self.store = store
-        numbers = [key for key in store.keys(_SESSION) if isinstance(key, int)]
+        numbers = [key for key in store.keys(SESSION) if isinstance(key, int)]
         self.sessions = [Session(store, number) for number in numbers]
 
     @classmethod
@@ -97,7 +103,75 @@ class Map:
         Raises:
             FormatError: The axes are not known.
         """
-        return invert(self.sessions[0].T_map_world) @ session.T_map_world
+        return invert(self.linked[0].T_map_world) @ session.T_map_world
+
+    @property
+    def links(self) -> list[Link]:
+        """The places that two drives saw, those that contradict the others included.
+
+        Raises:
+            FormatError: The record of the links is damaged.
+        """
+        if not self.store.has(LINKS, 0):
+            return []
+        with reading(self.store.name):
+            return [Link.from_tree(tree) for tree in self.store.get(LINKS, 0)["links"]]
+
+    @property
+    def linked(self) -> list[Session]:
+        """The drives that share the axes of the map; others are in it, but nobody knows where.
+
+        Raises:
+            FormatError: The record of the links is damaged.
+        """
+        if not self.store.has(LINKS, 0):
+            return self.sessions[:1]
+        with reading(self.store.name):
+            numbers = self.store.get(LINKS, 0)["linked"]
+            return [session for session in self.sessions if session.number in numbers]
+
+    def set_links(self, links: Sequence[Link], linked: Collection[int]) -> None:
+        """Keep the links, and the numbers of the drives that share the axes of the map.
+
+        Raises:
+            OutputError: They cannot be written.
+        """
+        content = {"links": [link.to_tree() for link in links], "linked": sorted(linked)}
+        self.store.put(LINKS, 0, content, compress=True)
+
+    def merge(self, other: Map) -> list[Session]:
+        """Add the drives of another finished map, and place those that saw the same places.
+
+        Args:
+            other: The other map; it stays as it is. `commit` makes the change permanent.
+
+        Returns:
+            The drives that are new here; those that could be placed are in `linked`.
+
+        Raises:
+            FormatError: A map is damaged, or a drive is in both.
+            OutputError: The map cannot be written.
+        """
+        from recon.map.sessions.copying import copy_sessions  # noqa: PLC0415 - it is above
+        from recon.map.sessions.joining import join_new  # noqa: PLC0415 - the same
+
+        new = copy_sessions(other, self)
+        join_new(self, new)
+        return [self.session(number) for number in new]
+
+    def tiles(self, settings: DriveSettings | None = None) -> Tiles:
+        """The linked drives in tiles: fused cloud, what moved, and occupancy from their rays.
+
+        Args:
+            settings: How to make them; None = the settings of the first drive.
+
+        Raises:
+            FormatError: A drive kept no rays, or the map is damaged.
+            SettingsError: The settings need finer or longer rays than were kept.
+        """
+        from recon.map.sessions.placed import place_map, settings_of  # noqa: PLC0415 - it is above
+
+        return place_map(self, settings or settings_of(self.linked[0])).tiles
 
     def localize(
         self,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 import weakref
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import RLock
@@ -205,19 +205,24 @@ class Store:
         """
         return ((key, self.read(kind, key)) for key in self.keys(kind))
 
-    def copy(self, kind: str, other: Store, keys: Iterable[Key] | None = None) -> None:
-        """Copy the records of a kind to another store, as they are, without unpacking them.
+    def copy(self, kind: str, other: Store, keys: Mapping[Key, Key] | None = None) -> None:
+        """Copy records of a kind to another store, as they are, without unpacking them.
+
+        Args:
+            kind: The kind.
+            other: The other store.
+            keys: Which ones, and their keys in the other store; None = all, under their own.
 
         Raises:
             FormatError: One is damaged.
             OutputError: The other one cannot be written.
         """
-        for key in self.keys(kind) if keys is None else keys:
+        for key, new in ({k: k for k in self.keys(kind)} if keys is None else keys).items():
             with self._lock, self._reading():
                 text, content, _ = self._row(kind, _name(key))
                 whole = content.read(content.left)
                 content.close()
-            other._insert(kind, _name(key), text, [whole])
+            other._insert(kind, _name(new), text, [whole])
 
     def commit(self) -> None:
         """Make everything so far permanent, all of it or, after an error, nothing.

@@ -22,7 +22,7 @@ from recon.places.graph import Closure
 
 FRAMES: Final = "frames"
 RAYS: Final = "rays"
-_SESSION: Final = "session"
+SESSION: Final = "session"
 AXES: Final = "axes"
 LOOPS: Final = "loops"
 _STATE: Final = "state"
@@ -87,7 +87,7 @@ class Session:
         self._health: list[OdometryHealth] = []
         self._flushed = 0
         with reading(store.name):
-            self.info = SessionInfo(**store.read(_SESSION, number))
+            self.info = SessionInfo(**store.read(SESSION, number))
             self._read_frames()
         self.submaps = Submaps(store, number)
         if self.submaps.frames > len(self):
@@ -101,7 +101,7 @@ class Session:
         Raises:
             OutputError: It cannot be written.
         """
-        store.put(_SESSION, number, asdict(info))
+        store.put(SESSION, number, asdict(info))
         return Session(store, number)
 
     def __len__(self) -> int:

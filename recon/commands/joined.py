@@ -1,0 +1,113 @@
+"""A run that puts several drives into one map: links them, places them, and makes the products."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from recon.commands.config import ReconConfig, check_changes, run_settings
+from recon.commands.map_options import MapOptions
+from recon.export.joined import JoinedMap, export_sessions, joined_figures, joined_warnings
+from recon.export.products import write_products
+from recon.map.sessions.copying import check_session, copy_sessions
+from recon.map.sessions.joining import join_new
+from recon.map.sessions.placed import place_map
+from recon.map.store.map import MAP_FILE, Map
+from recon.report.joined_page import write_joined_page
+from recon.run.finished import open_run
+from recon.run.run import ReplacingRun, Run
+
+REMADE = ("occupancy", "grid", "ground", "submaps", "mesh", "memory")
+"""Sections of the configuration that may differ from those of the first run."""
+Fill = Callable[[Run, Map], Sequence[int]]
+"""Puts drives into the empty map of a run; gives the numbers of those that are new in it."""
+
+
+def make_joined(
+    options: MapOptions,
+    settings: ReconConfig,
+    fill: Fill,
+    inputs: Sequence[Path],
+    replaced: Path | None = None,
+) -> dict[str, Any]:
+    """Fill the map of a run, link and place its drives, and make its products and its report.
+
+    Args:
+        options: Folder, threads, mesh and progress of the run.
+        settings: Its settings.
+        fill: Puts the drives into its map.
+        inputs: The files that are read.
+        replaced: The run whose place it takes in one step; None = it is a new one.
+
+    Returns:
+        The figures of ``summary.json``.
+
+    Raises:
+        ReconError: A drive is damaged or does not fit, or the folder cannot be written.
+    """
+    kind, out = (Run, options.out) if replaced is None else (ReplacingRun, replaced)
+    with (
+        kind(
+            options.command,
+            out,
+            settings,
+            threads=options.threads,
+            progress=options.progress,
+        ) as run,
+        Map.create(run.path(MAP_FILE), cache_bytes=settings.memory.cache_bytes) as map_,
+    ):
+        new = fill(run, map_)
+        with run.stage("links"):
+            join_new(map_, new)
+        map_.commit()
+        with run.stage("map"):
+            placed = place_map(map_, settings)
+        mesh = settings.mesh if options.mesh else None
+        made = write_products(
+            placed, run, run.watch, mesh=mesh, threads=options.threads, progress=options.progress
+        )
+        joined = JoinedMap(
+            map_, settings, made, None if made.mesh is None else made.mesh.to_show(run)
+        )
+        summary = {**joined_figures(joined), "warnings": joined_warnings(joined)}
+        export_sessions(joined, run)
+        with run.report(summary):
+            write_joined_page(joined, summary, run)
+        T_map_world = map_.linked[0].T_map_world.tolist()
+        map_.close()
+        run.finish(
+            summary,
+            source=", ".join(session["name"] for session in summary["sessions"]),
+            inputs=inputs,
+            record={"T_map_world": T_map_world},
+        )
+    return summary
+
+
+def copied(file: Path, map_: Map, settings: ReconConfig) -> list[int]:
+    """Copy the drives of a finished map into another; their numbers.
+
+    Raises:
+        ReconError: A drive is damaged, does not fit, or is there already.
+    """
+    with closing(Map.open(file)) as other:
+        for session in other.sessions:
+            check_session(session, settings)
+        return copy_sessions(other, map_)
+
+
+def joined_settings(
+    folder: Path, config: ReconConfig | None, sections: Sequence[str]
+) -> ReconConfig:
+    """The settings of a finished run, or those with changes where they have an effect.
+
+    Raises:
+        ReconError: There is no such run, or the changes have no effect.
+    """
+    open_run(folder)
+    ran = run_settings(folder)
+    if config is not None:
+        check_changes(ran, config, sections)
+    return config or ran

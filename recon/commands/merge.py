@@ -1,0 +1,145 @@
+"""`recon merge`, `recon map --into` and `--remove`: several drives in one map."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from recon.commands.config import ReconConfig, run_settings
+from recon.commands.joined import REMADE, copied, joined_settings, make_joined
+from recon.commands.map_options import MapOptions
+from recon.core.errors import SettingsError
+from recon.map.drive.empty import check_map
+from recon.map.drive.sequence import map_sequence
+from recon.map.drive.workspace import Workspace
+from recon.map.sessions.copying import copy_sessions
+from recon.map.store.finished import keep_map
+from recon.map.store.map import MAP_FILE, Map
+from recon.run.finished import open_run, refuse_as_target
+from recon.run.run import Run
+from recon.sources.protocol import StereoSource
+
+
+def run_merge(
+    runs: Sequence[Path], config: ReconConfig | None = None, options: MapOptions | None = None
+) -> dict[str, Any]:
+    """Make one map of several runs: what `recon merge` does.
+
+    The drives are linked by places that two of them saw, and placed in one pose graph; cloud,
+    OctoMap, grid and mesh are made of all that are linked with the first. What a later run saw
+    counts more than what an earlier one did.
+
+    Args:
+        runs: Folders of finished runs; the world and the axes of the first are those of the map.
+        config: Settings of the first run with changes; None = its own.
+        options: Folder, threads, mesh and progress of the run; None = the defaults.
+
+    Returns:
+        The figures of ``summary.json``.
+
+    Raises:
+        ReconError: A run is missing, unfinished or twice in the list, kept no rays, has voxels of
+            another size, or the folder cannot be written; nothing is left behind.
+    """
+    options = options or MapOptions(command="merge")
+    if len(runs) < 2:
+        raise SettingsError("there is nothing to merge", got=len(runs), expected="two runs")
+    _refuse_twice(runs)
+    settings = joined_settings(runs[0], config, REMADE)
+    for run in runs:
+        open_run(run)
+        refuse_as_target(run, options.out)
+
+    def fill(run: Run, map_: Map) -> list[int]:
+        added = [copied(folder / MAP_FILE, map_, settings) for folder in runs]
+        return [number for numbers in added[1:] for number in numbers]
+
+    return make_joined(options, settings, fill, [run / MAP_FILE for run in runs])
+
+
+def run_map_into(
+    folder: Path,
+    source: StereoSource,
+    config: ReconConfig | None = None,
+    options: MapOptions | None = None,
+) -> dict[str, Any]:
+    """Map a drive into the map of a finished run: what `recon map SOURCE --into RUN` does.
+
+    The folder is replaced in one step when all is done; until then it keeps the run as it was.
+
+    Args:
+        folder: Folder of the run.
+        source: The drive.
+        config: Settings of the run with changes; None = its own.
+        options: Options of the mapping, as for `run_map`; None = the defaults.
+
+    Raises:
+        ReconError: The run cannot be extended, or the drive cannot be mapped; the run stays.
+    """
+    options = options or MapOptions()
+    settings = config or run_settings(folder)
+
+    def fill(run: Run, map_: Map) -> list[int]:
+        copied(folder / MAP_FILE, map_, settings)
+        return _mapped(source, settings, options, run, map_)
+
+    files = [folder / MAP_FILE, *source.files]
+    return make_joined(options, settings, fill, files, replaced=folder)
+
+
+def run_remove(
+    folder: Path, number: int, config: ReconConfig | None = None, options: MapOptions | None = None
+) -> dict[str, Any]:
+    """Take a drive out of the map of a run: what `recon map --into RUN --remove SESSION` does.
+
+    Args:
+        folder: Folder of the run, which is replaced in one step.
+        number: Number of the drive, as ``sessions`` of the summary lists them.
+        config: Settings of the run with changes; None = its own.
+        options: Threads, mesh and progress of the run; None = the defaults.
+
+    Raises:
+        ReconError: There is no such drive, or no other one, or the run is damaged; the run stays.
+    """
+    options = options or MapOptions()
+    settings = joined_settings(folder, config, REMADE)
+
+    def fill(run: Run, map_: Map) -> list[int]:
+        with closing(Map.open(folder)) as old:
+            if len(old.sessions) < 2 and old.session(number):
+                raise SettingsError("the map has only this session", where=folder, got=number)
+            old.session(number)
+            copy_sessions(old, map_, without=[number])
+        return []
+
+    return make_joined(options, settings, fill, [folder / MAP_FILE], replaced=folder)
+
+
+def _mapped(
+    source: StereoSource, settings: ReconConfig, options: MapOptions, run: Run, map_: Map
+) -> list[int]:
+    """Map a drive, and copy it into a map; its number."""
+    with Map.create(run.state("drive.recon")) as drive:
+        mapped = map_sequence(
+            source,
+            settings,
+            known_poses=options.known_poses,
+            prior=options.prior,
+            progress=options.progress,
+            workspace=Workspace(drive, run.watch, run.threads),
+        )
+        check_map(mapped, source.name)
+        kept = run.state("kept.recon")
+        keep_map(drive, kept, settings)
+    return copied(kept, map_, settings)
+
+
+def _refuse_twice(folders: Sequence[Path]) -> None:
+    """Refuse a folder that is named twice."""
+    seen: set[Path] = set()
+    for folder in folders:
+        if folder.resolve() in seen:
+            raise SettingsError("the same run twice", got=folder, hint="name each run once")
+        seen.add(folder.resolve())

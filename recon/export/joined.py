@@ -1,0 +1,96 @@
+"""A map of several drives beside its products: figures, warnings, and the paths as files."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Any
+
+from recon.core.values import Trajectory, TriangleMesh
+from recon.export.products import Products
+from recon.io.trajectory import write_kitti_poses, write_tum
+from recon.map.ground.axes import base_axes
+from recon.map.settings import DriveSettings
+from recon.map.store.map import Map
+from recon.run.directory import RunDirectory
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedMap:
+    """A map of several drives, whose products are written.
+
+    Attributes:
+        map: The map.
+        settings: The settings of its products.
+        made: The products.
+        mesh: The surface in map axes; None = not made, or too large for memory.
+    """
+
+    map: Map
+    settings: DriveSettings
+    made: Products
+    mesh: TriangleMesh | None = None
+
+    @property
+    def paths(self) -> dict[int, Trajectory]:
+        """The path of each linked drive by its number, in the world of the first."""
+        return {
+            session.number: replace(
+                session.trajectory,
+                T_world_camera=self.map.T_world_session(session)
+                @ session.trajectory.T_world_camera,
+            )
+            for session in self.map.linked
+        }
+
+
+def joined_figures(joined: JoinedMap) -> dict[str, Any]:
+    """The figures for ``summary.json``."""
+    map_, made = joined.map, joined.made
+    T_map_world = map_.linked[0].T_map_world
+    linked = {session.number for session in map_.linked}
+    kept = [link for link in map_.links if link.kept]
+    pairs = Counter("-".join(map(str, link.sessions)) for link in kept)
+    return {
+        "frames": sum(map(len, map_.linked)),
+        "path_length_m": sum(path.path_length_m for path in joined.paths.values()),
+        "sessions": [
+            {
+                "number": session.number,
+                "name": session.info.source,
+                "frames": len(session),
+                "length_m": session.trajectory.path_length_m,
+                "linked": session.number in linked,
+            }
+            for session in map_.sessions
+        ],
+        "links": {"count": len(kept), "refused": len(map_.links) - len(kept), "pairs": dict(pairs)},
+        "points": made.points,
+        "points_removed": made.removed,
+        "voxels": made.voxels,
+        "faces": 0 if made.mesh is None else made.mesh.faces,
+        "T_map_world": T_map_world.tolist(),
+        "camera_height_m": made.camera_height_m,
+        "T_base_camera": base_axes(T_map_world, made.camera_height_m).tolist(),
+    }
+
+
+def joined_warnings(joined: JoinedMap) -> list[str]:
+    """What the user should know: drives that are linked to nothing."""
+    linked = joined.map.linked
+    apart = [session for session in joined.map.sessions if session not in linked]
+    names = ", ".join(f"{session.number} ({session.info.source})" for session in apart)
+    what = "shares no verified place" if len(apart) == 1 else "share no verified place"
+    told = f"session {names} {what} with session {linked[0].number}: kept in the map, but not in "
+    return [*([told + "cloud, grid, OctoMap and mesh"] if apart else ()), *joined.made.warnings]
+
+
+def export_sessions(joined: JoinedMap, directory: RunDirectory) -> None:
+    """Write ``sessions/<number>/trajectory_*.txt`` of the linked drives, in the map's world.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    for number, path in joined.paths.items():
+        write_kitti_poses(directory.path(f"sessions/{number}/trajectory_kitti.txt"), path)
+        write_tum(directory.path(f"sessions/{number}/trajectory_tum.txt"), path)

@@ -1,0 +1,1 @@
+"""Several drives in one map: copied into it, linked, placed, and taken out again."""

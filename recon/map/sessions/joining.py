@@ -1,0 +1,149 @@
+"""The drives of a map placed beside one another by their links, in one pose graph."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from recon.core.geometry.se3 import invert, orthonormalise
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64
+from recon.map.sessions.linking import DRIFT, find_links, path_up_to
+from recon.map.store.links import Link
+from recon.map.store.map import Map
+from recon.map.store.session import Session
+from recon.places.graph import Drive, Tie, join_drives
+from recon.places.verify import Loop
+
+
+@dataclass(frozen=True, eq=False)
+class _Joined:
+    """Drives that are held together.
+
+    Attributes:
+        paths: The path of each by its number, in the world of the first.
+        links: The links that hold them.
+    """
+
+    paths: dict[int, Trajectory]
+    links: list[Link]
+
+
+def join_new(map_: Map, new: Collection[int]) -> None:
+    """Find the links of new drives, and place all drives of the map, see `join_sessions`.
+
+    Args:
+        map_: The map, which is written.
+        new: Numbers of the drives that are new in it.
+
+    Raises:
+        FormatError: The map is damaged.
+        OutputError: The map cannot be written.
+    """
+    join_sessions(map_, [*map_.links, *find_links(map_, new)])
+
+
+def join_sessions(map_: Map, links: Sequence[Link]) -> None:
+    """Place the drives that links hold together; keep the links, and which drives those are.
+
+    The first drive stays where it is, and its axes are those of the map. Drives that no link holds
+    stay apart.
+
+    Args:
+        map_: The map, which is written.
+        links: All links between its drives.
+
+    Raises:
+        FormatError: The map is damaged.
+        OutputError: The map cannot be written.
+    """
+    joined = _held_together(map_, links)
+    for number, path in joined.paths.items():
+        _place(map_, map_.session(number), path)
+    kept = set(map(id, joined.links))
+    linked = joined.paths or [map_.sessions[0].number]
+    map_.set_links([replace(link, kept=id(link) in kept) for link in links], [*linked])
+
+
+def _held_together(map_: Map, links: Sequence[Link]) -> _Joined:
+    """Solve the graph until all of its drives are held by links that it believes."""
+    while True:
+        places = _reached(map_, links)
+        inside = [link for link in links if set(link.sessions) <= set(places)]
+        if len(places) == 1:
+            return _Joined({}, [])
+        joined = _solve(map_, places, inside)
+        if set(_reached(map_, joined.links)) == set(places):
+            return joined
+        links = joined.links
+
+
+def _reached(map_: Map, links: Sequence[Link]) -> dict[int, Float64]:
+    """About where the drives are that links connect with the first one.
+
+    Returns:
+        By number, ``T_world_session`` (4, 4), in the world of the first.
+    """
+    found = {map_.sessions[0].number: np.eye(4)}
+    surest = sorted(links, key=lambda link: -link.loop.inliers)
+    while True:
+        bridges = (link for link in surest if sum(n in found for n in link.sessions) == 1)
+        bridge = next(bridges, None)
+        if bridge is None:
+            return found
+        one, other = bridge.sessions
+        T_one_other = _motion(map_.session(one), map_.session(other), bridge.loop)
+        if one in found:
+            found[other] = orthonormalise(found[one] @ T_one_other)
+        else:
+            found[one] = orthonormalise(found[other] @ invert(T_one_other))
+
+
+def _motion(one: Session, other: Session, loop: Loop) -> Float64:
+    """``T_one_other`` (4, 4) between the worlds of two drives, by one link."""
+    T_one_first = one.trajectory.T_world_camera[loop.first]
+    T_other_last = other.trajectory.T_world_camera[loop.last]
+    return np.asarray(T_one_first @ loop.T_first_last @ invert(T_other_last))
+
+
+def _solve(map_: Map, places: dict[int, Float64], links: Sequence[Link]) -> _Joined:
+    """Solve the pose graph of some drives, with their own loops and the links between them."""
+    numbers = list(places)
+    sessions = [map_.session(number) for number in numbers]
+    drives = [_drive(session, places[session.number]) for session in sessions]
+    loops = [
+        Tie((place, place), Loop(**loop))
+        for place, session in enumerate(sessions)
+        for loop in session.loops.get("closed", ())
+    ]
+    ties = [Tie(_places(numbers, link), link.loop) for link in links]
+    joined = join_drives(drives, [*loops, *ties], DRIFT)
+    if joined is None:
+        return _Joined({}, [])
+    kept = joined.kept[len(loops) :]
+    believed = [link for link, keep in zip(links, kept, strict=True) if keep]
+    return _Joined(dict(zip(numbers, joined.trajectories, strict=True)), believed)
+
+
+def _places(numbers: list[int], link: Link) -> tuple[int, int]:
+    """The two drives of a link, by their place among the numbers."""
+    one, other = map(numbers.index, link.sessions)
+    return one, other
+
+
+def _drive(session: Session, T_world_session: Float64) -> Drive:
+    """A drive where it is about, for the pose graph."""
+    poses = T_world_session @ session.odometry.T_world_camera
+    return Drive(replace(session.odometry, T_world_camera=poses), path_up_to(session))
+
+
+def _place(map_: Map, session: Session, path: Trajectory) -> None:
+    """Write where a drive is: its axes, and how its path is bent."""
+    T_world_session = path.T_world_camera[0] @ invert(session.odometry.T_world_camera[0])
+    bent = invert(T_world_session) @ path.T_world_camera
+    session.set_loops({"closed": [], "refused": [], **session.loops, "T_world_camera": bent})
+    first = map_.sessions[0]
+    if session is not first:
+        session.set_axes(first.T_map_world @ T_world_session, session.camera)
