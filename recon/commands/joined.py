@@ -101,7 +101,7 @@ def copied(file: Path, map_: Map, settings: ReconConfig) -> list[int]:
 def joined_settings(
     folder: Path, config: ReconConfig | None, sections: Sequence[str]
 ) -> ReconConfig:
-    """The settings of a finished run, or those with changes where they have an effect.
+    """Return the settings of a finished run, or those with changes where they have an effect.
 
     Raises:
         ReconError: There is no such run, or the changes have no effect.

@@ -45,7 +45,7 @@ class JoinedMap:
 
 
 def joined_figures(joined: JoinedMap) -> dict[str, Any]:
-    """The figures for ``summary.json``."""
+    """Return the figures for ``summary.json``."""
     map_, made = joined.map, joined.made
     T_map_world = map_.linked[0].T_map_world
     linked = {session.number for session in map_.linked}
@@ -76,7 +76,7 @@ def joined_figures(joined: JoinedMap) -> dict[str, Any]:
 
 
 def joined_warnings(joined: JoinedMap) -> list[str]:
-    """What the user should know: drives that are linked to nothing."""
+    """Return what the user should know: drives that are linked to nothing."""
     linked = joined.map.linked
     apart = [session for session in joined.map.sessions if session not in linked]
     names = ", ".join(f"{session.number} ({session.info.source})" for session in apart)

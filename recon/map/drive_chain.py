@@ -43,23 +43,23 @@ class DriveChain:
         self.drive_of: NDArray[np.int64] = np.zeros(0, np.int64)
 
     def drive(self, numbered: tuple[int, Any]) -> int:
-        """The drive of what is numbered by submap."""
+        """Return the drive of what is numbered by submap."""
         return int(self.drive_of[numbered[0]]) if len(self.drive_of) else 0
 
     def joined(self, key: TileKey, *, note: bool) -> OccupancyPart:
-        """What all drives observed in a tile; ``note`` what each saw through, for `passed`."""
+        """Join what all drives observed in a tile; ``note`` what each saw through, for `passed`."""
         drives = self._drives(key)
         return _outdone(self._noted(key, drives) if note else (part for _, part in drives))
 
     def passed(self, key: TileKey, drive: int) -> NDArray[np.int64]:
-        """int64 (N,), the `passed_cells` of a drive that were noted in a tile."""
+        """Return int64 (N,), the `passed_cells` of a drive that were noted in a tile."""
         found = [tree["keys"] for n, tree in self._parts.read(_PASSED, key) if n == drive]
         return found[0] if found else np.zeros(0, np.int64)
 
     def changed(
         self, key: TileKey, seen: OccupancyVoxels, after: Mapping[int, OccupancyPart]
     ) -> OccupancyVoxels:
-        """The voxels of a tile, made again where ``after`` the end of submaps more was observed."""
+        """Make the voxels of a tile again where ``after`` the end of submaps more was observed."""
         blocks = np.unique(np.concatenate([part.rows.blocks for part in after.values()]))
         # Whether a surface crosses a voxel depends on what hit those that touch it.
         changed, needed = grown_blocks(blocks, 1), grown_blocks(blocks, 2)
@@ -76,7 +76,7 @@ class DriveChain:
     def _noted(
         self, key: TileKey, drives: Iterable[tuple[int, OccupancyPart]]
     ) -> Iterator[OccupancyPart]:
-        """The parts of drives, with a note of what each saw through."""
+        """Return the parts of drives, with a note of what each saw through."""
         for drive, part in drives:
             self._parts.put(_PASSED, key, {"keys": passed_cells(part)}, drive)
             yield part
@@ -87,7 +87,7 @@ class DriveChain:
         after: Mapping[int, OccupancyPart] | None = None,
         blocks: NDArray[np.int64] | None = None,
     ) -> Iterator[tuple[int, OccupancyPart]]:
-        """What each drive observed in a tile, in their order.
+        """Return what each drive observed in a tile, in their order.
 
         Args:
             key: The tile.
@@ -107,5 +107,5 @@ def _in_blocks(part: OccupancyPart, blocks: NDArray[np.int64] | None) -> Occupan
 
 
 def _outdone(drives: Iterable[OccupancyPart]) -> OccupancyPart:
-    """What drives observed one after the other; little of the older counts for a later one."""
+    """Chain what drives observed; little of the older counts for a later one."""
     return reduce(lambda old, new: join_occupancy([old, new.outdoing(_OLD)]), drives)

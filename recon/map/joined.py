@@ -41,7 +41,7 @@ def join_voxels(parts: Iterable[OccupancyVoxels], resolution_m: float) -> Occupa
 
 
 def in_window(voxels: OccupancyVoxels, window: Window) -> OccupancyVoxels:
-    """The voxels with their centres in a window."""
+    """Return the voxels with their centres in a window."""
     low, high = (
         np.ceil(np.array(xy) / voxels.resolution_m - 0.5) for xy in (window.low, window.high)
     )
@@ -51,13 +51,13 @@ def in_window(voxels: OccupancyVoxels, window: Window) -> OccupancyVoxels:
 
 
 def cloud_tree(cloud: PointCloud) -> dict[str, Any]:
-    """The arrays of a cloud by their names."""
+    """Return the arrays of a cloud by their names."""
     arrays = {f.name: getattr(cloud, f.name) for f in fields(cloud) if f.name != "frame"}
     return {name: array for name, array in arrays.items() if array is not None}
 
 
 def voxel_tree(voxels: OccupancyVoxels) -> dict[str, Any]:
-    """The arrays of voxels by their names."""
+    """Return the arrays of voxels by their names."""
     return {"keys": voxels.keys, "log_odds": voxels.log_odds}
 
 

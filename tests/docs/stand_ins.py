@@ -148,9 +148,15 @@ def results(folder: Path) -> None:
         write_pfm(folder / f"{name}.pfm", np.full((80, 120), 10.0, np.float32))
 
 
-def finished_run(folder: Path) -> None:
+def finished_run(folder: Path, source: SyntheticSource | None = None) -> None:
     config = load_config(overrides=["audit.quick=false"])
-    run_map(street(), config, MapOptions(audit=False, out=folder, mesh=False))
+    run_map(source or street(), config, MapOptions(audit=False, out=folder, mesh=False))
+
+
+def run_elsewhere(folder: Path) -> None:
+    """A run of another street; of two in one map, it stays apart."""
+    settings = street().settings.model_copy(update={"seed": 1})
+    finished_run(folder, SyntheticSource(settings, surface_range_m=30.0))
 
 
 def plugin(site: Path) -> None:
@@ -269,6 +275,8 @@ STAND_INS = (
     StandIn("drives/*", drive, "drives/monday"),
     StandIn("recon batch jobs.toml", scene, "scene"),
     StandIn("recon batch jobs.toml", job_file, "jobs.toml"),
+    StandIn("outputs/monday outputs/friday --out outputs/week  #", finished_run, "outputs/monday"),
+    StandIn("outputs/monday outputs/friday --out outputs/week  #", run_elsewhere, "outputs/friday"),
     StandIn(
         "recon occupancy outputs/kitti06 --resolution 0.1 --max", finished_run, "outputs/kitti06"
     ),

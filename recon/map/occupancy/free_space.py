@@ -21,7 +21,7 @@ def looked_through(
     reach_m: Float32 | None = None,
     free: np.float32 = _EVEN,
 ) -> Bool:
-    """Which points are in free space: their voxel is free, and nothing occupied is in reach.
+    """Return which points are in free space: their voxel is free, and nothing occupied is in reach.
 
     Neighbours count because a surface along occupied voxels lies half in free ones.
 
@@ -55,7 +55,7 @@ def looked_through(
 
 
 def _holds(keys: NDArray[np.int64], wanted: NDArray[np.int64]) -> Bool:
-    """bool (N,): which of the wanted keys are in the sorted ``keys``."""
+    """Return bool (N,): which of the wanted keys are in the sorted ``keys``."""
     if not len(keys):
         return np.zeros(len(wanted), dtype=bool)
     place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)

@@ -33,7 +33,7 @@ _LEAST_REACH: Final = 0.5
 
 
 def passed_cells(part: OccupancyPart) -> NDArray[np.int64]:
-    """int64 (N,), packed cells that a drive saw free in the end, or most of the time."""
+    """Return int64 (N,), packed cells that a drive saw free in the end, or most of the time."""
     change, low, high = part.rows.values.T
     free = (np.minimum(np.maximum(change, low), high) <= _FREE) | (change <= _PASSED)
     return pack_keys(part.cells[free])
@@ -46,7 +46,7 @@ def find_moved(
     voxels: OccupancyVoxels,
     passed: NDArray[np.int64],
 ) -> Bool:
-    """bool (N,), the rows of a part that something left which has moved.
+    """Return bool (N,), the rows of a part that something left which has moved.
 
     Args:
         part: What one drive fused.
@@ -62,7 +62,7 @@ def find_moved(
 
 
 def _reach_m(part: FusedPart, resolution_m: float) -> Float32:
-    """float32 (N,), how far from its surface a frame may have put a point."""
+    """Return float32 (N,), how far from its surface a frame may have put a point."""
     reach_m = np.full(len(part), _LEAST_REACH * resolution_m, np.float32)
     if "sigma_m" not in part.known:
         return reach_m

@@ -75,7 +75,7 @@ def check_session(session: Session, settings: DriveSettings) -> None:
 
 
 def _renumbered(keys: list[Key], numbers: dict[int, int]) -> dict[Key, Key]:
-    """The keys of some drives, and what they become with new numbers of drives."""
+    """Return the keys of some drives, and what they become with new numbers of drives."""
     found: dict[Key, Key] = {}
     for key in keys:
         session, *rest = key if isinstance(key, tuple) else (key,)

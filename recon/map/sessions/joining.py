@@ -81,7 +81,7 @@ def _held_together(map_: Map, links: Sequence[Link]) -> _Joined:
 
 
 def _reached(map_: Map, links: Sequence[Link]) -> dict[int, Float64]:
-    """About where the drives are that links connect with the first one.
+    """Return about where the drives are that links connect with the first one.
 
     Returns:
         By number, ``T_world_session`` (4, 4), in the world of the first.
@@ -102,7 +102,7 @@ def _reached(map_: Map, links: Sequence[Link]) -> dict[int, Float64]:
 
 
 def _motion(one: Session, other: Session, loop: Loop) -> Float64:
-    """``T_one_other`` (4, 4) between the worlds of two drives, by one link."""
+    """Return ``T_one_other`` (4, 4) between the worlds of two drives, by one link."""
     T_one_first = one.trajectory.T_world_camera[loop.first]
     T_other_last = other.trajectory.T_world_camera[loop.last]
     return np.asarray(T_one_first @ loop.T_first_last @ invert(T_other_last))
@@ -128,13 +128,13 @@ def _solve(map_: Map, places: dict[int, Float64], links: Sequence[Link]) -> _Joi
 
 
 def _places(numbers: list[int], link: Link) -> tuple[int, int]:
-    """The two drives of a link, by their place among the numbers."""
+    """Return the two drives of a link, by their place among the numbers."""
     one, other = map(numbers.index, link.sessions)
     return one, other
 
 
 def _drive(session: Session, T_world_session: Float64) -> Drive:
-    """A drive where it is about, for the pose graph."""
+    """Return a drive where it is about, for the pose graph."""
     poses = T_world_session @ session.odometry.T_world_camera
     return Drive(replace(session.odometry, T_world_camera=poses), path_up_to(session))
 

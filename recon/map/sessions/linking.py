@@ -46,7 +46,7 @@ def find_links(map_: Map, new: Collection[int]) -> list[Link]:
 
 
 def path_up_to(session: Session) -> Float64:
-    """float64 (N,), path of a drive up to each frame, where lost frames count several times."""
+    """Return float64 (N,), path of a drive up to each frame; lost frames count several times."""
     trusted = np.array([health.ok for health in session.health])
     return path_lengths(session.odometry.T_world_camera, trusted)
 

@@ -35,7 +35,7 @@ class PlacedMap:
 
 
 def settings_of(session: Session) -> DriveSettings:
-    """The settings that a drive was mapped with.
+    """Return the settings that a drive was mapped with.
 
     Raises:
         SettingsError: One is not known in this version.
@@ -74,7 +74,7 @@ def place_map(map_: Map, settings: DriveSettings, *, fuse: bool = True) -> Place
 
 
 def _joined(map_: Map, sessions: Sequence[Session], settings: DriveSettings) -> Submaps:
-    """The submaps of several drives one after the other, in the world of the first."""
+    """Return the submaps of several drives one after the other, in the world of the first."""
     made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
     for session in sessions:
         for submap in _moved(map_, session, settings):
@@ -83,7 +83,7 @@ def _joined(map_: Map, sessions: Sequence[Session], settings: DriveSettings) -> 
 
 
 def _moved(map_: Map, session: Session, settings: DriveSettings) -> Iterator[Submap]:
-    """The submaps of a drive in its place: fused sums moved, rays cast where they were seen."""
+    """Put the submaps of a drive in its place: fused sums moved, rays cast where they were seen."""
     T_world_session, corrections = map_.T_world_session(session), session.corrections()
     T_map_world = map_.linked[0].T_map_world
     poses = T_world_session @ session.trajectory.T_world_camera

@@ -27,7 +27,7 @@ class Link:
     kept: bool = True
 
     def between(self, one: int, other: int) -> Link:
-        """The link with other numbers of its drives."""
+        """Return the link with other numbers of its drives."""
         return replace(self, sessions=(one, other))
 
     def to_tree(self) -> dict[str, Any]:
@@ -36,7 +36,7 @@ class Link:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> Link:
-        """What `to_tree` gave.
+        """Return what `to_tree` gave.
 
         Raises:
             FormatError: It is not between two drives; other exceptions where it is no such tree.
