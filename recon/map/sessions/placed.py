@@ -83,7 +83,7 @@ def _joined(map_: Map, sessions: Sequence[Session], settings: DriveSettings) -> 
 
 
 def _moved(map_: Map, session: Session, settings: DriveSettings) -> Iterator[Submap]:
-    """Put the submaps of a drive in its place: fused sums moved, rays cast where they were seen."""
+    """Put the submaps of a drive in its place: sums are moved, rays cast where they were seen."""
     T_world_session, corrections = map_.T_world_session(session), session.corrections()
     T_map_world = map_.linked[0].T_map_world
     poses = T_world_session @ session.trajectory.T_world_camera
