@@ -13,7 +13,7 @@ from recon.map.localize.localize_run import LocalizeRun
 from recon.map.localize.localizer import State
 from recon.map.localize.sequence import LocalizedDrive
 from recon.report.page import write_page
-from recon.report.paths import grid_figure, path_figure
+from recon.report.paths import grid_figure, path_figure, seen_from_above
 from recon.report.style import BAD, FAINT, WIDE_IN, styled, to_png
 from recon.run.directory import RunDirectory
 
@@ -34,7 +34,7 @@ def _path(run: LocalizeRun) -> bytes | None:
     """The path on the grid, or alone if the map has none; None where there is neither."""
     path, T_map_world = run.drive.trajectory, run.drive.T_map_world
     if run.grid is not None:
-        return grid_figure(run.grid, path, T_map_world)
+        return grid_figure(run.grid, {"path": seen_from_above(path, T_map_world)})
     return path_figure(path, None, T_map_world) if len(path) else None
 
 

@@ -79,7 +79,7 @@ class Surroundings:
 
     def __init__(self, map_: Map, max_range_m: float) -> None:
         self._range_m = max_range_m
-        self._parts = [part for session in map_.sessions for part in _parts(map_, session)]
+        self._parts = [part for session in map_.linked for part in _parts(map_, session)]
         options = KissIcpOptions(max_range_m, max_range_m, _VOXEL_M, iterations=50)
         self._icp = KissIcp(replace(options, convergence=1e-3))
         self._loaded_at = np.full(3, np.inf)

@@ -34,7 +34,7 @@ class MapViews(Sequence[KnownView]):
 
     Args:
         map_: The map.
-        sessions: Numbers of the drives to take; None = all.
+        sessions: Numbers of the drives to take; None = those that share the axes of the map.
 
     Raises:
         FormatError: The map is damaged.
@@ -45,9 +45,10 @@ class MapViews(Sequence[KnownView]):
         self._keys: list[tuple[int, int]] = []
         self._poses: dict[int, Float64] = {}
         self._cameras: dict[int, RectifiedCamera] = {}
-        for session in map_.sessions:
+        taken = map_.linked if sessions is None else map(map_.session, sorted(sessions))
+        for session in taken:
             frames = session.keyframes.frames
-            if frames and (sessions is None or session.number in sessions):
+            if frames:
                 T_world_session = map_.T_world_session(session)
                 self._poses[session.number] = T_world_session @ session.trajectory.T_world_camera
                 self._cameras[session.number] = session.camera
