@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from recon.commands.config import ReconConfig, load_config
     from recon.commands.evaluate_middlebury import run_middlebury
     from recon.commands.export import run_export
+    from recon.commands.live import run_live
     from recon.commands.localize import run_localize
     from recon.commands.map import run_map
     from recon.commands.map_options import MapOptions
@@ -85,6 +86,7 @@ _HOMES = {
     "recon.rig.audit.audit": ("Audit",),
     "recon.commands.audit": ("run_audit",),
     "recon.commands.config": ("ReconConfig", "load_config"),
+    "recon.commands.live": ("run_live",),
     "recon.commands.localize": ("run_localize",),
     "recon.commands.map": ("run_map",),
     "recon.commands.map_options": ("MapOptions",),
@@ -167,6 +169,7 @@ __all__ = [
     "run_audit",
     "run_disparity",
     "run_export",
+    "run_live",
     "run_localize",
     "run_map",
     "run_middlebury",

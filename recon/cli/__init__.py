@@ -20,6 +20,7 @@ from recon.cli.capture import capture
 from recon.cli.demo import demo
 from recon.cli.doctor import doctor
 from recon.cli.export import export
+from recon.cli.live import live
 from recon.cli.localize import localize
 from recon.cli.map import map_
 from recon.cli.merge import merge
@@ -50,6 +51,7 @@ app.command(rich_help_panel=_RECONSTRUCT)(pair)
 app.command(rich_help_panel=_RECONSTRUCT)(disparity)
 app.command("map", rich_help_panel=_RECONSTRUCT)(map_)
 app.command(rich_help_panel=_RECONSTRUCT)(localize)
+app.command(rich_help_panel=_RECONSTRUCT)(live)
 app.command(rich_help_panel=_RECONSTRUCT)(merge)
 app.command(rich_help_panel=_RECONSTRUCT)(export)
 app.command(rich_help_panel=_RECONSTRUCT)(mesh)

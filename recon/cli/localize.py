@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -27,14 +26,10 @@ from recon.cli.options import (
     Threads,
     Tolerance,
     Verbose,
-    parse_numbers,
 )
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
-from recon.core.errors import SettingsError
-
-if TYPE_CHECKING:
-    from recon.map.localize.sequence import StartPose
+from recon.cli.start_pose import StartInMap, read_start
 
 
 def localize(
@@ -51,15 +46,7 @@ def localize(
     left: LeftView = None,
     right: RightView = None,
     tolerance: Tolerance = None,
-    start: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,YAW|FRAME",
-            help="Where the drive begins in map axes, if known: metres, and degrees from x to y. "
-            "A single number is the first frame to use.",
-            show_default="anywhere in the map, frame 0",
-        ),
-    ] = None,
+    start: StartInMap = None,
     end: End = None,
     stride: Stride = None,
     matcher: Matcher = None,
@@ -89,7 +76,7 @@ def localize(
         from recon.commands.map_options import MapRequest
         from recon.run.memory import memory_overrides
 
-        pose, first = _read_start(start)
+        pose, first = read_start(start)
         views = source_overrides(calib, left, right, tolerance, (first, end, stride))
         overrides = [*(set_ or ()), *matching_overrides(matcher), *views]
         settings = load_config(config, [*overrides, *memory_overrides(memory_limit)])
@@ -99,26 +86,3 @@ def localize(
         options = replace(options, command="localize", out=out, threads=threads, progress=viewer)
         run = run_localize(drive, map_, settings, options, start=pose)
     print_json(run.summary) if json else print_run(run.summary, stages=verbose)
-
-
-def _read_start(text: str | None) -> tuple[StartPose | None, int | None]:
-    """Read where a drive begins: a pose ``x,y,yaw``, or the number of its first frame.
-
-    Raises:
-        SettingsError: It is neither.
-    """
-    numbers = parse_numbers(text, "--start") or ()
-    if not numbers:
-        return None, None
-    if len(numbers) == 3 and all(map(math.isfinite, numbers)):
-        from recon.map.localize.sequence import StartPose
-
-        return StartPose(*numbers), None
-    if len(numbers) == 1 and numbers[0].is_integer():
-        return None, int(numbers[0])
-    raise SettingsError(
-        "not a pose, nor the number of a frame",
-        where="--start",
-        got=text,
-        expected="x,y,yaw in metres and degrees, such as 12.5,-3,90; or one whole number",
-    )

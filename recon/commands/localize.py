@@ -16,6 +16,7 @@ from recon.map.store.map import MAP_FILE, Map
 from recon.report.localize_page import write_localize_page
 from recon.run import Run
 from recon.run.finished import GRID, camera_height_of, refuse_as_target
+from recon.sources.live import LiveSource
 from recon.sources.protocol import StereoSource
 
 
@@ -60,6 +61,9 @@ def run_localize(
         made.summary.update(source=source.name, map_run=str(map_path), **drive.figures())
         made.summary["T_map_world"] = drive.T_map_world.tolist()
         made.summary["warnings"] = drive.warnings()
+        if isinstance(source, LiveSource):
+            made.summary["live"] = source.figures()
+            made.summary["warnings"] += source.warnings()
         with run.stage("write"):
             export_localized(drive, None if folder is None else camera_height_of(folder), run)
         with run.report(made.summary):

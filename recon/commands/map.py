@@ -22,6 +22,7 @@ from recon.rig.audit.audit import quick_warnings
 from recon.run import Run
 from recon.run.finished import UNTRUSTED
 from recon.run.summary import plain
+from recon.sources.live import LiveSource
 from recon.sources.protocol import IncompleteSource, StereoSource
 
 
@@ -124,6 +125,7 @@ def _warnings(source: StereoSource, mapped: MappedSequence) -> list[str]:
         *health_warnings(mapped.health),
         *(() if mapped.prior is None else mapped.prior.warnings()),
         *(() if mapped.loops is None else mapped.loops.warnings()),
+        *(source.warnings() if isinstance(source, LiveSource) else ()),
     ]
 
 
@@ -139,5 +141,6 @@ def _summary(
         "voxels": made.voxels,
         "faces": 0 if made.mesh is None else made.mesh.faces,
         **({"frames_left_out": source.left_out} if isinstance(source, IncompleteSource) else {}),
+        **({"live": source.figures()} if isinstance(source, LiveSource) else {}),
         **({} if prior is None else {"prior": {"from": options.prior_origin, **plain(prior)}}),
     }

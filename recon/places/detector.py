@@ -105,9 +105,10 @@ class LoopDetector:
             disparity: Of its left view.
             T_world_camera: float64 (4, 4), by odometry.
             path_m: Path up to it, by `path_lengths`.
-            measured: False where the pose is extrapolated; such a frame is no keyframe.
+            measured: False where the pose is extrapolated; such a frame is no keyframe, nor is one
+                that was not matched.
         """
-        if not measured or not self._is_due(T_world_camera):
+        if not measured or not disparity.valid.any() or not self._is_due(T_world_camera):
             return ()
         keyframe = make_keyframe(frame, pair, disparity)
         stored = StoredKeyframe(keyframe, T_world_camera, path_m)

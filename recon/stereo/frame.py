@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+
 from recon.core.values import (
     Disparity,
     PointCloud,
@@ -86,6 +88,16 @@ class FrameReconstructor:
             with stage("edges"):
                 disparity = remove_flying_edges(disparity)
         return rectified, disparity
+
+    def unmatched(self, pair: StereoPair) -> ReconstructedFrame:
+        """Return a frame that is rectified alone: every disparity is unknown, the cloud empty."""
+        with self._stopwatch.stage("rectify"):
+            rectified = self._rectifier.rectify(pair)
+        nothing = np.full(rectified.left.shape, np.nan, np.float32)
+        disparity = Disparity.from_values(nothing)
+        return ReconstructedFrame(
+            rectified, disparity, back_project(disparity, rectified, self._config.cloud)
+        )
 
     def inspect(self, pair: RectifiedPair) -> tuple[str, ...]:
         """Return warnings about the geometry of a pair; every 50th frame is inspected.

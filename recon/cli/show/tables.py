@@ -52,7 +52,7 @@ def print_evaluation(title: str, figures: Mapping[str, Any]) -> None:
 def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
     """Print a run's figures, its warnings and its folder."""
     shown = {key: value for key, value in summary.items() if key != "out"}
-    for group in ("prior", "loops", "links", "trajectory", "map", "disparity"):
+    for group in ("live", "prior", "loops", "links", "trajectory", "map", "disparity"):
         shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
     for part in ("voxels", "grid"):
         figures = summary.get("occupancy", {}).get(part, {})

@@ -38,6 +38,7 @@ from recon.odometry import (
 from recon.run.lookahead import look_ahead
 from recon.run.machine import serial_algebra
 from recon.run.progress import SILENT, Progress
+from recon.sources.live import LiveSource
 from recon.sources.protocol import IncompleteSource, StampedSource, StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 
@@ -183,7 +184,11 @@ def map_sequence(
         source.calibration, config, threads=work.threads, stopwatch=work.stopwatch
     )
 
+    live = source if isinstance(source, LiveSource) else None
+
     def reconstruct(pair: StereoPair) -> ReconstructedFrame:
+        if live is not None and live.hurried(pair):
+            return reconstructor.unmatched(pair)
         frame = reconstructor.reconstruct(pair)
         with work.stopwatch.stage("thin"):
             return replace(frame, rays=thin_rays(frame.cloud, config.occupancy))
@@ -201,7 +206,7 @@ def map_sequence(
     try:
         with serial_algebra():
             pairs = source.frames(len(drive.mapper))
-            for frame in look_ahead(reconstruct, pairs):
+            for frame in look_ahead(reconstruct, pairs, depth=2 if live is None else 1):
                 progress.on_step(drive.add(frame, total=len(source)))
             drive.settle()
     finally:
@@ -236,7 +241,7 @@ class _Drive:
     def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
         result = self.mapper.add(frame, total=total)
         self._loops.add(frame, result.T_world_camera, measured=result.health.ok)
-        if result.index <= total // 2:
+        if result.index <= total // 2 and (self._sample is None or len(frame.cloud)):
             self._sample = frame
         if len(self.mapper) - self._saved >= self._config.checkpoints.every_frames:
             self._save()

@@ -166,6 +166,8 @@ class Localizer:
 
     def _confirm(self, belief: Belief, keyframe: Keyframe, frame: OdometryFrame) -> _Confirmed:
         """Return the belief, corrected by the nearest views of the map and its surfaces."""
+        if not frame.disparity.valid.any():
+            return _Confirmed(belief, refused="the frame was not matched")
         loops, refused = [], ""
         for number in self._known.near(belief.T_world_camera, _VIEWS):
             verdict = self._known.compare(number, keyframe, frame.pair.camera)

@@ -22,6 +22,7 @@ from recon.odometry import OdometryFrame
 from recon.run.lookahead import look_ahead
 from recon.run.machine import serial_algebra
 from recon.run.progress import SILENT, Progress
+from recon.sources.live import LiveSource
 from recon.sources.protocol import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
@@ -212,7 +213,12 @@ def localize_sequence(
         source.calibration, config, threads=workspace.threads, stopwatch=watch
     )
 
+    live = source if isinstance(source, LiveSource) else None
+
     def match(pair: StereoPair) -> OdometryFrame:
+        if live is not None and live.hurried(pair):
+            unmatched = reconstructor.unmatched(pair)
+            return OdometryFrame(unmatched.pair, unmatched.disparity)
         return OdometryFrame(*reconstructor.match(pair))
 
     frames: list[LocalizedFrame] = []
@@ -220,7 +226,7 @@ def localize_sequence(
     begun = time.perf_counter()
     try:
         with serial_algebra():
-            for frame in look_ahead(match, source.frames()):
+            for frame in look_ahead(match, source.frames(), depth=2 if live is None else 1):
                 with watch.stage("localize"):
                     frames.append(_located(localizer, frame, len(frames)))
                 progress.on_step(frames[-1])

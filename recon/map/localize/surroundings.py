@@ -15,7 +15,7 @@ from recon.map.localize.belief import Belief
 from recon.map.store.map import Map
 from recon.map.store.session import Session
 from recon.odometry.gate import Correction, icp_covariance, judge
-from recon.odometry.kiss_icp import KissIcp, KissIcpOptions
+from recon.odometry.kiss_icp import IcpAlignment, KissIcp, KissIcpOptions
 from recon.odometry.points import select_points
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.surfaces import Fit, Surfaces, describe_surfaces, fit_surfaces
@@ -95,9 +95,8 @@ class Surroundings:
             frame: What it sees.
             learn: Whether the belief is good enough to learn the bias of the correction from.
         """
-        self._load(belief.T_world_camera[:3, 3])
         points = select_points(frame, self._range_m)
-        if len(points) < _MIN_POINTS or not len(self._surfaces.keys):
+        if len(points) < _MIN_POINTS:
             return None
         correction = self._measure(belief, points.xyz.astype(np.float64))
         verdict = judge(correction, self._offset, belief.covariance)
@@ -108,9 +107,14 @@ class Surroundings:
         T = belief.T_world_camera @ as_transform(correction.step - self._offset)
         return belief.corrected_to(T, icp_covariance(correction.after))
 
+    def align(self, xyz: Float64, T_world_guess: Float64) -> IcpAlignment:
+        """Return kiss-icp's pose of a frame with points (N, 3) in the map, from a guess."""
+        self._load(T_world_guess[:3, 3])
+        return self._icp.align(xyz, T_world_guess, _THRESHOLD_M)
+
     def _measure(self, belief: Belief, xyz: Float64) -> Correction:
         T_prior = belief.T_world_camera
-        alignment = self._icp.align(xyz, T_prior, _THRESHOLD_M)
+        alignment = self.align(xyz, T_prior)
         T_icp = alignment.T_world_camera
         return Correction(
             step=as_step(invert(T_prior) @ T_icp),
