@@ -19,6 +19,9 @@ from recon.sources.protocol import StereoSource
 _WAITING: Final = 3
 """Pairs that may wait; where more come, the oldest is left out."""
 
+_UNMATCHED: Final = 2
+"""Most pairs in a row that are not matched: tracking needs new points, and the map something."""
+
 
 @dataclass(frozen=True)
 class _Arrived:
@@ -33,7 +36,8 @@ class LiveSource:
 
     A thread reads each pair and hands it over when it is due. Where the consumer is behind, pairs
     wait, but never more than a few. One behind which another waits already is `hurried`: it should
-    be tracked without being matched. Where even that is too slow, the oldest are dropped.
+    be tracked without being matched, but every third one is not. Where even that is too slow, the
+    oldest are dropped.
 
     Args:
         source: The recording.
@@ -51,6 +55,7 @@ class LiveSource:
         self._error: BaseException | None = None
         self._due_s: list[float] = []
         self._hurried: set[int] = set()
+        self._in_a_row = 0
         self._latency_s: list[float] = []
         self._dropped = 0
 
@@ -96,7 +101,7 @@ class LiveSource:
             self._ended = True
 
     def hurried(self, pair: StereoPair) -> bool:
-        """Return whether another pair waited behind one when it was taken."""
+        """Return whether a pair should not be matched: another one waited when it was taken."""
         return pair.index in self._hurried
 
     def timed(self, progress: Progress) -> Progress:
@@ -168,7 +173,8 @@ class LiveSource:
                     raise self._error
                 return None
             arrived = self._waiting.popleft()
-            if self._waiting:
+            self._in_a_row = self._in_a_row + 1 if self._waiting else 0
+            if self._in_a_row % (_UNMATCHED + 1):
                 self._hurried.add(arrived.pair.index)
         self._due_s.append(arrived.due_s)
         return arrived

@@ -12,6 +12,7 @@ import pytest
 from recon.core.errors import FormatError
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.run.progress import SILENT
+from recon.sources import live as live_file
 from recon.sources.live import LiveSource
 
 GREY = np.zeros((16, 16), np.uint8)
@@ -75,6 +76,20 @@ def test_who_is_slow_loses_the_oldest_and_is_told_to_hurry() -> None:
     assert figures["frames_dropped"] == 6
     assert figures["frames_not_matched"] == 2
     assert [text.split()[0] for text in live.warnings()] == ["2", "6"]
+
+
+def test_of_pairs_that_hurry_every_third_is_matched(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_file, "_WAITING", 20)
+    recording = Recording(10)
+    live = LiveSource(recording, rate=1e9)
+    pairs = live.frames()
+    next(pairs)
+    recording.go.set()
+    recording.read.wait(10)
+
+    hurried = [live.hurried(pair) for pair in pairs]
+
+    assert hurried == [True, True, False, True, True, False, True, True, False]
 
 
 def test_the_time_from_arrival_to_result_is_measured() -> None:
