@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Bool, Float32, Float64, Int32
+from recon.export.mesh.surgery import renumbered
 
 
 @dataclass(frozen=True)
@@ -113,10 +114,10 @@ def _compact(mesh: TriangleMesh, faces: Int32) -> TriangleMesh:
     """The faces with the vertices that they use; degenerate faces of a cut are dropped."""
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    used, renumbered = np.unique(faces, return_inverse=True)
+    used, faces = renumbered(faces)
     return TriangleMesh(
         mesh.vertices[used],
-        renumbered.reshape(-1, 3).astype(np.int32),
+        faces,
         None if mesh.normals is None else mesh.normals[used],
         None if mesh.rgb is None else mesh.rgb[used],
     )

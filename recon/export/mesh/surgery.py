@@ -55,5 +55,11 @@ def _compact(vertices: Float32, faces: Int32) -> tuple[Float32, Int32]:
             "trimming left no face of the surface",
             hint="raise mesh.max_depth or mesh.max_distance_spacings, or filter less",
         )
-    used, renumbered = np.unique(faces, return_inverse=True)
-    return vertices[used], renumbered.reshape(-1, 3).astype(np.int32)
+    used, faces = renumbered(faces)
+    return vertices[used], faces
+
+
+def renumbered(faces: Int32) -> tuple[Int32, Int32]:
+    """The vertices that faces (F, 3) use: int32 (V,), ascending; and the faces with these alone."""
+    used, numbers = np.unique(faces, return_inverse=True)
+    return used, numbers.reshape(-1, 3).astype(np.int32)
