@@ -23,6 +23,10 @@ _UP_CAMERA: Final = np.array([0.0, -1.0, 0.0])
 _MAX_TILT_DEG: Final = 30.0
 """Planes tilted more than this are no ground."""
 
+_MIN_TILT_DEG: Final = 3.0
+"""The map is levelled only where the camera is tilted more than this: less is within the error of
+the measured ground, and of a road's own slope."""
+
 _MAX_RANGE_M: Final = 20.0
 """How far away the ground is looked for: farther points are too uncertain to level by."""
 
@@ -37,19 +41,12 @@ _TRIALS: Final = 300
 
 
 class AxesSettings(Settings):
-    """Where the map has its origin, and when it is levelled by the ground."""
+    """Where the map has its origin."""
 
     origin: Literal["camera", "ground"] = Field(
         "camera",
         description="Origin of the map: the first left camera, or the ground below it, so that "
         "z = 0 is on the ground at the start.",
-    )
-    level_min_tilt_deg: float = Field(
-        3.0,
-        ge=0.0,
-        le=90.0,
-        description="The map is levelled only where the camera is tilted more than this. 0 levels "
-        "every map, 90 none, if the rig's own axes are wanted.",
     )
 
 
@@ -83,7 +80,7 @@ def map_axes(
 
     Args:
         ground: The ground below the first camera, or None (not found).
-        settings: When to level, and where the origin is.
+        settings: Where the origin is.
         camera_height_m: Known height of the camera above the ground; None = that of ``ground``.
 
     Returns:
@@ -95,7 +92,7 @@ def map_axes(
         MappingError: The origin is to be on the ground, and there is none.
     """
     turn = AXES_MAP_WORLD
-    if ground is not None and ground.tilt_deg > settings.level_min_tilt_deg:
+    if ground is not None and ground.tilt_deg > _MIN_TILT_DEG:
         normal_map = AXES_MAP_WORLD @ ground.normal
         axis = np.cross(normal_map, [0.0, 0.0, 1.0])
         axis /= np.linalg.norm(axis)
