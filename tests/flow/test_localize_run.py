@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from recon.cli import app
 from recon.io.trajectory import read_tum
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetScene
+from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti
 
 STREET = StreetScene(

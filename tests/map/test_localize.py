@@ -24,7 +24,7 @@ from recon.map.settings import DriveSettings
 from recon.map.store.map import Map
 from recon.map.store.session import SessionInfo
 from recon.sources.synthetic import SyntheticSource
-from recon.street import StreetScene
+from recon.street.settings import StreetScene
 
 RIG = {"width_px": 400, "height_px": 150, "focal_px": 225.0, "smooth_edges": False}
 STREET = StreetScene(frames=24, seed=1, **RIG)
