@@ -2,17 +2,220 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Annotated, Literal
+
 import typer
 
-from recon.cli.evaluate_disparity import disparity
-from recon.cli.evaluate_map import map_
 from recon.cli.evaluate_middlebury import middlebury
-from recon.cli.evaluate_occupancy import occupancy
-from recon.cli.evaluate_trajectory import trajectory
+from recon.cli.options import Json, Quiet, parse_numbers
+from recon.cli.session import session
+from recon.cli.show.tables import print_evaluation, print_figures, print_json
 
 app = typer.Typer(no_args_is_help=True, help="Compare results with ground truth.")
 app.command()(middlebury)
-app.command()(disparity)
-app.command()(trajectory)
-app.command()(occupancy)
-app.command("map")(map_)
+
+
+@app.command()
+def disparity(
+    estimate: Annotated[
+        Path, typer.Argument(help="Disparity map: PFM, or 16-bit PNG as used by KITTI.")
+    ],
+    truth: Annotated[Path, typer.Argument(help="Ground truth, in either format.")],
+    mask: Annotated[
+        Path | None, typer.Option(help="Image that is 255 at the pixels to compare.")
+    ] = None,
+    scale: Annotated[
+        float,
+        typer.Option(
+            min=1e-3,
+            help="Scale of the reported errors: 4 reports a quarter-size map at full size.",
+        ),
+    ] = 1.0,
+    confidence: Annotated[
+        Path | None, typer.Option(help="Confidence of the map (PFM), to be evaluated too.")
+    ] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare a disparity map with ground truth: Middlebury's measures and KITTI's D1.
+
+    Reported for the pixels that have a value (sparse) and with holes filled
+    (dense).
+
+    Examples:
+      recon evaluate disparity disparity.pfm disp0GT.pfm
+      recon evaluate disparity disparity.pfm disp0GT.pfm --mask mask0nocc.png
+    """
+    with session(quiet=quiet):
+        from recon.commands.evaluate_disparity import run_evaluate_disparity
+
+        figures = run_evaluate_disparity(estimate, truth, mask, scale=scale, confidence=confidence)
+    if json:
+        print_json(figures)
+        return
+    shown = {name: value for name, value in figures.items() if not isinstance(value, dict)}
+    for kind in ("sparse", "dense"):
+        flat = {f"bad {limit}": share for limit, share in figures[kind]["bad"].items()}
+        shown |= {f"{kind} {name}": value for name, value in (flat | figures[kind]).items()}
+    rated = figures.get("confidence", {})
+    shown |= {f"confidence {name}": rated[name] for name in ("ece", "ause") if name in rated}
+    print_figures(f"{estimate} against {truth}", shown)
+
+
+@app.command()
+def trajectory(
+    estimate: Annotated[Path, typer.Argument(help="Estimated trajectory, in KITTI or TUM format.")],
+    truth: Annotated[Path, typer.Argument(help="Ground truth, in either format.")],
+    align: Annotated[
+        Literal["none", "origin", "se3", "sim3"],
+        typer.Option(
+            help="Alignment of the estimate: none, at the first pose (origin), rigid (se3), or "
+            "rigid with scale (sim3)."
+        ),
+    ] = "se3",
+    lengths: Annotated[
+        str | None,
+        typer.Option(
+            help="Lengths of the segments in metres, e.g. 50,100.",
+            show_default="100 to 800, or shorter on short drives",
+        ),
+    ] = None,
+    step: Annotated[
+        int | None,
+        typer.Option(
+            help="Frames between the starts of segments.",
+            show_default="10, or 1 on short drives",
+        ),
+    ] = None,
+    rpe_frames: Annotated[int, typer.Option(help="Frame distance of the RPE.")] = 1,
+    times: Annotated[
+        Path | None,
+        typer.Option(help="Times of the poses of a KITTI file, in seconds, one per line."),
+    ] = None,
+    tolerance: Annotated[
+        float,
+        typer.Option(min=0, help="Largest time difference between two matched poses, in seconds."),
+    ] = 0.01,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for a report and its plots.")
+    ] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare a trajectory with ground truth: KITTI's relative errors, ATE and RPE.
+
+    Poses are matched by time where both files have times (TUM, or KITTI with
+    --times), else in order. With --out, writes a report with plots.
+
+    Examples:
+      recon evaluate trajectory trajectory_kitti.txt poses.txt --out outputs/path
+      recon evaluate trajectory trajectory_tum.txt groundtruth.txt --align sim3
+    """
+    with session(quiet=quiet):
+        from recon.commands.evaluate_trajectory import run_evaluate_trajectory
+        from recon.evaluation.trajectory import TrajectoryRules
+
+        asked = {
+            "alignment": align,
+            "lengths_m": parse_numbers(lengths, "--lengths"),
+            "step_frames": step,
+            "rpe_frames": rpe_frames,
+        }
+        rules = TrajectoryRules.parse(asked, where="recon evaluate trajectory")
+        figures = run_evaluate_trajectory(
+            estimate, truth, rules, times=times, tolerance_s=tolerance, out=out
+        )
+    print_json(figures) if json else print_evaluation(f"{estimate} against {truth}", figures)
+
+
+@app.command()
+def occupancy(
+    run: Annotated[Path, typer.Argument(help="Folder of a recon demo run.")],
+    least_frames: Annotated[
+        int, typer.Option(min=1, help="Compare only what at least this many frames saw.")
+    ] = 3,
+    picture: Annotated[
+        Path | None, typer.Option(help="PNG to draw: the grid with its errors in colour.")
+    ] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare voxels and grid of a demo run with the exact truth.
+
+    Precision and recall of occupied voxels; intersection over union of the
+    grid.
+
+    Examples:
+      recon evaluate occupancy outputs/demo/latest --picture compared.png
+    """
+    with session(quiet=quiet):
+        from recon.commands.evaluate_occupancy import run_evaluate_occupancy
+        from recon.run.summary import plain
+
+        compared = run_evaluate_occupancy(run, least_frames, image=picture)
+        figures = plain(compared.metrics)
+    if json:
+        print_json(figures)
+        return
+    shown = {
+        f"{part} {name}": value
+        for part, values in figures.items()
+        if isinstance(values, dict)
+        for name, value in values.items()
+    }
+    print_figures(f"{run} against the true street", shown)
+
+
+@app.command("map")
+def map_(
+    run: Annotated[Path, typer.Argument(help="Folder of a run, or a PLY point cloud.")],
+    reference: Annotated[Path, typer.Argument(help="Reference point cloud (PLY).")],
+    reference_frame: Annotated[
+        Literal["camera", "map"],
+        typer.Option(help="Frame of REFERENCE: the first left camera, or the map."),
+    ] = "camera",
+    threshold: Annotated[
+        str,
+        typer.Option(
+            help="Distance in metres up to which a point counts as correct; several with commas."
+        ),
+    ] = "0.2",
+    align_to: Annotated[
+        Path | None,
+        typer.Option(
+            help="Ground-truth poses (KITTI or TUM): align the path of the run, and the map with "
+            "it, to these first."
+        ),
+    ] = None,
+    align: Annotated[
+        Literal["none", "icp"], typer.Option(help="Align the cloud to the reference with ICP.")
+    ] = "none",
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for clouds coloured by error.")
+    ] = None,
+    json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare a map with a reference cloud: precision, recall and F-score.
+
+    Nothing is aligned unless asked for. With --out, writes both clouds coloured
+    by error.
+
+    Examples:
+      recon evaluate map outputs/map/latest lidar_map.ply --threshold 0.1,0.2,0.5
+      recon evaluate map outputs/map/latest lidar_map.ply --align-to poses.txt
+    """
+    with session(quiet=quiet):
+        from recon.commands.evaluate_map import run_evaluate_map
+
+        figures = run_evaluate_map(
+            run,
+            reference,
+            frame=reference_frame,
+            align_to=align_to,
+            icp=align == "icp",
+            thresholds_m=parse_numbers(threshold, "--threshold") or (),
+            out=out,
+        )
+    print_json(figures) if json else print_evaluation(f"{run} against {reference}", figures)

@@ -33,6 +33,9 @@ from recon.report.colour import (
 )
 from recon.report.style import FAINT, HALF_IN, WIDE_IN, bare_figure, show_image, styled, to_png
 
+ERROR_LIMIT_PX = 4.0
+"""Error of the last colour: the largest threshold of Middlebury's table."""
+
 # Height of the strip below an image: axis label and ticks, colour bar, and depths above it.
 _BELOW_IN = 1.0
 _BAR_BOTTOM_IN = 0.5
@@ -110,11 +113,11 @@ def confidence_figure(disparity: Disparity) -> bytes:
 
 
 @styled
-def error_figure(error_px: NDArray[Any], limit_px: float) -> bytes:
-    """Draw the absolute disparity error of each pixel, up to ``limit_px``; NaN = not compared."""
-    figure = _image(colour_error(error_px, limit_px))
+def error_figure(error_px: NDArray[Any]) -> bytes:
+    """Draw the absolute disparity error of each pixel, up to the limit; NaN = not compared."""
+    figure = _image(colour_error(error_px, ERROR_LIMIT_PX))
     label = "absolute disparity error in pixels (dark: not compared)"
-    _colour_bar(figure, ERROR_SCALE, (0.0, limit_px), label, extend="max")
+    _colour_bar(figure, ERROR_SCALE, (0.0, ERROR_LIMIT_PX), label, extend="max")
     return to_png(figure)
 
 

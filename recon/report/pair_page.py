@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 
 from recon.core.geometry.projection import depth_from_disparity
 from recon.io.images.image import write_image
 from recon.report.colour import colour_confidence, colour_disparity, colour_reasons
-from recon.report.images import error_figure, stereo_figures
+from recon.report.images import ERROR_LIMIT_PX, error_figure, stereo_figures
 from recon.report.page import write_page
 from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
 from recon.run.directory import RunDirectory
 from recon.stereo.pair_run import PairRun
-
-_ERROR_LIMIT_PX: Final = 4.0
 
 
 def write_pair_page(run: PairRun, directory: RunDirectory) -> None:
@@ -48,13 +44,13 @@ def pair_content(run: PairRun) -> Json:
     scene = Scene(T_UPRIGHT_CAMERA, run.cloud, run.mesh, eye_m=_beside_camera(run))
     error: bytes | None = None
     if run.truth is not None and run.truth.values.shape == run.disparity.values.shape:
-        error = error_figure(np.abs(run.disparity.values - run.truth.values), _ERROR_LIMIT_PX)
+        error = error_figure(np.abs(run.disparity.values - run.truth.values))
     return {
         "run": run,
         "warnings": run.warnings,
         "result": stereo_figures(run.pair, run.disparity),
         "error": error,
-        "limit_px": _ERROR_LIMIT_PX,
+        "limit_px": ERROR_LIMIT_PX,
         "view": plot_scene(scene),
     }
 

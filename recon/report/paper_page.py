@@ -30,6 +30,7 @@ from recon.evaluation.paper.scenes import camera_of_table_1
 from recon.io.images.image import write_image
 from recon.report.colour import DISPARITY_SCALE, colour_disparity, colour_values, value_range
 from recon.report.images import (
+    ERROR_LIMIT_PX,
     depth_figure,
     disparity_figure,
     error_figure,
@@ -53,7 +54,6 @@ from recon.report.style import (
 )
 from recon.run.directory import RunDirectory
 
-_ERROR_LIMIT_PX: Final = 4.0
 _MAX_POINTS: Final = 20_000
 _NEAR_SHARE: Final = 0.9  # the caption of the clouds says so
 _LOOK_FROM: Final = (-1.15, 0.4, 0.4)  # relative to the centre of a cloud, in its longest side
@@ -80,7 +80,7 @@ def write_paper_page(run: PaperRun, directory: RunDirectory) -> None:
         run=run,
         titles=TITLES,
         drawn=[_drawn(result) for result in run.experiments],
-        limit_px=_ERROR_LIMIT_PX,
+        limit_px=ERROR_LIMIT_PX,
         bad_px=BAD_PX,
         # Experiments have their own sections.
         of_the_run={k: v for k, v in run.summary.items() if k not in {"experiments", "table_1"}},
@@ -112,7 +112,7 @@ def _drawn_method(result: ExperimentResult, one: MethodResult) -> dict[str, Any]
     error: bytes | None = None
     if result.experiment.truth is not None:
         error_px = np.abs(one.disparity.values - result.experiment.truth.values)
-        error = error_figure(error_px, _ERROR_LIMIT_PX)
+        error = error_figure(error_px)
     return {
         "method": one.method,
         "wide": is_wide(one.disparity.values.shape),

@@ -110,12 +110,6 @@ def test_extrinsics_beside_the_intrinsics_are_found(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.T_right_left, calibration().T_right_left)
 
 
-def test_extrinsics_may_have_any_name_when_given(tmp_path: Path) -> None:
-    inner = write_nodes(tmp_path / "a.yml", **both_cameras(), imageSize=np.array([640, 480]))
-    outer = write_nodes(tmp_path / "b.yml", **pose())
-    assert read_opencv_calibration(inner, outer).left.width_px == 640
-
-
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [

@@ -33,7 +33,7 @@ def test_every_figure_of_a_pair_is_a_png(pair: RectifiedPair, disparity: Dispari
     decode(confidence_figure(disparity))
     decode(reasons_figure(disparity))
     decode(depth_figure(25.0 / disparity.values))
-    decode(error_figure(disparity.values - 2, 4.0))
+    decode(error_figure(disparity.values - 2))
 
 
 def test_figures_without_any_value_are_drawn(pair: RectifiedPair, nothing_found: Disparity) -> None:
@@ -41,7 +41,7 @@ def test_figures_without_any_value_are_drawn(pair: RectifiedPair, nothing_found:
     decode(depth_figure(nothing_found.values))
     decode(confidence_figure(nothing_found))
     decode(reasons_figure(nothing_found))
-    decode(error_figure(nothing_found.values, 4.0))
+    decode(error_figure(nothing_found.values))
 
 
 def test_figure_of_a_disparity_below_zero_is_drawn(

@@ -44,18 +44,13 @@ Nodes = dict[str, Float64 | str]
 
 @reader
 def read_opencv_calibration(
-    intrinsics: StrPath,
-    extrinsics: StrPath | None = None,
-    *,
-    size_px: tuple[int, int] | None = None,
-    metres_per_unit: float = 1.0,
+    path: StrPath, *, size_px: tuple[int, int] | None = None, metres_per_unit: float = 1.0
 ) -> StereoCalibration:
     """Read two raw cameras from one file, or from OpenCV's pair of files.
 
     Args:
-        intrinsics: File with ``M1 D1 M2 D2`` (or ``cameraMatrix1`` …), and possibly ``R T``.
-        extrinsics: File with ``R T``. None = the same file if it has them, else the file in the
-            same folder with ``extrinsics`` in place of ``intrinsics`` in its name.
+        path: File with ``M1 D1 M2 D2`` (or ``cameraMatrix1`` …), and ``R T``; if not, they are in
+            the file beside it that has ``extrinsics`` in place of ``intrinsics`` in its name.
         size_px: (width, height) of the images, for files without ``image_width`` and
             ``image_height``.
         metres_per_unit: Unit of ``T`` in metres: 0.001 for millimetres, or the square size if the
@@ -65,27 +60,27 @@ def read_opencv_calibration(
         FormatError: A file or matrix is missing, or the image size is unknown.
         CalibrationError: The calibration cannot give depth, or cannot be of images of ``size_px``.
     """
-    nodes = read_file_storage(intrinsics)
-    outer = _find_extrinsics(intrinsics, extrinsics, nodes)
+    nodes = read_file_storage(path)
+    outer = _find_extrinsics(path, nodes)
     stated = _size(nodes)
     size = stated or size_px
     if size is None:
         raise FormatError(
             "calibration does not contain the image size",
-            where=intrinsics,
+            where=path,
             expected="image_width and image_height",
             hint="from Python: pass width_px and height_px, or give the file itself to "
             "recon.reconstruct or recon.match, which take the size from the images",
         )
     model = _model(nodes)
     lens: LensModel = model or "pinhole"
-    left = _camera(nodes, (_LEFT_MATRIX, _LEFT_DISTORTION), size, lens, intrinsics)
-    right = _camera(nodes, (_RIGHT_MATRIX, _RIGHT_DISTORTION), size, lens, intrinsics)
+    left = _camera(nodes, (_LEFT_MATRIX, _LEFT_DISTORTION), size, lens, path)
+    right = _camera(nodes, (_RIGHT_MATRIX, _RIGHT_DISTORTION), size, lens, path)
     if model is None:
         for camera in (left, right):
-            _check_model(camera, intrinsics)
+            _check_model(camera, path)
     if stated is None:
-        check_unsized((left.matrix[0, 2], left.matrix[1, 2]), *size, intrinsics)
+        check_unsized((left.matrix[0, 2], left.matrix[1, 2]), *size, path)
     outer_nodes = read_file_storage(outer)
     rotation = _matrix(outer_nodes, _ROTATION, (3, 3), outer)
     translation = _matrix(outer_nodes, _TRANSLATION, (3,), outer)
@@ -195,13 +190,10 @@ def _size(nodes: Nodes) -> tuple[int, int] | None:
     return None
 
 
-def _find_extrinsics(intrinsics: StrPath, extrinsics: StrPath | None, nodes: Nodes) -> StrPath:
+def _find_extrinsics(path: StrPath, nodes: Nodes) -> StrPath:
     """Return the file with ``R`` and ``T``."""
-    if extrinsics is not None:
-        return extrinsics
-    path = Path(intrinsics)
-    beside = path.with_name(path.name.replace("intrinsics", "extrinsics"))
-    return beside if _find(nodes, _ROTATION) is None and beside.is_file() else intrinsics
+    beside = Path(path).with_name(Path(path).name.replace("intrinsics", "extrinsics"))
+    return beside if _find(nodes, _ROTATION) is None and beside.is_file() else path
 
 
 def _check_baseline(baseline_m: float, path: StrPath) -> None:
