@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.values.arrays import Float64
-from recon.street.kernels.noise import value_noise_reference
+from recon.street.kernels.noise import value_noise
 from recon.street.soup import Paint, TriangleSoup, merge, painted
 
 FAR_UV = 100.0
@@ -134,8 +134,8 @@ def bumpy_ball(
         splits: Number of times that the faces of an icosahedron are split in four.
     """
     flat, places = _icosphere_corners(splits)
-    hills = value_noise_reference(flat / wavelength, seed)
-    hills += 0.5 * value_noise_reference(flat * (2.0 / wavelength), seed + 1)
+    hills = value_noise(flat / wavelength, seed)
+    hills += 0.5 * value_noise(flat * (2.0 / wavelength), seed + 1)
     surface = flat * (1.0 + bump * hills)[:, None] * np.asarray(radii_m)
     corners = surface[places].reshape(-1, 3, 3)
     return painted(corners, corners[..., :2].copy(), paint, _smooth_normals(corners, places))

@@ -6,7 +6,7 @@ voxel are in arrays at that row, in the order in which voxels were first seen, s
 not depend on the hash. Tables and arrays grow by doubling: adding a point takes constant time on
 average, however large the map is.
 
-The reference implementations in plain Python are in `recon.core.kernels.voxels_reference`.
+The reference implementations in plain Python are in `tests/core/kernels/voxels_reference.py`.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Nodes come depth first, the children of a node in the order of their numbers (bit 0 is x, bit 1 y,
 bit 2 z). A walk can stop after any node and continue with the next ones, so a tree of any size can
-be read in pieces. The reference
-implementation is `recon.io.kernels.octree_reference`.
+be read in pieces. The reference implementation is in
+`tests/io/kernels/octree_reference.py`.
 """
 
 from __future__ import annotations

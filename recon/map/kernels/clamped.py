@@ -10,7 +10,8 @@ chaining the parts in order gives exactly what one long drive would have given, 
 Adding up clamped log-odds would not: a car that was seen ten times in one part, and looked through
 ten times in the next, would stay.
 
-The twins in plain Python are in `recon.map.kernels.clamped_reference`.
+The reference implementations in plain Python are in
+`tests/map/kernels/clamped_reference.py`.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ rule (Hornung et al. 2013). Then `recon.map.kernels.clamped` adds the frame to t
 A measurement is a normal distribution along its ray, not a point: a cell is hit by the share of the
 distribution that lies in it, and only what lies well before it is free.
 
-All lengths are in cells, except those of the points given. The twins in plain Python are in
-`recon.map.kernels.raycast_reference`.
+All lengths are in cells, except those of the points given. The reference implementations in
+plain Python are in `tests/map/kernels/raycast_reference.py`.
 
 Ref: J. Amanatides and A. Woo, "A fast voxel traversal algorithm for ray tracing", Eurographics
 1987; A. Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on

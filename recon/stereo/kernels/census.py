@@ -130,24 +130,3 @@ def _write_census(
                         bits, bit = none, first
         if n % 8 > 0:
             store_row(planes, n // 8 + 1, x, bits)
-
-
-def planes_reference(grey: NDArray[np.uint8], descriptor: Descriptor) -> NDArray[np.uint8]:
-    """Reference implementation of `write_planes`: uint8 (``descriptor.planes``, H, W)."""
-    height, width = grey.shape
-    around = np.pad(grey.astype(np.int64), 1, mode="edge")
-    slopes = around[:, 2:] - around[:, :-2]
-    gradient = slopes[:-2] + 2 * slopes[1:-1] + slopes[2:]
-    planes = np.zeros((descriptor.planes, height, width), np.uint8)
-    planes[0] = np.clip(gradient, -descriptor.cap, descriptor.cap) + descriptor.cap
-    around = np.pad(grey, ((descriptor.rows_radius,) * 2, (descriptor.radius,) * 2), mode="edge")
-    bits = [
-        around[dy : dy + height, dx : dx + width] < grey
-        for dy in range(2 * descriptor.rows_radius + 1)
-        for dx in range(2 * descriptor.radius + 1)
-        if (dy, dx) != (descriptor.rows_radius, descriptor.radius)
-    ]
-    if bits:
-        packed = np.packbits(np.stack(bits), axis=0, bitorder="little")
-        planes[1 : 1 + len(packed)] = packed
-    return planes

@@ -1,6 +1,6 @@
 """Averages over pairs of opposite neighbours, which keep slopes and steps.
 
-The reference implementation is in `recon.stereo.kernels.opposite_reference`.
+The reference implementation is in `tests/stereo/kernels/opposite_reference.py`.
 """
 
 from __future__ import annotations

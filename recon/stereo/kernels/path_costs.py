@@ -4,7 +4,7 @@ A row of costs is an array (candidates, W). The pixels of a candidate lie side b
 view as in the right, so vector registers are filled along the row and only its end needs padding.
 Sums over the window's width are kept for as many rows as the window is high.
 
-The reference implementation is in `recon.stereo.kernels.semi_global_reference`.
+The reference implementation is in `tests/stereo/kernels/semi_global_reference.py`.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ disparities of a window gives the normal, with its sign, without a search for ne
 over a window are made down its columns first, then along its rows, by loops that the compiler
 vectorises.
 
-The reference implementation is in `recon.stereo.kernels.points_reference`.
+The reference implementation is in `tests/stereo/kernels/points_reference.py`.
 """
 
 from __future__ import annotations

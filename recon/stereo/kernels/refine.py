@@ -1,7 +1,7 @@
 """From the minima of a search to disparities: checks, sub-pixel fit, confidence and sigma.
 
 Works on the result of any search over whole disparities (`recon.stereo.kernels.minima.Minima`).
-The reference implementation is in `recon.stereo.kernels.refine_reference`.
+The reference implementation is in `tests/stereo/kernels/refine_reference.py`.
 """
 
 from __future__ import annotations

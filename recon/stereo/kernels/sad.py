@@ -8,7 +8,7 @@ columns that stay in a core's own cache.
 Two halves that are shifted against each other make a slanted window, which costs one more addition
 than the upright one, not another search.
 
-The reference implementation is in `recon.stereo.kernels.sad_reference`.
+The reference implementation is in `tests/stereo/kernels/sad_reference.py`.
 
 Ref: K. Mühlmann et al., "Calculating dense disparity maps from color stereo images, an efficient
 implementation", IJCV 47, 2002; N. Einecke, J. Eggert, "A multi-block-matching approach for

@@ -10,7 +10,7 @@ The sweep down goes on from block to block; the sweep up starts afresh some rows
 and a band is wider than the part of it that is kept. After this overlap a path hardly depends on
 where it started.
 
-`semi_global_reference.semi_global_minima_reference` is the same in plain numpy.
+The reference implementation is in `tests/stereo/kernels/semi_global_reference.py`.
 
 Ref: H. Hirschmüller, "Stereo processing by semiglobal matching and mutual information", PAMI 30,
 2008, equations 13 and 14.

@@ -155,7 +155,7 @@ def lattice_values(
     return np.asarray((h >> _TOP).astype(np.float64) * _UNIT - 1.0)
 
 
-def value_noise_reference(xyz: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
+def value_noise(xyz: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
     """Return one octave of `fractal_noise` with spacing 1 and no blur, in plain numpy."""
     base = np.floor(xyz)
     t = xyz - base
@@ -167,34 +167,3 @@ def value_noise_reference(xyz: NDArray[np.float64], seed: int) -> NDArray[np.flo
         ix, iy, iz = (base + step).astype(np.int64).T
         total += share * lattice_values(ix, iy, iz, seed)
     return total
-
-
-def fractal_noise_reference(
-    xyz: NDArray[np.float64],
-    smear: NDArray[np.float64],
-    width: NDArray[np.float64],
-    wavelength: NDArray[np.float64],
-    octaves: int,
-    gain: float,
-    seed: int,
-) -> NDArray[np.float64]:
-    """Return the plain-numpy twin of `fractal_noise`, one point at a time."""
-    turn = np.array([[2.0, 3.0, 6.0], [6.0, 2.0, -3.0], [3.0, -6.0, 2.0]]) / 7.0
-    amplitudes = gain ** np.arange(octaves)
-    out = np.empty(len(width))
-    for i in range(len(width)):
-        length = float(np.linalg.norm(smear[i]))
-        taps = int(np.clip(np.ceil(length / width[i]), 1, MAX_TAPS))
-        blur = max(width[i], length / taps)
-        along = (np.arange(taps) + 0.5) / taps - 0.5
-        points = xyz[i] + along[:, None] * smear[i]
-        total = 0.0
-        for octave, amplitude in enumerate(amplitudes):
-            points = points @ turn.T
-            spacing = wavelength[i] * 0.5**octave
-            fade = np.clip(spacing / blur - 1.0, 0.0, 1.0)
-            total += (
-                amplitude * fade * value_noise_reference(points / spacing, seed + octave).mean()
-            )
-        out[i] = total / np.sqrt((amplitudes**2).sum())
-    return out

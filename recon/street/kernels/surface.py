@@ -119,39 +119,3 @@ def describe_hits(
             uvs[i, c] = value
             spreads[i, c] = np.sqrt(square * width * width + smeared * smeared)
     return SurfaceHits(xyz, normals, uvs, widths, smears, spreads)
-
-
-def describe_hits_reference(
-    table: SurfaceTable,
-    faces: NDArray[np.int32],
-    origin: Float64,
-    directions: Float64,
-    pixel: float,
-) -> SurfaceHits:
-    """Return the plain-numpy twin of `describe_hits`, all points at once."""
-    plane = table.normal[faces]
-    along = (directions * plane).sum(axis=1)
-    depth = ((table.anchor[faces] - origin) * plane).sum(axis=1) / along
-    xyz = origin + depth[:, None] * directions
-    local = (xyz - table.anchor[faces])[:, :, None]
-
-    view = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    cosine = (view * plane).sum(axis=1)
-    stretch = 1.0 / np.maximum(np.abs(cosine), _MIN_COSINE)
-    width = depth * pixel * np.maximum(stretch / MAX_STRETCH, 1.0)
-    stretch = np.minimum(stretch, MAX_STRETCH)
-    sine = np.maximum(np.sqrt(np.maximum(1.0 - cosine**2, 0.0)), 1e-9)
-    smear = (width * np.sqrt(stretch**2 - 1.0) / sine)[:, None] * (view - cosine[:, None] * plane)
-
-    shading = table.shading[faces] + (table.to_shading[faces] @ local)[:, :, 0]
-    shading *= (-np.sign(along) / np.linalg.norm(shading, axis=1))[:, None]
-    to_uv = table.to_uv[faces]
-    across = np.linalg.norm(to_uv, axis=2) * width[:, None]
-    return SurfaceHits(
-        xyz=xyz,
-        normal=shading,
-        uv=table.uv[faces] + (to_uv @ local)[:, :, 0],
-        width=width,
-        smear=smear,
-        spread=np.hypot(across, (to_uv @ smear[:, :, None])[:, :, 0]),
-    )

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.core.kernels import voxels
-from recon.core.kernels.voxels_reference import sum_points_reference
+from tests.core.kernels.voxels_reference import sum_points_reference
 
 # float32 sums of n ≤ 240 terms err by n · 2^-24 of the sum of their sizes: 1.4e-5 of the sum where
 # all have one sign (values, weights; information takes two operations a term). Offsets from the

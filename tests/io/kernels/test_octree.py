@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.io.kernels.octree import Leaves, begin_walk, find_leaves
-from recon.io.kernels.octree_reference import Leaf, find_leaves_reference
+from tests.io.kernels.octree_reference import Leaf, find_leaves_reference
 
 DEPTH = 4
 

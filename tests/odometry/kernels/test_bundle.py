@@ -18,7 +18,7 @@ from recon.odometry.kernels.bundle import (
     linearise,
     solve_step,
 )
-from recon.odometry.kernels.bundle_reference import (
+from tests.odometry.kernels.bundle_reference import (
     cost_reference,
     linearise_reference,
     solve_step_reference,

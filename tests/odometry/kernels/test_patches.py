@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.odometry.kernels.patches import Placing, place_patches
-from recon.odometry.kernels.patches_reference import place_patches_reference
+from tests.odometry.kernels.patches_reference import place_patches_reference
 
 PLACING = Placing(radius=4, steps=6, close=0.01, reach=3.0)
 

@@ -9,10 +9,31 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from recon.stereo.kernels.census import Descriptor, planes_reference, write_planes
+from recon.stereo.kernels.census import Descriptor, write_planes
 
 Image = NDArray[np.uint8]
 greys = hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=12))
+
+
+def planes_reference(grey: NDArray[np.uint8], descriptor: Descriptor) -> NDArray[np.uint8]:
+    """Reference implementation of `write_planes`: uint8 (``descriptor.planes``, H, W)."""
+    height, width = grey.shape
+    around = np.pad(grey.astype(np.int64), 1, mode="edge")
+    slopes = around[:, 2:] - around[:, :-2]
+    gradient = slopes[:-2] + 2 * slopes[1:-1] + slopes[2:]
+    planes = np.zeros((descriptor.planes, height, width), np.uint8)
+    planes[0] = np.clip(gradient, -descriptor.cap, descriptor.cap) + descriptor.cap
+    around = np.pad(grey, ((descriptor.rows_radius,) * 2, (descriptor.radius,) * 2), mode="edge")
+    bits = [
+        around[dy : dy + height, dx : dx + width] < grey
+        for dy in range(2 * descriptor.rows_radius + 1)
+        for dx in range(2 * descriptor.radius + 1)
+        if (dy, dx) != (descriptor.rows_radius, descriptor.radius)
+    ]
+    if bits:
+        packed = np.packbits(np.stack(bits), axis=0, bitorder="little")
+        planes[1 : 1 + len(packed)] = packed
+    return planes
 
 
 def planes_of(

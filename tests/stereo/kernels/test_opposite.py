@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from recon.stereo.kernels.opposite import average_opposite
-from recon.stereo.kernels.opposite_reference import average_opposite_reference
+from tests.stereo.kernels.opposite_reference import average_opposite_reference
 
 maps = hnp.arrays(
     np.float32,

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.stereo.kernels.points import Maps, PointRules, make_points
-from recon.stereo.kernels.points_reference import make_points_reference
+from tests.stereo.kernels.points_reference import make_points_reference
 
 RULES = PointRules(
     focal=100.0,

@@ -24,7 +24,7 @@ from recon.stereo.kernels.refine import (
     refined_in,
     reject,
 )
-from recon.stereo.kernels.refine_reference import refine_minima_reference
+from tests.stereo.kernels.refine_reference import refine_minima_reference
 
 RULES = Rules(
     ndisp=8,

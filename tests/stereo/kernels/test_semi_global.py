@@ -31,7 +31,7 @@ from recon.stereo.kernels.semi_global import (
     scratch_bytes,
     semi_global_minima,
 )
-from recon.stereo.kernels.semi_global_reference import semi_global_minima_reference
+from tests.stereo.kernels.semi_global_reference import semi_global_minima_reference
 
 Image = NDArray[np.uint8]
 

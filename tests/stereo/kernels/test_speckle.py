@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from recon.stereo.kernels.speckle import find_speckles
-from recon.stereo.kernels.speckle_reference import find_speckles_reference
+from tests.stereo.kernels.speckle_reference import find_speckles_reference
 
 maps = hnp.arrays(
     np.float32,

@@ -9,7 +9,7 @@ from hypothesis.extra import numpy as hnp
 
 from recon.core.values.arrays import Float32
 from recon.stereo.kernels.tiles import GROUP, Support, Tiles, make_tiles, offer_supported
-from recon.stereo.kernels.tiles_reference import offer_supported_reference, offered_reference
+from tests.stereo.kernels.tiles_reference import offer_supported_reference, offered_reference
 
 NDISP = 40
 LENIENT = Support(margin_x=0, margin_y=0, margin=0, matched=0.0, share=0.0, least=1)

@@ -7,12 +7,48 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.street.kernels.surface import (
+    _MIN_COSINE,
     MAX_STRETCH,
     SurfaceHits,
     SurfaceTable,
     describe_hits,
-    describe_hits_reference,
 )
+
+
+def describe_hits_reference(
+    table: SurfaceTable,
+    faces: np.ndarray,
+    origin: np.ndarray,
+    directions: np.ndarray,
+    pixel: float,
+) -> SurfaceHits:
+    """Return what `describe_hits` does, in plain numpy and all points at once."""
+    plane = table.normal[faces]
+    along = (directions * plane).sum(axis=1)
+    depth = ((table.anchor[faces] - origin) * plane).sum(axis=1) / along
+    xyz = origin + depth[:, None] * directions
+    local = (xyz - table.anchor[faces])[:, :, None]
+
+    view = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    cosine = (view * plane).sum(axis=1)
+    stretch = 1.0 / np.maximum(np.abs(cosine), _MIN_COSINE)
+    width = depth * pixel * np.maximum(stretch / MAX_STRETCH, 1.0)
+    stretch = np.minimum(stretch, MAX_STRETCH)
+    sine = np.maximum(np.sqrt(np.maximum(1.0 - cosine**2, 0.0)), 1e-9)
+    smear = (width * np.sqrt(stretch**2 - 1.0) / sine)[:, None] * (view - cosine[:, None] * plane)
+
+    shading = table.shading[faces] + (table.to_shading[faces] @ local)[:, :, 0]
+    shading *= (-np.sign(along) / np.linalg.norm(shading, axis=1))[:, None]
+    to_uv = table.to_uv[faces]
+    across = np.linalg.norm(to_uv, axis=2) * width[:, None]
+    return SurfaceHits(
+        xyz=xyz,
+        normal=shading,
+        uv=table.uv[faces] + (to_uv @ local)[:, :, 0],
+        width=width,
+        smear=smear,
+        spread=np.hypot(across, (to_uv @ smear[:, :, None])[:, :, 0]),
+    )
 
 
 def _random_table(rng: np.random.Generator, n: int) -> SurfaceTable:

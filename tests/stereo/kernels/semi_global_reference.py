@@ -9,7 +9,7 @@ from recon.stereo.kernels.minima import Minima
 from recon.stereo.kernels.path_costs import Views, Window
 from recon.stereo.kernels.path_rows import Paths
 from recon.stereo.kernels.plane_minima import PARTS, Band
-from recon.stereo.kernels.sad_reference import minima_reference
+from tests.stereo.kernels.sad_reference import minima_reference
 
 Int64 = NDArray[np.int64]
 

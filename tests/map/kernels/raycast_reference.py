@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.voxels_reference import Cell
 from recon.map.kernels.raycast import MIN_DEPTH_M, Rays
+from tests.core.kernels.voxels_reference import Cell
 
 
 def measure_points_reference(

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from recon.stereo.kernels.half_windows import Search
 from recon.stereo.kernels.minima import NO_COST, Minima
 from recon.stereo.kernels.tiles import Tiles
-from recon.stereo.kernels.tiles_reference import offered_reference
+from tests.stereo.kernels.tiles_reference import offered_reference
 
 
 def sad_minima_reference(

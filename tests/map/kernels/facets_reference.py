@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.voxels_reference import Cell
 from recon.map.kernels.facets import LEAST
+from tests.core.kernels.voxels_reference import Cell
 
 
 def crossed_cells_reference(
