@@ -16,19 +16,20 @@ from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float64, UInt8
 from recon.odometry.kernels.patches import Placing, place_patches
 
-_PLACING: Final = Placing(radius=8, steps=10, close=0.01, reach=3.0)
-"""Patches of 17 pixels, within 3 pixels of where the motion says."""
+_PLACING: Final = Placing(radius=6, steps=10, close=0.03, reach=3.0)
+"""Patches of 13 pixels, within 3 pixels of where the motion says."""
 
 _MIN_CORRELATION: Final = 0.75
 """Least correlation of a patch with the one it is found as."""
 
 _SLOPE_PX: Final = 6
-"""Half width of the neighbourhood whose disparities give the slope of a surface."""
+"""Half width of the neighbourhood whose disparities give the slope of a surface; of which every
+second row and column is taken, as neighbours share their windows anyhow."""
 
 _ON_SURFACE_PX: Final = 1.0
 """Largest difference between the disparity of a feature's surface and that of a neighbour on it."""
 
-_MIN_NEIGHBOURS: Final = 12
+_MIN_NEIGHBOURS: Final = 6
 """With fewer neighbours on the surface it counts as upright."""
 
 _ROUNDS: Final = 3
@@ -89,7 +90,7 @@ def surface_slopes(disparity: Disparity, uv: Float64) -> Float64:
 
     A plane is fitted to the neighbours that lie on it; 0 where there are too few.
     """
-    offset = np.arange(-_SLOPE_PX, _SLOPE_PX + 1)
+    offset = np.arange(-_SLOPE_PX, _SLOPE_PX + 1, 2)
     right, down = (x.ravel() for x in np.meshgrid(offset, offset))
     column, row = np.rint(uv).astype(np.int64).T
     height, width = disparity.values.shape

@@ -17,15 +17,9 @@ _WINDOW_PX: Final = 17
 _LEVELS: Final = 3
 """Pyramid levels above full resolution."""
 
-_RETURN_LEVELS: Final = 0
-"""Pyramid levels for tracking back. It starts where it should end, so it only has to stay there."""
-
 _MAX_EXPOSURE_CHANGE: Final = 0.05
 """Relative change of brightness or contrast above which an image is adapted to the exposure of the
 last one before tracking."""
-
-_MAX_RETURN_PX: Final = 0.5
-"""Largest distance between a feature and where tracking forth and back ends."""
 
 _NEIGHBOUR_PX: Final = 2
 """Half width of the neighbourhood whose median is the disparity."""
@@ -38,7 +32,7 @@ _MIN_EIGENVALUE: Final = 1e-4
 
 
 def follow(source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32) -> tuple[Float32, Bool]:
-    """Track features to another image, and back again as a check.
+    """Track features to another image, roughly: as patches that look the same.
 
     Args:
         source: Image in which the features are known.
@@ -47,22 +41,30 @@ def follow(source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32) -> tupl
         guess_uv: float32 (N, 2), predicted columns and rows in ``target``.
 
     Returns:
-        float32 (N, 2), columns and rows in ``target``, and bool (N,), True where tracking back
-        ends at the feature.
+        float32 (N, 2), columns and rows in ``target``, and bool (N,), True where something was
+        found; part of it is wrong.
 
     Ref:
-        Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2001;
-        Kalal, Mikolajczyk, Matas, "Forward-backward error", ICPR 2010.
+        Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", 2001.
     """
     if not len(uv):
         return uv.copy(), np.zeros(0, np.bool_)
-    target = _comparable(source, target)
-    there, found = _lucas_kanade(source, target, uv, guess_uv, _LEVELS)
-    back, found_back = _lucas_kanade(target, source, there, uv, _RETURN_LEVELS)
-    returned = np.abs(back - uv).max(axis=1) <= _MAX_RETURN_PX
+    end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
+    there, status, _ = cv2.calcOpticalFlowPyrLK(
+        source,
+        _comparable(source, target),
+        uv.reshape(-1, 1, 2),
+        guess_uv.reshape(-1, 1, 2).copy(),
+        winSize=(_WINDOW_PX, _WINDOW_PX),
+        maxLevel=_LEVELS,
+        criteria=end,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=_MIN_EIGENVALUE,
+    )
+    there, found = there.reshape(-1, 2), status.ravel().astype(np.bool_)
     height, width = target.shape
     inside = (there >= 0).all(axis=1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
-    return there, np.asarray(found & found_back & returned & inside)
+    return there, np.asarray(found & inside)
 
 
 def _comparable(source: UInt8, target: UInt8) -> UInt8:
@@ -97,26 +99,3 @@ def sample_disparity(disparity: Disparity, uv: Float32) -> Float32:
     agrees = np.abs(middle - centre) <= _MAX_DISPARITY_STEP_PX
     sampled: Float32 = np.where(agrees, middle, np.nan).astype(np.float32)
     return sampled
-
-
-def _lucas_kanade(
-    source: UInt8,
-    target: UInt8,
-    uv: Float32,
-    guess_uv: Float32,
-    levels: int,
-) -> tuple[Float32, Bool]:
-    """Return one way of `follow`."""
-    end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
-    there, status, _ = cv2.calcOpticalFlowPyrLK(
-        source,
-        target,
-        uv.reshape(-1, 1, 2),
-        guess_uv.reshape(-1, 1, 2).copy(),
-        winSize=(_WINDOW_PX, _WINDOW_PX),
-        maxLevel=levels,
-        criteria=end,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=_MIN_EIGENVALUE,
-    )
-    return there.reshape(-1, 2), status.reshape(-1).astype(np.bool_)
