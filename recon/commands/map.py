@@ -123,6 +123,7 @@ def _warnings(source: StereoSource, mapped: MappedSequence) -> list[str]:
     return [
         *([f"{left_out} {images} no partner: left out"] if left_out else ()),
         *health_warnings(mapped.health),
+        *(() if mapped.expected_drift is None else mapped.expected_drift.warnings()),
         *(() if mapped.prior is None else mapped.prior.warnings()),
         *(() if mapped.loops is None else mapped.loops.warnings()),
         *(source.warnings() if isinstance(source, LiveSource) else ()),

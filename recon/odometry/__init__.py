@@ -1,5 +1,6 @@
 """From frames to poses: visual odometry, corrected by kiss-icp where that helps."""
 
+from recon.odometry.expected import ExpectedDrift, expected_drift
 from recon.odometry.known import KnownPoses
 from recon.odometry.prior import MotionPrior
 from recon.odometry.prior_axes import FoundAxes, find_axes, first_moving
@@ -9,6 +10,7 @@ from recon.odometry.settings import OdometrySettings, PriorSettings
 
 __all__ = [
     "ODOMETRIES",
+    "ExpectedDrift",
     "FoundAxes",
     "KnownPoses",
     "MotionPrior",
@@ -18,6 +20,7 @@ __all__ = [
     "OdometryResult",
     "OdometrySettings",
     "PriorSettings",
+    "expected_drift",
     "find_axes",
     "first_moving",
     "make_odometry",

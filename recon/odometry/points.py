@@ -49,14 +49,6 @@ def select_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
     return _cloud(frame, depth, sigma, good)
 
 
-def all_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
-    """Return every pixel with a depth up to a range, as a LiDAR odometry would take them."""
-    camera = frame.pair.camera
-    depth = depth_from_disparity(frame.disparity.values, camera)
-    sigma = depth_sigma(depth, frame.disparity.sigma_px, camera)
-    return _cloud(frame, depth, sigma, np.asarray(depth <= max_range_m))
-
-
 def textured(grey: UInt8, min_gradient: float) -> Bool:
     """Return bool (H, W), where the image changes along the row: only that fixes a disparity."""
     gradient = cv2.Sobel(grey, cv2.CV_32F, 1, 0, ksize=3)

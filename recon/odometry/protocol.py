@@ -37,6 +37,9 @@ class OdometryHealth:
         reprojection_px: Their median reprojection error.
         sigma_m: Standard deviation of the visual translation, given the frames before.
         sigma_deg: That of the rotation.
+        scale_px: Disparity on which the length of the motion rests: the mean over the features,
+            each weighted by how much it tells. What all disparities are off, in shares of it, the
+            motion is too long or too short.
         icp_points: Points given to ICP.
         overlap: Share of ICP source points with a neighbour in the map.
         residual_m: Median distance of those to the map.
@@ -53,6 +56,7 @@ class OdometryHealth:
     reprojection_px: float = float("nan")
     sigma_m: float = float("nan")
     sigma_deg: float = float("nan")
+    scale_px: float = float("nan")
     icp_points: int = 0
     overlap: float = float("nan")
     residual_m: float = float("nan")

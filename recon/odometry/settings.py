@@ -46,8 +46,8 @@ class OdometrySettings(Settings):
 
     method: OdometryName = Field(
         "fused",
-        description="visual = features, fastest; kiss = kiss-icp on the whole cloud, for "
-        "comparison; fused = features, corrected by ICP where it is more certain.",
+        description="visual = features, fastest; kiss = kiss-icp alone, on the points that stereo "
+        "measures well; fused = features, corrected by ICP where it is more certain.",
     )
     max_range_m: float = Field(
         30.0,

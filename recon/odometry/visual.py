@@ -310,6 +310,7 @@ class VisualOdometry:
             reprojection_px=float(np.median(np.linalg.norm(error, axis=1))),
             sigma_m=float(np.linalg.norm(sigma[:3])),
             sigma_deg=float(np.rad2deg(np.linalg.norm(sigma[3:]))),
+            scale_px=_scale_px(window.uvd[-1, :, 2], camera),
             notes=(seen.note,) if seen.note else (),
         )
         T_world_camera = window.T_world_camera[-1].copy()
@@ -319,6 +320,15 @@ class VisualOdometry:
 def _information(window: TrackWindow, camera: RectifiedCamera) -> Float64:
     """Return information (6, 6) of the newest pose, scaled because errors of tracks correlate."""
     return _INDEPENDENCE * pose_information(window, camera)
+
+
+def _scale_px(disparity: Float64, camera: RectifiedCamera) -> float:
+    """Return the disparity that fixes the length of a motion, from those (N,) of the features.
+
+    A disparity gives a share of the depth, so a feature tells as much as the square of its own.
+    """
+    d = disparity[np.isfinite(disparity)] + camera.doffs_px
+    return float(d @ d / d.sum()) if len(d) else float("nan")
 
 
 def _seen_from(T_world_camera: Float64, xyz_world: Float64, camera: RectifiedCamera) -> Float64:

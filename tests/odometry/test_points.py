@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.core.values import RectifiedCamera
 from recon.odometry import points
-from recon.odometry.points import all_points, consistent, select_points, textured
+from recon.odometry.points import consistent, select_points, textured
 from recon.odometry.protocol import OdometryFrame
 
 See = Callable[..., OdometryFrame]
@@ -60,10 +59,3 @@ def test_pixels_at_the_rim_of_the_unknown_are_not_consistent(see: See, blind: Se
 
 def test_a_frame_without_disparity_gives_no_points(blind: See) -> None:
     assert len(select_points(blind(), 30.0)) == 0
-    assert len(all_points(blind(), 30.0)) == 0
-
-
-def test_all_points_are_every_pixel_within_range(see: See, camera: RectifiedCamera) -> None:
-    frame = see(np.eye(4))
-    depth = camera.focal_px * camera.baseline_m / frame.disparity.values
-    assert len(all_points(frame, 30.0)) == int((depth <= 30.0).sum())

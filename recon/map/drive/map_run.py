@@ -63,6 +63,7 @@ class MapRun:
         """Return the figures of path, map and errors."""
         mapped = self.mapped
         frames, seconds = len(mapped.trajectory), mapped.seconds
+        drift = mapped.expected_drift
         measured = {
             "trajectory": self.metrics,
             "map": self.map_metrics,
@@ -73,6 +74,8 @@ class MapRun:
             "frames": frames,
             "fps": frames / seconds if seconds > 0 else None,
             "path_length_m": mapped.trajectory.path_length_m,
+            "expected_drift_percent": None if drift is None else drift.percent,
+            "expected_drift_rig_percent": None if drift is None else drift.rig_percent,
             "frames_not_trusted": sum(not record.ok for record in mapped.health),
             "focal_px": mapped.camera.focal_px,
             "field_of_view_deg": mapped.camera.field_of_view_deg,

@@ -25,12 +25,14 @@ from recon.map.settings import DriveSettings
 from recon.map.store.submaps import Submaps
 from recon.map.tiles import Tiles
 from recon.odometry import (
+    ExpectedDrift,
     KnownPoses,
     MotionPrior,
     Odometry,
     OdometryFrame,
     OdometryHealth,
     PriorSettings,
+    expected_drift,
     find_axes,
     first_moving,
     make_odometry,
@@ -125,6 +127,11 @@ class MappedSequence:
     def voxels(self) -> OccupancyVoxels:
         """The whole 3-D occupancy, map axes; for long drives, see `tiles`."""
         return join_voxels((tile.voxels for tile in self.tiles), self.tiles.resolution_m)
+
+    @cached_property
+    def expected_drift(self) -> ExpectedDrift | None:
+        """How far the path may be off; None where no motion was measured."""
+        return expected_drift(self.trajectory, self.health, self.camera)
 
     def corrected(self, T_corrected_world: Float64) -> MappedSequence:
         """The drive with each submap and its part of the path moved rigidly.
