@@ -136,7 +136,7 @@ def test_a_drive_backwards_from_the_middle_is_found(street, street_map, truth):
     assert error_m.max() < 0.2
 
 
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_in_another_street_nothing_is_found(street_map, seed):
     drive = _localized(film(STREET.model_copy(update={"seed": seed, "frames": 8})), street_map)
 
@@ -146,6 +146,7 @@ def test_in_another_street_nothing_is_found(street_map, seed):
     assert "not found in the map" in drive.warnings()[0]
 
 
+@pytest.mark.slow
 def test_a_drive_that_leaves_the_map_is_lost_and_then_searched(street, truth):
     """The map ends after half of the drive; what lies beyond is not made up."""
     made = Map.temporary()
@@ -221,3 +222,16 @@ def test_a_damaged_map_is_refused_in_one_line(street, street_map):
 
     with pytest.raises(FormatError):
         _localized(street.taken(slice(1, 4, 2)), Map(damaged.store))
+
+
+@pytest.mark.slow
+def test_where_a_street_repeats_itself_no_place_is_believed():
+    """Each place of the drive is in the map twice, 40 m apart; either could be right."""
+    scene = STREET.model_copy(update={"path": "straight", "repeat_m": 40.0, "frames": 56})
+    repeated = film(scene.model_copy(update={"speed_m_per_frame": 1.5}))
+    made = Map.temporary()
+    map_sequence(repeated.taken(slice(0, None, 2)), SETTINGS, workspace=Workspace(made))
+
+    drive = _localized(repeated.taken(slice(7, 20, 2)), made)
+
+    assert {frame.located.state for frame in drive.frames} == {State.SEARCHING}
