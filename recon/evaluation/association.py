@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import EvaluationError
-from recon.core.geometry.interpolation import nearest_times
+from recon.core.geometry.interpolation import nearest_sorted
 from recon.core.values import Trajectory
 
 TOLERANCE_S: Final = 0.01
@@ -30,8 +30,8 @@ def associate(
     Raises:
         EvaluationError: No poses match.
     """
-    there = nearest_times(estimate.timestamps_s, truth.timestamps_s)
-    back = nearest_times(truth.timestamps_s, estimate.timestamps_s)
+    there = nearest_sorted(estimate.timestamps_s, truth.timestamps_s)
+    back = nearest_sorted(truth.timestamps_s, estimate.timestamps_s)
     apart_s = np.abs(truth.timestamps_s[there] - estimate.timestamps_s)
     mutual = (back[there] == np.arange(len(estimate))) & (apart_s <= tolerance_s)
     if not mutual.any():

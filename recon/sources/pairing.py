@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import SourceError
-from recon.core.geometry.interpolation import nearest_times
+from recon.core.geometry.interpolation import nearest_sorted
 from recon.core.values.arrays import Float64
 from recon.sources.settings import SourceSettings
 
@@ -286,7 +286,7 @@ def pair_stamps(left_s: Float64, right_s: Float64, tolerance_s: float, where: st
     Raises:
         SourceError: No two are close enough.
     """
-    to_right, to_left = nearest_times(left_s, right_s), nearest_times(right_s, left_s)
+    to_right, to_left = nearest_sorted(left_s, right_s), nearest_sorted(right_s, left_s)
     mutual = to_left[to_right] == np.arange(len(left_s))
     apart_s = np.abs(right_s[to_right] - left_s)
     chosen = np.flatnonzero(mutual & (apart_s <= tolerance_s))

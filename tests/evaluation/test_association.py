@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.core.errors import EvaluationError
-from recon.core.geometry.interpolation import nearest_times
+from recon.core.geometry.interpolation import nearest_sorted
 from recon.core.values import Trajectory
 from recon.evaluation.association import associate
 
@@ -24,7 +24,7 @@ def path(times_s: np.ndarray) -> Trajectory:
 @given(times=TIMES, others=TIMES)
 def test_the_nearest_time_is_no_farther_than_any(times: np.ndarray, others: np.ndarray) -> None:
     apart = np.abs(times[:, None] - others[None])
-    found = nearest_times(times, others)
+    found = nearest_sorted(times, others)
     np.testing.assert_array_equal(apart[np.arange(len(times)), found], apart.min(axis=1))
 
 

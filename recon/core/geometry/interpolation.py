@@ -1,8 +1,11 @@
-"""Poses between others, and the nearest of times."""
+"""Poses between others, and the nearest of sorted numbers, such as times."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import exp_so3, log_so3, make_transform
 from recon.core.values import Trajectory
@@ -42,9 +45,12 @@ def pose_between(first: Float64, second: Float64, share: float) -> Float64:
     return make_transform(first[:3, :3] @ exp_so3(share * turn), position)
 
 
-def nearest_times(times_s: Float64, others_s: Float64) -> Int32:
-    """Return int32 (N,): for each time, the index of the nearest of the others (M ≥ 1, sorted)."""
-    after = np.clip(np.searchsorted(others_s, times_s), 0, len(others_s) - 1)
+def nearest_sorted(numbers: NDArray[Any], others: NDArray[Any]) -> Int32:
+    """Return int32 (N,): for each number, the index of the nearest of the others (M ≥ 1, sorted).
+
+    Of two that are equally near, it is the first.
+    """
+    after = np.clip(np.searchsorted(others, numbers), 0, len(others) - 1)
     before = np.maximum(after - 1, 0)
-    earlier = np.abs(times_s - others_s[before]) <= np.abs(others_s[after] - times_s)
+    earlier = np.abs(numbers - others[before]) <= np.abs(others[after] - numbers)
     return np.where(earlier, before, after).astype(np.int32)

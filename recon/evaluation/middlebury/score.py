@@ -8,12 +8,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from recon.core.geometry.interpolation import nearest_sorted
 from recon.core.values import DisparityMetrics
-from recon.core.values.arrays import Float32
+from recon.core.values.arrays import Bool, Float32, Int32, frozen_array
 from recon.evaluation.disparity import evaluate_depth
 from recon.evaluation.middlebury.rules import evaluate_middlebury, values_compared, weighted_mean
 from recon.evaluation.middlebury.scenes import ScoredScene
-from recon.stereo.match.fill import fill_holes
 
 MASKS: Final = {"nonocc": False, "all": True}
 """Pixels that are scored: those seen by both cameras, or occluded ones as well."""
@@ -89,3 +89,41 @@ def _depth(scene: ScoredScene, values: Float32, *, occluded: bool) -> Figures:
     compared = values_compared(values, scene.truth.values.shape, scene.rules)
     metrics = evaluate_depth(compared, scene.truth, scene.truth_camera, occluded=occluded)
     return {"depth": asdict(metrics)}
+
+
+def fill_holes(values: Float32) -> Float32:
+    """Give each pixel without a disparity that of the background beside it.
+
+    What only one camera sees is hidden behind something nearer, so a hole gets the smaller one of
+    the nearest values to the left and to the right on its row, or the only one. A row without any
+    value is copied from the nearest row with some, the upper one of two. Known values stay.
+
+    Args:
+        values: float32 (H, W), pixels; NaN = none.
+
+    Returns:
+        float32 (H, W); all NaN where ``values`` are, else without NaN.
+
+    Raises:
+        ShapeError: The array has another dtype or shape.
+
+    Ref: the background interpolation of A. Geiger et al., KITTI stereo development kit.
+    """
+    values = frozen_array("values", values, np.float32, (None, None))
+    known = np.isfinite(values)
+    from_left = _gather(values, _last_known(known))
+    from_right = _gather(values[:, ::-1], _last_known(known[:, ::-1]))[:, ::-1]
+    filled = np.where(known, values, np.fmin(from_left, from_right))
+    rows = np.flatnonzero(known.any(axis=1))
+    return filled[rows[nearest_sorted(np.arange(len(filled)), rows)]] if rows.size else filled
+
+
+def _last_known(known: Bool) -> Int32:
+    """Return int32 (H, W): column of the nearest known pixel at or left of each; -1 = none."""
+    columns = np.arange(known.shape[1], dtype=np.int32)
+    return np.asarray(np.maximum.accumulate(np.where(known, columns, np.int32(-1)), axis=1))
+
+
+def _gather(values: Float32, columns: Int32) -> Float32:
+    there = np.take_along_axis(values, np.maximum(columns, 0).astype(np.intp), axis=1)
+    return np.where(columns >= 0, there, np.float32(np.nan))

@@ -9,25 +9,31 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from functools import partial
 from typing import Final
 
+import cv2
+import numpy as np
 from pydantic import Field
 
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
-from recon.stereo.kernels.half_windows import Search, empty_scratch, empty_views, lay_out
-from recon.stereo.kernels.minima import empty_minima
-from recon.stereo.kernels.refine import REFINED_BYTES, Refined, Rules, refine_minima, refined_in
-from recon.stereo.kernels.sad import sad_minima
-from recon.stereo.kernels.tiles import Tiles, offer_supported
-from recon.stereo.match.gradients import clipped_gradients, no_texture, texture
-from recon.stereo.match.half_size import (
-    LEAST_NDISP,
-    SUPPORT,
-    divided,
-    half_rules,
-    half_search,
-    halve,
-    undivided,
+from recon.stereo.kernels.half_windows import (
+    Search,
+    empty_scratch,
+    empty_views,
+    lay_out,
+    widest_block,
 )
+from recon.stereo.kernels.minima import empty_minima
+from recon.stereo.kernels.refine import (
+    NO_FIT,
+    REFINED_BYTES,
+    Refined,
+    Rules,
+    refine_minima,
+    refined_in,
+)
+from recon.stereo.kernels.sad import sad_minima
+from recon.stereo.kernels.tiles import Support, Tiles, make_tiles, offer_supported
+from recon.stereo.match.gradients import clipped_gradients, no_texture, texture
 from recon.stereo.match.scratch import ResultPool, ScratchPool
 from recon.stereo.match.search import (
     MeasuredSettings,
@@ -46,6 +52,21 @@ WINDOW_SLANT: Final = 1 / 3
 """Disparity per row of a second window, which competes with the upright one at each pixel; 0 =
 none. On level ground it is baseline / camera height. Its upper and its lower half are moved against
 each other by whole disparities, so that any slant near this one is the same."""
+RADIUS_PX: Final = 3
+"""Half the window at half size: smaller than at full size, or thin things are lost."""
+
+UNIQUENESS_PERCENT: Final = 5
+LEFT_RIGHT_PX: Final = 1
+
+LEAST_NDISP: Final = 32
+"""With fewer candidates a search at half size takes longer than it saves."""
+
+TILE_HEIGHT_PX: Final = 16
+_TILE_COLUMNS: Final = 160
+"""Columns of a tile together with those that its windows reach over."""
+
+SUPPORT: Final = Support(margin_x=8, margin_y=8, margin=3, matched=0.15, share=0.03, least=4)
+"""How much support at half size offers candidates to a tile."""
 
 
 class SadSettings(MeasuredSettings):
@@ -193,3 +214,46 @@ class _StripSearch:
             in_strips(pool, self._threads, prepare, height)
             in_strips(pool, self._threads, search_strip, height)
         return refined
+
+
+def halve(image: UInt8) -> UInt8:
+    """Return means of two by two pixels; a last row or column that is left over counts twice."""
+    rows, columns = image.shape
+    even = image
+    if rows % 2 or columns % 2:
+        even = np.pad(image, ((0, rows % 2), (0, columns % 2)), mode="edge")
+    size = (even.shape[1] // 2, even.shape[0] // 2)
+    return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def half_search(search: Search) -> Search:
+    """Return what to search at half size."""
+    minimum = search.minimum // 2
+    ndisp = -(-(search.minimum + search.ndisp) // 2) - minimum
+    return Search(ndisp, minimum, RADIUS_PX, RADIUS_PX, search.cost_cap, slant=0)
+
+
+def half_rules(search: Search) -> Rules:
+    """Return what makes a match of a search at half size reliable."""
+    return Rules(
+        ndisp=search.ndisp,
+        minimum=search.minimum,
+        fit=NO_FIT,
+        texture=0.0,
+        uniqueness=UNIQUENESS_PERCENT,
+        left_right=LEFT_RIGHT_PX,
+        window_pixels=(2 * RADIUS_PX + 1) ** 2,
+        sigma_floor_px=0.1,
+    )
+
+
+def undivided(search: Search, shape: tuple[int, int]) -> Tiles:
+    """Return one tile from top to bottom, offered everything, as wide as is fast."""
+    return make_tiles(shape, (shape[0], widest_block(search, shape[1])), search.ndisp)
+
+
+def divided(search: Search, shape: tuple[int, int]) -> Tiles:
+    """Return the tiles that are offered what half size supports."""
+    height = max(TILE_HEIGHT_PX, search.rows_radius)
+    width = min(_TILE_COLUMNS - 2 * search.radius, shape[1])
+    return make_tiles(shape, (height, width), search.ndisp)

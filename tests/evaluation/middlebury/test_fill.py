@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.core.errors import ShapeError
-from recon.stereo.match.fill import fill_holes
+from recon.evaluation.middlebury.score import fill_holes
 
 N = float("nan")
 
