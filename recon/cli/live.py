@@ -67,9 +67,9 @@ def live(
 ) -> None:
     """Map a drive while its images arrive: the source is played at its time stamps.
 
-    Where the machine is too slow, frames are tracked without being matched, and if
-    that does not help, dropped: summary.json counts both, and the time from an image
-    to its pose. With --map the drive is found in that map instead.
+    Where the machine is too slow, frames are tracked without being matched, and
+    if that does not help, dropped: summary.json counts both, and the time from
+    an image to its pose. With --map the drive is found in that map instead.
 
     Examples:
       recon live rides/today

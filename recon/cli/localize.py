@@ -60,9 +60,9 @@ def localize(
 ) -> None:
     """Find a drive in a map that is there already: the pose of each frame.
 
-    The first frames are recognised by the keyframes of the map, later ones tracked
-    against its features and surfaces. Frames are searching, tracking or lost; only
-    those that are tracked have a pose. The map is not changed.
+    The first frames are recognised by the keyframes of the map, later ones
+    tracked against its features and surfaces. Frames are searching, tracking or
+    lost; only those that are tracked have a pose. The map is not changed.
 
     Examples:
       recon localize rides/today --map outputs/map/latest

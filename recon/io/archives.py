@@ -177,7 +177,7 @@ def _checked(entry: _Entry) -> PurePosixPath:
 
 
 def _inside(name: str) -> bool:
-    """Whether a path stays where it begins, on every system."""
+    """Return whether a path stays where it begins, on every system."""
     plain = name.isprintable() and not {"\\", ":"} & set(name)
     return plain and not (posixpath.normpath(name) + "/").startswith(("/", "../"))
 

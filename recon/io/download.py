@@ -31,7 +31,7 @@ _RANGE: Final = re.compile(r"bytes (\d+)-(\d+)/(\d+|\*)")
 _PASSING: Final = frozenset({408, 425, 429, 500, 502, 503, 504})
 
 Tell = Callable[[int, int | None], None]
-"""Told the bytes that are there and, if it is known, how many there will be."""
+"""Receives the number of bytes that are there and, if it is known, of those to come in all."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def download(
         address: Its address, with http or https.
         path: Where to; it appears when it is complete and is what was promised.
         promise: What it must be.
-        tell: Told of each megabyte.
+        tell: Called after each megabyte.
 
     Raises:
         DownloadError: The server does not have the file or another one, sends more than it said,
@@ -212,7 +212,7 @@ class _SafeRedirects(urllib.request.HTTPRedirectHandler):
 
 
 def _opener() -> urllib.request.OpenerDirector:
-    """What opens http and https alone: no files, no FTP."""
+    """Return what opens http and https alone: no files, no FTP."""
     opener = urllib.request.OpenerDirector()
     for handler in (
         urllib.request.ProxyHandler,
@@ -228,7 +228,7 @@ def _opener() -> urllib.request.OpenerDirector:
 
 
 def _span(response: http.client.HTTPResponse) -> tuple[int, int | None]:
-    """Return where the content begins in the file, and the size of the file if it is told."""
+    """Return where the content begins in the file, and the size of the file if it is stated."""
     ranged = _RANGE.fullmatch(response.headers.get("Content-Range", ""))
     if response.status == http.client.PARTIAL_CONTENT and ranged is not None:
         return int(ranged[1]), None if ranged[3] == "*" else int(ranged[3])
@@ -298,7 +298,7 @@ def _size(part: Path) -> int:
 
 
 def _note(part: Path) -> Path:
-    """The file with the version of a download that was begun."""
+    """Return the file with the version of a download that was begun."""
     return part.with_name(part.name + ".version")
 
 

@@ -110,7 +110,7 @@ def _receive(one: Download, work: Path, mirror: str | None, progress: Progress) 
 
 
 def _published(address: str, one: Download) -> str:
-    """The hash in a file of its owners, whose first word it is."""
+    """Return the hash in a file of its owners, whose first word it is."""
     words = fetch_text(address).split()
     if not words or not words[0].isalnum() or not words[0].isascii():
         raise DownloadError("no hash is there", where=address)

@@ -129,14 +129,14 @@ class LiveSource:
         }
 
     def warnings(self) -> list[str]:
-        """What was left out, in words."""
-        told = []
+        """Return what was left out, in words."""
+        lines = []
         if self._hurried:
             what = "tracked, but not matched: the map lacks what they saw"
-            told.append(f"{len(self._hurried)} frames came too fast and were {what}")
+            lines.append(f"{len(self._hurried)} frames came too fast and were {what}")
         if self._dropped:
-            told.append(f"{self._dropped} frames came too fast and were dropped")
-        return told
+            lines.append(f"{self._dropped} frames came too fast and were dropped")
+        return lines
 
     def _play(self, start: int) -> None:
         """Hand over each pair when it is due."""
