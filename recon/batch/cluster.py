@@ -79,15 +79,24 @@ class Cluster:
         for job in jobs:
             self._submit(Try(job), folder, every_s, ended, tries)
         while tries:
-            future = self._next(ended)
-            done = tries.pop(future.key)
-            outcome = _outcome(future)
-            if outcome.state == "broken" and done.number < done.job.retries:
-                last = done.number + 1 == done.job.retries
-                again = Try(done.job, done.number + 1, anew=last and outcome.resumed)
-                self._submit(again, folder, every_s, ended, tries)
-            else:
-                yield done, outcome
+            for key, outcome in self._outcomes(ended):
+                done = tries.pop(key)
+                if outcome.state == "broken" and done.number < done.job.retries:
+                    last = done.number + 1 == done.job.retries
+                    again = Try(done.job, done.number + 1, anew=last and outcome.resumed)
+                    self._submit(again, folder, every_s, ended, tries)
+                else:
+                    yield done, outcome
+
+    def _outcomes(self, ended: SimpleQueue[Any]) -> Iterator[tuple[str, Outcome]]:
+        """Wait for futures that have ended; yield how, by key, of all that have by now."""
+        futures = [self._next(ended)]
+        while not ended.empty():
+            futures.append(ended.get())
+        finished = {one.key: one for one in futures if one.status == "finished"}
+        found = self._client.gather(finished, errors="skip")  # at once: each takes a round trip
+        for one in futures:
+            yield one.key, found[one.key] if one.key in found else _without_result(one)
 
     def _next(self, ended: SimpleQueue[Any]) -> Any:
         """Return the next future that has ended."""
@@ -207,19 +216,17 @@ def _work(job: Job, folder: str, anew: bool, every_s: float) -> Outcome:
     return Outcome(**{**vars(outcome), "worker": worker.address})
 
 
-def _outcome(future: Any) -> Outcome:
-    """Return how a try ended; a worker that died with it broke it."""
-    if future.status == "finished":
-        return Outcome(**vars(future.result()))
-    if future.status == "error":
-        error = future.exception()
-        return Outcome("broken", f"its worker died ({type(error).__name__})")
-    raise ClusterError("the scheduler is gone", got=future.status)
+def _without_result(future: Any) -> Outcome:
+    """Return how a try ended that gave nothing: its worker died with it."""
+    if future.status != "error":
+        raise ClusterError("the scheduler is gone", got=future.status)
+    return Outcome("broken", f"its worker died ({type(future.exception()).__name__})")
 
 
 def _be_quiet() -> None:
     """Keep the messages of Dask from standard error: what matters of them is told by us."""
-    for name in ("distributed", "tornado", "bokeh"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    with suppress(AttributeError):
-        require("dask", extra=EXTRA).config.set({"logging.distributed": "critical"})
+    # Dask gives each part of it a level of its own.
+    parts = [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]
+    for name in (*parts, "distributed", "tornado", "bokeh", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    require("dask", extra=EXTRA).config.set({"logging.distributed": "critical"})

@@ -151,9 +151,11 @@ def _options(options: Sequence[str], where: str) -> Sequence[str]:
 def _sources(command: str, source: Sequence[str], folder: Path) -> list[str]:
     """Return the arguments of a command; for a pair, the files of a scene's folder."""
     place = folder / source[0]
-    layout = find_layout(place) if len(source) == 1 and place.is_dir() else None
-    if command not in ("pair", "disparity") or layout is None:
+    if command not in ("pair", "disparity") or len(source) > 1:
         return list(source)
+    layout = find_layout(place) if place.is_dir() else None
+    if layout is None:  # the job itself says what is missing
+        return [str(place / "im0.png"), str(place / "im1.png")]
     images = (find_image(place, stem) or place / stem for stem in (layout.left, layout.right))
     calib, truth = place / "calib.txt", place / f"{layout.truth_left}.pfm"
     return [

@@ -20,13 +20,16 @@ from typing import IO, Any, Final
 
 from recon.batch.job import Job, Outcome, State, is_done
 from recon.core.errors import OutputError
+from recon.io.lock import is_locked
 from recon.run import Run
+from recon.run.directory import lock_file
 
 Tell = Callable[[dict[str, Any]], None]
 """Told now and then how far a job is."""
 
 _PROGRAM: Final = (sys.executable, "-m", "recon.batch.guard")
 _LOOK_S: Final = 0.2
+_OTHERS_S: Final = 90.0
 _LEAST_FREE_BYTES: Final = 32_000_000
 _INPUT: Final = (1, 2)
 """Exit codes of bad input and of wrong usage."""
@@ -58,6 +61,7 @@ def run_job(
     out, begun, where = folder / job.name, time.monotonic(), f"{platform.node()}:{os.getpid()}"
     if is_done(out):
         return Outcome("succeeded", worker=where)
+    _wait_for_others(out, stopped)
     resumed = job.resumes(out) and not anew
     with tempfile.TemporaryFile() as printed:
         try:
@@ -70,6 +74,13 @@ def run_job(
     state = _state(job, out, code)
     seconds = round(time.monotonic() - begun, 3)
     return Outcome(state, "" if state == "succeeded" else error, seconds, where, resumed)
+
+
+def _wait_for_others(out: Path, stopped: Callable[[], bool]) -> None:
+    """Wait for an earlier try, whose worker does not know yet that its scheduler is gone."""
+    late = time.monotonic() + _OTHERS_S
+    while is_locked(lock_file(out)) and time.monotonic() < late and not stopped():
+        time.sleep(_LOOK_S)
 
 
 def _run(

@@ -9,6 +9,21 @@ from pathlib import Path
 from recon.core.errors import OutputError
 
 
+def is_locked(path: Path) -> bool:
+    """Return whether a process holds the lock on a file, which need not exist."""
+    try:
+        handle = os.open(path, os.O_RDWR)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(handle)
+    return False
+
+
 def take_lock(path: Path, what: str, *, where: Path, hint: str) -> int:
     """Lock a file, which is created with its folders; closing the handle releases it.
 

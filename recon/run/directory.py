@@ -38,6 +38,11 @@ def state_folder(folder: Path) -> Path:
     return folder / _PARTIAL / _STATE
 
 
+def lock_file(folder: Path) -> Path:
+    """Return the file that is locked while a run writes to a folder."""
+    return folder / _PARTIAL / _LOCK
+
+
 def default_folder(command: str, base: Path = Path("outputs")) -> Path:
     """``outputs/<command>/<UTC stamp>``."""
     stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%S.%fZ")
@@ -98,7 +103,7 @@ class RunDirectory:
         self._made = [p for p in (self.folder, *self.folder.parents) if not p.exists()]
         try:
             self._lock = take_lock(
-                self._partial / _LOCK,
+                lock_file(self.folder),
                 "another run is writing to this folder",
                 where=self.folder,
                 hint="wait for it, or choose another --out",

@@ -62,6 +62,11 @@ def test_the_folder_of_a_scene_is_a_pair_with_calibration_and_truth(tmp_path: Pa
     ]  # fmt: skip
 
 
+def test_a_scene_that_is_not_there_is_left_to_its_job(tmp_path: Path) -> None:
+    line = planned(Entry("a", "pair", ("nowhere",)), folder=tmp_path)
+    assert line[:3] == ["pair", f"{tmp_path}/nowhere/im0.png", f"{tmp_path}/nowhere/im1.png"]
+
+
 def test_a_run_that_was_begun_is_resumed_with_its_limits(tmp_path: Path) -> None:
     (job,) = plan_jobs([DRIVE], PROGRAM, Limits(threads=3, memory="2G"), ROOT)
     state_folder(tmp_path).mkdir(parents=True)
@@ -103,7 +108,7 @@ def test_a_damaged_plan_is_one_line(tmp_path: Path, content: str) -> None:
         ({"options": ("--no-such",)}, "job a: No such option.*no-such"),
         ({"options": ("another",)}, "unexpected extra argument"),
         ({"source": ("a", "b")}, "unexpected extra argument"),
-        ({"command": "pair", "source": ("left.png",)}, "Missing argument"),
+        ({"command": "evaluate trajectory"}, "Missing argument"),
         ({"memory": "much"}, "cannot read this size"),
     ],
 )

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ import pytest
 
 from recon.batch.job import Job, is_done
 from recon.batch.process import run_job
+from recon.io.lock import take_lock
+from recon.run.directory import lock_file
 from tests.batch.jobs import job, stand_in, tries
 
 __all__ = ["stand_in"]
@@ -78,6 +81,17 @@ def test_a_job_that_nobody_waits_for_is_killed(tmp_path: Path) -> None:
     outcome = run_job(job("a", "endless"), tmp_path, stopped=begun.is_file)
     assert (outcome.state, outcome.error) == ("broken", "was stopped")
     assert ended(int(begun.read_text()))
+
+
+@usefixtures
+def test_a_try_waits_for_an_earlier_one_that_still_runs(tmp_path: Path) -> None:
+    lock = take_lock(lock_file(tmp_path / "a"), "", where=tmp_path, hint="")
+    release = threading.Timer(1.0, os.close, [lock])
+    release.start()
+    begun = time.monotonic()
+    assert run_job(job("a"), tmp_path).state == "succeeded"
+    assert time.monotonic() - begun >= 1.0
+    release.join()
 
 
 @usefixtures

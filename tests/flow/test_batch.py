@@ -18,7 +18,7 @@ from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 from tests.flow.test_killed_runs import content
 from tests.flow.test_paper import write_scene
-from tests.hostile.refusals import assert_refused, run
+from tests.hostile.refusals import assert_refused, run, run_apart
 from tests.scenery.kitti import write_kitti
 from tests.scenery.planes import slanted_pair
 
@@ -153,9 +153,14 @@ def test_a_client_that_is_killed_leaves_no_process_and_what_is_missing_is_done(
 @pytest.mark.timeout(900)
 def test_an_interrupted_batch_says_how_to_go_on(batches: Batches, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    client = subprocess.Popen(
-        batches.command(out), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    # Whoever runs the tests in the background has them ignore SIGINT.
+    start = (
+        "import runpy, signal\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "runpy.run_module('recon', run_name='__main__', alter_sys=True)\n"
     )
+    command = [sys.executable, "-c", start, *batches.command(out)[3:]]
+    client = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     wait_until(lambda: below(client, "recon.batch.guard"), client, "first job")
     left = below(client, "recon", "spawn")
     client.send_signal(signal.SIGINT)
@@ -174,16 +179,16 @@ def test_a_job_that_fails_by_its_input_is_reported_and_the_exit_code_is_1(
 ) -> None:
     scene = str(batches.jobs.parent / "scene")
     sources = [scene, str(tmp_path / "nowhere")]
-    ended = run("batch", "pair", *sources, "--out", tmp_path / "out", "--workers", "1", "--json")
-    assert ended.code == 1
+    words = ("batch", "pair", *sources, "--out", tmp_path / "out")
+    ended = run_apart(*words, "--workers", "1", "--json", seconds=600)
+    assert ended.code == 1, ended.err
     summary = json.loads(ended.out)
     assert (summary["succeeded"], summary["failed"]) == (1, 1)
     assert summary["jobs"][0]["figures"]["disparity.bad.2.0"] < 5
     assert "nowhere" in summary["jobs"][1]["error"]
     assert (tmp_path / "out" / "report.html").is_file()
     assert not (tmp_path / "out" / "nowhere").exists()
-    again = run("batch", "pair", *sources, "--out", tmp_path / "out")
-    assert_refused(again, "not empty", "--resume goes on with it")
+    assert_refused(run(*words), "not empty", "--resume goes on with it")
 
 
 @pytest.mark.parametrize(
