@@ -46,6 +46,11 @@ class ExpectedDrift:
     rig_percent: float
     rests_on_m: float
 
+    @property
+    def radius_share(self) -> float:
+        """Where a position is with 95 % probability: within this share of the path up to it."""
+        return _SIGMAS * self.percent / 100.0
+
     def warnings(self) -> list[str]:
         """Return what the user should know: that the length of the path is not certain."""
         half_width = _SIGMAS * self.rig_percent

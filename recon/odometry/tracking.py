@@ -49,7 +49,7 @@ def follow(source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32) -> tupl
     """
     if not len(uv):
         return uv.copy(), np.zeros(0, np.bool_)
-    end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
+    end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.05)
     there, status, _ = cv2.calcOpticalFlowPyrLK(
         source,
         _comparable(source, target),

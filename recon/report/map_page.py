@@ -44,9 +44,11 @@ def map_content(run: MapRun) -> Json:
 def _figures(run: MapRun) -> dict[str, bytes | None]:
     path, health, T_map_world = run.mapped.trajectory, run.mapped.health, run.mapped.T_map_world
     truth = None if run.truth is None else run.truth.trajectory
+    drift = run.mapped.expected_drift
+    radius_share = 0.0 if drift is None else drift.radius_share
     return {
         "grid": grid_figure(run.grid, {"path": seen_from_above(path, T_map_world)}),
-        "path": path_figure(path, truth, T_map_world, health),
+        "path": path_figure(path, truth, T_map_world, health, radius_share),
         "loops": _loops(run),
         "drift": None if truth is None else drift_figure(path, truth, health),
         "health": health_figure(health) if health else None,

@@ -40,6 +40,7 @@ _MAP_LABELS: Final = ("x, forward at the start (m)", "y, left at the start (m)")
 _MOST_CELLS: Final = 2400  # of a grid's figure, a side: some for each of its pixels
 _MARGIN_CELLS: Final = 10
 _PATH_MARGIN_M: Final = 3.0
+_CIRCLES: Final = 5  # along a path, of its expected drift
 _ESTIMATE_LINE: Final = {"color": ESTIMATE, "linewidth": 1.8, "label": "estimate"}
 _TRUTH_LINE: Final = {"color": TRUTH, "linewidth": 3.5, "alpha": 0.75, "label": "truth"}
 
@@ -49,6 +50,7 @@ def path_figure(
     truth: Trajectory | None,
     T_map_world: NDArray[Any],
     health: Sequence[OdometryHealth] = (),
+    radius_share: float = 0.0,
 ) -> bytes:
     """Draw the path in map axes from above; poses that are not trusted are marked.
 
@@ -57,9 +59,14 @@ def path_figure(
         truth: The true path, in the same world, or None.
         T_map_world: (4, 4), from world to map axes.
         health: One record per pose of ``estimate``, or none.
+        radius_share: Where the camera was with 95 % probability: circles of this share of the path
+            up to there; 0 = not known.
     """
     path = seen_from_above(estimate, T_map_world)
     lines: list[Line] = [(path, _ESTIMATE_LINE)]
+    if radius_share > 0.0:
+        look = {"color": ESTIMATE, "linewidth": 0.8, "label": "95 % (expected drift)"}
+        lines.append((_circles(path, radius_share * estimate.distances_m), look))
     if truth is not None:
         lines.insert(0, (seen_from_above(truth, T_map_world), _TRUTH_LINE))
     bad = _bad_frames(health, len(estimate))
@@ -67,6 +74,14 @@ def path_figure(
         look = {"marker": "x", "linestyle": "", "markersize": 8, "markeredgewidth": 2}
         lines.append((path[bad], {**look, "color": BAD, "label": f"not trusted ({len(bad)})"}))
     return _top_view(lines, path, _MAP_LABELS)
+
+
+def _circles(path: Float64, radii_m: Float64) -> Float64:
+    """Return circles around some poses of a path (N, 2), evenly along it, NaN in between."""
+    at = np.linspace(0, len(path) - 1, _CIRCLES + 1).astype(np.int64)[1:]
+    angle = np.append(np.linspace(0.0, 2.0 * np.pi, 49), np.nan)
+    round_ = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.asarray(path[at, None] + radii_m[at, None, None] * round_).reshape(-1, 2)
 
 
 def loops_figure(

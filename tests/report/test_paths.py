@@ -31,6 +31,14 @@ def test_path_is_drawn_with_and_without_truth(
     assert is_png(path_figure(trajectory, truth, T_map_world, health))
 
 
+def test_the_expected_drift_is_drawn_around_the_path(
+    trajectory: Trajectory, T_map_world: Float64
+) -> None:
+    known = path_figure(trajectory, None, T_map_world, (), 0.1)
+    assert is_png(known)
+    assert known != path_figure(trajectory, None, T_map_world)
+
+
 @pytest.mark.parametrize("frames", [0, 1])
 def test_path_of_one_frame_or_none_is_drawn(frames: int, T_map_world: Float64) -> None:
     path = Trajectory(np.tile(np.eye(4), (frames, 1, 1)), np.zeros(frames))
