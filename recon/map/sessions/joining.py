@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from recon.map.store.map import Map
 from recon.map.store.session import Session
 from recon.places.graph import Drive, Tie, join_drives
 from recon.places.verify import Loop
+
+_ALONE: Final = "T_alone_camera"
+"""The path of a drive before links to others bent it; None = that of odometry."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +64,11 @@ def join_sessions(map_: Map, links: Sequence[Link]) -> None:
         OutputError: The map cannot be written.
     """
     joined = _held_together(map_, links)
-    for number, path in joined.paths.items():
-        _place(map_, map_.session(number), path)
+    for session in map_.sessions:
+        if session.number in joined.paths:
+            _place(map_, session, joined.paths[session.number])
+        elif _ALONE in session.loops:
+            session.set_loops({**session.loops, "T_world_camera": session.loops[_ALONE]})
     kept = set(map(id, joined.links))
     linked = joined.paths or [map_.sessions[0].number]
     map_.set_links([replace(link, kept=id(link) in kept) for link in links], [*linked])
@@ -143,7 +150,9 @@ def _place(map_: Map, session: Session, path: Trajectory) -> None:
     """Write where a drive is: its axes, and how its path is bent."""
     T_world_session = path.T_world_camera[0] @ invert(session.odometry.T_world_camera[0])
     bent = invert(T_world_session) @ path.T_world_camera
-    session.set_loops({"closed": [], "refused": [], **session.loops, "T_world_camera": bent})
+    loops = {"closed": [], "refused": [], "T_world_camera": None, **session.loops}
+    alone = loops.get(_ALONE, loops["T_world_camera"])
+    session.set_loops({**loops, _ALONE: alone, "T_world_camera": bent})
     first = map_.sessions[0]
     if session is not first:
         session.set_axes(first.T_map_world @ T_world_session, session.camera)

@@ -1,0 +1,221 @@
+"""Drives are merged, added to a run and taken out of it, whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from recon.cli import app
+from recon.commands.config import load_config
+from recon.commands.map import run_map
+from recon.commands.map_options import MapOptions
+from recon.commands.merge import run_map_into, run_merge, run_remove
+from recon.commands.occupancy import run_occupancy
+from recon.core.values import StereoPair
+from recon.io.trajectory import read_trajectory
+from recon.map.store.map import Map
+from recon.sources.synthetic import SyntheticSource
+from recon.street.settings import StreetScene
+
+RIG = {"width_px": 320, "height_px": 120, "focal_px": 180.0, "smooth_edges": False}
+"""Large enough that places are recognised."""
+FIRST, FRAMES = 5, 14
+OPTIONS = MapOptions(mesh=False, audit=False)
+
+
+class Part:
+    """Some frames of a street drive, as a source that knows no truth."""
+
+    description = "a part of a street"
+    truth = None
+    files: Sequence[Path] = ()
+
+    def __init__(self, first: int, seed: int = 2) -> None:
+        self._street = SyntheticSource(StreetScene(frames=first + FRAMES, seed=seed, **RIG))
+        self._first = first
+        self.name = f"street {seed} from {first}"
+        self.calibration = self._street.calibration
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return self.frames()
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        return self._street.frames(self._first + start)
+
+
+def _map(source: Part, out: Path) -> Path:
+    run_map(source, load_config(), MapOptions(out=out, mesh=False, audit=False))
+    return out
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs of two drives that overlap; a third one is elsewhere. They must not be changed."""
+    folder = tmp_path_factory.mktemp("runs")
+    _map(Part(0), folder / "first")
+    _map(Part(FIRST), folder / "second")
+    _map(Part(0, seed=9), folder / "elsewhere")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def merged(runs: Path) -> Path:
+    options = MapOptions("merge", runs / "merged", mesh=False)
+    run_merge([runs / name for name in ("first", "second", "elsewhere")], None, options)
+    return runs / "merged"
+
+
+@pytest.fixture
+def run(runs: Path, tmp_path: Path) -> Path:
+    """A run of the first drive that may be changed."""
+    return Path(shutil.copytree(runs / "first", tmp_path / "run"))
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def summary_of(folder: Path) -> dict:
+    return json.loads((folder / "summary.json").read_text())
+
+
+def test_drives_that_share_places_are_linked_and_others_stay_apart(merged: Path) -> None:
+    found = summary_of(merged)
+    assert [drive["linked"] for drive in found["sessions"]] == [True, True, False]
+    assert found["links"]["pairs"].keys() == {"0-1"}
+    assert found["links"]["count"] >= 3
+    assert found["frames"] == 2 * FRAMES
+    assert any("session 2 (street 9 from 0)" in warning for warning in found["warnings"])
+
+
+def test_the_second_drive_is_placed_where_it_was(merged: Path) -> None:
+    true = SyntheticSource(StreetScene(frames=FIRST + FRAMES, seed=2, **RIG)).trajectory
+    path = read_trajectory(merged / "sessions/1/trajectory_tum.txt")
+    off_m = np.linalg.norm(path.positions_m - true.positions_m[FIRST:], axis=1)
+    assert off_m.max() < 0.3
+    assert not (merged / "sessions/2").exists()
+
+
+def test_the_folder_of_a_merged_map_is_a_run_like_others(merged: Path, tmp_path: Path) -> None:
+    for name in ("map/cloud.ply", "map/removed.ply", "map/octomap.bt", "report.html"):
+        assert (merged / name).is_file()
+    run_occupancy(merged, out=tmp_path / "again")
+    grids = [(folder / "map/grid.pgm").read_bytes() for folder in (merged, tmp_path / "again")]
+    assert grids[0] == grids[1]
+
+
+def test_the_map_of_several_drives_is_open_to_python(merged: Path, runs: Path) -> None:
+    with Map.open(merged) as map_, Map.temporary() as other:
+        assert [session.number for session in map_.linked] == [0, 1]
+        assert all(link.kept for link in map_.links)
+        assert sum(len(tile.cloud) for tile in map_.tiles()) > 1000
+        for name in ("first", "second"):
+            with Map.open(runs / name) as one:
+                other.merge(one)
+        assert [session.number for session in other.linked] == [0, 1]
+
+
+def test_a_drive_is_added_to_a_run_and_taken_out_again(run: Path, runs: Path) -> None:
+    (run / "notes.txt").write_text("mine")
+    added = run_map_into(run, Part(FIRST), None, OPTIONS)
+    assert [drive["linked"] for drive in added["sessions"]] == [True, True]
+    assert summary_of(run)["sessions"] == added["sessions"]
+    run_remove(run, 1, None, OPTIONS)
+    assert [drive["number"] for drive in summary_of(run)["sessions"]] == [0]
+    for name in ("map/grid.pgm", "map/octomap.ot"):
+        assert (run / name).read_bytes() == (runs / "first" / name).read_bytes()
+    assert (run / "notes.txt").read_text() == "mine"
+    assert [p.name for p in run.parent.iterdir()] == [run.name]
+
+
+@pytest.mark.parametrize("at", ["recon.run.directory.exchange", "recon.commands.joined.place_map"])
+def test_what_fails_before_the_end_leaves_the_run_as_it_was(run: Path, at: str) -> None:
+    before = content(run)
+    with patch(at, side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
+        run_map_into(run, Part(FIRST), None, OPTIONS)
+    assert {n: c for n, c in content(run).items() if not n.startswith(".partial")} == before
+    run_map_into(run, Part(FIRST), None, OPTIONS)  # and it can be tried again
+    assert len(summary_of(run)["sessions"]) == 2
+
+
+def _refused(*arguments: object) -> str:
+    done = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert done.exit_code in (1, 2), done.output
+    assert "Traceback" not in done.output
+    return " ".join(done.output.replace("\u2502", " ").split())
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        ("missing", "does not contain a finished run"),
+        ("first", "the same run twice"),
+        ("copy", "has this drive already"),
+        ("pair", "the run made no map"),
+        ("unfinished", "does not contain a finished run"),
+        ("coarse", "voxels of different sizes"),
+        ("newer", "newer version of recon"),
+        ("no map", "map.recon"),
+    ],
+)
+def test_what_cannot_be_merged_is_one_line(
+    runs: Path, tmp_path: Path, second: str, message: str
+) -> None:
+    other = tmp_path / second
+    if second == "first":
+        other = runs / "first"
+    elif second not in ("missing", "unfinished"):
+        shutil.copytree(runs / ("first" if second == "copy" else "second"), other)
+    if second == "pair":
+        (other / "run.json").write_text('{"command": "pair"}')
+    elif second == "unfinished":
+        (other / ".partial/.state").mkdir(parents=True)
+    elif second == "coarse":
+        with Map.open(other, read_only=False) as map_:
+            info = map_.store.read("session", 0)
+            info["config"]["fusion"]["voxel_m"] = 0.2
+            map_.store.put("session", 0, info)
+            map_.commit()
+    elif second == "newer":
+        with Map.open(other, read_only=False) as map_:
+            map_.store._database.execute("PRAGMA user_version = 99")
+            map_.commit()
+    elif second == "no map":
+        (other / "map/map.recon").unlink()
+    told = _refused("merge", runs / "first", other, "--out", tmp_path / "out", "--no-mesh")
+    assert message in told
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["merge", "RUN"], "nothing to merge"),
+        (["merge", "RUN", "OTHER", "--out", "OTHER"], "would replace the run"),
+        (["map", "x", "--into", "RUN", "--resume", "OTHER"], "--into changes RUN"),
+        (["map", "x", "--into", "RUN", "--out", "OTHER"], "--into changes RUN"),
+        (["map", "x", "--into", "RUN", "--remove", "0"], "maps no SOURCE"),
+        (["map", "--remove", "0"], "--into"),
+        (["map", "--into", "RUN", "--remove", "5"], "no such session"),
+        (["map", "--into", "RUN", "--remove", "0"], "only this session"),
+        (["map", "x", "--into", "nowhere"], "does not contain a finished run"),
+        (["map", "x", "--into", "RUN", "--set", "fusion.voxel_m=0.3"], "x"),
+    ],
+)
+def test_options_that_say_nothing_together_are_one_line(
+    runs: Path, arguments: list[str], message: str
+) -> None:
+    places = {"RUN": str(runs / "first"), "OTHER": str(runs / "second")}
+    before = content(runs / "first")
+    assert message in _refused(*(places.get(part, part) for part in arguments))
+    assert content(runs / "first") == before
