@@ -1,7 +1,7 @@
 """Moving objects: how much of them is taken out of the fused cloud, and how much else with them.
 
-A rendered street in which cars and people move is mapped once with known poses. Points near the
-path of something that moves, and far from what stands, are its points; points on what stands are
+A rendered street in which cars and people move is mapped once with known poses. Points on
+something that moves, and far from what stands, are its points; points on what stands are
 judged by how many of them are left, those of posts and lamps apart. The same table for DUFOMap, on
 the clouds of the same frames, if it is installed (``pip install dufomap``).
 
@@ -38,6 +38,8 @@ from recon.street.soup import Material, Paint, TriangleSoup, merge, move
 
 ON_IT_M = 0.15
 """Points within this distance of a surface are on it, give or take its depth error."""
+BESIDE_M = 0.4
+"""Points farther from a surface than this are not on it."""
 THIN = (Material.METAL,)
 
 
@@ -148,9 +150,12 @@ class Truth:
     def score(self, before: PointCloud, after: PointCloud) -> dict[str, Any]:
         """Return the shares of points that are gone."""
         left = distances(after.xyz, before.xyz) < 0.01
-        stands = self.standing.distance(before.xyz) <= ON_IT_M
-        moves = ~stands & (self.moving.distance(before.xyz) <= 2 * ON_IT_M)
-        stands &= self.moving.distance(before.xyz) > 2 * ON_IT_M
+        from_standing, from_moving = (
+            surface.distance(before.xyz) for surface in (self.standing, self.moving)
+        )
+        # What is near both may be of either.
+        moves = (from_standing > BESIDE_M) & (from_moving <= ON_IT_M)
+        stands = (from_standing <= ON_IT_M) & (from_moving > BESIDE_M)
         found = {
             "moving_points": int(moves.sum()),
             "moving_gone": share(~left[moves]),

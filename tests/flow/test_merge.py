@@ -209,7 +209,6 @@ def test_what_cannot_be_merged_is_one_line(
         (["map", "--into", "RUN", "--remove", "5"], "no such session"),
         (["map", "--into", "RUN", "--remove", "0"], "only this session"),
         (["map", "x", "--into", "nowhere"], "does not contain a finished run"),
-        (["map", "x", "--into", "RUN", "--set", "fusion.voxel_m=0.3"], "x"),
     ],
 )
 def test_options_that_say_nothing_together_are_one_line(
