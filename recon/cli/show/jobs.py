@@ -62,6 +62,7 @@ class JobLines:
             console=console,
         )
         self._running: dict[str, Any] = {}
+        self._ended = set[str]()
         self._failed = 0
 
     def on_start(self, name: str, total: int, unit: str = "jobs") -> None:
@@ -77,6 +78,8 @@ class JobLines:
             self._console.print(text, markup=False, highlight=False)
             return
         name = event["name"]
+        if name in self._ended:  # told before it ended, heard after
+            return
         if name not in self._running:
             self._running[name] = self._lines.add_task(name, total=None, state="")
         self._lines.update(
@@ -89,6 +92,7 @@ class JobLines:
     def on_step(self, step: Step) -> None:
         """Remove the line of a job that has ended, and move the bar."""
         name, _, why = step.state.partition(" ")
+        self._ended.add(name)
         if name in self._running:
             self._lines.remove_task(self._running.pop(name))
         if not step.ok:
