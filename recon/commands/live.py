@@ -12,7 +12,7 @@ from recon.commands.config import ReconConfig, load_config
 from recon.commands.localize import run_localize
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core.errors import SettingsError
+from recon.core.errors import MappingError, SettingsError
 from recon.core.values import StereoPair
 from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
@@ -65,7 +65,19 @@ def run_live(
     options = replace(options, audit=False, progress=played.timed(options.progress))
     if map_path is not None:
         return run_localize(played, map_path, config, options, start=start).summary
-    return run_map(played, config, options).summary
+    try:
+        return run_map(played, config, options).summary
+    except MappingError as error:
+        raise _because_it_was_too_fast(error, played) from error
+
+
+def _because_it_was_too_fast(error: MappingError, played: LiveSource) -> MappingError:
+    """Say of a drive that gave no map what was left out of it, if anything was."""
+    if not played.warnings():
+        return error
+    why = "; ".join(played.warnings())
+    hint = "play it more slowly, such as --rate 0.5, or take a smaller image or a faster matcher"
+    return MappingError(error.what, where=error.where, got=why, hint=hint)
 
 
 class _Beginning:

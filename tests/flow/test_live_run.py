@@ -12,7 +12,7 @@ from recon.commands.config import ReconConfig, load_config
 from recon.commands.live import run_live
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core.errors import SettingsError
+from recon.core.errors import MappingError, SettingsError
 from recon.io.trajectory import read_tum
 from recon.map.store.map import Map
 from recon.sources import live
@@ -88,6 +88,17 @@ def test_a_drive_is_found_in_a_map_while_it_arrives(
     assert summary["frames_tracking"] >= 7
     assert summary["live"]["frames_arrived"] == 8
     assert (tmp_path / "live" / "states.csv").is_file()
+
+
+def test_a_machine_that_is_much_too_slow_is_told_so(street, config, monkeypatch, tmp_path) -> None:
+    """Of frames that were all tracked alone, there is no map."""
+    monkeypatch.setattr(live, "_WAITING", 1000)
+    monkeypatch.setattr(LiveSource, "hurried", lambda self, pair: pair.index > 0)
+    monkeypatch.setattr(LiveSource, "warnings", lambda self: ["7 frames came too fast"])
+
+    with pytest.raises(MappingError, match=r"the map is empty.*7 frames came too fast.*--rate"):
+        _live(street, config, tmp_path / "live")
+    assert not (tmp_path / "live" / "summary.json").exists()
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
