@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -26,11 +27,6 @@ _COLUMNS: Final = (
 _ACCURACY: Final = (
     "trajectory.t_rel_percent", "map.f_score", "t_rel_percent", "f_score", "disparity.bad.2.0",
     "bad.2.0", "valid_percent", "points",
-)  # fmt: skip
-
-_WITHOUT_PAGE: Final = (
-    "disparity", "export", "mesh", "occupancy", "rectify", "merge", "evaluate map",
-    "evaluate occupancy", "evaluate disparity",
 )  # fmt: skip
 
 
@@ -60,7 +56,12 @@ def write_batch_page(
         found=summary,
         head=table.head,
         jobs=[
-            {"name": one.job.name, "page": _page(one), "cells": cells[1:], "why": why}
+            {
+                "name": one.job.name,
+                "page": _page(one, directory.folder),
+                "cells": cells[1:],
+                "why": why,
+            }
             for one, cells, why in _ranked(results)
         ],
         sweep=sweep,
@@ -132,11 +133,11 @@ def _draw(axes: Axes, done: Sequence[JobResult], setting: str, name: str) -> Non
     axes.legend()
 
 
-def _page(one: JobResult) -> str:
-    """The page of a job's folder; "" = there is none."""
+def _page(one: JobResult, folder: Path) -> str:
+    """The page to look at in the folder of a job; "" = it has no result."""
     if one.state != "succeeded":
         return ""
-    return "summary.json" if one.job.command in _WITHOUT_PAGE else "report.html"
+    return "report.html" if (folder / one.job.name / "report.html").is_file() else "summary.json"
 
 
 def _ranked(results: Sequence[JobResult]) -> list[tuple[JobResult, Sequence[str], str]]:

@@ -37,7 +37,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "jobs": [{}] * 12, "succeeded": 10, "failed": 1, "seconds": 60.0, "workers": 2,
         "jobs_per_hour": 600.0,
     }  # fmt: skip
-    with RunDirectory(out) as directory:
+    (out / "drive3_w=9").mkdir(parents=True)
+    (out / "drive3_w=9" / "report.html").touch()
+    with RunDirectory(out, resume=True) as directory:
         write_batch_page(results(), summary, directory)
     return out
 
@@ -48,6 +50,7 @@ def test_the_report_shows_outliers_first_and_links_to_the_runs(folder: Path) -> 
     names = [re.sub("<[^>]+>", "", row) for row in rows][:3]
     assert names[:2] == ["bad", "drive3_w=9"]
     assert 'href="drive3_w%3D9/report.html"' in page
+    assert 'href="drive4_w%3D9/summary.json"' in page
     assert 'href="bad' not in page
     assert 'href="later' not in page
     assert "trajectory.t_rel_percent 99 (usually" in page
