@@ -39,7 +39,7 @@ def test_without_noise_the_true_rig_comes_back(make_views, lens: str) -> None:
     assert turn_deg(fit.calibration, rig) < (0.02 if lens == "rational" else 1e-5)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 @pytest.mark.parametrize("lens", LENSES)
 def test_with_a_tenth_of_a_pixel_of_noise_the_rig_is_right_within_the_bounds(
     make_views, lens: str, seed: int
