@@ -239,7 +239,11 @@ def left_cars(days: Sequence[SyntheticSource]) -> Float64:
     vertices = days[0].world.soup.vertices.reshape(-1, 9)
     rows = np.flatnonzero(np.isin(corners_of(days[0].world), gone))
     corners = se3.apply(T, vertices[rows].reshape(-1, 3).astype(np.float64))
-    return seen[near(PointCloud(seen.astype(np.float32), frame="world"), corners, 0.35)]
+    there = seen[near(PointCloud(seen.astype(np.float32), frame="world"), corners, 0.35)]
+    # Where something stands on the second day, points are of that.
+    T_first_second = T @ days[1].world.T_street_camera[0]
+    later = se3.apply(T_first_second, days[1].truth.surface.xyz.astype(np.float64))
+    return there[~near(PointCloud(there.astype(np.float32), frame="world"), later, 0.35)]
 
 
 def corners_of(world: StreetWorld) -> np.ndarray:
@@ -277,8 +281,9 @@ def alike(tries: int, width: int) -> dict[str, Any]:
     drives = [keyframes(seed, width) for seed in range(int(np.ceil((2 * tries) ** 0.5)) + 1)]
     pairs = [(a, b) for a in range(len(drives)) for b in range(a)][:tries]
     wrong = sum(bool(links_between(drives[a], drives[b])) for a, b in pairs)
-    repeated = [keyframes(seed, width, repeat_m=30.0, frames=48) for seed in range(5)]
-    ambiguous = sum(bool(links_between(d[:16], d[18:34])) for d in repeated)
+    # The first drive sees each place of the repeated street more than once.
+    repeated = [keyframes(seed, width, repeat_m=30.0, frames=58) for seed in range(5)]
+    ambiguous = sum(bool(links_between(d[:44], d[44:])) for d in repeated)
     return {"tries": len(pairs), "wrong": wrong, "repeated": len(repeated), "linked": ambiguous}
 
 
