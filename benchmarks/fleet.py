@@ -30,10 +30,10 @@ from typing import Any
 import psutil
 from distributed import Client, get_worker
 
-from recon.batch.cluster import Cluster, local_cluster
-from recon.batch.job import Job, Outcome
 from recon.core.values import RectifiedCamera
 from recon.io.images.image import write_image
+from recon.run.batch.cluster import Cluster, local_cluster
+from recon.run.batch.job import Job, Outcome
 from recon.run.machine import available_cores
 from tests.scenery.planes import slanted_pair
 

@@ -80,12 +80,12 @@ def batch(
     if (resume is None) == (not what):
         raise typer.BadParameter("give JOBS, or COMMAND and SOURCES, or --resume FOLDER")
     with session(quiet=quiet):
-        from recon.batch.job_file import SUFFIXES, jobs_of_sources, read_jobs
-        from recon.batch.plan import Limits
-        from recon.batch.work import BatchOptions
         from recon.cli.program import known_program
         from recon.cli.show.jobs import choose_job_viewer
         from recon.commands.batch import resume_batch, run_batch
+        from recon.run.batch.job_file import SUFFIXES, jobs_of_sources, read_jobs
+        from recon.run.batch.plan import Limits
+        from recon.run.batch.work import BatchOptions
 
         viewer = choose_job_viewer(quiet=quiet, verbose=verbose)
         options = BatchOptions(out, scheduler, workers, fail_fast, viewer, viewer.on_job)

@@ -7,8 +7,8 @@ from typing import Any
 
 import typer
 
-from recon.batch.plan import Program
 from recon.core.errors import SettingsError
+from recon.run.batch.plan import Program
 
 # Typer has a copy of click in it, or uses the one that is installed.
 _USAGE_ERROR: Any = typer.BadParameter.__base__

@@ -7,17 +7,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from recon.batch.cluster import connect
-from recon.batch.figures import JobResult, compare, result_of
-from recon.batch.job import Job, Outcome, is_done
-from recon.batch.job_file import Entry
-from recon.batch.plan import PLAN, Limits, Program, plan_jobs, read_plan, write_plan
-from recon.batch.work import BatchOptions, work_off
 from recon.commands.config import load_config
 from recon.core.errors import ClusterError, OutputError
 from recon.io.files import naming
 from recon.report.batch_page import write_batch_page
 from recon.run import Run
+from recon.run.batch.cluster import connect
+from recon.run.batch.figures import JobResult, compare, result_of
+from recon.run.batch.job import Job, Outcome, is_done
+from recon.run.batch.job_file import Entry
+from recon.run.batch.plan import PLAN, Limits, Program, plan_jobs, read_plan, write_plan
+from recon.run.batch.work import BatchOptions, work_off
 from recon.run.directory import default_folder
 
 COMMANDS: Final = (

@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from recon.batch.figures import JobResult, outliers_first
 from recon.io.atomic import write_bytes, write_text
 from recon.report.page import write_page
 from recon.report.style import WIDE_IN, styled, to_png
 from recon.report.table import NOT_KNOWN, Table, csv_text, join
+from recon.run.batch.figures import JobResult, outliers_first
 from recon.run.directory import RunDirectory
 
 #: Columns of the tables for people, where any job has them; the CSV has every figure.

@@ -108,11 +108,11 @@ def test_workers_and_jobs_that_are_killed_at_random_change_nothing(
 ) -> None:
     rng, kills, out = np.random.default_rng(0), 0, tmp_path / "out"
     client = subprocess.Popen(batches.command(out), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    wait_until(lambda: below(client, "recon.batch.guard"), client, "first job")
+    wait_until(lambda: below(client, "recon.run.batch.guard"), client, "first job")
     while client.poll() is None and kills < KILLS:
         time.sleep(rng.uniform(0.5, 8.0))
         if client.poll() is None and (
-            found := below(client, "recon.batch.guard", "multiprocessing.spawn")
+            found := below(client, "recon.run.batch.guard", "multiprocessing.spawn")
         ):
             victim = found[rng.integers(len(found))]
             if victim.is_running():
@@ -136,7 +136,7 @@ def test_a_client_that_is_killed_leaves_no_process_and_what_is_missing_is_done(
     )
     # One drive is done, another is being mapped.
     wait_until(lambda: list(out.glob("drive?/run.json")), client, "first result")
-    wait_until(lambda: below(client, "recon.batch.guard"), client, "second job")
+    wait_until(lambda: below(client, "recon.run.batch.guard"), client, "second job")
     done = [path.stat().st_mtime_ns for path in sorted(out.glob("*/run.json"))]
     named = [path.parent.name for path in sorted(out.glob("*/run.json"))]
     left = below(client, "recon", "spawn")
@@ -161,7 +161,7 @@ def test_an_interrupted_batch_says_how_to_go_on(batches: Batches, tmp_path: Path
     )
     command = [sys.executable, "-c", start, *batches.command(out)[3:]]
     client = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    wait_until(lambda: below(client, "recon.batch.guard"), client, "first job")
+    wait_until(lambda: below(client, "recon.run.batch.guard"), client, "first job")
     left = below(client, "recon", "spawn")
     client.send_signal(signal.SIGINT)
     _, told = client.communicate(timeout=120)

@@ -56,8 +56,8 @@ def test_a_scheduler_that_is_killed_is_one_line_and_another_one_finishes(tmp_pat
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
         )
-        wait_until(lambda: below(workers[0], "recon.batch.guard"), client, "first job")
-        jobs = [job for worker in workers for job in below(worker, "recon.batch.guard")]
+        wait_until(lambda: below(workers[0], "recon.run.batch.guard"), client, "first job")
+        jobs = [job for worker in workers for job in below(worker, "recon.run.batch.guard")]
         scheduler.kill()
         _, told = client.communicate(timeout=300)
         assert client.returncode == 1

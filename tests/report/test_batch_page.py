@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from recon.batch.figures import JobResult, compare
 from recon.report.batch_page import write_batch_page
+from recon.run.batch.figures import JobResult, compare
 from recon.run.directory import RunDirectory
-from tests.batch.jobs import job
+from tests.run.batch.jobs import job
 
 
 def results() -> list[JobResult]:

@@ -7,10 +7,10 @@ import json
 
 from rich.console import Console
 
-from recon.batch.figures import JobResult
-from recon.batch.work import JobStep
 from recon.cli.show.jobs import JobEvents, JobLines, NoJobs, choose_job_viewer
-from tests.batch.jobs import job
+from recon.run.batch.figures import JobResult
+from recon.run.batch.work import JobStep
+from tests.run.batch.jobs import job
 
 CLUSTER = {"event": "cluster", "workers": 2, "dashboard": "http://127.0.0.1:1/status"}
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from recon.batch.cluster import Cluster
-from recon.batch.figures import JobResult, result_of
-from recon.batch.job import Job
-from recon.batch.plan import Limits
+from recon.run.batch.cluster import Cluster
+from recon.run.batch.figures import JobResult, result_of
+from recon.run.batch.job import Job
+from recon.run.batch.plan import Limits
 from recon.run.machine import available_cores
 from recon.run.progress import SILENT, Progress
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from recon.batch.job_file import Entry
-from recon.batch.plan import Limits, plan_jobs, read_plan, write_plan
 from recon.cli.program import known_program
 from recon.core.errors import ReconError, SettingsError
+from recon.run.batch.job_file import Entry
+from recon.run.batch.plan import Limits, plan_jobs, read_plan, write_plan
 from recon.run.directory import STARTED, state_folder
 from tests.docs.blocks import ROOT
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from recon.batch.cluster import Cluster, Try, join_cluster, local_cluster
-from recon.batch.job import Job, Outcome
 from recon.core.errors import ClusterError, MissingDependencyError
-from tests.batch.jobs import job, stand_in, tries
+from recon.run.batch.cluster import Cluster, Try, join_cluster, local_cluster
+from recon.run.batch.job import Job, Outcome
+from tests.run.batch.jobs import job, stand_in, tries
 
 distributed = pytest.importorskip("distributed")
 __all__ = ["stand_in"]
@@ -78,7 +78,7 @@ def test_needs_that_no_worker_declares_do_not_keep_a_job_waiting(
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recon.batch.cluster._REACH_S", 0.5)
+    monkeypatch.setattr("recon.run.batch.cluster._REACH_S", 0.5)
     with pytest.raises(ClusterError, match="scheduler cannot be reached"):
         join_cluster("tcp://127.0.0.1:9").__enter__()
 

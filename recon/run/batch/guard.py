@@ -2,7 +2,7 @@
 
 Standard input is a pipe from there: when it closes, the whole group of processes is killed.
 
-    python -m recon.batch.guard map drive --out folder
+    python -m recon.run.batch.guard map drive --out folder
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from recon.batch.job_file import jobs_of_sources, read_jobs
 from recon.core.errors import ReconError, SettingsError
+from recon.run.batch.job_file import jobs_of_sources, read_jobs
 
 FULL = """
 [[job]]

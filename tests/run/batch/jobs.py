@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from recon.batch import process
-from recon.batch.job import Job
+from recon.run.batch import process
+from recon.run.batch.job import Job
 
 #: What `recon` would do, without what it needs to start: `… map WHAT --out FOLDER …`.
 STAND_IN = """

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from recon.batch.job import Job, is_done
-from recon.batch.process import run_job
 from recon.io.lock import take_lock
+from recon.run.batch.job import Job, is_done
+from recon.run.batch.process import run_job
 from recon.run.directory import lock_file
-from tests.batch.jobs import job, stand_in, tries
+from tests.run.batch.jobs import job, stand_in, tries
 
 __all__ = ["stand_in"]
 usefixtures = pytest.mark.usefixtures("stand_in")

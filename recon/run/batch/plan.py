@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from recon.batch.job import Job
-from recon.batch.job_file import Entry
 from recon.core.errors import FormatError, SettingsError
 from recon.io.atomic import write_text
 from recon.io.files import read_text, reading
 from recon.io.middlebury.layout import find_image, find_layout
+from recon.run.batch.job import Job
+from recon.run.batch.job_file import Entry
 from recon.run.memory import parse_size_mb
 
 PLAN: Final = "jobs.json"

@@ -10,10 +10,10 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Final
 
-from recon.batch.job import Job, Outcome
-from recon.batch.process import Tell, run_job
 from recon.core.errors import ClusterError
 from recon.core.optional import require
+from recon.run.batch.job import Job, Outcome
+from recon.run.batch.process import Tell, run_job
 
 EXTRA: Final = "cluster"
 _TOPIC: Final = "recon-jobs"

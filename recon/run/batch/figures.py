@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from recon.batch.job import Job, Outcome
 from recon.io.files import read_text, reading
+from recon.run.batch.job import Job, Outcome
 from recon.run.run import SUMMARY
 
 _SUMMARY_BYTES: Final = 1 << 26

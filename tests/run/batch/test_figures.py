@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from recon.batch.figures import JobResult, compare, flat, outliers_first, result_of
-from recon.batch.job import Outcome
 from recon.core.errors import FormatError
-from tests.batch.jobs import job
+from recon.run.batch.figures import JobResult, compare, flat, outliers_first, result_of
+from recon.run.batch.job import Outcome
+from tests.run.batch.jobs import job
 
 
 def result(name: str, **figures: float) -> JobResult:

@@ -18,16 +18,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import IO, Any, Final
 
-from recon.batch.job import Job, Outcome, State, is_done
 from recon.core.errors import OutputError
 from recon.io.lock import is_locked
 from recon.run import Run
+from recon.run.batch.job import Job, Outcome, State, is_done
 from recon.run.directory import lock_file
 
 Tell = Callable[[dict[str, Any]], None]
 """Told now and then how far a job is."""
 
-_PROGRAM: Final = (sys.executable, "-m", "recon.batch.guard")
+_PROGRAM: Final = (sys.executable, "-m", "recon.run.batch.guard")
 _LOOK_S: Final = 0.2
 _OTHERS_S: Final = 90.0
 _LEAST_FREE_BYTES: Final = 32_000_000
