@@ -75,7 +75,7 @@ def make_joined(
         export_sessions(joined, run)
         with run.report(summary):
             write_joined_page(joined, summary, run)
-        T_map_world = map_.linked[0].T_map_world.tolist()
+        T_map_world = map_.first.T_map_world.tolist()
         map_.close()
         run.finish(
             summary,

@@ -47,7 +47,7 @@ class JoinedMap:
 def joined_figures(joined: JoinedMap) -> dict[str, Any]:
     """Return the figures for ``summary.json``."""
     map_, made = joined.map, joined.made
-    T_map_world = map_.linked[0].T_map_world
+    T_map_world = map_.first.T_map_world
     linked = {session.number for session in map_.linked}
     kept = [link for link in map_.links if link.kept]
     pairs = Counter("-".join(map(str, link.sessions)) for link in kept)

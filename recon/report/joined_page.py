@@ -20,7 +20,7 @@ def write_joined_page(joined: JoinedMap, summary: dict[str, Any], directory: Run
     Raises:
         OutputError: The file cannot be written.
     """
-    T_map_world, made = joined.map.linked[0].T_map_world, joined.made
+    T_map_world, made = joined.map.first.T_map_world, joined.made
     named = {f"session {number}": path for number, path in joined.paths.items()}
     from_above = {name: seen_from_above(path, T_map_world) for name, path in named.items()}
     ways = [(name, np.asarray(apply(T_map_world, p.positions_m))) for name, p in named.items()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from recon.commands.occupancy import run_occupancy
 from recon.core.geometry.se3 import invert
 from recon.core.values import Trajectory
 from recon.io.trajectory import read_tum
+from recon.map.store.map import MAP_FILE
+from recon.map.store.records import Store
 from recon.sources.kitti import open_kitti
 from recon.sources.protocol import StereoSource
 from tests.flow.rooms import RoomSource
@@ -118,14 +121,14 @@ def test_the_base_is_where_the_camera_stands_on_the_road(small_demo: Path) -> No
 
 
 def test_frames_that_are_not_trusted_free_nothing(small_demo: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    copy.mkdir()
-    for name in ("config.yaml", "trajectory_kitti.txt"):
-        (copy / name).symlink_to(small_demo / name)
-    (copy / "map").symlink_to(small_demo / "map")
-    record = json.loads((small_demo / "run.json").read_text())
-    assert 0 not in record["untrusted_frames"]
-    (copy / "run.json").write_text(json.dumps(record | {"untrusted_frames": [0, 1]}))
+    copy = shutil.copytree(small_demo, tmp_path / "copy")
+    with Store.open(copy / MAP_FILE) as store:
+        frames = store.get("frames", (0, 0))
+        ok = frames["health"]["ok"]
+        assert ok[0]
+        health = frames["health"] | {"ok": [False, False, *ok[2:]]}
+        store.put("frames", (0, 0), frames | {"health": health})
+        store.commit()
     run_occupancy(copy, out=tmp_path / "out")
     assert (ServedMap(tmp_path / "out").at(np.zeros((1, 2))) == UNKNOWN).all()
 

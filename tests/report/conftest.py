@@ -21,6 +21,7 @@ from recon.core.values import (
     TriangleMesh,
 )
 from recon.core.values.arrays import Float64
+from recon.odometry.expected import ExpectedDrift
 from recon.odometry.protocol import OdometryHealth
 
 HEIGHT_PX, WIDTH_PX = 24, 60
@@ -120,6 +121,7 @@ def drive(
         health=health,
         sample=SimpleNamespace(pair=pair, disparity=disparity),
         loops=None,
+        expected_drift=ExpectedDrift(0.8, 0.7, 12.0),
     )
     return SimpleNamespace(
         name="drives/drive <1>",

@@ -80,12 +80,12 @@ def test_paths_and_cloud_are_drawn_in_the_same_axes(drive: SimpleNamespace) -> N
     assert high == pytest.approx(10.0, abs=0.3)
 
 
-def test_page_of_a_drive_with_nothing_but_a_path_is_made(drive: SimpleNamespace) -> None:
-    drive.truth = drive.metrics = drive.cloud = drive.mesh = drive.grid = None
+def test_page_of_a_drive_with_nothing_but_path_and_grid_is_made(drive: SimpleNamespace) -> None:
+    drive.truth = drive.metrics = drive.cloud = drive.mesh = None
     drive.summary, drive.mapped.health = {}, ()
     page = map_html(drive)
     assert "Path from above" in blocks(page)
-    assert not {"In 3-D", "Occupancy grid", "Notes of the odometry"} & blocks(page).keys()
+    assert not {"In 3-D", "Notes of the odometry"} & blocks(page).keys()
 
 
 def test_page_of_a_pair_without_any_disparity_is_made(

@@ -176,7 +176,7 @@ def open_localizer(
     known = known_places(map_)
     among = None
     if start is not None:
-        among = start.near(map_.linked[0].T_map_world @ known.T_world_camera)
+        among = start.near(map_.first.T_map_world @ known.T_world_camera)
         if not among.any():
             raise MappingError(
                 "no keyframe of the map is near the start pose",
@@ -235,7 +235,7 @@ def localize_sequence(
         progress.on_finish()
     if not frames:
         raise RegistrationError("the source has no frame", where=source.name)
-    T_map_world = map_.linked[0].T_map_world
+    T_map_world = map_.first.T_map_world
     return LocalizedDrive(tuple(frames), T_map_world, time.perf_counter() - begun)
 
 

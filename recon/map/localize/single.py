@@ -26,6 +26,6 @@ def locate_pair(
             together.
     """
     known = known_places(map_)
-    camera = calibration or map_.sessions[0].camera
+    camera = calibration or map_.first.camera
     frame = OdometryFrame(*FrameReconstructor(camera, config or DriveSettings()).match(pair))
     return Localizer(known, frames=1).add(frame)

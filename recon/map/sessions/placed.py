@@ -61,7 +61,7 @@ def place_map(map_: Map, settings: DriveSettings, *, fuse: bool = True) -> Place
     sessions = map_.linked
     for session in sessions:
         check_rays(session, settings)
-    T_map_world = sessions[0].T_map_world
+    T_map_world = map_.first.T_map_world
     if len(sessions) == 1:
         submaps, corrections = with_occupancy(sessions[0], settings), sessions[0].corrections()
     else:
@@ -85,7 +85,7 @@ def _joined(map_: Map, sessions: Sequence[Session], settings: DriveSettings) -> 
 def _moved(map_: Map, session: Session, settings: DriveSettings) -> Iterator[Submap]:
     """Put the submaps of a drive in its place: sums are moved, rays cast where they were seen."""
     T_world_session, corrections = map_.T_world_session(session), session.corrections()
-    T_map_world = map_.linked[0].T_map_world
+    T_map_world = map_.first.T_map_world
     poses = T_world_session @ session.trajectory.T_world_camera
     for number, submap in enumerate(with_occupancy(session, settings, T_map_world, poses)):
         T = T_world_session if corrections is None else T_world_session @ corrections[number]

@@ -103,7 +103,7 @@ class Map:
         Raises:
             FormatError: The axes are not known.
         """
-        return invert(self.linked[0].T_map_world) @ session.T_map_world
+        return invert(self.first.T_map_world) @ session.T_map_world
 
     @property
     def links(self) -> list[Link]:
@@ -129,6 +129,17 @@ class Map:
         with reading(self.store.name):
             numbers = self.store.get(LINKS, 0)["linked"]
             return [session for session in self.sessions if session.number in numbers]
+
+    @property
+    def first(self) -> Session:
+        """The drive whose world and axes are those of the map.
+
+        Raises:
+            FormatError: The map has no drive.
+        """
+        if not (linked := self.linked):
+            raise FormatError("the map has no drive", where=self.store.name)
+        return linked[0]
 
     def set_links(self, links: Sequence[Link], linked: Collection[int]) -> None:
         """Keep the links, and the numbers of the drives that share the axes of the map.
@@ -171,7 +182,7 @@ class Map:
         """
         from recon.map.sessions.placed import place_map, settings_of  # noqa: PLC0415 - it is above
 
-        return place_map(self, settings or settings_of(self.linked[0])).tiles
+        return place_map(self, settings or settings_of(self.first)).tiles
 
     def localize(
         self,
