@@ -119,7 +119,7 @@ def test_the_process_of_a_job_dies_with_its_worker(tmp_path: Path) -> None:
         "print(child.pid, flush=True)\n"
         "time.sleep(600)\n"
     )
-    guard = Path(__file__).parents[2] / "recon" / "batch" / "guard.py"
+    guard = Path(__file__).parents[3] / "recon" / "run" / "batch" / "guard.py"
     start = (
         "import subprocess, sys\n"
         "job = subprocess.Popen(sys.argv[1:], stdin=subprocess.PIPE, start_new_session=True)\n"
