@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from recon.commands.config import ReconConfig, load_config
+from recon.commands.identity import identity_of
 from recon.commands.map_options import MapOptions
-from recon.commands.resume import begin_or_resume, identity_of, tell_how_to_resume
+from recon.commands.resume import begin_or_resume, with_resume_hint
 from recon.evaluation.drive import compare_with_truth
 from recon.export.paths import export_paths
 from recon.export.products import Products, write_products
@@ -60,7 +61,7 @@ def run_map(
             progress=options.progress,
             resume=options.resume,
         ) as run,
-        tell_how_to_resume(run),
+        with_resume_hint(run),
         begin_or_resume(run, source, config, identity, options.arguments) as map_,
     ):
         mapped = map_sequence(
@@ -117,7 +118,7 @@ def run_map(
 
 
 def _warnings(source: StereoSource, mapped: MappedSequence) -> list[str]:
-    """What the user should know about the drive."""
+    """Return what the user should know about the drive."""
     left_out = source.left_out if isinstance(source, IncompleteSource) else 0
     images = "image has" if left_out == 1 else "images have"
     return [

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
-import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,35 +10,16 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
+from recon.commands.identity import refuse_others
 from recon.commands.map_options import MapRequest
-from recon.core.errors import (
-    FormatError,
-    MemoryLimitError,
-    OutputError,
-    ReconError,
-    SettingsError,
-)
-from recon.core.values import Trajectory
+from recon.core.errors import FormatError, MemoryLimitError, OutputError, ReconError
 from recon.map.drive.workspace import ANEW, resuming, session_info
 from recon.map.store.map import Map
 from recon.run.directory import RECORD, STARTED, RunDirectory, state_folder
-from recon.run.machine import versions
 from recon.run.memory import memory_overrides
-from recon.run.record import fingerprint
 from recon.sources.protocol import StereoSource
 
-_OTHER: Final = {
-    "config": "other settings",
-    "source": "another source",
-    "poses": "other poses",
-    "prior": "another prior",
-    "versions": "other versions",
-}
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_HEAD_BYTES: Final = 4096
-_MEMORY: Final = "memory"
-_NOTHING: Final = "there is no unfinished run to resume"
-_START_ANEW: Final = "start it without --resume"
 
 
 def resumed(
@@ -68,33 +47,10 @@ def resumed(
     settings = ReconConfig.parse(started["identity"]["config"], where=str(folder))
     asked = load_config(config, [*overrides, *memory_overrides(memory_limit)])
     if config is not None or overrides:
-        _refuse_others({"config": asked.model_dump(mode="json")}, started["identity"], folder)
+        refuse_others({"config": asked.model_dump(mode="json")}, started["identity"], folder)
     if asked.memory.limit_mb is not None:
-        settings = settings.model_copy(update={_MEMORY: asked.memory})
+        settings = settings.model_copy(update={"memory": asked.memory})
     return request, settings
-
-
-def identity_of(
-    source: StereoSource,
-    config: ReconConfig,
-    known_poses: Trajectory | None,
-    prior: Trajectory | None = None,
-) -> dict[str, Any]:
-    """Everything that must be unchanged for a resumed run to give the same result."""
-    return {
-        "config": config.model_dump(mode="json"),
-        "source": {"frames": len(source), **fingerprint(source.files, head_bytes=_HEAD_BYTES)},
-        "poses": _digest(known_poses),
-        "prior": _digest(prior),
-        "versions": versions(),
-    }
-
-
-def _digest(path: Trajectory | None) -> str | None:
-    """SHA-256 of the poses and timestamps; None = no trajectory."""
-    if path is None:
-        return None
-    return hashlib.sha256(path.T_world_camera.tobytes() + path.timestamps_s.tobytes()).hexdigest()
 
 
 def begin_or_resume(
@@ -113,7 +69,7 @@ def begin_or_resume(
     """
     path, memory = directory.state(STARTED), config.memory.cache_bytes
     if directory.resumes:
-        _refuse_others(identity, read_started(directory.folder)["identity"], directory.folder)
+        refuse_others(identity, read_started(directory.folder)["identity"], directory.folder)
         with resuming(path):
             return Map.open(path, read_only=False, cache_bytes=memory)
     map_ = Map.create(path, cache_bytes=memory)
@@ -124,7 +80,7 @@ def begin_or_resume(
 
 
 @contextmanager
-def tell_how_to_resume(directory: RunDirectory) -> Iterator[None]:
+def with_resume_hint(directory: RunDirectory) -> Iterator[None]:
     """Add a hint on how to resume to errors after which the run can be resumed.
 
     Raises:
@@ -134,24 +90,21 @@ def tell_how_to_resume(directory: RunDirectory) -> Iterator[None]:
     try:
         yield
     except (OutputError, MemoryLimitError, OSError, MemoryError, KeyboardInterrupt) as error:
-        told = _with_hint(error, directory.folder) if directory.resumable else None
-        if told is None:
+        hinted = _with_hint(error, directory.folder) if directory.resumable else None
+        if hinted is None:
             raise
-        raise told from error
+        raise hinted from error
 
 
 def _with_hint(error: BaseException, folder: Path) -> BaseException | None:
-    """The error with a hint on how to resume; None if it is raised unchanged."""
+    """Return the error with a hint on how to resume; None if it is raised unchanged."""
     hint = f"recon map --resume {shlex.quote(str(folder))} goes on from there"
     if isinstance(error, KeyboardInterrupt):
         return KeyboardInterrupt(hint)
     if isinstance(error, OutputError):
-        return OutputError(error.what, where=error.where, got=error.got, hint=hint)
+        return error.but(hint=hint)
     if isinstance(error, MemoryLimitError):
-        more = f"{hint} with a larger --memory-limit"
-        return MemoryLimitError(
-            error.what, where=error.where, got=error.got, expected=error.expected, hint=more
-        )
+        return error.but(hint=f"{hint} with a larger --memory-limit")
     if isinstance(error, MemoryError):
         return MemoryLimitError("out of memory", hint=f"{hint}; give it a --memory-limit")
     if isinstance(error, OSError) and error.errno in _NO_ROOM:
@@ -160,7 +113,7 @@ def _with_hint(error: BaseException, folder: Path) -> BaseException | None:
 
 
 def read_started(folder: Path) -> dict[str, Any]:
-    """Read what an unfinished run was started with.
+    """Read what an unfinished run was started with: its ``identity`` and ``arguments``.
 
     Raises:
         OutputError: The folder holds no unfinished run.
@@ -174,13 +127,15 @@ def read_started(folder: Path) -> dict[str, Any]:
             raise FormatError(
                 "the unfinished map cannot be read", where=path, got=error, hint=ANEW
             ) from error
-        finished = (folder / RECORD).is_file()
-        hint = "it is finished; without --resume it runs again" if finished else _START_ANEW
-        raise OutputError(_NOTHING, where=folder, hint=hint) from error
+        finished = "it is finished; without --resume it runs again"
+        hint = finished if (folder / RECORD).is_file() else "start it without --resume"
+        raise OutputError(
+            "there is no unfinished run to resume", where=folder, hint=hint
+        ) from error
 
 
 def _checked(started: Any) -> dict[str, Any]:
-    """What a run was started with, if it has the form that `begin_or_resume` writes.
+    """Check that it has the form that `begin_or_resume` writes.
 
     Raises:
         TypeError: A part has another type; a `LookupError` if it is missing.
@@ -190,36 +145,3 @@ def _checked(started: Any) -> dict[str, Any]:
     if not plain or not all(isinstance(v, str | bool | None) for v in parts[-1].values()):
         raise TypeError("not what a run is started with")
     return {"identity": parts[0], "arguments": parts[-1]}
-
-
-def _refuse_others(now: Mapping[str, Any], then: Mapping[str, Any], folder: Path) -> None:
-    """Refuse to resume with inputs or settings that differ."""
-    # Through JSON, like the stored values, so that tuples equal lists.
-    for part, value in json.loads(json.dumps(dict(now))).items():
-        after, before = _without_limit(value), _without_limit(then.get(part))
-        if after == before:
-            continue
-        key, got, expected = _first_difference(after, before, part)
-        raise SettingsError(
-            f"the run was started with {_OTHER[part]}",
-            where=folder,
-            got=f"{key} = {got}",
-            expected=expected,
-            hint="resume with what it was started with, or start anew without --resume",
-        )
-
-
-def _without_limit(part: Any) -> Any:
-    """A part of an identity without the memory limit, which a resumed run may change."""
-    if not isinstance(part, dict):
-        return part
-    return {name: value for name, value in part.items() if name != _MEMORY}
-
-
-def _first_difference(now: Any, then: Any, key: str) -> tuple[str, Any, Any]:
-    """Dotted key and the two values of the first leaf that differs."""
-    if isinstance(now, dict) and isinstance(then, dict):
-        for name in [*now, *(then.keys() - now.keys())]:
-            if now.get(name) != then.get(name):
-                return _first_difference(now.get(name), then.get(name), f"{key}.{name}")
-    return key, now, then

@@ -27,6 +27,8 @@ from __future__ import annotations
 from os import PathLike
 from typing import Any, Final
 
+from typing_extensions import Self
+
 _LONGEST: Final = 300
 """Letters of a value in a message: content from outside may have any length."""
 
@@ -57,6 +59,11 @@ class ReconError(Exception):
         self.expected = expected
         self.hint = hint
         super().__init__(self._line())
+
+    def but(self, **parts: Any) -> Self:
+        """Return the same error with other ``where``, ``got``, ``expected`` or ``hint``."""
+        own = {name: getattr(self, name) for name in ("where", "got", "expected", "hint")}
+        return type(self)(self.what, **{**own, **parts})
 
     def _line(self) -> str:
         found = [

@@ -39,14 +39,12 @@ def naming(path: StrPath) -> Iterator[None]:
     except ReconError as error:
         if error.where is not None:
             raise
-        raise type(error)(
-            error.what, where=path, got=error.got, expected=error.expected, hint=error.hint
-        ) from error
+        raise error.but(where=path) from error
 
 
 @contextmanager
 def reading(path: StrPath) -> Iterator[None]:
-    """Yield the name the file in every error raised while its content is parsed.
+    """Name the file in every error that is raised while its content is parsed.
 
     Content from outside can make a parser raise anything. Around parsing, and only there, every
     exception is a fault of the file; elsewhere it is a fault of ours and must not pass as one.

@@ -135,14 +135,11 @@ def plan_by_features(images: ImagePairs) -> RectifyPlan:
     except CalibrationError as error:
         if len(images.pairs) > 1:
             raise
-        raise CalibrationError(
-            error.what,
-            where=images.pairs[0][0],
-            got=error.got,
-            expected=error.expected,
-            hint=f"{error.hint}; or it has too few good matches, and several pairs are needed: "
-            "give two folders of one rig, or a calibration with --calib",
-        ) from error
+        more = (
+            "several pairs are needed: give two folders of one rig, or a calibration with --calib"
+        )
+        hint = f"{error.hint}; or it has too few good matches, and {more}"
+        raise error.but(where=images.pairs[0][0], hint=hint) from error
 
     def warp(pair: StereoPair) -> tuple[UInt8, UInt8]:
         left, right = (
