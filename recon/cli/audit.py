@@ -7,28 +7,13 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import (
-    SOURCES_HELP,
-    Calib,
-    Config,
-    End,
-    Json,
-    LeftView,
-    Quiet,
-    RightView,
-    Set,
-    SourceKind,
-    Start,
-    Stride,
-    Tolerance,
-    Verbose,
-)
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_figures, print_json
 
 
 def audit(
-    source: Annotated[Path, typer.Argument(help=SOURCES_HELP)],
+    source: Annotated[Path, typer.Argument(help=opt.SOURCES_HELP)],
     mend: Annotated[
         Path | None,
         typer.Option(help="Write a calibration with corrected row alignment to this file."),
@@ -37,19 +22,19 @@ def audit(
         Path | None,
         typer.Option("--out", "-o", help="Folder for a report with images.", show_default="none"),
     ] = None,
-    kind: SourceKind = None,
-    calib: Calib = None,
-    left: LeftView = None,
-    right: RightView = None,
-    tolerance: Tolerance = None,
-    start: Start = None,
-    end: End = None,
-    stride: Stride = None,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    kind: opt.SourceKind = None,
+    calib: opt.Calib = None,
+    left: opt.LeftView = None,
+    right: opt.RightView = None,
+    tolerance: opt.Tolerance = None,
+    start: opt.Start = None,
+    end: opt.End = None,
+    stride: opt.Stride = None,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Check a recording before a long run: good, usable or not usable, and why.
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Json, Out, Quiet, Set, Verbose
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_batch, print_json
 
@@ -17,7 +17,7 @@ What = Annotated[list[str] | None, typer.Argument(metavar="JOBS|COMMAND SOURCE..
 
 def batch(
     what: What = None,
-    out: Out = None,
+    out: opt.Out = None,
     resume: Annotated[
         Path | None, typer.Option(help="Do what is missing of the batch in this folder.")
     ] = None,
@@ -59,10 +59,10 @@ def batch(
         list[str] | None,
         typer.Option(help="Word for each command line, e.g. --option=--no-mesh. May be repeated."),
     ] = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Run many commands, side by side, on this machine or a cluster.
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Json, Quiet
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_figures, print_json
 
@@ -38,8 +38,8 @@ def board(
         float,
         typer.Option(min=30, max=2400, help="Approximate resolution of a PNG, in pixels per inch."),
     ] = 300.0,
-    json: Json = False,
-    quiet: Quiet = False,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Draw a calibration board to scale, for printing.
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from recon.cli.options import Config, Json, Quiet, Set, Threads, Verbose
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
@@ -61,12 +61,12 @@ def calibrate(
             show_default="outputs/calibrate/<UTC time stamp>",
         ),
     ] = None,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    threads: Threads = None,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
 ) -> None:
     """Calibrate a stereo rig from images of a board, predict its depth error, and judge it.
 

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Quiet, Set
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_figures, print_json
 
@@ -35,10 +35,10 @@ def capture(
     preview: Annotated[
         int | None, typer.Option(min=1, help="Update preview.jpg every N pairs.")
     ] = None,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Record a drive from two cameras, or from one that has both views side by side.
 

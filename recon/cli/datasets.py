@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Json, Quiet, Verbose
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_datasets, print_json
 
@@ -29,8 +29,8 @@ def list_(
         str | None, typer.Argument(help="A data set, to list its parts.", show_default="all")
     ] = None,
     folder: Folder = _FOLDER,
-    json: Json = False,
-    quiet: Quiet = False,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """List the data sets with size, licence and what is there already.
 
@@ -60,9 +60,9 @@ def fetch(
             show_default="the owners' server",
         ),
     ] = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Download, check and unpack data sets as recon reads them.
 
@@ -85,7 +85,7 @@ def fetch(
 
 @app.command()
 def verify(
-    names: Names, folder: Folder = _FOLDER, json: Json = False, quiet: Quiet = False
+    names: Names, folder: Folder = _FOLDER, json: opt.Json = False, quiet: opt.Quiet = False
 ) -> None:
     """Compare the files of fetched data sets with what was unpacked.
 

@@ -6,26 +6,26 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Mesh, Out, Quiet, Set, Threads, Verbose
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
 
 def demo(
-    out: Out = None,
+    out: opt.Out = None,
     frames: Annotated[
         int | None, typer.Option(min=1, help="Number of frames.", show_default="40")
     ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, help="Seed of the street.", show_default="0")
     ] = None,
-    mesh: Mesh = True,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    threads: Threads = None,
+    mesh: opt.Mesh = True,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
 ) -> None:
     """Render a synthetic street drive, map it and compare the result with the truth.
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Json, Quiet
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_json
 
@@ -16,8 +16,8 @@ def doctor(
         bool,
         typer.Option("--compile", help="Compile the kernels now, instead of checking anything."),
     ] = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Check the installation: Python, packages, system libraries, memory, folders.
 

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from recon.cli import options as opt
 from recon.cli.evaluate_middlebury import middlebury
-from recon.cli.options import Json, Quiet, parse_numbers
 from recon.cli.session import session
 from recon.cli.show.tables import print_evaluation, print_figures, print_json
 
@@ -35,8 +35,8 @@ def disparity(
     confidence: Annotated[
         Path | None, typer.Option(help="Confidence of the map (PFM), to be evaluated too.")
     ] = None,
-    json: Json = False,
-    quiet: Quiet = False,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Compare a disparity map with ground truth: Middlebury's measures and KITTI's D1.
 
@@ -100,8 +100,8 @@ def trajectory(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for a report and its plots.")
     ] = None,
-    json: Json = False,
-    quiet: Quiet = False,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Compare a trajectory with ground truth: KITTI's relative errors, ATE and RPE.
 
@@ -118,7 +118,7 @@ def trajectory(
 
         asked = {
             "alignment": align,
-            "lengths_m": parse_numbers(lengths, "--lengths"),
+            "lengths_m": opt.parse_numbers(lengths, "--lengths"),
             "step_frames": step,
             "rpe_frames": rpe_frames,
         }
@@ -138,8 +138,8 @@ def occupancy(
     picture: Annotated[
         Path | None, typer.Option(help="PNG to draw: the grid with its errors in colour.")
     ] = None,
-    json: Json = False,
-    quiet: Quiet = False,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Compare voxels and grid of a demo run with the exact truth.
 
@@ -194,8 +194,8 @@ def map_(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for clouds coloured by error.")
     ] = None,
-    json: Json = False,
-    quiet: Quiet = False,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """Compare a map with a reference cloud: precision, recall and F-score.
 
@@ -215,7 +215,7 @@ def map_(
             frame=reference_frame,
             align_to=align_to,
             icp=align == "icp",
-            thresholds_m=parse_numbers(threshold, "--threshold") or (),
+            thresholds_m=opt.parse_numbers(threshold, "--threshold") or (),
             out=out,
         )
     print_json(figures) if json else print_evaluation(f"{run} against {reference}", figures)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_json
 
@@ -55,16 +55,16 @@ def middlebury(
             "truth), or estimated from each pair.",
         ),
     ] = "scene",
-    out: Out = None,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
+    out: opt.Out = None,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
     latex: Annotated[
         bool, typer.Option("--latex", help="Print the tables in LaTeX, the best value in bold.")
     ] = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    threads: Threads = None,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
 ) -> None:
     """Score matchers on Middlebury scenes with the measures of the benchmark.
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Formats, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
@@ -22,18 +22,18 @@ def export(
             show_default="all",
         ),
     ] = None,
-    out: Out = None,
-    formats: Formats = None,
+    out: opt.Out = None,
+    formats: opt.Formats = None,
     resolution: Annotated[
         float | None,
         typer.Option(help="Cell size of grid and OctoMap in metres.", show_default="as in the run"),
     ] = None,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    threads: Threads = None,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
 ) -> None:
     """Make the cloud, grid, OctoMap or mesh of a run again, with other settings or formats.
 

@@ -8,33 +8,14 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import (
-    SOURCES_HELP,
-    Calib,
-    Config,
-    End,
-    Json,
-    LeftView,
-    Matcher,
-    MemoryLimit,
-    Mesh,
-    Out,
-    Quiet,
-    RightView,
-    Set,
-    SourceKind,
-    Stride,
-    Threads,
-    Tolerance,
-    Verbose,
-)
+from recon.cli import options as opt
+from recon.cli.drive import StartInMap, open_drive, read_start
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
-from recon.cli.start_pose import StartInMap, read_start
 
 
 def live(
-    source: Annotated[Path, typer.Argument(help=SOURCES_HELP)],
+    source: Annotated[Path, typer.Argument(help=opt.SOURCES_HELP)],
     rate: Annotated[
         float, typer.Option(help="How many times as fast as recorded the source is played.")
     ] = 1.0,
@@ -46,24 +27,24 @@ def live(
             show_default="make a map",
         ),
     ] = None,
-    out: Out = None,
-    kind: SourceKind = None,
-    calib: Calib = None,
-    left: LeftView = None,
-    right: RightView = None,
-    tolerance: Tolerance = None,
+    out: opt.Out = None,
+    kind: opt.SourceKind = None,
+    calib: opt.Calib = None,
+    left: opt.LeftView = None,
+    right: opt.RightView = None,
+    tolerance: opt.Tolerance = None,
     start: StartInMap = None,
-    end: End = None,
-    stride: Stride = None,
-    matcher: Matcher = None,
-    mesh: Mesh = False,
-    memory_limit: MemoryLimit = None,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    threads: Threads = None,
+    end: opt.End = None,
+    stride: opt.Stride = None,
+    matcher: opt.Matcher = None,
+    mesh: opt.Mesh = False,
+    memory_limit: opt.MemoryLimit = None,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
 ) -> None:
     """Map a drive while its images arrive: the source is played at its time stamps.
 
@@ -77,8 +58,6 @@ def live(
       recon live rides/today --map outputs/map/latest
     """
     with session(quiet=quiet):
-        from recon.cli.show.announce import announce
-        from recon.cli.show.progress import choose_viewer
         from recon.commands.config import load_config, matching_overrides, source_overrides
         from recon.commands.live import run_live
         from recon.commands.map_options import MapRequest
@@ -88,9 +67,8 @@ def live(
         views = source_overrides(calib, left, right, tolerance, (first, end, stride))
         overrides = [*(set_ or ()), *matching_overrides(matcher), *views]
         settings = load_config(config, [*overrides, *memory_overrides(memory_limit)])
-        drive, options = MapRequest(source, kind, mesh=mesh).open(settings)
-        announce(drive, quiet=quiet, verbose=verbose)
-        viewer = choose_viewer(quiet=quiet, verbose=verbose)
-        options = replace(options, command="live", out=out, threads=threads, progress=viewer)
+        request = MapRequest(source, kind, mesh=mesh)
+        drive, options = open_drive(request, settings, quiet=quiet, verbose=verbose)
+        options = replace(options, command="live", out=out, threads=threads)
         summary = run_live(drive, settings, options, rate=rate, map_path=map_, start=pose)
     print_json(summary) if json else print_run(summary, stages=verbose)

@@ -9,42 +9,23 @@ from typing import Annotated, Literal
 
 import typer
 
-from recon.cli.options import (
-    Calib,
-    Config,
-    End,
-    Json,
-    LeftView,
-    Matcher,
-    MemoryLimit,
-    Mesh,
-    Out,
-    Quiet,
-    RightView,
-    Set,
-    SourceArgument,
-    SourceKind,
-    Start,
-    Stride,
-    Threads,
-    Tolerance,
-    Verbose,
-)
+from recon.cli import options as opt
+from recon.cli.drive import open_drive
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
 
 def map_(
-    source: SourceArgument = None,
-    out: Out = None,
-    kind: SourceKind = None,
-    calib: Calib = None,
-    left: LeftView = None,
-    right: RightView = None,
-    tolerance: Tolerance = None,
-    start: Start = None,
-    end: End = None,
-    stride: Stride = None,
+    source: opt.SourceArgument = None,
+    out: opt.Out = None,
+    kind: opt.SourceKind = None,
+    calib: opt.Calib = None,
+    left: opt.LeftView = None,
+    right: opt.RightView = None,
+    tolerance: opt.Tolerance = None,
+    start: opt.Start = None,
+    end: opt.End = None,
+    stride: opt.Stride = None,
     odometry: Annotated[
         Literal["fused", "visual", "kiss"] | None,
         typer.Option(
@@ -64,8 +45,8 @@ def map_(
             "file on the clock of the images, or a topic of the bag, such as /odom.",
         ),
     ] = None,
-    matcher: Matcher = None,
-    mesh: Mesh = True,
+    matcher: opt.Matcher = None,
+    mesh: opt.Mesh = True,
     resume: Annotated[
         Path | None,
         typer.Option(help="Continue the interrupted run in this folder; without SOURCE."),
@@ -83,13 +64,13 @@ def map_(
             metavar="SESSION", help="With --into, without SOURCE: take a drive out of its map."
         ),
     ] = None,
-    memory_limit: MemoryLimit = None,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    threads: Threads = None,
+    memory_limit: opt.MemoryLimit = None,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
 ) -> None:
     """Map a stereo drive: trajectory, point cloud, Nav2 grid, OctoMap, mesh, report.
 
@@ -110,7 +91,7 @@ def map_(
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
     _check_folders(source, out, resume, into, remove)
     with session(quiet=quiet):
-        from recon.cli.show.announce import announce, warn
+        from recon.cli.show.announce import warn
         from recon.cli.show.progress import choose_viewer
         from recon.commands.config import (
             load_config,
@@ -135,20 +116,16 @@ def map_(
             settings = load_config(config, [*overrides, *limit])
         else:
             request, settings = resumed(resume, request, config, overrides, memory_limit)
-        viewer = choose_viewer(quiet=quiet, verbose=verbose)
         if into is not None and remove is not None:
+            viewer = choose_viewer(quiet=quiet, verbose=verbose)
             options = MapOptions(threads=threads, mesh=mesh, progress=viewer)
             summary = run_remove(into, remove, settings, options)
         else:
-            drive, options = request.open(settings)
-            announce(drive, quiet=quiet, verbose=verbose)
+            drive, options = open_drive(request, settings, quiet=quiet, verbose=verbose)
+            tell = partial(warn, quiet=quiet, verbose=verbose)
+            going_on = resume is not None
             options = replace(
-                options,
-                out=resume or out,
-                threads=threads,
-                resume=resume is not None,
-                progress=viewer,
-                tell=partial(warn, quiet=quiet, verbose=verbose),
+                options, out=resume or out, threads=threads, resume=going_on, tell=tell
             )
             if into is None:
                 summary = run_map(drive, settings, options).summary

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Mesh, Out, Quiet, Set, Threads, Verbose
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
@@ -17,14 +17,14 @@ def merge(
         list[Path],
         typer.Argument(metavar="RUN RUN...", help="Folders of finished runs, the oldest first."),
     ],
-    out: Out = None,
-    mesh: Mesh = True,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    threads: Threads = None,
+    out: opt.Out = None,
+    mesh: opt.Mesh = True,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
 ) -> None:
     """Make one map of several runs: linked by places that two of them saw.
 

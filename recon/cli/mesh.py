@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Formats, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
@@ -20,14 +20,14 @@ def mesh(
             help="PLY point cloud (normals and colours are used), or the folder of a run.",
         ),
     ],
-    out: Out = None,
-    formats: Formats = None,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    threads: Threads = None,
+    out: opt.Out = None,
+    formats: opt.Formats = None,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
 ) -> None:
     """Reconstruct a surface mesh from a PLY point cloud, or from a run of map or pair.
 

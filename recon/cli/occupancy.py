@@ -7,14 +7,14 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
 
 def occupancy(
     run: Annotated[Path, typer.Argument(help="Folder of a recon map or recon demo run.")],
-    out: Out = None,
+    out: opt.Out = None,
     resolution: Annotated[
         float | None, typer.Option(help="Cell size in metres.", show_default="as in the run")
     ] = None,
@@ -29,12 +29,12 @@ def occupancy(
         float | None,
         typer.Option(help="Ignore obstacles farther than this from the camera, in metres."),
     ] = None,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    threads: Threads = None,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
 ) -> None:
     """Make another Nav2 grid and OctoMap of a run: cell size, height band, range.
 

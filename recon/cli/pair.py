@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Formats, Json, Matcher, Out, Quiet, Set, Threads, Verbose
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
@@ -69,16 +69,16 @@ def pair(
         Path | None,
         typer.Option(help="Ground-truth disparity (PFM or 16-bit PNG) to compare with."),
     ] = None,
-    out: Out = None,
-    formats: Formats = None,
-    matcher: Matcher = None,
+    out: opt.Out = None,
+    formats: opt.Formats = None,
+    matcher: opt.Matcher = None,
     ndisp: Ndisp = None,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    threads: Threads = None,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
 ) -> None:
     """Reconstruct one stereo pair: disparity, depth, point cloud, mesh, report.
 
@@ -125,15 +125,15 @@ def disparity(
         Path | None,
         typer.Option(help=_CALIB_HELP + " Without one, the pair must be rectified already."),
     ] = None,
-    out: Out = None,
-    matcher: Matcher = None,
+    out: opt.Out = None,
+    matcher: opt.Matcher = None,
     ndisp: Ndisp = None,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    threads: Threads = None,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
 ) -> None:
     """Compute the disparity of one pair: PFM, 16-bit PNG, confidence, reason codes.
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Config, Json, Out, Quiet, Set, Threads, Verbose
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
@@ -24,13 +24,13 @@ def paper(
         bool,
         typer.Option("--as-printed", help="Also run the method as printed, and compare the two."),
     ] = False,
-    out: Out = None,
-    config: Config = None,
-    set_: Set = None,
-    json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    threads: Threads = None,
+    out: opt.Out = None,
+    config: opt.Config = None,
+    set_: opt.Set = None,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
 ) -> None:
     """Repeat experiments 2 to 4 of the paper that this project is based on.
 

@@ -15,7 +15,7 @@ _USAGE_ERROR: Any = typer.BadParameter.__base__
 
 
 def known_program() -> Program:
-    """What jobs can run: the commands of this program that write a result."""
+    """Return what jobs can run: the commands of this program that write a result."""
     from recon.cli import app
     from recon.commands.batch import COMMANDS
 

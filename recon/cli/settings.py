@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from recon.cli.options import Json, Quiet
+from recon.cli import options as opt
 from recon.cli.session import session
 from recon.cli.show.tables import print_json
 
@@ -22,8 +22,8 @@ def settings(
     markdown: Annotated[
         bool, typer.Option("--markdown", help="Print the page docs/settings.md.")
     ] = False,
-    json: Json = False,
-    quiet: Quiet = False,
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
 ) -> None:
     """List settings: name, default, unit, values, and what each does.
 

@@ -1,17 +1,21 @@
-"""The option that says where a drive begins in a map."""
+"""What commands that take a drive share: how it is opened, and where it begins in a map."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from recon.cli.options import parse_numbers
+from recon.cli import options as opt
 from recon.core.errors import SettingsError
 
 if TYPE_CHECKING:
+    from recon.commands.config import ReconConfig
+    from recon.commands.map_options import MapOptions, MapRequest
     from recon.map.localize.sequence import StartPose
+    from recon.sources.protocol import StereoSource
 
 StartInMap = Annotated[
     str | None,
@@ -25,13 +29,29 @@ StartInMap = Annotated[
 ]
 
 
+def open_drive(
+    request: MapRequest, settings: ReconConfig, *, quiet: bool, verbose: bool
+) -> tuple[StereoSource, MapOptions]:
+    """Open a drive, say how it is read, and return it with the options of its run.
+
+    Raises:
+        ReconError: It cannot be opened.
+    """
+    from recon.cli.show.announce import announce
+    from recon.cli.show.progress import choose_viewer
+
+    drive, options = request.open(settings)
+    announce(drive, quiet=quiet, verbose=verbose)
+    return drive, replace(options, progress=choose_viewer(quiet=quiet, verbose=verbose))
+
+
 def read_start(text: str | None) -> tuple[StartPose | None, int | None]:
     """Read where a drive begins: a pose ``x,y,yaw``, or the number of its first frame.
 
     Raises:
         SettingsError: It is neither.
     """
-    numbers = parse_numbers(text, "--start") or ()
+    numbers = opt.parse_numbers(text, "--start") or ()
     if not numbers:
         return None, None
     if len(numbers) == 3 and all(map(math.isfinite, numbers)):
