@@ -29,7 +29,7 @@ def match(
     matcher: str | Matcher = "sad",
     **settings: Any,
 ) -> Disparity:
-    """Disparity of two images.
+    """Match two images: return their disparity.
 
     Args:
         left: uint8 (H, W) grey or (H, W, 3) RGB.
@@ -63,7 +63,7 @@ def reconstruct(
     *,
     matcher: str | Matcher | None = None,
 ) -> ReconstructedFrame:
-    """Rectified pair, disparity and cloud (camera axes, metres) of two images.
+    """Reconstruct two images: rectified pair, disparity and cloud (camera axes, metres).
 
     Args:
         left: uint8 (H, W) grey or (H, W, 3) RGB.
@@ -81,7 +81,7 @@ def reconstruct(
 
 
 def _rig_of(calibration: Calibration, pair: StereoPair) -> _Rig:
-    """The calibration, read for images of this size if it is a file."""
+    """Return the calibration, read for images of this size if it is a file."""
     if isinstance(calibration, RectifiedCamera | StereoCalibration):
         return calibration
     height_px, width_px = pair.left.shape[:2]
@@ -89,7 +89,7 @@ def _rig_of(calibration: Calibration, pair: StereoPair) -> _Rig:
 
 
 def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of one matcher as a part of those of all."""
+    """Return the settings of one matcher as a part of those of all."""
     if isinstance(matcher, str) and matcher in MATCHERS:
         return {field_of(matcher): settings}
     if settings:

@@ -92,7 +92,7 @@ def run_calibration(
 
 
 def _videos(left: str, right: str | None) -> list[Path]:
-    """The arguments if they are videos, else nothing."""
+    """Return the arguments if they are videos, else nothing."""
     sides = [side for side in (left, right) if side is not None]
     videos = [Path(side) for side in sides if is_video(side)]
     if len(videos) != len(sides) and (videos or right is None):

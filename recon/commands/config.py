@@ -45,7 +45,7 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfi
         return most if limit_mb is None else min(most, limit_mb / _BYTES_PER_PIXEL)
 
     def recorded(self, command: str) -> dict[str, Any]:
-        """The groups that determine the result of a command.
+        """Return the groups that determine the result of a command.
 
         What is open by default and open here is left out; so are the settings of matchers that
         are not used, and a street that is the usual one.
@@ -135,7 +135,7 @@ def run_settings(
     overrides: Sequence[str] = (),
     without: Collection[str] = (),
 ) -> ReconConfig:
-    """The settings of a finished run of map, demo or pair, with changes.
+    """Return the settings of a finished run of map, demo or pair, with changes.
 
     Args:
         folder: Folder of the run.
@@ -183,7 +183,7 @@ def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[st
 
 
 def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> list[str]:
-    """Overrides for the matcher and its disparity range; None = unchanged."""
+    """Return overrides for the matcher and its disparity range; None = unchanged."""
     chosen = [] if matcher is None else [f"matching.matcher={matcher}"]
     fields = MatchingSettings.model_fields
     ranged = [
@@ -197,7 +197,7 @@ def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> 
 def pair_config(
     path: Path | None, overrides: Sequence[str], matcher: str | None, ndisp: int | None
 ) -> ReconConfig:
-    """The configuration of one pair, with its matcher and disparity range; None = unchanged.
+    """Return the configuration of one pair, with its matcher and disparity range; None = unchanged.
 
     Raises:
         SettingsError: As for `load_config`, or the matcher searches no range.
@@ -218,7 +218,7 @@ def source_overrides(
     tolerance_s: float | None,
     frames: tuple[int | None, int | None, int | None] = (None, None, None),
 ) -> list[str]:
-    """Overrides for facts that the files of a source do not contain; None = unchanged.
+    """Return overrides for facts that the files of a source do not contain; None = unchanged.
 
     Args:
         calib: Calibration file.
@@ -241,7 +241,7 @@ def source_overrides(
 
 
 def capture_overrides(size: str | None, rate_hz: float | None) -> list[str]:
-    """Overrides for a recording; None = unchanged.
+    """Return overrides for a recording; None = unchanged.
 
     Raises:
         SettingsError: The size is not of the form 1280x720.
@@ -258,7 +258,7 @@ def capture_overrides(size: str | None, rate_hz: float | None) -> list[str]:
 
 
 def _recorded(settings: Settings, usual: Sequence[Settings]) -> dict[str, Any]:
-    """The plain values of settings, without what is open here and in all of the usual ones."""
+    """Return the plain values of settings, without what is open here and in the usual ones."""
     plain = settings.model_dump(mode="json")
     for name in type(settings).model_fields:
         value, others = getattr(settings, name), [getattr(other, name) for other in usual]

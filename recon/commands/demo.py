@@ -49,7 +49,7 @@ def run_demo(
 
 
 def demo_source(config: ReconConfig) -> SyntheticSource:
-    """A street whose true surface extends as far as the map does.
+    """Return a street whose true surface extends as far as the map does.
 
     Surfaces beyond the range limit are not fused, so the ground truth leaves them out.
     """

@@ -121,12 +121,12 @@ def compile_kernels() -> WarmUp:
 
 
 def _read_again(octomap: Path) -> None:
-    """As a mesh of a run does, which asks where the cameras saw free space."""
+    """Read the map as a mesh of a run does, which asks where the cameras saw free space."""
     for _ in octomap_pieces(octomap):
         pass
 
 
 def _move_submaps(mapped: MappedSequence) -> None:
-    """As closed loops do; so small a drive has none."""
+    """Move the submaps as closed loops do; so small a drive has none."""
     turn = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.zeros(3))
     len(mapped.corrected(np.tile(turn, (len(mapped.submaps.entries), 1, 1))).tiles)

@@ -67,7 +67,7 @@ def run_evaluate_disparity(
 
 
 def _rated(values: Float32, path: Path) -> Disparity:
-    """A disparity map with the confidence read from a file."""
+    """Return a disparity map with the confidence read from a file."""
     confidence = read_pfm(path)
     if confidence.shape != values.shape:
         raise EvaluationError(

@@ -127,7 +127,7 @@ def _watched(
     parallel: int,
     progress: Progress,
 ) -> Iterator[tuple[str, SceneFigures | None]]:
-    """Figures of each scene, in order, some scenes at once."""
+    """Yield figures of each scene, in order, some scenes at once."""
     pool, last = ThreadPoolExecutor(parallel), time.perf_counter()
     try:
         scored = pool.map(score, paths.keys(), paths.values())

@@ -69,7 +69,7 @@ def run_export(
 def _export_pair(
     source: Path, config: ReconConfig, products: Sequence[str], run: Run, formats: Sequence[str]
 ) -> dict[str, Any]:
-    """Products of a run of `recon pair`."""
+    """Return products of a run of `recon pair`."""
     cloud, camera = source / PAIR_CLOUD, camera_of_pair(source)
     figures: dict[str, Any] = {"run": str(source), "cloud": str(cloud), "warnings": []}
     if "cloud" in products:
@@ -81,7 +81,7 @@ def _export_pair(
 
 
 def _known(products: Sequence[str], possible: Sequence[str]) -> Sequence[str]:
-    """The requested products, or all.
+    """Return the requested products, or all.
 
     Raises:
         SettingsError: One is unknown, or not possible for such a run.

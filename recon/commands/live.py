@@ -111,7 +111,7 @@ def _warm_up(source: StereoSource, config: ReconConfig, map_path: Path | None) -
 
 
 def _committed_often(config: ReconConfig, source: StereoSource, rate: float) -> ReconConfig:
-    """The configuration with a commit every few seconds, by the times of the first pairs."""
+    """Return the configuration with a commit every few seconds, by the times of the first pairs."""
     times_s = [pair.timestamp_s for pair in _Beginning(source)]
     period_s = (times_s[-1] - times_s[0]) / max(1, len(times_s) - 1) / rate if times_s else 0.0
     every = min(config.checkpoints.every_frames, max(1, round(_COMMIT_S / max(period_s, 1e-3))))

@@ -74,7 +74,7 @@ def run_localize(
 
 
 def _grid_of(folder: Path | None) -> OccupancyGrid | None:
-    """The grid of the run that made the map; None = there is none."""
+    """Return the grid of the run that made the map; None = there is none."""
     if folder is None or not (folder / GRID).is_file():
         return None
     return read_nav2(folder / GRID)

@@ -71,7 +71,7 @@ class MapRequest:
     mesh: bool = True
 
     def arguments(self) -> dict[str, Any]:
-        """The request as plain values, with absolute paths."""
+        """Return the request as plain values, with absolute paths."""
         prior = self.prior
         return {
             "source": _absolute(self.source),
@@ -83,7 +83,7 @@ class MapRequest:
 
     @classmethod
     def of(cls, arguments: Mapping[str, Any]) -> Self:
-        """The request with these `arguments`."""
+        """Return the request with these `arguments`."""
         source, poses = (arguments.get(name) for name in ("source", "poses"))
         return cls(
             source=None if source is None else Path(source),
@@ -94,7 +94,7 @@ class MapRequest:
         )
 
     def over(self, earlier: Self) -> Self:
-        """This request, with what it leaves open as in an earlier one.
+        """Return this request, with what it leaves open as in an earlier one.
 
         Raises:
             SettingsError: It wants no mesh, and the earlier one does.

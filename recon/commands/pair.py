@@ -133,7 +133,7 @@ def run_disparity(
 def _measure(
     given: PairInput, disparity: Disparity
 ) -> tuple[DisparityMetrics | None, dict[str, Any]]:
-    """Errors against ground truth if there is one, and the figures of a disparity with them."""
+    """Return the errors of a disparity, None without ground truth, and its figures with them."""
     figures = {"pair": given.pair.name, **disparity_figures(disparity)}
     if given.truth is None:
         return None, figures

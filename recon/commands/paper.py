@@ -62,7 +62,7 @@ def run_paper(
 
 
 def headline(summary: dict[str, Any]) -> dict[str, str]:
-    """One line for each experiment and method, for the command's table."""
+    """Return one line for each experiment and method, for the command's table."""
     lines = {}
     for number, experiment in summary["experiments"].items():
         for method, figures in experiment["methods"].items():

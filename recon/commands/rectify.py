@@ -81,7 +81,7 @@ def run_rectify(
 
 
 def _rectified_name(path: Path) -> str:
-    """The name of an image in its own file type; PNG for the types that are not written."""
+    """Return the name of an image in its own file type; PNG for the types that are not written."""
     return path.name if path.suffix.lower() in _KEPT_TYPES else f"{path.stem}.png"
 
 

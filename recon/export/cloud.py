@@ -80,7 +80,7 @@ class CloudSample:
             self._kept = [self._within_the_limit(join_clouds(self._kept))]
 
     def cloud(self) -> PointCloud:
-        """The sample."""
+        """Return the sample."""
         return join_clouds(self._kept)
 
     def _within_the_limit(self, cloud: PointCloud) -> PointCloud:
@@ -97,6 +97,6 @@ class CloudSample:
 
 
 def _first_of_cells(cloud: PointCloud, cell_m: float) -> NDArray[np.intp]:
-    """Indices of the first point in each cell, in order."""
+    """Return indices of the first point in each cell, in order."""
     keys = voxels.pack_keys(np.floor(cloud.xyz / cell_m).astype(np.int64))
     return np.sort(np.unique(keys, return_index=True)[1])

@@ -108,7 +108,7 @@ class _Flattening:
         return WrittenGrid(grid, height_m if driven else None, _warnings(height_m, driven))
 
     def _extent(self) -> tuple[TileKey, TileKey]:
-        """Smallest x and y of the cells, and the largest ones plus one."""
+        """Return the smallest x and y of the cells, and the largest ones plus one."""
         low, high = self._tiles.extent
         path_m = self._path_m[self._trusted, :2]
         if not len(path_m):
@@ -121,7 +121,7 @@ class _Flattening:
     def _flat(
         self, key: TileKey, settings: GroundSettings, path: DrivenPath | None
     ) -> OccupancyGrid | None:
-        """The grid of a tile and its margin; None without voxels or a path nearby."""
+        """Return the grid of a tile and its margin; None without voxels or a path nearby."""
         window = self._tiles.window(key).wider(settings.reach_m)
         path_m = window.path(self._path_m)
         if not len(path_m):
@@ -132,13 +132,13 @@ class _Flattening:
         return flatten(voxels, ground, self._config.grid) if len(voxels) else None
 
     def _ground_points(self, window: Window) -> PointCloud:
-        """Points in which ground is looked for: those of the cloud, and floors of voxels."""
+        """Return points in which ground is looked for: those of the cloud, and floors of voxels."""
         return add_floors(self._tiles.cloud_in(window), self._tiles.floors_in(window))
 
     def _passed(
         self, key: TileKey, path: DrivenPath, ground: GroundSurface
     ) -> dict[int, OccupancyPart]:
-        """The space that the vehicle took up in a tile and its margin, by submap."""
+        """Return the space that the vehicle took up in a tile and its margin, by submap."""
         path = path.select(self._tiles.window(key).wider(_MARGIN_M).contains(path.points_m))
         width_m = self._config.grid.vehicle_width_m
         free = log_odds(MIN_PROBABILITY)
@@ -150,14 +150,14 @@ class _Flattening:
         return passed
 
     def _driven_path(self) -> DrivenPath | None:
-        """The path, if the vehicle has a width."""
+        """Return the path, if the vehicle has a width."""
         if self._config.grid.vehicle_width_m == 0:
             return None
         submap, step_m = self._tiles.submap_of_frame, self._resolution_m / 2
         return DrivenPath.through(self._path_m, self._trusted, submap, step_m)
 
     def _crossed(self, margin_m: float) -> list[TileKey]:
-        """The tiles that the path touches, or comes near to at one of its poses."""
+        """Return the tiles that the path touches, or comes near to at one of its poses."""
         corners = [np.array(side) * margin_m for side in product((-1, 1), repeat=2)]
         path_m = self._path_m[np.isfinite(self._path_m[:, 0]), :2]
         near = np.concatenate([path_m + corner for corner in corners])
@@ -166,7 +166,7 @@ class _Flattening:
         ]
 
     def _along_the_path(self) -> tuple[GroundSettings, bool]:
-        """The settings with one camera height for the whole drive, and whether it is driven."""
+        """Return the settings with one camera height for the drive, and whether it is driven."""
         settings, heights, drops = self._config.ground, [], [np.zeros(0)]
         for key in self._crossed(0.0):
             window = self._tiles.window(key)
@@ -182,7 +182,7 @@ class _Flattening:
 
 
 def _warnings(camera_height_m: float | None, driven: bool) -> tuple[str, ...]:
-    """What a user of the grid should know."""
+    """Return what a user of the grid should know."""
     if driven:
         return ()
     if camera_height_m is None:

@@ -59,7 +59,7 @@ def _line(frame: LocalizedFrame) -> str:
 
 
 def _numbers(T_world_camera: Float64, covariance: Float64) -> list[str]:
-    """Pose, standard deviations and the upper half of the covariance, row by row."""
+    """Return pose, standard deviations and the upper half of the covariance, row by row."""
     pose = [*T_world_camera[:3, 3], *quaternion_from_rotation(T_world_camera[:3, :3])]
     spread = [*np.sqrt(np.diag(covariance)), *(covariance[i, j] for i, j in _ENTRIES)]
     return [*(f"{value:.9f}" for value in pose), *(f"{value:.6e}" for value in spread)]

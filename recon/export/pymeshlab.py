@@ -34,7 +34,7 @@ def screened_poisson(
     samples_per_node: float,
     point_weight: float,
 ) -> tuple[Float32, Int32, Float32]:
-    """Closed surface through oriented points.
+    """Return the closed surface through oriented points.
 
     Args:
         xyz: (N, 3), metres, finite.

@@ -94,7 +94,7 @@ def remake_map(
 
 
 def from_rays(products: Collection[str]) -> bool:
-    """Whether products are made from the rays of a run, so that its voxels can be others."""
+    """Return whether products are made from the rays of a run, so that its voxels can be others."""
     return "grid" in products or "octomap" in products
 
 
@@ -190,7 +190,7 @@ def copy_file(file: Path, target: Path) -> None:
 
 
 def _cells(grid: OccupancyGrid) -> dict[str, Any]:
-    """Figures of the grid."""
+    """Return figures of the grid."""
     rows, columns = grid.cells.shape
     return {
         "resolution_m": grid.resolution_m,

@@ -62,7 +62,7 @@ def voxel_tree(voxels: OccupancyVoxels) -> dict[str, Any]:
 
 
 def grown_blocks(blocks: NDArray[np.int64], by: int) -> NDArray[np.int64]:
-    """Packed blocks with those up to ``by`` blocks away from one on each axis."""
+    """Return packed blocks with those up to ``by`` blocks away from one on each axis."""
     steps = np.array(list(product(range(-by, by + 1), repeat=3)))
     around = unpack_keys(blocks)[:, None] + steps
     return np.unique(pack_keys(around.reshape(-1, 3)))

@@ -68,7 +68,7 @@ class Submap:
     occupancy: OccupancyPart
 
     def moved(self, motion: SubmapMotion) -> Submap:
-        """The submap after a correction of its pose."""
+        """Return the submap after a correction of its pose."""
         return replace(
             self,
             fused=self.fused.moved(motion.T_corrected_world, motion.voxel_m),
@@ -76,7 +76,7 @@ class Submap:
         )
 
     def to_tree(self) -> dict[str, Any]:
-        """Everything, as a tree of arrays and plain values."""
+        """Return everything, as a tree of arrays and plain values."""
         return {
             "index": self.index,
             "first_frame": self.first_frame,
@@ -87,7 +87,7 @@ class Submap:
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Submap:
-        """What `to_tree` gave."""
+        """Return what `to_tree` gave."""
         return cls(
             tree["index"],
             tree["first_frame"],
@@ -182,7 +182,7 @@ class SubmapBuilder:
         return long or (limit is not None and self._fused.nbytes + self._occupancy.nbytes >= limit)
 
     def current(self) -> Submap:
-        """The submap so far; without frames it is empty."""
+        """Return the submap so far; without frames it is empty."""
         return Submap(
             self._index,
             self._first_frame,
@@ -192,7 +192,7 @@ class SubmapBuilder:
         )
 
     def close(self) -> Submap:
-        """The submap, whose place the next one takes."""
+        """Return the submap, whose place the next one takes."""
         submap = Submap(
             self._index,
             self._first_frame,
@@ -205,7 +205,7 @@ class SubmapBuilder:
         return submap
 
     def state(self) -> dict[str, Any]:
-        """All that decides what comes later, as a tree of arrays and plain values."""
+        """Return all that decides what comes later, as a tree of arrays and plain values."""
         return {
             "submap": self.current().to_tree(),
             "path_m": self._path_m,

@@ -170,7 +170,7 @@ class Tiles:
         return (Tile(key, self) for key in self._parts.keys)
 
     def window(self, key: TileKey) -> Window:
-        """The bounds of a tile."""
+        """Return the bounds of a tile."""
         return self._parts.window(key)
 
     def put_cloud(self, cloud: PointCloud) -> None:
@@ -184,13 +184,13 @@ class Tiles:
             self._parts.put(_VOXELS, key, voxel_tree(voxels.select(inside)))
 
     def removed(self, key: TileKey) -> PointCloud:
-        """The points that are left out of the cloud of a tile since they moved."""
+        """Return the points that are left out of the cloud of a tile since they moved."""
         self.cloud(key)
         found = self._parts.read(_REMOVED, key)
         return join_clouds(PointCloud(**tree, frame="map") for _, tree in found)
 
     def cloud(self, key: TileKey) -> PointCloud:
-        """The fused and filtered points of a tile, frame ``map``, without what moved.
+        """Return the fused and filtered points of a tile, frame ``map``, without what moved.
 
         Filters see a margin around the tile, so that the tiles together equal the filtered whole
         (except for statistical limits, which are those of the tile).
@@ -204,13 +204,13 @@ class Tiles:
         return join_clouds(PointCloud(**tree, frame="map") for _, tree in found)
 
     def voxels(self, key: TileKey) -> OccupancyVoxels:
-        """The observed voxels of a tile, map axes."""
+        """Return the observed voxels of a tile, map axes."""
         return in_window(self.wide_voxels(key), self.window(key))
 
     def wide_voxels(
         self, key: TileKey, after: Mapping[int, OccupancyPart] | None = None
     ) -> OccupancyVoxels:
-        """The observed voxels of a tile and of the margin on which its cells in a grid depend.
+        """Return the observed voxels of a tile and of the margin that its grid cells depend on.
 
         Args:
             key: The tile.
@@ -230,17 +230,17 @@ class Tiles:
         return self._chain.changed(key, voxels, inside)
 
     def cloud_in(self, window: Window) -> PointCloud:
-        """The points in a window, frame ``map``."""
+        """Return the points in a window, frame ``map``."""
         clouds = map(self.cloud, self._parts.under(window))
         return join_clouds(cloud.select(window.contains(cloud.xyz)) for cloud in clouds)
 
     def voxels_in(self, window: Window) -> OccupancyVoxels:
-        """The voxels with their centres in a window."""
+        """Return the voxels with their centres in a window."""
         found = map(self.voxels, self._parts.under(window))
         return join_voxels([in_window(voxels, window) for voxels in found], self.resolution_m)
 
     def floors_in(self, window: Window) -> Float32:
-        """float32 (N, 3), what `find_floors` finds in a window."""
+        """Return float32 (N, 3), what `find_floors` finds in a window."""
         found = [np.zeros((0, 3), np.float32)]
         for key in self._parts.under(window):
             if not self._parts.numbers(_FLOORS, key):
@@ -281,7 +281,7 @@ class Tiles:
         return True
 
     def _moved(self, submap: Submap, T_corrected_world: Float64 | None) -> Submap:
-        """A submap with its correction applied."""
+        """Return a submap with its correction applied."""
         if T_corrected_world is None or np.array_equal(T_corrected_world, np.eye(4)):
             return submap
         voxel_m = self.config.fusion.voxel_m
@@ -292,7 +292,7 @@ class Tiles:
     def _pieces(
         self, submap: Submap
     ) -> Iterator[tuple[str, TileKey, FusedPart | OccupancyPart, int]]:
-        """A submap in pieces: their kind, tile, content, and the bytes that joining them takes."""
+        """Yield a submap in pieces: kind, tile, content, and the bytes that joining it takes."""
         fused, occupancy, voxel_m = submap.fused, submap.occupancy, self.config.fusion.voxel_m
         centres_m = apply(self._T_map_world, (fused.cells + 0.5) * voxel_m)
         for key, inside in self._parts.near(centres_m, self._filter_margin_m):
@@ -301,7 +301,7 @@ class Tiles:
             yield OCCUPANCY, key, occupancy.select(inside), int(inside.sum()) * _BLOCK_BYTES
 
     def _centres_m(self, part: OccupancyPart) -> Float64:
-        """float64 (B, 3), centres of the blocks of a part."""
+        """Return float64 (B, 3), centres of the blocks of a part."""
         return np.asarray((part.blocks + 0.5) * self._block_m)
 
     def _divide(self, drives: Sequence[int]) -> None:
@@ -311,7 +311,7 @@ class Tiles:
         self.submap_of_frame = np.insert(self.submap_of_frame, ends, -1)
 
     def _fused(self, key: TileKey) -> tuple[PointCloud, PointCloud]:
-        """The points of a tile, frame ``map``: the filtered ones, and those that moved."""
+        """Return the points of a tile, frame ``map``: the filtered ones, and those that moved."""
         kept, removed = [], []
         numbered = ((n, FusedPart.from_tree(tree)) for n, tree in self._parts.read(_FUSED, key))
         for drive, parts in groupby(numbered, key=self._chain.drive):
@@ -323,7 +323,7 @@ class Tiles:
         return self._placed(key, cloud), self._placed(key, self._exported(removed))
 
     def _exported(self, parts: Iterable[FusedPart]) -> PointCloud:
-        """The points of voxels that enough frames saw, frame ``world``."""
+        """Return the points of voxels that enough frames saw, frame ``world``."""
         fusion = self.config.fusion
         # A drive with fewer frames than the minimum count must still give a map.
         least = min(fusion.min_count, len(self.submap_of_frame))
@@ -331,12 +331,12 @@ class Tiles:
         return fused.cloud(fusion.voxel_m, least)
 
     def _placed(self, key: TileKey, cloud: PointCloud) -> PointCloud:
-        """The points in a tile, frame ``map``, of a cloud in frame ``world``."""
+        """Return the points in a tile, frame ``map``, of a cloud in frame ``world``."""
         placed = transform_cloud(cloud, self._T_map_world, frame="map")
         return placed.select(self.window(key).contains(placed.xyz))
 
     def _moved_rows(self, key: TileKey, drive: int, fused: FusedPart) -> Bool:
-        """Which rows of what a drive fused in a tile and its margin are of something that moved."""
+        """Return which rows of what a drive fused in a tile and its margin are of what moved."""
         fusion = self.config.fusion
         if not fusion.remove_moving:
             return np.zeros(len(fused), np.bool_)
@@ -346,7 +346,7 @@ class Tiles:
 
 
 def _wider(extent: tuple[TileKey, TileKey], part: OccupancyPart) -> tuple[TileKey, TileKey]:
-    """An extent of cells that holds those of a part as well."""
+    """Return an extent of cells that holds those of a part as well."""
     columns = part.cells[:, :2]
     if not len(columns):
         return extent

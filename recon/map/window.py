@@ -24,16 +24,16 @@ class Window:
     high: tuple[float, float]
 
     def wider(self, margin_m: float) -> Self:
-        """The rectangle with a margin around it."""
+        """Return the rectangle with a margin around it."""
         (x0, y0), (x1, y1) = self.low, self.high
         return type(self)((x0 - margin_m, y0 - margin_m), (x1 + margin_m, y1 + margin_m))
 
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Which points (N, 2 or 3) lie in the window."""
+        """Return which points (N, 2 or 3) lie in the window."""
         return np.asarray(((points[:, :2] >= self.low) & (points[:, :2] < self.high)).all(axis=1))
 
     def path(self, path_m: Float64) -> Float64:
-        """The pieces of a path (N, 3) inside, with a row of NaN after each piece that leaves."""
+        """Return the pieces of a path (N, 3) inside, with a row of NaN after each that leaves."""
         inside = self.contains(path_m)
         leaves = np.r_[False, inside[:-1]] & ~inside
         return np.asarray(np.where(inside[:, None], path_m, np.nan)[inside | leaves])

@@ -163,7 +163,7 @@ def _sample(
 
 
 def _interpolated(image: UInt8, u: Float64, v: Float64) -> Float64:
-    """Grey values (N,) between pixels."""
+    """Return grey values (N,) between pixels."""
     if not len(u):
         return np.zeros(0)
     # OpenCV refuses maps of more than 32767 rows, so the points are wrapped into rows.

@@ -107,7 +107,7 @@ def best_covariance() -> Float64:
 
 
 def icp_covariance(fit: Fit) -> Float64:
-    """Covariance (6, 6) of ICP: from the surfaces that fix it, with a floor for their bias."""
+    """Return the covariance (6, 6) of ICP: from the surfaces that fix it, at least their bias."""
     return covariance_of(_ICP_INDEPENDENCE * fit.information) + best_covariance()
 
 

@@ -40,7 +40,7 @@ def _frames(first: int, last: int) -> str:
 
 
 def _stretches(indices: Sequence[int]) -> list[tuple[int, int]]:
-    """Runs of consecutive numbers as (first, last)."""
+    """Return runs of consecutive numbers as (first, last)."""
     stretches: list[tuple[int, int]] = []
     for index in indices:
         if stretches and index == stretches[-1][1] + 1:

@@ -224,7 +224,7 @@ class _RangedKissIcp(KissICP):  # type: ignore[misc]
         self._source_range_m = options.source_range_m
 
     def voxelize(self, iframe: Float64) -> tuple[Float64, Float64]:
-        """Source and map points; source points near the map's edge would bias the alignment."""
+        """Return source and map points; those near the map's edge would bias the alignment."""
         source, frame = super().voxelize(iframe)
         near = np.linalg.norm(source, axis=1) <= self._source_range_m
         return source[near], frame
@@ -257,7 +257,7 @@ class _RangedKissIcp(KissICP):  # type: ignore[misc]
 
 
 def _config(options: KissIcpOptions) -> KISSConfig:
-    """kiss-icp's configuration; ``model_construct`` ignores environment variables."""
+    """Return the configuration of kiss-icp; ``model_construct`` ignores environment variables."""
     return KISSConfig.model_construct(
         out_dir="",
         data=DataConfig(max_range=options.max_range_m, min_range=0.0, deskew=False),

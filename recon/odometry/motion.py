@@ -39,12 +39,12 @@ class Motion:
         return orthonormalise(self.T_world_camera @ part_of(self.T_before_camera, share))
 
     def moved(self, T_world_camera: Float64, timestamp_s: float) -> Motion:
-        """After a measured pose, which gives a new motion."""
+        """Return the model after a measured pose, which gives a new motion."""
         motion = invert(self.T_world_camera) @ T_world_camera
         return Motion(T_world_camera, timestamp_s, motion, timestamp_s - self.timestamp_s)
 
     def drifted(self, timestamp_s: float) -> Motion:
-        """After a frame without a measured pose: the same motion continues."""
+        """Return the model after a frame without a measured pose: the same motion continues."""
         T = self.predict(timestamp_s)
         return Motion(T, timestamp_s, self.T_before_camera, self.interval_s)
 

@@ -26,7 +26,7 @@ _MAX_SIGMA_M: Final = 1.0
 
 
 def select_points(frame: OdometryFrame, max_range_m: float) -> PointCloud:
-    """Near, textured points whose disparity agrees with its neighbours.
+    """Return near, textured points whose disparity agrees with its neighbours.
 
     Dense stereo clouds are smeared along the rays where there is little texture, and extend the
     ground towards the camera; ICP on all points underestimates forward motion.

@@ -66,7 +66,7 @@ class MotionPrior:
         return self._pose_at(time_s) is not None
 
     def motion(self, from_s: float, to_s: float) -> Float64 | None:
-        """T_from_to (4, 4) of the camera between two times; None = the path has a gap there."""
+        """Return T_from_to (4, 4) of the camera between two times; None = a gap in the path."""
         start, end = self._pose_at(from_s), self._pose_at(to_s)
         if start is None or end is None or not to_s > from_s:
             return None

@@ -115,7 +115,7 @@ def _in_sigmas(T: Float64, settings: PriorSettings) -> float:
 
 
 def _visual_motions(prior: MotionPrior, frames: Iterable[OdometryFrame]) -> list[_VisualMotion]:
-    """Visual motions that are long enough, one after the other, where the prior is known."""
+    """Return visual motions that are long enough, one after the other, where the prior is known."""
     odometry, motions = VisualOdometry(), []
     start: tuple[int, float, Float64] | None = None
     covariance = np.zeros((6, 6))
@@ -139,7 +139,7 @@ def _visual_motions(prior: MotionPrior, frames: Iterable[OdometryFrame]) -> list
 
 
 def _distances(priors: Mapping[Axes, MotionPrior], seen: _VisualMotion) -> dict[Axes, float]:
-    """Distance of each prior from a visual motion, in standard deviations of their difference."""
+    """Return how far each prior is from a visual motion, in standard deviations."""
     return {axes: _distance(prior, seen) for axes, prior in priors.items()}
 
 

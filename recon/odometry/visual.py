@@ -160,7 +160,7 @@ class VisualOdometry:
         return None if self._prior is None else self._prior.motion(from_s, to_s)
 
     def _contradicts(self, state: VisualState, seen: _Seen, frame: OdometryFrame) -> bool:
-        """Whether the visual motion since the last registered frame contradicts the prior."""
+        """Return whether the visual motion since the last registration contradicts the prior."""
         prior_motion = self._prior_motion(state.seen_s, frame.pair.timestamp_s)
         if prior_motion is None or self._prior is None:
             return False

@@ -91,14 +91,14 @@ class TrackWindow:
         return TrackWindow(self.T_world_camera[-frames:], uvd[:, keep], self.xyz_world[keep])
 
     def without_newest(self, wrong: Bool) -> TrackWindow:
-        """The window without the newest observations of masked points (N,): their tracks end."""
+        """Return the window without the newest observations of masked points: their tracks end."""
         uvd = self.uvd.copy()
         uvd[-1, wrong] = np.nan
         return replace(self, uvd=uvd)
 
 
 def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
-    """Observed minus predicted column, row, disparity (N, 3) in the newest frame; NaN = unseen."""
+    """Return observed minus predicted column, row, disparity (N, 3), newest frame; NaN = none."""
     xyz = apply(invert(window.T_world_camera[-1]), window.xyz_world)
     z = np.maximum(xyz[:, 2], bundle.MIN_DEPTH_M)
     f = camera.focal_px
@@ -179,7 +179,7 @@ def _cost(window: TrackWindow, model: bundle.BundleModel) -> float:
 
 
 def _moved(window: TrackWindow, step_pose: Float64, step_point: Float64) -> TrackWindow:
-    """A window after a step; that of a pose is a translation and a rotation in its own axes."""
+    """Return a window after a step; poses step by translation and rotation in their own axes."""
     poses = np.stack(
         [T @ as_transform(step) for T, step in zip(window.T_world_camera, step_pose, strict=True)]
     )

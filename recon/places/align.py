@@ -135,7 +135,7 @@ def _normal_equations(first: Seen, last: Seen, T: Float64) -> tuple[Float64, Flo
 
 
 def _residuals(xyz: Float64, d_xyz: Float64, seen: Seen) -> tuple[Float64, Float64]:
-    """Whitened residuals (N, 3) and their derivatives (N, 3, 6); 0 for points behind a camera."""
+    """Return whitened residuals (N, 3) and derivatives (N, 3, 6); 0 for points behind a camera."""
     sigma, camera = np.array([_SIGMA_UV_PX, _SIGMA_UV_PX, _SIGMA_D_PX]), seen.camera
     front = xyz[:, 2] > 0.1
     z = np.where(front, xyz[:, 2], 1.0)

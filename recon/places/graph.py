@@ -62,7 +62,7 @@ class Closure:
     refused: tuple[Loop, ...]
 
     def correction(self, odometry: Trajectory, frame: int) -> Float64:
-        """``T_corrected_world`` (4, 4) for what was mapped at a frame with the odometry's pose."""
+        """Return ``T_corrected_world`` (4, 4) for what was mapped at a frame by odometry."""
         T_new, T_old = (path.T_world_camera[frame] for path in (self.trajectory, odometry))
         return orthonormalise(T_new @ invert(T_old))
 

@@ -136,7 +136,7 @@ def _chosen_bits() -> NDArray[np.intp]:
 
 
 def _spread(corners: Sequence[Any], shape: tuple[int, ...]) -> Any:
-    """The strongest corners of all cells, one rank after the other, until there are enough."""
+    """Return the strongest corners of all cells, rank after rank, until there are enough."""
     uv = _places_of(corners)
     strength = np.array([corner.response for corner in corners], np.float32)
     octave = np.array([corner.octave for corner in corners], np.int32)
@@ -155,7 +155,7 @@ def _places_of(corners: Sequence[Any]) -> Float32:
 
 
 def _disparity(disparity: Disparity, uv: Float32, camera: RectifiedCamera) -> Float32:
-    """Disparity (N,) at features; NaN where unknown, small, or inconsistent with neighbours."""
+    """Return the disparity (N,) at features; NaN where unknown, small, or unlike neighbours."""
     height, width = disparity.values.shape
     column, row = np.rint(uv).astype(np.int64).T
     step = np.arange(-1, 2)

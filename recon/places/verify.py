@@ -256,7 +256,7 @@ def _weakness(
 
 
 def _spread(seen: Seen) -> int:
-    """Of 4 by 4 cells of the image, how many hold a feature."""
+    """Return how many of 4 by 4 cells of the image hold a feature."""
     uvd, camera = seen.uvd, seen.camera
     column = np.clip(uvd[:, 0] * _CELLS / camera.width_px, 0, _CELLS - 1).astype(int)
     row = np.clip(uvd[:, 1] * _CELLS / camera.height_px, 0, _CELLS - 1).astype(int)
@@ -264,7 +264,7 @@ def _spread(seen: Seen) -> int:
 
 
 def _sigma_m(information: Float64) -> float:
-    """Standard deviation of the translation in its worst direction; infinity where unknown."""
+    """Return the deviation of the translation in its worst direction; infinity = unknown."""
     values = np.linalg.eigvalsh(information)
     if values[0] <= 1e-9 * values[-1]:
         return float("inf")

@@ -134,7 +134,7 @@ def _draw(axes: Axes, done: Sequence[JobResult], setting: str, name: str) -> Non
 
 
 def _page(one: JobResult, folder: Path) -> str:
-    """The page to look at in the folder of a job; "" = it has no result."""
+    """Return the page to look at in the folder of a job; "" = it has no result."""
     if one.state != "succeeded":
         return ""
     return "report.html" if (folder / one.job.name / "report.html").is_file() else "summary.json"

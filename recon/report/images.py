@@ -167,7 +167,7 @@ def depth_marks(
 
 
 def reason_shares(reason: UInt8) -> dict[Reason, float]:
-    """Return share of the pixels, in [0, 1], for each reason that occurs; the largest first."""
+    """Return the share of the pixels, in [0, 1], for each reason that occurs; the largest first."""
     counts = np.bincount(reason.ravel(), minlength=len(Reason))
     total = max(int(counts.sum()), 1)
     order = sorted(Reason, key=lambda code: -int(counts[code]))

@@ -31,7 +31,7 @@ def write_localize_page(run: LocalizeRun, directory: RunDirectory) -> None:
 
 
 def _path(run: LocalizeRun) -> bytes | None:
-    """The path on the grid, or alone if the map has none; None where there is neither."""
+    """Return the path on the grid, or alone if the map has none; None where there is neither."""
     path, T_map_world = run.drive.trajectory, run.drive.T_map_world
     if run.grid is not None:
         return grid_figure(run.grid, {"path": seen_from_above(path, T_map_world)})
@@ -40,7 +40,7 @@ def _path(run: LocalizeRun) -> bytes | None:
 
 @styled
 def certainty_figure(drive: LocalizedDrive) -> bytes:
-    """Standard deviations of each pose, and what confirms it; other frames are shaded."""
+    """Return standard deviations of each pose, and what confirms it; other frames are shaded."""
     known = [frame.located for frame in drive.frames]
     sigmas_m = [
         np.nan if x.covariance is None else np.sqrt(np.trace(x.covariance[:3, :3])) for x in known

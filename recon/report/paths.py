@@ -230,7 +230,7 @@ def grid_figure(grid: OccupancyGrid, paths: Mapping[str, Float64]) -> bytes:
 
 @styled
 def timing_figure(stages: Mapping[str, float]) -> bytes:
-    """Time and share of each stage, in the order of the mapping."""
+    """Draw time and share of each stage, in the order of the mapping."""
     figure = Figure((HALF_IN, max(1.6, 0.42 * len(stages) + 0.9)))
     axes = figure.subplots()
     seconds = np.asarray(list(stages.values()), dtype=np.float64)

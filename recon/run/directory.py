@@ -44,7 +44,7 @@ def lock_file(folder: Path) -> Path:
 
 
 def default_folder(command: str, base: Path = Path("outputs")) -> Path:
-    """``outputs/<command>/<UTC stamp>``."""
+    """Return ``outputs/<command>/<UTC stamp>``."""
     stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%S.%fZ")
     return base / command / stamp
 

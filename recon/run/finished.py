@@ -71,7 +71,7 @@ def open_run(folder: Path) -> FinishedRun:
 
 
 def is_pair_run(folder: Path) -> bool:
-    """Whether a folder holds a finished run of `recon pair`.
+    """Return whether a folder holds a finished run of `recon pair`.
 
     Raises:
         FormatError: The folder does not contain a finished run.
@@ -80,7 +80,7 @@ def is_pair_run(folder: Path) -> bool:
 
 
 def camera_of_pair(folder: Path) -> RectifiedCamera:
-    """The rectified camera of a run of `recon pair`, from its summary.
+    """Return the rectified camera of a run of `recon pair`, from its summary.
 
     Raises:
         FormatError: The summary cannot be read, or names no camera.
@@ -101,7 +101,7 @@ def camera_of_pair(folder: Path) -> RectifiedCamera:
 
 
 def camera_height_of(folder: Path) -> float | None:
-    """How high the camera of a run is above the ground, from its summary; None = it is not known.
+    """Return the height of the camera of a run above the ground, from its summary; None = unknown.
 
     Raises:
         FormatError: The folder does not contain a finished run, or its summary is damaged.

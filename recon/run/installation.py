@@ -74,7 +74,7 @@ class Check:
 
 
 def check_python() -> Check:
-    """The version of Python."""
+    """Check the version of Python."""
     least = ".".join(map(str, MIN_PYTHON))
     ok = sys.version_info >= MIN_PYTHON
     return Check(
@@ -83,13 +83,13 @@ def check_python() -> Check:
 
 
 def check_packages(packages: Mapping[str, str]) -> list[Check]:
-    """Installed version of each package, and whether it can be imported."""
+    """Check the version of each package, and whether it can be imported."""
     with ThreadPoolExecutor(max_workers=available_cores()) as pool:
         return list(pool.map(check_package, packages, packages.values()))
 
 
 def check_package(name: str, module: str) -> Check:
-    """One package, imported in its own process."""
+    """Check one package, imported in its own process."""
     try:
         installed = version(name)
     except PackageNotFoundError:
@@ -101,19 +101,19 @@ def check_package(name: str, module: str) -> Check:
 
 
 def check_system_libraries(libraries: Mapping[str, str]) -> list[Check]:
-    """The shared libraries that the packages load; no checks outside Linux."""
+    """Check the shared libraries that the packages load; none outside Linux."""
     if sys.platform != "linux":
         return []
     return [_check_library(library, package) for library, package in libraries.items()]
 
 
 def check_cores() -> Check:
-    """CPU cores available to this process."""
+    """Count the CPU cores available to this process."""
     return Check("cores", ok=True, found=str(available_cores()), needed=False)
 
 
 def check_memory() -> Check:
-    """The memory of the machine."""
+    """Check the memory of the machine."""
     try:
         memory_gb = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9
     except (AttributeError, ValueError, OSError):  # not available on this system
@@ -124,14 +124,14 @@ def check_memory() -> Check:
 
 
 def check_opencv_threads() -> Check:
-    """Default number of threads of OpenCV."""
+    """Ask OpenCV for its default number of threads."""
     done, told = _run_python("import cv2; print(cv2.getNumThreads())")
     found = told if done else "unknown"
     return Check("OpenCV threads", done, found, "" if done else "see opencv", needed=False)
 
 
 def check_numba() -> Iterator[Check]:
-    """Whether kernels are compiled, and whether the compiled code is cached for the next run."""
+    """Check whether kernels are compiled, and whether machine code is kept for the next run."""
     off = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
     yield Check(
         "compiled kernels",
@@ -149,7 +149,7 @@ def check_numba() -> Iterator[Check]:
 
 
 def check_kiss_icp_environment() -> Check:
-    """Environment variables ``kiss_icp_…``, which would silently change kiss-icp's settings."""
+    """Check for variables ``kiss_icp_…``, which would silently change kiss-icp's settings."""
     names = sorted(name for name in os.environ if name.lower().startswith("kiss_icp"))
     hint = f"unset {' '.join(names)}" if names else ""
     found = ", ".join(names) or "none set"
@@ -157,7 +157,7 @@ def check_kiss_icp_environment() -> Check:
 
 
 def check_data() -> Check:
-    """The folder of real data that tests and benchmarks use."""
+    """Check the folder of real data that tests and benchmarks use."""
     name, folder = "real data (RECON_DATA)", os.environ.get("RECON_DATA")
     if not folder:
         return Check(name, ok=True, found="not set; only tests and benchmarks use it", needed=False)
@@ -167,7 +167,7 @@ def check_data() -> Check:
 
 
 def check_folder(name: str, folder: Path, *, needed: bool, hint: str) -> Check:
-    """Whether a folder, or the one that it would be created in, is writable."""
+    """Check whether a folder, or the one that it would be created in, is writable."""
     nearest = next((p for p in (folder, *folder.absolute().parents) if p.exists()), Path())
     try:
         with tempfile.TemporaryFile(dir=nearest):
@@ -178,7 +178,7 @@ def check_folder(name: str, folder: Path, *, needed: bool, hint: str) -> Check:
 
 
 def check_disk(folder: Path) -> Check:
-    """Free disk space for results."""
+    """Check the free disk space for results."""
     nearest = next((p for p in (folder, *folder.absolute().parents) if p.exists()), Path())
     free_gb = shutil.disk_usage(nearest).free / 1e9
     ok = free_gb >= MIN_DISK_GB
@@ -195,7 +195,7 @@ def _check_library(library: str, package: str) -> Check:
 
 
 def _run_python(code: str) -> tuple[bool, str]:
-    """Whether code runs in a new Python process, and the last line that it printed."""
+    """Return whether code runs in a new Python process, and the last line that it printed."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", code],

@@ -35,19 +35,19 @@ class Progress(Protocol):
     """Receives the progress of a run, in the thread that runs it."""
 
     def on_start(self, name: str, total: int, unit: str = "frames") -> None:
-        """A series of ``total`` items begins."""
+        """Begin a series of ``total`` items."""
         ...
 
     def on_step(self, step: Step) -> None:
-        """An item is done."""
+        """Count an item that is done."""
         ...
 
     def on_stage(self, name: str) -> None:
-        """A stage that is not per item, such as ``mesh``, begins."""
+        """Begin a stage that is not per item, such as ``mesh``."""
         ...
 
     def on_finish(self) -> None:
-        """The series has ended, successfully or not."""
+        """End the series, successfully or not."""
         ...
 
 

@@ -56,7 +56,7 @@ def open_kitti_raw(folder: Path, settings: SourceSettings) -> ImageSource:
 
 
 def _read_list(view: Path) -> list[tuple[float, Path]]:
-    """Time stamp and image of each frame; where images are missing, names give the frame."""
+    """Return time and image of each frame; where images are missing, names give the frame."""
     path, images = view / "timestamps.txt", list_images(view / "data")
     if not path.exists():
         raise SourceError("times are missing", where=path)

@@ -113,7 +113,7 @@ class LiveSource:
         self._latency_s.append(time.perf_counter() - self._due_s[index])
 
     def figures(self) -> dict[str, Any]:
-        """What was late and what was left out."""
+        """Return what was late and what was left out."""
         latency_ms = 1e3 * np.array(self._latency_s or [np.nan])
         p50, p95 = np.percentile(latency_ms, (50, 95)).tolist()
         known = bool(self._latency_s)

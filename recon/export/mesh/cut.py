@@ -26,12 +26,12 @@ class Plane:
     at_m: float
 
     def holds(self, vertices: Float32) -> Bool:
-        """bool (V,): vertices that lie exactly in the plane, as those of a cut do."""
+        """Return bool (V,): vertices that lie exactly in the plane, as those of a cut do."""
         return np.asarray(vertices[:, self.axis] == np.float32(self.at_m))
 
 
 def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleMesh:
-    """The part of a mesh on one side of a plane; triangles that cross it are split.
+    """Return the part of a mesh on one side of a plane; triangles that cross it are split.
 
     Two meshes of one surface, cut along the same plane, meet there without overlap.
 
@@ -87,13 +87,13 @@ def with_vertices(mesh: TriangleMesh, new: Float32, edges: Int32, share: Float64
 
 
 def between(values: NDArray[Any], edges: Int32, share: Float64) -> Float64:
-    """float64 (N, 3): vertex values (V, 3), interpolated linearly along edges."""
+    """Return float64 (N, 3): vertex values (V, 3), interpolated linearly along edges."""
     first, last = values[edges[:, 0]], values[edges[:, 1]]
     return np.asarray((1 - share[:, None]) * first + share[:, None] * last)
 
 
 def _first_turned(faces: Int32, inside: Bool, corners: int) -> Int32:
-    """Faces (F, 3), each rotated so that its ``corners`` corners inside come first."""
+    """Return faces (F, 3), each rotated so that its ``corners`` corners inside come first."""
     odd = inside[faces] if corners == 1 else ~inside[faces]
     # The odd corner comes first if it is inside, last if it is outside.
     start = (np.argmax(odd, axis=1) + (0 if corners == 1 else 1)) % 3
@@ -102,7 +102,7 @@ def _first_turned(faces: Int32, inside: Bool, corners: int) -> Int32:
 
 
 def _with_cuts(mesh: TriangleMesh, edges: Int32, away: Float32, plane: Plane) -> TriangleMesh:
-    """The mesh with a new vertex where each edge (E, 2) meets the plane."""
+    """Return the mesh with a new vertex where each edge (E, 2) meets the plane."""
     first, last = edges.T
     share = (away[first] / (away[first] - away[last])).astype(np.float64)
     new = between(mesh.vertices, edges, share).astype(np.float32)
@@ -111,7 +111,7 @@ def _with_cuts(mesh: TriangleMesh, edges: Int32, away: Float32, plane: Plane) ->
 
 
 def _compact(mesh: TriangleMesh, faces: Int32) -> TriangleMesh:
-    """The faces with the vertices that they use; degenerate faces of a cut are dropped."""
+    """Return the faces with the vertices that they use; degenerate faces of a cut are dropped."""
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
     used, faces = renumbered(faces)

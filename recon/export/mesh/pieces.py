@@ -85,7 +85,7 @@ class WrittenMesh:
         return sum(piece.vertices for piece in self.pieces)
 
     def to_show(self, directory: RunDirectory) -> TriangleMesh | None:
-        """The mesh for images; None if it is too large for memory."""
+        """Return the mesh for images; None if it is too large for memory."""
         whole = directory.path(WHOLE)
         return read_mesh(whole) if self.faces <= SAMPLE_FACES else None
 
@@ -128,7 +128,7 @@ def export_mesh(
 
 
 def _count(tiles: Tiles, settings: MeshSettings) -> Counter[PieceKey]:
-    """Number of points in each piece. Pieces are centred at multiples of their edge."""
+    """Return the number of points in each piece. Pieces are centred at multiples of their edge."""
     found: Counter[PieceKey] = Counter()
     for tile in tiles:
         homes = np.floor(tile.cloud.xyz[:, :2] / settings.tile_m + 0.5).astype(np.int64)
@@ -167,7 +167,7 @@ class _Mesher:
         return WrittenMesh(self.points.total(), tuple(pieces), self._warnings(failed))
 
     def _warnings(self, failed: dict[PieceKey, MeshingError]) -> tuple[str, ...]:
-        """One line about the pieces without a surface, naming the one with the most points."""
+        """Return a line about the pieces without a surface, naming the one with the most points."""
         if not failed:
             return ()
         worst = max(failed, key=self.points.__getitem__)
@@ -176,14 +176,14 @@ class _Mesher:
         return (f"no surface in {tiles}, {share:.1%} of the points ({failed[worst]})",)
 
     def _surface(self, key: PieceKey) -> TriangleMesh | MeshingError:
-        """The surface of a piece, or the error why there is none, handled when its turn comes."""
+        """Return the surface of a piece, or the error why there is none, raised at its turn."""
         try:
             return self._cut(key)
         except MeshingError as error:
             return error
 
     def _cut(self, key: PieceKey) -> TriangleMesh:
-        """The surface of a piece with its margin, cut at the sides of the piece."""
+        """Return the surface of a piece with its margin, cut at the sides of the piece."""
         wide = self._window(key).wider(_OVERLAP_M)
         cloud = self.tiles.cloud_in(wide)
         wrong = None
@@ -200,14 +200,14 @@ class _Mesher:
         return mesh
 
     def _target(self, seen: int) -> int | None:
-        """Target number of triangles of a piece with its margin, by its share of the points."""
+        """Return how many triangles a piece with its margin gets, by its share of the points."""
         target = self.settings.target_faces
         if target is None:
             return None
         return max(4, round(target * seen / self.points.total()))
 
     def _joined(self, key: PieceKey, mesh: TriangleMesh) -> TriangleMesh:
-        """The mesh of a piece, joined to those of its earlier neighbours."""
+        """Return the mesh of a piece, joined to those of its earlier neighbours."""
         for axis, far in _SIDES:
             plane = self._plane(key, axis, far)
             step = np.zeros(2, int)
@@ -221,7 +221,7 @@ class _Mesher:
         return mesh
 
     def _window(self, key: PieceKey) -> Window:
-        """The bounds of a piece."""
+        """Return the bounds of a piece."""
         (x, y), edge_m = key, self.settings.tile_m
         return Window(
             (x * edge_m - edge_m / 2, y * edge_m - edge_m / 2),

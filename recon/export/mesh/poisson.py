@@ -153,7 +153,7 @@ def trimmed_surface(
     octree: Octree,
     wrong: Callable[[Float32], Bool] | None = None,
 ) -> TriangleMesh:
-    """The Poisson surface of a cloud with normals, without what no points support.
+    """Return the Poisson surface of a cloud with normals, without what no points support.
 
     Args:
         cloud: Finite points with unit normals, in coordinates that are equally precise everywhere.
@@ -190,7 +190,7 @@ def trimmed_surface(
 
 
 def usable(cloud: PointCloud) -> PointCloud:
-    """The finite points of a cloud, if they can span a surface.
+    """Return the finite points of a cloud, if they can span a surface.
 
     Raises:
         MeshingError: The points are too few, coincident or collinear, or one is far off.
@@ -232,7 +232,7 @@ def _refuse_outliers(xyz: Float32) -> None:
 
 
 def oriented(cloud: PointCloud, viewpoint_m: Point | None) -> PointCloud:
-    """The points that have a normal, or all points with estimated normals."""
+    """Return the points that have a normal, or all points with estimated normals."""
     if cloud.normals is not None:
         # NaN fails the comparison, so it counts as no normal.
         known = np.asarray(np.linalg.norm(cloud.normals, axis=1) > 0.5)
@@ -254,13 +254,13 @@ def _required(normals: Float32 | None) -> Float32:
 
 
 def widest_cell(xyz: Float32, settings: MeshSettings) -> float:
-    """Widest octree cell that the settings allow, in the unit of the points."""
+    """Return the widest octree cell that the settings allow, in the unit of the points."""
     step = max(1, len(xyz) // _SPACING_SAMPLES)
     return settings.cell_spacings * float(np.median(_spacing(xyz[::step], xyz)))
 
 
 def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
-    """The smallest octree depth whose cells are no wider than the settings allow."""
+    """Return the smallest octree depth whose cells are no wider than the settings allow."""
     cell_m = widest_cell(xyz, settings)
     extent_m = float(np.ptp(xyz, axis=0).max()) * OCTREE_SCALE
     if cell_m * 2**settings.max_depth <= extent_m:
@@ -269,12 +269,12 @@ def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
 
 
 def _spacing(some_xyz: Float32, xyz: Float32) -> Float32:
-    """float32 (N,): distance of points of a cloud to their neighbours in it."""
+    """Return float32 (N,): distance of points of a cloud to their neighbours in it."""
     return open3d_clouds.nearest(some_xyz, xyz, _SPACING_NEIGHBOURS)[1][:, -1]
 
 
 def _near_data(vertices: Float32, xyz: Float32, spacings: float) -> Bool:
-    """bool (V,): vertices within ``spacings`` local point spacings of the nearest point."""
+    """Return bool (V,): vertices within ``spacings`` local point spacings of the nearest point."""
     index, distance_m = open3d_clouds.nearest(vertices, xyz)
     near, where = np.unique(index[:, 0], return_inverse=True)
     local_m = _spacing(xyz[near], xyz)
@@ -284,5 +284,5 @@ def _near_data(vertices: Float32, xyz: Float32, spacings: float) -> Bool:
 
 
 def _nearest_points(vertices: Float32, xyz: Float32) -> Int32:
-    """int32 (V,): the point nearest to each vertex."""
+    """Return int32 (V,): the point nearest to each vertex."""
     return open3d_clouds.nearest(vertices, xyz)[0][:, 0]

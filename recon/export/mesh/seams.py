@@ -34,7 +34,7 @@ class OnEdges:
 
 
 def open_edges(mesh: TriangleMesh, plane: Plane) -> Float32:
-    """Boundary edges of a mesh that lie in a plane: float32 (E, 2, 3)."""
+    """Return boundary edges of a mesh that lie in a plane: float32 (E, 2, 3)."""
     return np.asarray(mesh.vertices[_open_corners(mesh, plane)[:, :2]])
 
 
@@ -62,7 +62,7 @@ def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float
 
 
 def nearest_on_edges(points: Float32, edges: Float32) -> OnEdges:
-    """The nearest points on line segments, among those with the nearest midpoints.
+    """Return the nearest points on line segments, among those with the nearest midpoints.
 
     Args:
         points: float32 (N, 3).
@@ -130,7 +130,7 @@ def _split_faces(
 
 
 def _open_corners(mesh: TriangleMesh, plane: Plane) -> Int32:
-    """Boundary edges in a plane: int32 (E, 4).
+    """Return boundary edges in a plane: int32 (E, 4).
 
     First and last vertex in the order of the triangle, its third vertex, and its index.
     """

@@ -10,7 +10,7 @@ from recon.io.models import open3d_meshes
 
 
 def keep_vertices(vertices: Float32, faces: Int32, keep: Bool) -> tuple[Float32, Int32]:
-    """The part of a mesh whose faces have all three vertices in ``keep``.
+    """Return the part of a mesh whose faces have all three vertices in ``keep``.
 
     Args:
         vertices: float32 (V, 3).
@@ -27,7 +27,7 @@ def keep_vertices(vertices: Float32, faces: Int32, keep: Bool) -> tuple[Float32,
 
 
 def drop_small_components(vertices: Float32, faces: Int32, min_faces: int) -> tuple[Float32, Int32]:
-    """The connected pieces of a mesh that have at least ``min_faces`` faces.
+    """Return the connected pieces of a mesh that have at least ``min_faces`` faces.
 
     Raises:
         MeshingError: No piece is large enough.
@@ -37,7 +37,7 @@ def drop_small_components(vertices: Float32, faces: Int32, min_faces: int) -> tu
 
 
 def vertex_normals(vertices: Float32, faces: Int32) -> Float32:
-    """float32 (V, 3): unit vertex normals, the area-weighted mean of those of their faces."""
+    """Return float32 (V, 3): unit normals, the area-weighted mean of those of their faces."""
     corners = vertices[faces].astype(np.float64)
     # The length of the cross product is twice the area, so the mean is weighted by area.
     of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -60,6 +60,6 @@ def _compact(vertices: Float32, faces: Int32) -> tuple[Float32, Int32]:
 
 
 def renumbered(faces: Int32) -> tuple[Int32, Int32]:
-    """The vertices that faces (F, 3) use: int32 (V,), ascending; and the faces with these alone."""
+    """Return int32 (V,): vertices that faces (F, 3) use, ascending; and the faces with these."""
     used, numbers = np.unique(faces, return_inverse=True)
     return used, numbers.reshape(-1, 3).astype(np.int32)

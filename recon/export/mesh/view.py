@@ -78,7 +78,7 @@ def reconstruct_view(
 
 
 def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
-    """Share of the points of a pair that are covered by its mesh, from 0 to 1.
+    """Return the share of the points of a pair that are covered by its mesh, from 0 to 1.
 
     Args:
         mesh: The mesh in camera axes, with at least one face.
@@ -90,7 +90,7 @@ def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
 
 
 def check_coverage(coverage: float) -> tuple[str, ...]:
-    """A warning if the mesh of a pair leaves out much of its cloud.
+    """Return a warning if the mesh of a pair leaves out much of its cloud.
 
     Args:
         coverage: Share of the points that are on the mesh, see `mesh_coverage`.
@@ -122,7 +122,7 @@ class _ImageSpace:
         return _DISPARITY_STEP * self.focal_px * self.baseline_m
 
     def of_cloud(self, cloud: PointCloud) -> PointCloud:
-        """A cloud in camera axes and its normals, in image coordinates."""
+        """Return a cloud in camera axes and its normals, in image coordinates."""
         x, y, z = cloud.xyz.T.astype(np.float64)
         xyz = np.stack([self.focal_px * x / z, self.focal_px * y / z, -self._range / z], axis=1)
         if cloud.normals is None:
@@ -136,7 +136,7 @@ class _ImageSpace:
         return replace(cloud, xyz=xyz.astype(np.float32), normals=pulled.astype(np.float32))
 
     def metres(self, vertices: Float32) -> Float32:
-        """float32 (V, 3): camera axes from image coordinates."""
+        """Return float32 (V, 3): camera axes from image coordinates."""
         column, row, disparity = vertices.T.astype(np.float64)
         z = -self._range / disparity
         xyz = np.stack([column * z / self.focal_px, row * z / self.focal_px, z], axis=1)
@@ -144,7 +144,7 @@ class _ImageSpace:
 
 
 def _octree(xyz: Float32, settings: MeshSettings) -> Octree:
-    """Octree whose cells are as wide as the settings allow, for an image of any size."""
+    """Return the octree whose cells are as wide as the settings allow, for an image of any size."""
     if settings.depth is not None:
         return Octree(settings.depth)
     extent = float(np.ptp(xyz, axis=0).max())

@@ -52,7 +52,7 @@ class DriveLoops:
         return np.asarray(np.linalg.norm(moved, axis=1))
 
     def submap_corrections(self, entries: Sequence[SubmapEntry]) -> Float64 | None:
-        """``T_corrected_world`` (S, 4, 4), the correction of each submap: that of its middle frame.
+        """Return ``T_corrected_world`` (S, 4, 4) of each submap: that of its middle frame.
 
         None if no loop was closed, so that no submap moves by a rounding error.
         """
@@ -62,7 +62,7 @@ class DriveLoops:
         return np.stack([self.closure.correction(self.odometry, frame) for frame in middles])
 
     def figures(self) -> dict[str, Any]:
-        """The figures for ``summary.json``."""
+        """Return the figures for ``summary.json``."""
         return {
             "keyframes": self.keyframes,
             "found": self.found,
@@ -74,7 +74,7 @@ class DriveLoops:
         }
 
     def edges(self) -> dict[str, Any]:
-        """The loops, for ``loops.json``."""
+        """Return the loops, for ``loops.json``."""
         return {
             name: [
                 {
@@ -90,7 +90,7 @@ class DriveLoops:
         }
 
     def record(self) -> dict[str, Any]:
-        """What a map keeps of it: the loops, and the path after closure if one was closed."""
+        """Return what a map keeps of it: the loops, and the path after closure if any closed."""
         closed, refused = self.closure.closed, self.closure.refused
         return {
             "closed": [asdict(loop) for loop in closed],
@@ -99,7 +99,7 @@ class DriveLoops:
         }
 
     def warnings(self) -> list[str]:
-        """Warnings about loops that were not closed."""
+        """Return warnings about loops that were not closed."""
         closed, refused = len(self.closure.closed), len(self.closure.refused)
         if refused and not closed:
             what = "they contradict the odometry; the map may show a place twice"
@@ -207,7 +207,7 @@ class LoopWatch:
             self._waiting.popleft().result()
 
     def _advance(self, T_world_camera: Float64, *, measured: bool) -> float:
-        """Path length up to the next frame, as the detector measures it."""
+        """Return path length up to the next frame, as the detector measures it."""
         before = self._last if self._path_m else T_world_camera
         step = path_lengths(np.stack([before, T_world_camera]), np.array([True, measured]))
         self._path_m.append((self._path_m[-1] if self._path_m else 0.0) + float(step[1]))

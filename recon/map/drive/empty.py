@@ -48,7 +48,7 @@ def check_map(mapped: MappedSequence, where: str) -> None:
 
 
 def _explain_poses(health: Sequence[OdometryHealth]) -> tuple[str, str] | None:
-    """What is wrong with the poses, and what to do; None if most are trusted."""
+    """Return what is wrong with the poses, and what to do; None if most are trusted."""
     bad = [record for record in health if not record.ok]
     if 2 * len(bad) <= len(health):
         return None
@@ -66,7 +66,7 @@ def _explain_poses(health: Sequence[OdometryHealth]) -> tuple[str, str] | None:
 
 
 def _explain_sample(mapped: MappedSequence) -> tuple[str, str]:
-    """Why nothing of the frame in the middle of the drive is in the map, and what to do."""
+    """Return why nothing of the frame in the middle of the drive is in the map, and what to do."""
     config, frame = mapped.config, mapped.sample
     if not len(frame.cloud):
         found = _depths(frame.disparity, mapped.camera)
@@ -89,7 +89,7 @@ def _nearest_m(frame: ReconstructedFrame) -> float:
 
 
 def _depths(disparity: Disparity, camera: RectifiedCamera) -> str:
-    """The share of pixels with a match, and their depths."""
+    """Return the share of pixels with a match, and their depths."""
     share = f"{100 * float(disparity.valid.mean()):.1f} % of the pixels matched"
     if not disparity.valid.any():
         return share
@@ -99,7 +99,7 @@ def _depths(disparity: Disparity, camera: RectifiedCamera) -> str:
 
 
 def _limits(settings: CloudSettings) -> str:
-    """The depths and errors that a cloud takes, in words."""
+    """Return the depths and errors that a cloud takes, in words."""
     farthest = "any depth" if settings.max_range_m is None else f"{settings.max_range_m:g} m"
     limits = f"from {settings.min_range_m:g} m to {farthest}"
     if settings.max_relative_sigma is None:

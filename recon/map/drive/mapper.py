@@ -55,7 +55,7 @@ class Mapper:
         self._grain = ray_grain(config.occupancy) if config.occupancy.keep_rays else None
 
     def __len__(self) -> int:
-        """Number of frames so far."""
+        """Return the number of frames so far."""
         return len(self.session)
 
     def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
@@ -115,7 +115,7 @@ class Mapper:
             self.session.submaps.add(self._builder.close())
 
     def state(self) -> dict[str, Any]:
-        """What later results depend on beside the session, as a tree of arrays and plain values."""
+        """Return what later results depend on beside the session, as arrays and plain values."""
         self._behind.settle()
         return {
             "odometry": self._odometry.state(),
@@ -136,7 +136,7 @@ class Mapper:
                 raise FormatError("submaps of the drive are missing")
 
     def _builder_from(self, frame: ReconstructedFrame) -> SubmapBuilder:
-        """The submap under construction; the first frame fixes the map axes."""
+        """Return the submap under construction; the first frame fixes the map axes."""
         if self._builder is None:
             ground = estimate_ground(frame.cloud)
             height_m = self._config.ground.camera_height_m

@@ -60,7 +60,7 @@ class UsedPrior:
     sigmas: Mapping[str, float] = field(default_factory=dict)
 
     def warnings(self) -> list[str]:
-        """What the user should know about it."""
+        """Return what the user should know about it."""
         if self.known_from != "assumed":
             return []
         what = "too little motion was seen to tell the axes of the prior"
@@ -134,7 +134,7 @@ class MappedSequence:
         return expected_drift(self.trajectory, self.health, self.camera)
 
     def corrected(self, T_corrected_world: Float64) -> MappedSequence:
-        """The drive with each submap and its part of the path moved rigidly.
+        """Return the drive with each submap and its part of the path moved rigidly.
 
         Args:
             T_corrected_world: float64 (S, 4, 4), one correction per submap.
@@ -149,7 +149,7 @@ class MappedSequence:
         )
 
     def closed(self, loops: DriveLoops) -> MappedSequence:
-        """The drive after loop closure: the corrected trajectory, and submaps that follow it."""
+        """Return the drive after loop closure: the corrected path, and submaps that follow it."""
         return replace(
             self,
             trajectory=loops.closure.trajectory,
@@ -323,7 +323,7 @@ def _axes_of(
     reconstructor: FrameReconstructor,
     settings: PriorSettings,
 ) -> UsedPrior:
-    """The axes of a prior: those set, else those that explain the first motions in the images."""
+    """Return the axes of a prior: those set, else those that explain the first motions."""
     start = 0
     if isinstance(source, StampedSource):
         MotionPrior(prior, settings).check_covers(source.stamps_s)

@@ -36,7 +36,7 @@ class Workspace:
     threads: int | None = None
 
     def session(self, source: StereoSource, config: DriveSettings) -> Session:
-        """The session of a drive: the last one of the map, or a new one."""
+        """Return the session of a drive: the last one of the map, or a new one."""
         last = self.map.sessions[-1] if self.map.sessions else None
         return self.map.begin(session_info(source, config)) if last is None else last
 
@@ -58,7 +58,7 @@ def resuming(where: str | Path) -> Iterator[None]:
 def session_info(
     source: StereoSource, config: DriveSettings, start: Mapping[str, Any] | None = None
 ) -> SessionInfo:
-    """What a session is a drive of.
+    """Return what a session is a drive of.
 
     Args:
         source: The source.

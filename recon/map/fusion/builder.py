@@ -57,7 +57,7 @@ class FusionSettings(Settings):
 
 
 def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
-    """The depth at which a matching error of 0.3 px costs ``max_depth_error_m``.
+    """Return the depth at which a matching error of 0.3 px costs ``max_depth_error_m``.
 
     The error of a depth grows with its square, ``Z²·error_px / (f·b)``: beyond this range a rig
     measures less precisely than the map requires. The setting fits short and long baselines.
@@ -93,7 +93,7 @@ class MapBuilder:
         self._known = dict.fromkeys(KNOWABLE, True)
 
     def __len__(self) -> int:
-        """Number of voxels seen by at least one frame."""
+        """Return the number of voxels seen by at least one frame."""
         return int(self._sums.used[0])
 
     def integrate(self, cloud: PointCloud) -> None:
@@ -115,7 +115,7 @@ class MapBuilder:
         self._frames += 1
 
     def cloud(self, min_count: int | None = None) -> PointCloud:
-        """The map so far, one point per voxel, in the order in which voxels were first seen.
+        """Return the map so far, one point per voxel, in the order in which voxels were first seen.
 
         Args:
             min_count: Voxels seen by fewer frames are left out, or by fewer than one less where
@@ -128,7 +128,7 @@ class MapBuilder:
         return self.part().cloud(s.voxel_m, min_count or s.min_count)
 
     def part(self) -> FusedPart:
-        """What was seen since the start, or since the last `take`."""
+        """Return what was seen since the start, or since the last `take`."""
         n, s = len(self), self._sums
         known = tuple(name for name, value in self._known.items() if value)
         return FusedPart(
@@ -140,7 +140,7 @@ class MapBuilder:
         )
 
     def take(self) -> FusedPart:
-        """The part so far; the builder starts a new one."""
+        """Return the part so far; the builder starts a new one."""
         part = self.part()
         self._sums = voxels.make_sums(1, VALUES)
         self._known, self._frames = dict.fromkeys(self._known, True), 0
@@ -164,7 +164,7 @@ class MapBuilder:
         return len(self) * sum(array[:1].nbytes for array in self._sums[1:-1])
 
     def _weights(self, cloud: PointCloud) -> Float32:
-        """Weight of each point; 0 = not used. float32 (N,)."""
+        """Return the weight of each point; 0 = not used. float32 (N,)."""
         confidence = np.float32(1) if cloud.confidence is None else cloud.confidence
         if cloud.sigma_m is None:
             return np.full(len(cloud), 1.0, np.float32) * confidence
@@ -191,7 +191,7 @@ class MapBuilder:
 
 
 def _values(cloud: PointCloud) -> Float32:
-    """What is averaged of each point: colour, normal, confidence; 0 where unknown. (N, 7)."""
+    """Return what is averaged of each point, (N, 7): colour, normal, confidence; 0 = unknown."""
     values = np.zeros((len(cloud), VALUES), np.float32)
     for columns, array in (
         (RGB, cloud.rgb),

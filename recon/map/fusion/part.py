@@ -55,7 +55,7 @@ class FusedPart:
         return voxels.unpack_keys(self.keys)
 
     def select(self, which: NDArray[Any]) -> FusedPart:
-        """The rows of a boolean mask or of an index array, in that order."""
+        """Return the rows of a boolean mask or of an index array, in that order."""
         return FusedPart(
             self.keys[which],
             self.sums[which],
@@ -65,16 +65,16 @@ class FusedPart:
         )
 
     def to_tree(self) -> dict[str, Any]:
-        """Everything, as a tree of arrays and plain values."""
+        """Return everything, as a tree of arrays and plain values."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> FusedPart:
-        """What `to_tree` gave."""
+        """Return what `to_tree` gave."""
         return cls(**{**tree, "known": tuple(tree["known"])})
 
     def moved(self, T_new_world: Float64, voxel_m: float) -> FusedPart:
-        """The part after a rigid motion: each voxel's sums go to the voxel of its moved mean point.
+        """Return the part after a rigid motion: sums of a voxel go to that of its moved mean point.
 
         Where several go to the same voxel, their sums add up; the number of frames and the
         information are the largest of theirs, since the frames are the same.
@@ -89,12 +89,12 @@ class FusedPart:
         return _merged(replace(self, keys=voxels.pack_keys(cells), sums=sums))
 
     def moved_keys(self, T_new_world: Float64, voxel_m: float) -> NDArray[np.int64]:
-        """int64 (N,), packed cell of each row after a rigid motion, several rows in one or not."""
+        """Return int64 (N,), packed cell of each row after a rigid motion; rows may share one."""
         points = apply(T_new_world, self.points(voxel_m))
         return voxels.pack_keys(np.floor(points / voxel_m).astype(np.int64))
 
     def cloud(self, voxel_m: float, least: int) -> PointCloud:
-        """One point per voxel that enough frames saw.
+        """Return one point per voxel that enough frames saw.
 
         Args:
             voxel_m: Edge of a voxel.
@@ -122,18 +122,18 @@ class FusedPart:
         )
 
     def points(self, voxel_m: float) -> Float64:
-        """float64 (N, 3), the mean point of each voxel, world axes."""
+        """Return float64 (N, 3), the mean point of each voxel, world axes."""
         return np.asarray((self.cells + 0.5) * voxel_m + self.sums[:, _OFFSET] / self.sums[:, :1])
 
     def _needed(self, least: int) -> Int32:
-        """int32 (N,), frames that must have seen each voxel."""
+        """Return int32 (N,), frames that must have seen each voxel."""
         if "sigma_m" not in self.known:
             return np.full(len(self), least, np.int32)
         precise = self.information >= np.float32(PRECISE_SIGMA_M**-2)
         return np.where(precise, max(1, least - 1), least).astype(np.int32)
 
     def _has_direction(self, rows: NDArray[np.intp]) -> Bool:
-        """Which voxels have normals that do not cancel; all, where normals are not known."""
+        """Return which voxels have normals that do not cancel; all, where normals are not known."""
         if "normals" not in self.known:
             return np.ones(len(rows), dtype=np.bool_)
         sums = self.sums[rows]
@@ -160,7 +160,7 @@ def join_fused(parts: Iterable[FusedPart]) -> FusedPart:
 
 
 def _merged(part: FusedPart) -> FusedPart:
-    """One row for each voxel, in the order of the first row of each."""
+    """Return one row for each voxel, in the order of the first row of each."""
     order = np.argsort(part.keys, kind="stable")
     keys = part.keys[order]
     begin = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
@@ -175,5 +175,5 @@ def _merged(part: FusedPart) -> FusedPart:
 
 
 def _unit(vectors: Float32) -> Float32:
-    """Vectors (N, 3) at unit length."""
+    """Return vectors (N, 3) at unit length."""
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))

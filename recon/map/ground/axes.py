@@ -113,7 +113,7 @@ def base_axes(T_map_world: Float64, camera_height_m: float | None) -> Float64:
 
 
 def _height_along_z(ground: GroundPlane | None, turn: NDArray[Any]) -> float:
-    """How far the ground is below the camera, along z of the map."""
+    """Return how far the ground is below the camera, along z of the map."""
     if ground is None:
         raise MappingError(
             "the first frame shows no ground to put the map's origin on",
@@ -148,7 +148,7 @@ def estimate_ground(cloud: PointCloud) -> GroundPlane | None:
 
 
 def _candidates(cloud: PointCloud) -> Float64:
-    """Points in range that a tilted ground could hold, thinned evenly; float64 (N, 3)."""
+    """Return points in range that a tilted ground could hold, thinned evenly; float64 (N, 3)."""
     xyz = cloud.xyz.astype(np.float64)
     z = xyz[:, 2]
     highest = z * math.tan(math.radians(_MAX_TILT_DEG))
@@ -158,7 +158,7 @@ def _candidates(cloud: PointCloud) -> Float64:
 
 
 def _best_plane(xyz: Float64) -> tuple[Float64, float]:
-    """The plane through three points that most points support."""
+    """Return the plane through three points that most points support."""
     random = np.random.default_rng(0)
     few = xyz[:: max(1, len(xyz) // 4000)]
     triples = few[random.integers(0, len(few), (_TRIALS, 3))]
@@ -175,7 +175,7 @@ def _best_plane(xyz: Float64) -> tuple[Float64, float]:
 
 
 def _fit_plane(xyz: Float64) -> tuple[Float64, float]:
-    """The plane nearest to the points in the least-squares sense; its normal points up."""
+    """Return the plane nearest to the points in the least-squares sense; its normal points up."""
     centre = xyz.mean(axis=0)
     _, vectors = np.linalg.eigh(np.cov((xyz - centre).T))
     normal: NDArray[Any] = vectors[:, 0] * (-1.0 if vectors[1, 0] > 0 else 1.0)

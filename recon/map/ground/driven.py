@@ -63,12 +63,12 @@ class DrivenPath:
         return cls(points[keep], np.append(submap[0], submap[end])[keep])
 
     def select(self, which: NDArray[Any]) -> DrivenPath:
-        """The points of a mask."""
+        """Return the points of a mask."""
         return DrivenPath(self.points_m[which], self.submap[which])
 
 
 def is_driven(drops_m: Float64, camera_height_m: float) -> bool:
-    """Whether something carries the camera over the ground; a drone does not.
+    """Return whether something carries the camera over the ground; a drone does not.
 
     Args:
         drops_m: float64 (C,), heights of the path above what was seen below it, place by place.
@@ -107,7 +107,7 @@ def sweep(points_m: Float64, ground: GroundSurface, width_m: float, resolution_m
 
 
 def _on_ground(points_m: Float64, ground: GroundSurface) -> Bool:
-    """Which points are not above something else than the ground; unseen ground is ground."""
+    """Return which points are not above something else than the ground; unseen ground is ground."""
     off_m = np.abs(ground.drop_at(points_m[:, :2]) - ground.camera_height_m)
     return np.asarray(~(off_m > _SAME_M))
 
@@ -115,7 +115,7 @@ def _on_ground(points_m: Float64, ground: GroundSurface) -> Bool:
 def _columns(
     points_m: Float64, width_m: float, resolution_m: float
 ) -> tuple[NDArray[np.int64], Float64]:
-    """Columns (N, 2) near the path, each once, and its lowest height near each, (N,)."""
+    """Return columns (N, 2) near the path, each once, and its lowest height near each, (N,)."""
     reach = int(np.ceil(width_m / 2 / resolution_m)) + 1
     around = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), axis=-1).reshape(-1, 2)
     home = np.floor(points_m[:, :2] / resolution_m).astype(np.int64)

@@ -21,7 +21,7 @@ _REACH: Final = 2
 
 
 def find_floors(voxels: OccupancyVoxels) -> Float32:
-    """float32 (N, 3), centres of the occupied voxels with free space right above them.
+    """Return float32 (N, 3), centres of the occupied voxels with free space right above them.
 
     Walls have none. Voxels on another column do not matter, so tiles can be looked at alone.
     """
@@ -29,7 +29,7 @@ def find_floors(voxels: OccupancyVoxels) -> Float32:
 
 
 def add_floors(cloud: PointCloud, floors: Float32) -> PointCloud:
-    """A cloud to look for ground in: its points, and floors where it has too few.
+    """Return a cloud to look for ground in: its points, and floors where it has too few.
 
     Args:
         cloud: The fused cloud in map axes.
@@ -50,7 +50,7 @@ def add_floors(cloud: PointCloud, floors: Float32) -> PointCloud:
 
 
 def _floors(voxels: OccupancyVoxels) -> Int32:
-    """int32 (N, 3), the occupied voxels that are free above."""
+    """Return int32 (N, 3), the occupied voxels that are free above."""
     if len(voxels) == 0:
         return voxels.keys
     packed = pack_keys(voxels.keys)
@@ -67,19 +67,19 @@ def _floors(voxels: OccupancyVoxels) -> Int32:
 
 
 def _value_at(packed: NDArray[np.int64], log_odds: Float32, wanted: NDArray[np.int64]) -> Float32:
-    """Log-odds of cells among sorted ones; NaN where they were not observed."""
+    """Return log-odds of cells among sorted ones; NaN where they were not observed."""
     place = np.minimum(np.searchsorted(packed, wanted), len(packed) - 1)
     return np.where(packed[place] == wanted, log_odds[place], np.float32(np.nan))
 
 
 def _unknown(floors: Float32, known: Float32) -> Bool:
-    """Which floors lie in cells of the ground where fewer than ``min_points`` are known."""
+    """Return which floors lie in cells of the ground where fewer than ``min_points`` are known."""
     cells, counts = np.unique(_columns(known, CELL_M), return_counts=True)
     measured = cells[counts >= MIN_POINTS]
     return np.isin(_columns(floors, CELL_M), measured, invert=True)
 
 
 def _columns(xyz: Float32, cell_m: float) -> NDArray[np.int64]:
-    """One number for each point's cell of the ground."""
+    """Return one number for each point's cell of the ground."""
     cells = np.floor(xyz[:, :2].astype(np.float64) / cell_m).astype(np.int64)
     return np.asarray((cells[:, 0] << 32) + cells[:, 1])

@@ -147,7 +147,7 @@ def flatten(
 
 
 def _decide(found: _Found, s: GridSettings) -> NDArray[np.int8]:
-    """int8 (rows, columns), what each cell is."""
+    """Return int8 (rows, columns), what each cell is."""
     blocked = _without_small_blobs(found.blocked, s.min_blob_cells)
     free = found.seen_through & ~blocked & ~(found.low_hit & _beside(blocked))
     unsure = found.hit & ~free & ~_beside(free)
@@ -159,7 +159,7 @@ def _decide(found: _Found, s: GridSettings) -> NDArray[np.int8]:
 
 
 def drop_undecided(voxels: OccupancyVoxels, settings: GridSettings) -> OccupancyVoxels:
-    """The voxels that are occupied or free by the settings; the others count as unknown.
+    """Return the voxels that are occupied or free by the settings; the others count as unknown.
 
     Programs that read an OctoMap call everything above 0.5 occupied, and the rest free: a voxel
     that a single uncertain ray touched would be either.
@@ -172,20 +172,20 @@ def drop_undecided(voxels: OccupancyVoxels, settings: GridSettings) -> Occupancy
 def _floor(
     ground: GroundSurface, low: NDArray[Any], shape: tuple[int, int], resolution_m: float
 ) -> Float64:
-    """Height of the ground at the centre of each cell, row by row; float64 (rows·columns,)."""
+    """Return float64 (rows·columns,), height of the ground at the centre of each cell."""
     row, column = np.divmod(np.arange(shape[0] * shape[1]), shape[1])
     xy = (np.stack([column, row], axis=1) + low + 0.5) * resolution_m
     return ground.height_at(xy)
 
 
 def _beside(cells: Bool) -> Bool:
-    """The cells of a mask, and those that share a side with one."""
+    """Return the cells of a mask, and those that share a side with one."""
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     return np.asarray(cv2.dilate(cells.astype(np.uint8), cross) > 0)
 
 
 def _without_small_blobs(blocked: Bool, least: int) -> Bool:
-    """The mask without connected blobs (8 neighbours) of fewer than ``least`` cells."""
+    """Return the mask without connected blobs (8 neighbours) of fewer than ``least`` cells."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(
         blocked.astype(np.uint8), connectivity=8, ltype=cv2.CV_32S
     )

@@ -89,7 +89,7 @@ class GroundSurface:
         freeze(self, "drops_m", np.float64, self.heights_m.shape)
 
     def height_at(self, xy: NDArray[Any]) -> Float64:
-        """Height of the ground at places (N, 2), metres; float64 (N,), NaN = unknown.
+        """Return height of the ground at places (N, 2), metres; float64 (N,), NaN = unknown.
 
         Bilinear between the centres of cells; unknown where the cell of the place itself is.
         """
@@ -108,14 +108,14 @@ class GroundSurface:
         return np.where(known, total / np.where(known, weight, 1.0), np.nan)
 
     def drop_at(self, xy: NDArray[Any]) -> Float64:
-        """`drops_m` of the cells of places (N, 2); float64 (N,), NaN = unknown."""
+        """Return `drops_m` of the cells of places (N, 2); float64 (N,), NaN = unknown."""
         if self.drops_m is None:
             return np.full(len(xy), np.nan)
         column, row = np.floor((np.asarray(xy, np.float64) - self.origin_m) / self.cell_m).T
         return self._cells(row, column, self.drops_m)
 
     def _cells(self, row: Float64, column: Float64, values: Float64 | None = None) -> Float64:
-        """Values of cells, by default heights; NaN outside the surface."""
+        """Return values of cells, by default heights; NaN outside the surface."""
         values = self.heights_m if values is None else values
         rows, columns = values.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
@@ -194,7 +194,7 @@ class _Field:
         self._cell, self._z = self._points(cloud)
 
     def camera_height(self) -> float:
-        """The commonest height of the path above the points near it; NaN without points."""
+        """Return the commonest height of the path above the points near it; NaN without points."""
         near = self._ring.ravel()[self._cell] == 0
         drop = self._path_z.ravel()[self._cell[near]] - self._z[near]
         drop = drop[(drop > 2 * _BIN_M) & (drop < _DEEPEST_M)]
@@ -206,7 +206,7 @@ class _Field:
         return float(np.median(drop[np.abs(drop - mode) < 3 * _BIN_M]))
 
     def drops(self) -> Float64:
-        """Commonest height of the path above the points of each cell that it crosses, else NaN."""
+        """Return the commonest height of the path above the points of each cell; NaN = none."""
         drop = self._path_z.ravel()[self._cell] - self._z
         below = (drop > 2 * _BIN_M) & (drop < _DEEPEST_M)
         found = np.full(self.heights.size, np.nan)
@@ -255,7 +255,7 @@ class _Field:
         self._gap.ravel()[cells] = gap
 
     def _from_neighbours(self, cells: NDArray[np.intp]) -> tuple[Float64, Float64]:
-        """Mean height of the known neighbours of cells, and their smallest gap."""
+        """Return mean height of the known neighbours of cells, and their smallest gap."""
         rows, columns = np.divmod(cells, self.heights.shape[1])
         total, number = np.zeros(len(cells)), np.zeros(len(cells))
         gap = np.full(len(cells), np.inf)
@@ -270,7 +270,7 @@ class _Field:
         return np.where(number > 0, total / np.maximum(number, 1), np.nan), gap
 
     def _path_height(self, path: Float64) -> Float64:
-        """Mean height of the path in each cell that it crosses; NaN elsewhere."""
+        """Return mean height of the path in each cell that it crosses; NaN elsewhere."""
         cells, _ = self._cells_of(path)
         size = self.heights.size
         number = np.bincount(cells, minlength=size)
@@ -279,7 +279,7 @@ class _Field:
         return np.asarray(mean.reshape(self.heights.shape))
 
     def _points(self, cloud: PointCloud) -> tuple[NDArray[np.intp], Float64]:
-        """Cell and height of each point that may be ground."""
+        """Return cell and height of each point that may be ground."""
         xyz = cloud.xyz.astype(np.float64)
         if cloud.normals is not None:
             upright = math.cos(math.radians(MAX_TILT_DEG))
@@ -290,7 +290,7 @@ class _Field:
         return cells[reached], z[reached]
 
     def _cells_of(self, xyz: Float64) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        """Flat index of the cell of each point, and whether it lies on the field."""
+        """Return flat index of the cell of each point, and whether it lies on the field."""
         rows, columns = self.heights.shape
         place = np.floor((xyz[:, :2] - self.origin) / CELL_M)
         inside = np.all((place >= 0) & (place < (columns, rows)), axis=1)
@@ -299,14 +299,14 @@ class _Field:
 
 
 def _pieces(path: Float64) -> list[Float64]:
-    """The runs of rows between those of NaN."""
+    """Return the runs of rows between those of NaN."""
     known = np.isfinite(path).all(axis=1)
     runs = np.split(path, np.flatnonzero(np.diff(known)) + 1)
     return [run for run in runs if len(run) and np.isfinite(run[0]).all()]
 
 
 def _densify(path: Float64, step_m: float) -> Float64:
-    """The path with points at most ``step_m`` apart."""
+    """Return the path with points at most ``step_m`` apart."""
     if len(path) == 1:
         return path
     pieces = np.linalg.norm(np.diff(path, axis=0), axis=1)
@@ -316,7 +316,7 @@ def _densify(path: Float64, step_m: float) -> Float64:
 
 
 def _rings(seeds: NDArray[np.bool_], reach: int) -> NDArray[np.int32]:
-    """Steps (to any of 8 neighbours) from the nearest seed; the largest int32 beyond ``reach``."""
+    """Return steps (to 8 neighbours) from the nearest seed; the largest int32 beyond ``reach``."""
     away = np.where(seeds, 0, 255).astype(np.uint8)
     steps = np.rint(cv2.distanceTransform(away, cv2.DIST_C, 3)).astype(np.int32)
     return np.where(steps <= reach, steps, np.iinfo(np.int32).max).astype(np.int32)

@@ -130,7 +130,7 @@ class LocalizedDrive:
         return Trajectory(np.array(poses).reshape(-1, 4, 4), times_s)
 
     def figures(self) -> dict[str, Any]:
-        """The figures for ``summary.json``."""
+        """Return the figures for ``summary.json``."""
         states = [frame.located.state for frame in self.frames]
         seconds = np.array([frame.seconds for frame in self.frames])
         sigmas_m = [_sigma_m(frame.located) for frame in self.tracked]
@@ -148,7 +148,7 @@ class LocalizedDrive:
         }
 
     def warnings(self) -> list[str]:
-        """What the user should know."""
+        """Return what the user should know."""
         states = [frame.located.state for frame in self.frames]
         lost = states.count(State.LOST)
         if not self.tracked:
@@ -246,12 +246,12 @@ def _located(localizer: Localizer, frame: OdometryFrame, index: int) -> Localize
 
 
 def _sigma_m(located: Located) -> float:
-    """Standard deviation of a position: the root of the sum of those along three axes."""
+    """Return standard deviation of a position: the root of the sum of those along three axes."""
     covariance = np.zeros((6, 6)) if located.covariance is None else located.covariance
     return float(np.sqrt(np.trace(covariance[:3, :3])))
 
 
 def _turned_back(yaw_deg: float) -> Float64:
-    """float64 (2, 2), that turns rows (x, y) back by a heading."""
+    """Return float64 (2, 2), that turns rows (x, y) back by a heading."""
     c, s = math.cos(math.radians(yaw_deg)), math.sin(math.radians(yaw_deg))
     return np.array([[c, -s], [s, c]])

@@ -57,7 +57,7 @@ class _Part:
     cameras_m: Float64
 
     def points(self) -> Float64:
-        """float64 (M, 3), the fused points in the world of the map."""
+        """Return float64 (M, 3), the fused points in the world of the map."""
         with reading(self.session.where):
             fusion = self.session.info.config["fusion"]
             voxel_m, least = float(fusion["voxel_m"]), int(fusion["min_count"])
@@ -141,7 +141,7 @@ class Surroundings:
 
 
 def _parts(map_: Map, session: Session) -> Iterator[_Part]:
-    """The submaps of a drive."""
+    """Yield the submaps of a drive."""
     corrections, T_map_session = session.corrections(), map_.T_world_session(session)
     cameras_m = apply(T_map_session, session.trajectory.positions_m)
     for entry in session.submaps.entries:

@@ -122,16 +122,16 @@ class OccupancyBuilder:
         self._map = clamped.add_evidence(self._map, self._evidence, low, high)
 
     def voxels(self) -> OccupancyVoxels:
-        """Every voxel that was observed so far, block by block as first touched."""
+        """Return every voxel that was observed so far, block by block as first touched."""
         return self.part().voxels(self._settings.resolution_m)
 
     def part(self) -> OccupancyPart:
-        """What was observed since the start, or since the last `take`."""
+        """Return what was observed since the start, or since the last `take`."""
         points = points_of(self._points) if self._settings.thin_surfaces else None
         return OccupancyPart(clamped.observed_rows(self._map), points)
 
     def take(self) -> OccupancyPart:
-        """The part so far; the builder starts a new one."""
+        """Return the part so far; the builder starts a new one."""
         part, self._map = self.part(), clamped.make_clamped(256)
         self._points = voxels.make_sums(_FIRST_POINTS, 0)
         return part
@@ -149,7 +149,7 @@ class OccupancyBuilder:
         return int(self._map.used[0]) * self._map.cells[:1].nbytes + points
 
     def _rays(self, cloud: PointCloud, T_map_camera: Float64) -> raycast.Rays:
-        """One ray per voxel in which enough points end; lengths in voxels."""
+        """Return one ray per voxel in which enough points end; lengths in voxels."""
         s = self._settings
         T = T_map_camera.copy()
         T[:3] /= s.resolution_m
@@ -173,7 +173,7 @@ class OccupancyBuilder:
 
 
 def _hits(rays: raycast.Rays) -> voxels.VoxelPoints:
-    """The ends of the rays that hit something, precise ones with more weight."""
+    """Return the ends of the rays that hit something, precise ones with more weight."""
     hit = np.flatnonzero(rays.hit > 0)
     weights = 1.0 / (rays.sigma[hit] ** 2 + _LEAST_SIGMA_CELLS**2)
     return voxels.VoxelPoints(
@@ -184,7 +184,7 @@ def _hits(rays: raycast.Rays) -> voxels.VoxelPoints:
 def _reduce(
     ends: Float32, values: Float32, count: Int32 | None, least: int
 ) -> tuple[Float64, Float32]:
-    """Means of the ends (M, 3) and values (M, C) in each voxel with ``least`` trusted points."""
+    """Return mean ends (M, 3) and values (M, C) of each voxel with ``least`` trusted points."""
     trusted = (values[:, 2] > 0).astype(np.float32)
     weights = trusted if count is None else trusted * count.astype(np.float32)
     points = voxels.VoxelPoints(ends, weights, values)
@@ -196,7 +196,7 @@ def _reduce(
 
 
 def sigma_and_confidence(cloud: PointCloud) -> tuple[Float32, Float32]:
-    """Both float32 (N,); 0 m and 1 where the cloud has none."""
+    """Return both float32 (N,); 0 m and 1 where the cloud has none."""
     n = len(cloud)
     return (
         np.zeros(n, np.float32) if cloud.sigma_m is None else cloud.sigma_m,

@@ -6,5 +6,5 @@ import math
 
 
 def log_odds(probability: float) -> float:
-    """``ln(p / (1 - p))`` of a probability in (0, 1)."""
+    """Return ``ln(p / (1 - p))`` of a probability in (0, 1)."""
     return math.log(probability / (1.0 - probability))

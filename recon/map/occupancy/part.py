@@ -48,7 +48,7 @@ class OccupancyPart:
         return (corner + local).astype(np.int32)
 
     def select(self, which: NDArray[Any]) -> OccupancyPart:
-        """The blocks of a boolean mask (B,)."""
+        """Return the blocks of a boolean mask (B,)."""
         sizes = np.diff(self.rows.starts)
         cells = np.repeat(which, sizes)
         starts = np.concatenate([[0], np.cumsum(sizes[which])]).astype(np.int64)
@@ -59,7 +59,7 @@ class OccupancyPart:
         )
 
     def to_tree(self) -> dict[str, Any]:
-        """Everything, as a tree of arrays."""
+        """Return everything, as a tree of arrays."""
         points = self.points
         return {
             "rows": self.rows._asdict(),
@@ -68,14 +68,14 @@ class OccupancyPart:
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> OccupancyPart:
-        """What `to_tree` gave."""
+        """Return what `to_tree` gave."""
         points = tree["points"]
         return cls(
             clamped.CellRows(**tree["rows"]), None if points is None else SurfacePoints(**points)
         )
 
     def moved(self, T_new_map: Float64, resolution_m: float) -> OccupancyPart:
-        """The part after a rigid motion: each cell gets the values that were at its centre."""
+        """Return the part after a rigid motion: a cell gets the values that were at its centre."""
         T_cells = T_new_map.copy()
         T_cells[:3, 3] /= resolution_m
         blocks = clamped.chain_rows(clamped.make_clamped(1), self.rows)
@@ -86,7 +86,7 @@ class OccupancyPart:
         return moved.select(np.diff(moved.rows.starts) > 0)
 
     def outdoing(self, most: float) -> OccupancyPart:
-        """The part of a later drive, before which log-odds count as ``most`` at the most."""
+        """Return the part of a later drive, before which log-odds count as ``most`` at the most."""
         change, low, high = self.rows.values.T
         # x -> min(max(x + change, low), high) after x -> min(max(x, -most), most).
         ends = [np.clip(change + end, low, high) for end in (-most, most)]
@@ -94,7 +94,7 @@ class OccupancyPart:
         return replace(self, rows=self.rows._replace(values=values))
 
     def voxels(self, resolution_m: float) -> OccupancyVoxels:
-        """The log-odds of a drive that consists of this part alone.
+        """Return the log-odds of a drive that consists of this part alone.
 
         A voxel that was hit is undecided unless the surface of the points around it crosses it:
         the surface is then in the voxel before or behind.
@@ -107,7 +107,7 @@ class OccupancyPart:
 
 
 def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints) -> Float32:
-    """Log-odds (N,) of cells (N, 3), no more than unsure where no surface crosses."""
+    """Return log-odds (N,) of cells (N, 3), no more than unsure where no surface crosses."""
     hit = np.flatnonzero(log_odds > _UNSURE)
     # What was hit and then looked through is no surface: a car that drove off, an outlier.
     points = points.select(np.isin(points.keys, voxels.pack_keys(cells[hit])))
@@ -116,7 +116,7 @@ def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints) -> Float32:
 
 
 def join_occupancy(parts: Iterable[OccupancyPart]) -> OccupancyPart:
-    """Parts that follow one another in time, chained."""
+    """Return parts that follow one another in time, chained."""
     blocks, points = clamped.make_clamped(1), []
     for part in parts:
         blocks = clamped.chain_rows(blocks, part.rows)
@@ -127,7 +127,7 @@ def join_occupancy(parts: Iterable[OccupancyPart]) -> OccupancyPart:
 
 
 def free_part(keys: Int32, log_odds: float) -> OccupancyPart:
-    """A part of a drive after which cells have given log-odds, whatever was known of them before.
+    """Return a part after which cells have given log-odds, whatever was known of them before.
 
     Args:
         keys: int32 (N, 3), the cells, each once.

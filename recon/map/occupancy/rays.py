@@ -26,7 +26,7 @@ _FIRST_ROWS: Final = 1 << 15
 
 
 def ray_grain(settings: OccupancySettings) -> RayGrain:
-    """The resolution of the rays that are kept for a map."""
+    """Return the resolution of the rays that are kept for a map."""
     cell_m = settings.resolution_m / settings.rays_per_voxel
     # The farthest places must fit into 16 bits.
     unit_m = max(cell_m / _UNITS_PER_CELL, (_beyond_m(settings) + cell_m) / _LARGEST)
@@ -74,5 +74,5 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
 
 
 def _beyond_m(settings: OccupancySettings) -> float:
-    """Where points out of range are moved to: never into a cube with one that is in range."""
+    """Return where points out of range are moved to: never into a cube with one in range."""
     return settings.max_range_m + 2 * settings.resolution_m / settings.rays_per_voxel

@@ -33,16 +33,16 @@ class SurfacePoints:
         return len(self.keys)
 
     def select(self, which: NDArray[Any]) -> SurfacePoints:
-        """The rows of a boolean mask or of an index array, in that order."""
+        """Return the rows of a boolean mask or of an index array, in that order."""
         return SurfacePoints(self.keys[which], self.sums[which])
 
     def in_blocks(self, blocks: NDArray[np.int64]) -> SurfacePoints:
-        """The cells that lie in some packed blocks."""
+        """Return the cells that lie in some packed blocks."""
         home = voxels.pack_keys(voxels.unpack_keys(self.keys) >> BLOCK_BITS)
         return self.select(np.isin(home, blocks))
 
     def moved(self, T_new_map: Float64) -> SurfacePoints:
-        """The sums after a rigid motion: those of a cell go to the cell of its moved mean point.
+        """Return the sums after a rigid motion: those of a cell go to that of its moved mean point.
 
         Args:
             T_new_map: float64 (4, 4), its translation in cells.
@@ -55,17 +55,17 @@ class SurfacePoints:
         return join_points([SurfacePoints(voxels.pack_keys(cells), sums.astype(np.float32))])
 
     def cross(self, cells: Int32) -> Bool:
-        """bool (N,): which cells (N, 3) the surface through the points around them crosses."""
+        """Return bool (N,): cells (N, 3) that the surface through points around them crosses."""
         return facets.crossed_cells(cells, self.keys, self.sums)
 
 
 def join_points(parts: Iterable[SurfacePoints]) -> SurfacePoints:
-    """Points of different frames as those of one drive."""
+    """Return points of different frames as those of one drive."""
     return points_of(sum_points(parts))
 
 
 def sum_points(parts: Iterable[SurfacePoints]) -> voxels.VoxelSums:
-    """Sums to which more can be added, in cells of edge 1."""
+    """Return sums to which more can be added, in cells of edge 1."""
     total = voxels.make_sums(1, 0)
     for part in parts:
         none = np.zeros(len(part), np.float32)
@@ -74,6 +74,6 @@ def sum_points(parts: Iterable[SurfacePoints]) -> voxels.VoxelSums:
 
 
 def points_of(total: voxels.VoxelSums) -> SurfacePoints:
-    """A copy of what was summed up."""
+    """Return a copy of what was summed up."""
     n = int(total.used[0])
     return SurfacePoints(total.keys[:n].copy(), total.sums[:n].copy())

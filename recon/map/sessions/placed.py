@@ -95,7 +95,7 @@ def _moved(map_: Map, session: Session, settings: DriveSettings) -> Iterator[Sub
 
 
 def _with_gaps(parts: Sequence[np.ndarray], gap: float) -> np.ndarray:
-    """Rows of several drives, with a row in between."""
+    """Return rows of several drives, with a row in between."""
     rows = [parts[0]]
     for part in parts[1:]:
         rows += [np.full_like(part[:1], gap), part]

@@ -26,7 +26,7 @@ _MOST_INFLATED: Final = 1040
 
 
 def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, list[Bytes]]:
-    """A tree as JSON, and the bytes of its arrays, to be written one after the other.
+    """Return a tree as JSON, and the bytes of its arrays, to be written one after the other.
 
     In the JSON, ``{"tree": …}`` is a mapping and ``{"array": …}`` an array: its dtype as numpy
     spells it, its shape, ``C`` or ``F`` for the axis that varies fastest (the last, the first),
@@ -62,7 +62,7 @@ def to_bytes(tree: Mapping[str, Any], *, compress: bool) -> tuple[str, list[Byte
 
 
 def from_bytes(text: str, read: Callable[[int], bytearray]) -> dict[str, Any]:
-    """The tree of `to_bytes`. Tuples are lists now.
+    """Return the tree of `to_bytes`. Tuples are lists now.
 
     Args:
         text: The JSON.
@@ -95,7 +95,7 @@ def from_bytes(text: str, read: Callable[[int], bytearray]) -> dict[str, Any]:
 
 
 def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | memoryview]:
-    """Dtype, shape, layout and codec of an array, and its bytes."""
+    """Return dtype, shape, layout and codec of an array, and its bytes."""
     # Products of matrices round differently in another order of axes.
     layout = "F" if array.flags.f_contiguous and not array.flags.c_contiguous else "C"
     little = array.astype(array.dtype.newbyteorder("<"), copy=False)
@@ -114,7 +114,7 @@ def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | me
 
 
 def _unpack(head: Sequence[Any], packed: bytearray) -> NDArray[Any]:
-    """The array of these bytes, which it takes over where they are not compressed.
+    """Return the array of these bytes, which it takes over where they are not compressed.
 
     Raises:
         FormatError: They are no such array.
@@ -144,7 +144,7 @@ def _columns(shape: Sequence[int]) -> int:
 
 
 def _planes(array: NDArray[Any]) -> NDArray[np.uint8]:
-    """uint8 (columns, bytes of a number, N)."""
+    """Return uint8 (columns, bytes of a number, N)."""
     size = array.dtype.itemsize
     columns = array.reshape(-1, _columns(array.shape))
     split = columns.view(np.uint8).reshape(-1, columns.shape[1], size)

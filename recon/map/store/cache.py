@@ -34,7 +34,7 @@ class Cache:
         return self._size
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
-        """The value of a key, made now unless it is kept; two threads may both make it."""
+        """Return the value of a key, made now unless it is kept; two threads may both make it."""
         with self._lock:
             if key in self._held:
                 self._held.move_to_end(key)
@@ -67,7 +67,7 @@ class Cache:
 
 
 def size_of(value: object) -> int:
-    """Bytes of the arrays in a value: in mappings, sequences and dataclasses; others are small."""
+    """Return bytes of the arrays in a value: in mappings, sequences and dataclasses."""
     if isinstance(value, np.ndarray):
         return value.nbytes
     if isinstance(value, Mapping):

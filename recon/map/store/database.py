@@ -27,7 +27,7 @@ _ROOM: Final = "check that the folder is writable and the disk is not full"
 
 
 def connect(path: Path | None, *, read_only: bool = False) -> sqlite3.Connection:
-    """A connection without transactions of its own; the lock of the store guards it."""
+    """Return a connection without transactions of its own; the lock of the store guards it."""
     name: str | Path = "" if path is None else path
     if path is not None and read_only:
         name = f"{path.absolute().as_uri()}?mode=ro"
@@ -107,7 +107,7 @@ class Content:
             self._file = BytesIO(database.execute(query, (row,)).fetchone()[0])
 
     def read(self, size: int) -> bytearray:
-        """The next bytes, exactly as many.
+        """Return the next bytes, exactly as many.
 
         Raises:
             FormatError: There are not so many.
@@ -195,5 +195,5 @@ def writing(path: Path | None) -> Iterator[None]:
 
 
 def beside(path: Path) -> list[Path]:
-    """What SQLite keeps beside a file that is being written."""
+    """Return what SQLite keeps beside a file that is being written."""
     return [path.with_name(path.name + end) for end in ("-wal", "-shm", "-journal")]

@@ -67,7 +67,7 @@ def with_occupancy(
     T_map_world: Float64 | None = None,
     T_world_camera: Float64 | None = None,
 ) -> Submaps:
-    """The submaps of a finished drive, with occupancy made from its rays, in a temporary store.
+    """Return the submaps of a finished drive in a temporary store, with occupancy from its rays.
 
     Args:
         session: The drive.
@@ -131,7 +131,7 @@ def check_rays(session: Session, settings: DriveSettings) -> None:
 
 
 def _compact(submap: Submap, least: int, where: _Places) -> Submap:
-    """A submap as it is kept: without voxels that fewer frames saw and no other submap can add to.
+    """Return a submap as kept: without voxels that too few frames saw and no submap adds to.
 
     The caller names no submap, so that one at a time is in memory.
     """
@@ -154,7 +154,7 @@ class _Places:
         self._boxes = [self._box(index) for index in range(len(self._submaps))]
 
     def shared(self, index: int) -> Bool:
-        """Which voxels share their place with one of another submap, or, moved, of the same."""
+        """Return which voxels share their place with one of another submap or, moved, their own."""
         keys = self._keys(index)
         _, where, counts = np.unique(keys, return_inverse=True, return_counts=True)
         found = counts[where] > 1
@@ -165,7 +165,7 @@ class _Places:
         return found
 
     def _keys(self, index: int) -> NDArray[np.int64]:
-        """int64 (N,), packed cell of each voxel of a submap."""
+        """Return int64 (N,), packed cell of each voxel of a submap."""
         return self._submaps.store.cache.get(
             ("moved keys", id(self), index), lambda: self._moved(index)
         )
@@ -177,7 +177,7 @@ class _Places:
         return fused.moved_keys(self._corrections[index], self._voxel_m)
 
     def _box(self, index: int) -> tuple[Int32, Int32]:
-        """Smallest and largest cell of a submap."""
+        """Return the smallest and the largest cell of a submap."""
         cells = voxels.unpack_keys(self._keys(index))
         nowhere = np.full(3, np.iinfo(np.int32).max)
         if not len(cells):
@@ -186,7 +186,7 @@ class _Places:
 
 
 def _rounded(values: Float32, bits: int) -> Float32:
-    """Numbers with fewer bits behind the point of their mantissa; the rest is zero."""
+    """Return numbers with fewer bits behind the point of their mantissa; the rest is zero."""
     drop = 23 - bits
     half = np.int32(1 << (drop - 1))
     whole = np.ascontiguousarray(values).view(np.int32) + half
@@ -194,6 +194,6 @@ def _rounded(values: Float32, bits: int) -> Float32:
 
 
 def _nothing() -> OccupancyPart:
-    """Occupancy without a cell."""
+    """Return occupancy without a cell."""
     blocks, starts, cells = np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(0, np.uint16)
     return OccupancyPart(clamped.CellRows(blocks, starts, cells, np.zeros((0, 3), np.float32)))

@@ -44,7 +44,7 @@ class Keyframes:
         self._store.put(KEYFRAME, key, content, compress=True)
 
     def get(self, frame: int) -> StoredKeyframe:
-        """The keyframe of a frame, read unless it was read lately.
+        """Return the keyframe of a frame, read unless it was read lately.
 
         Raises:
             FormatError: It is missing or damaged.
@@ -62,7 +62,7 @@ class Keyframes:
         return self._store.numbers(KEYFRAME, self._session)
 
     def __iter__(self) -> Iterator[StoredKeyframe]:
-        """All keyframes, in the order of their frames."""
+        """Return all keyframes, in the order of their frames."""
         return map(self._read, self.frames)
 
     def _read(self, frame: int) -> StoredKeyframe:

@@ -31,7 +31,7 @@ class Link:
         return replace(self, sessions=(one, other))
 
     def to_tree(self) -> dict[str, Any]:
-        """Everything, as a tree of arrays and plain values."""
+        """Return everything, as a tree of arrays and plain values."""
         return {"sessions": self.sessions, "loop": asdict(self.loop), "kept": self.kept}
 
     @classmethod

@@ -82,7 +82,7 @@ class Map:
         return f"Map({self.store.name!r}, {len(self.sessions)} sessions)"
 
     def session(self, number: int = 0) -> Session:
-        """A drive in the map.
+        """Return a drive in the map.
 
         Raises:
             FormatError: There is none of this number.
@@ -96,7 +96,7 @@ class Map:
         )
 
     def T_world_session(self, session: Session) -> Float64:
-        """float64 (4, 4), from the world of a drive to that of the map, which is its first drive's.
+        """Return float64 (4, 4), from the world of a drive to that of the map, its first drive's.
 
         Drives that are linked share the axes of the map.
 
@@ -171,7 +171,7 @@ class Map:
         return [self.session(number) for number in new]
 
     def tiles(self, settings: DriveSettings | None = None) -> Tiles:
-        """The linked drives in tiles: fused cloud, what moved, and occupancy from their rays.
+        """Return the linked drives in tiles: cloud, what moved, and occupancy from their rays.
 
         Args:
             settings: How to make them; None = the settings of the first drive.

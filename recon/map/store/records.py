@@ -126,7 +126,7 @@ class Store:
         self._insert(kind, _name(key), text, content)
 
     def get(self, kind: str, key: Key) -> dict[str, Any]:
-        """A record, which others may hold as well: copy it before changing it.
+        """Return a record, which others may hold as well: copy it before changing it.
 
         Raises:
             FormatError: It is missing or damaged.
@@ -134,7 +134,7 @@ class Store:
         return self.cache.get((kind, key), lambda: self.read(kind, key))
 
     def read(self, kind: str, key: Key) -> dict[str, Any]:
-        """A record read from the file, past the cache; for those that are read once.
+        """Return a record read from the file, past the cache; for those that are read once.
 
         Raises:
             FormatError: It is missing or damaged.
@@ -162,7 +162,7 @@ class Store:
                 self.cache.drop((kind, each))
 
     def keys(self, kind: str) -> list[Key]:
-        """The keys of a kind, in order.
+        """Return the keys of a kind, in order.
 
         Raises:
             FormatError: The file is damaged.
@@ -173,7 +173,7 @@ class Store:
         return sorted(found, key=lambda key: key if isinstance(key, tuple) else (key,))
 
     def numbers(self, kind: str, session: int) -> list[int]:
-        """The second numbers of the keys of a kind that begin with the number of a session.
+        """Return the second numbers of the keys of a kind that begin with the number of a session.
 
         Raises:
             FormatError: The file is damaged.
@@ -182,7 +182,7 @@ class Store:
         return [key[1] for key in keys if key[0] == session]
 
     def kinds(self) -> list[str]:
-        """The kinds of which there are records, in order.
+        """Return the kinds of which there are records, in order.
 
         Raises:
             FormatError: The file is damaged.
@@ -192,7 +192,7 @@ class Store:
             return [str(kind) for (kind,) in rows]
 
     def has(self, kind: str, key: Key) -> bool:
-        """Whether there is such a record."""
+        """Return whether there is such a record."""
         query = "SELECT 1 FROM record WHERE kind = ? AND key = ?"
         with self._lock, self._reading():
             return self._database.execute(query, (kind, _name(key))).fetchone() is not None
@@ -274,7 +274,7 @@ class Store:
             self.cache.drop((kind, _key(name)))
 
     def _row(self, kind: str, name: str) -> tuple[str, Content, int]:
-        """Text, content and checksum of a record."""
+        """Return text, content and checksum of a record."""
         query = "SELECT rowid, length(content), tree, checksum FROM record"
         query += " WHERE kind = ? AND key = ?"
         found = self._database.execute(query, (kind, name)).fetchone()

@@ -105,7 +105,7 @@ class Session:
         return Session(store, number)
 
     def __len__(self) -> int:
-        """Number of frames so far."""
+        """Return the number of frames so far."""
         return len(self._poses)
 
     def __repr__(self) -> str:
@@ -168,7 +168,7 @@ class Session:
         return self._store.get(LOOPS, self.number)
 
     def corrections(self) -> Float64 | None:
-        """float64 (S, 4, 4), what loop closure moves each submap by; None = nothing moves.
+        """Return float64 (S, 4, 4), what loop closure moves each submap by; None = nothing moves.
 
         Raises:
             FormatError: The record of the loops is damaged.
@@ -217,7 +217,7 @@ class Session:
         self._store.put(RAYS, (self.number, frame), content, compress=True)
 
     def rays(self, frame: int) -> tuple[RayCloud, RayGrain]:
-        """The rays of a frame, as they were kept.
+        """Return the rays of a frame, as they were kept.
 
         Raises:
             FormatError: They are missing or damaged.
@@ -248,7 +248,7 @@ class Session:
         self._store.put(_STATE, self.number, state)
 
     def state(self) -> dict[str, Any] | None:
-        """The state of an unfinished drive, to go on from; None = nothing is known.
+        """Return the state of an unfinished drive, to go on from; None = nothing is known.
 
         Raises:
             FormatError: It is damaged.
@@ -313,7 +313,7 @@ def _check_rotations(path: Trajectory) -> None:
 
 
 def _checked(grain: RayGrain) -> RayGrain:
-    """The resolution of rays.
+    """Return the resolution of rays.
 
     Raises:
         FormatError: It is impossible.
@@ -326,7 +326,7 @@ def _checked(grain: RayGrain) -> RayGrain:
 
 
 def _zigzag(steps: NDArray[np.int16]) -> NDArray[np.uint16]:
-    """Steps of either sign as small positive numbers: 0, −1, 1, −2 become 0, 1, 2, 3."""
+    """Return steps of either sign as small positive numbers: 0, −1, 1, −2 become 0, 1, 2, 3."""
     return ((steps << 1) ^ (steps >> 15)).view(np.uint16)
 
 

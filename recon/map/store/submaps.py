@@ -89,7 +89,7 @@ class Submaps:
         self._entries.append(entry)
 
     def get(self, index: int) -> Submap:
-        """A submap, read from the map: it is large, and used once.
+        """Return a submap, read from the map: it is large, and used once.
 
         Raises:
             FormatError: It is missing or damaged.
@@ -98,5 +98,5 @@ class Submaps:
             return Submap.from_tree(self.store.read(SUBMAP, (self._session, index)))
 
     def __iter__(self) -> Iterator[Submap]:
-        """The submaps in order, read one at a time."""
+        """Return the submaps in order, read one at a time."""
         return map(self.get, range(len(self)))

@@ -42,14 +42,14 @@ class TileParts:
         return list(self._keys)
 
     def window(self, key: TileKey) -> Window:
-        """The bounds of a tile."""
+        """Return the bounds of a tile."""
         (column, row), edge_m = key, self.edge_m
         return Window((column * edge_m, row * edge_m), ((column + 1) * edge_m, (row + 1) * edge_m))
 
     def near(
         self, places_m: NDArray[np.floating[Any]], margin_m: float
     ) -> Iterator[tuple[TileKey, Bool]]:
-        """The tiles that have places (N, 2 or 3) in them or their margin, and which ones."""
+        """Yield the tiles that have places (N, 2 or 3) in them or their margin, and which ones."""
         home = np.floor(places_m[:, :2] / self.edge_m).astype(np.int64)
         # Packed into one integer, since numpy sorts rows slowly.
         homes = unpack_keys(np.unique(pack_keys(np.pad(home, ((0, 0), (0, 1))))))
@@ -62,14 +62,14 @@ class TileParts:
                 yield key, inside
 
     def under(self, window: Window) -> list[TileKey]:
-        """The tiles that a window touches and in which there is something."""
+        """Return the tiles that a window touches and in which there is something."""
         low = np.floor(np.array(window.low) / self.edge_m).astype(int).tolist()
         high = np.floor(np.array(window.high) / self.edge_m).astype(int).tolist()
         columns, rows = (range(a, b + 1) for a, b in zip(low, high, strict=True))
         return [key for key in product(columns, rows) if key in self._keys]
 
     def numbers(self, kind: str, key: TileKey) -> Sequence[int]:
-        """The numbers of the parts of a kind in a tile, in the order in which they were put."""
+        """Return the numbers of the parts of a kind in a tile, in the order they were put."""
         return tuple(self._numbers[kind].get(key, ()))
 
     def put(
@@ -86,7 +86,7 @@ class TileParts:
         self._keys[key] = None
 
     def read(self, kind: str, key: TileKey) -> Iterator[tuple[int, dict[str, Any]]]:
-        """The parts of a kind in a tile with their numbers, one at a time; arrays are read-only.
+        """Yield the parts of a kind in a tile with their numbers; arrays are read-only.
 
         Raises:
             FormatError: One is damaged.

@@ -62,7 +62,7 @@ class MapViews(Sequence[KnownView]):
     @overload
     def __getitem__(self, number: slice) -> list[KnownView]: ...
     def __getitem__(self, number: int | slice) -> KnownView | list[KnownView]:
-        """A view.
+        """Return a view.
 
         Raises:
             FormatError: It is damaged.

@@ -207,7 +207,7 @@ def _work(job: Job, folder: str, anew: bool, every_s: float) -> Outcome:
     tell: Callable[[dict[str, Any]], None] = lambda event: worker.log_event(_TOPIC, event)  # noqa: E731
 
     def stopped() -> bool:
-        """Whether the task was cancelled, or its client is gone."""
+        """Return whether the task was cancelled, or its client is gone."""
         task = worker.state.tasks.get(key)
         return task is None or task.state in ("cancelled", "released")
 

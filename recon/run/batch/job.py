@@ -63,7 +63,7 @@ class Job:
         return [*self.words, "--out", str(out), *shown]
 
     def resumes(self, out: Path) -> bool:
-        """Whether an earlier try left something to go on with."""
+        """Return whether an earlier try left something to go on with."""
         return self.command == _RESUMABLE and (state_folder(out) / STARTED).is_file()
 
 
@@ -87,7 +87,7 @@ class Outcome:
 
 
 def is_done(out: Path) -> bool:
-    """Whether the result of a job is there; the record is the last file of a run."""
+    """Return whether the result of a job is there; the record is the last file of a run."""
     return (out / RECORD).is_file() and (out / SUMMARY).is_file()
 
 

@@ -218,11 +218,11 @@ def _spread(entries: Sequence[Entry], sweep: Mapping[str, Sequence[Any]]) -> Ite
 
 
 def _plain(value: Any) -> str:
-    """A value as part of the name of a folder."""
+    """Return a value as part of the name of a folder."""
     return re.sub(r"[^A-Za-z0-9_.+-]", "-", str(value))
 
 
 def _name_of(source: str) -> str:
-    """The last part of a path, without what a folder cannot be named by."""
+    """Return the last part of a path, without what a folder cannot be named by."""
     name = _plain(Path(source).resolve().name)
     return re.sub(r"^[^A-Za-z0-9]+", "", name) or "job"

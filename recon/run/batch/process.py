@@ -122,7 +122,7 @@ def _run(
 
 
 def _environment() -> dict[str, str]:
-    """The environment, in which the folder of the job cannot hide this program."""
+    """Return the environment, in which the folder of the job cannot hide this program."""
     paths = (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
