@@ -8,7 +8,7 @@
     [[job]]
     name = "monday"                          the folder of its result
     command = "map"                          any command that writes results
-    source = "drives/monday"                 or several: ["left.png", "right.png"]
+    source = "drives/monday"                 or several: ["left.png", "right.png"]; none for demo
     options = ["--no-mesh"]                  optional, like all below
     set = ["odometry.method=visual"]
     threads = 2
@@ -47,7 +47,7 @@ class Entry:
     Attributes:
         name: Its name.
         command: The command, such as ``map`` or ``evaluate trajectory``.
-        source: What the command works on, in the order of its arguments.
+        source: What the command works on, in the order of its arguments; empty = it needs nothing.
         options: Further words of the command line.
         set: Settings, as ``key=value``.
         threads: Threads of its process; None = as the batch says.
@@ -59,7 +59,7 @@ class Entry:
 
     name: str
     command: str
-    source: tuple[str, ...]
+    source: tuple[str, ...] = ()
     options: tuple[str, ...] = ()
     set: tuple[str, ...] = ()
     threads: int | None = None
@@ -171,7 +171,7 @@ def _entry(content: Any, where: str) -> Entry:
     if not isinstance(content, Mapping):
         raise SettingsError("job is not a table", where=where, got=type(content).__name__)
     _check_keys(content, _JOB_KEYS, where)
-    for key in ("name", "command", "source"):
+    for key in ("name", "command"):
         if key not in content:
             raise SettingsError(f"job has no {key}", where=where)
     values = {key: _value(key, value, where) for key, value in content.items()}

@@ -21,6 +21,7 @@ PLAN: Final = "jobs.json"
 _PLAN_BYTES: Final = 1 << 30
 #: A job writes into its own folder, and says what the batch reads.
 _NOT_OPTIONS: Final = ("--out", "-o", "--resume", "--json", "--latex", "--quiet", "-q", "--help")
+_WITHOUT_SOURCE: Final = ("demo",)
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,8 @@ def _job(entry: Entry, program: Program, limits: Limits, folder: Path) -> Job:
     if command not in program.commands:
         known = ", ".join(program.commands)
         raise SettingsError("unknown command", where=where, got=entry.command, expected=known)
+    if not entry.source and command not in _WITHOUT_SOURCE:
+        raise SettingsError("job has no source", where=where)
     takes, entry = program.commands[command], _fill_in(entry, limits)
     words = [*command.split(), *_sources(command, entry.source, folder)]
     words += [word for text in entry.set for word in ("--set", text)]
@@ -150,9 +153,9 @@ def _options(options: Sequence[str], where: str) -> Sequence[str]:
 
 def _sources(command: str, source: Sequence[str], folder: Path) -> list[str]:
     """Return the arguments of a command; for a pair, the files of a scene's folder."""
-    place = folder / source[0]
-    if command not in ("pair", "disparity") or len(source) > 1:
+    if command not in ("pair", "disparity") or len(source) != 1:
         return list(source)
+    place = folder / source[0]
     layout = find_layout(place) if place.is_dir() else None
     if layout is None:  # the job itself says what is missing
         return [str(place / "im0.png"), str(place / "im1.png")]

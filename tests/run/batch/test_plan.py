@@ -52,6 +52,10 @@ def test_an_option_that_a_command_does_not_have_is_left_out_of_the_limits() -> N
     assert not {"--threads", "--memory-limit"} & set(line)
 
 
+def test_a_demo_needs_no_source() -> None:
+    assert planned(Entry("a", "demo", options=("--frames", "6")))[:3] == ["demo", "--frames", "6"]
+
+
 def test_the_folder_of_a_scene_is_a_pair_with_calibration_and_truth(tmp_path: Path) -> None:
     for name in ("im0.png", "im1.png", "calib.txt", "disp0GT.pfm"):
         (tmp_path / name).touch()
@@ -97,6 +101,7 @@ def test_a_damaged_plan_is_one_line(tmp_path: Path, content: str) -> None:
     [
         ({"command": "mapp"}, "job a: unknown command .*got mapp"),
         ({"command": "batch"}, "unknown command"),
+        ({"source": ()}, "job a: job has no source"),
         ({"command": "rm -rf /"}, "unknown command"),
         ({"command": "map drive2"}, "unknown command"),
         ({"command": ""}, "unknown command"),
