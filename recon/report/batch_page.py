@@ -146,4 +146,8 @@ def _ranked(results: Sequence[JobResult]) -> list[tuple[JobResult, Sequence[str]
 
 
 def _cells(one: JobResult, columns: Sequence[str]) -> list[str]:
-    return [f"{one.figures[name]:.4g}" if name in one.figures else NOT_KNOWN for name in columns]
+    figures = (one.figures.get(name) for name in columns)
+    return [
+        NOT_KNOWN if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+        for value in figures
+    ]

@@ -40,7 +40,7 @@ class SyntheticSource:
     @property
     def name(self) -> str:
         """Seed and number of frames."""
-        return f"synthetic street {self.settings.seed}, {self.settings.frames} frames"
+        return f"synthetic street {self.settings.seed}"
 
     @property
     def description(self) -> str:

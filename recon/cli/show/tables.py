@@ -59,7 +59,7 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
         shown |= {f"occupancy.{part}.{key}": value for key, value in figures.items()}
     for drive in summary.get("sessions", ()):
         place = "" if drive["linked"] else ", apart"
-        shown[f"session {drive['number']}"] = f"{drive['name']}, {drive['frames']} frames{place}"
+        shown[f"session {drive['number']}"] = f"{drive['name']}: {drive['frames']} frames{place}"
     if stages:
         shown |= {f"seconds.{key}": value for key, value in summary["stages"].items()}
     print_figures("", shown)
