@@ -15,11 +15,14 @@ from recon.core.values.board import parse_board
 from recon.io.cameras.calibration import read_calibration
 from recon.io.images.image import read_image, write_image
 from recon.rig.calibrate.board_views import find_views
-from recon.rig.calibrate.summary import tell_depths
+from recon.rig.calibrate.result import CalibrationForm, CalibrationRun, write_calibration
+from recon.rig.calibrate.summary import describe_depths
 from recon.sources.image_pairs import pair_images
 from recon.stereo.rectify.rectifier import Rectifier
 from tests.scenery.boards import board_rig, place_boards, render_views
 from tests.sources.drives import write_video
+
+pytestmark = pytest.mark.usefixtures("blank_figures")
 
 BOARD = parse_board("chess:9x6:25mm")
 QUICK = ["calibration.bootstrap=60"]
@@ -50,10 +53,14 @@ def calibrate(folder: Path, out: Path, form: str = "recon", board: str = "chess:
     )
 
 
-@pytest.mark.parametrize("form", ["recon", "opencv", "ros", "kalibr"])
-def test_pictures_give_the_true_rig_in_every_format(drawn: Path, tmp_path: Path, form: str) -> None:
-    run, rig = calibrate(drawn, tmp_path, form), board_rig()
-    summary = json.loads((tmp_path / "report" / "summary.json").read_text())
+@pytest.fixture(scope="module")
+def run(drawn: Path, tmp_path_factory: pytest.TempPathFactory) -> CalibrationRun:
+    """A calibration whose figures, files and report several tests look at."""
+    return calibrate(drawn, tmp_path_factory.mktemp("calibrated"))
+
+
+def assert_true_rig(run: CalibrationRun) -> None:
+    summary, rig = run.summary, board_rig()
     assert summary["stereo_rms_px"] < 0.15
     assert summary["epipolar_px"] < 0.1
     # Corners of rendered images are good to about 0.1 px, and eight views are few.
@@ -62,23 +69,43 @@ def test_pictures_give_the_true_rig_in_every_format(drawn: Path, tmp_path: Path,
     assert (summary["views"], summary["views_used"]) == (9, 8)
     assert summary["pictures_without_board"] == ["right04.png"]
     assert any("right04.png" in line for line in summary["warnings"])
-    read = read_calibration(run.summary["files"][0], 640, 480)
+
+
+def assert_read_back(file: Path, run: CalibrationRun) -> None:
+    read = read_calibration(file, 640, 480)
     assert isinstance(read, StereoCalibration)
     assert read.baseline_m == pytest.approx(run.fit.calibration.baseline_m, rel=1e-9)
-    assert Rectifier(read).camera.focal_px == pytest.approx(summary["rectified_focal_px"], rel=1e-6)
+    focal_px = run.summary["rectified_focal_px"]
+    assert Rectifier(read).camera.focal_px == pytest.approx(focal_px, rel=1e-6)
 
 
-def test_report_and_pictures_are_written(drawn: Path, tmp_path: Path) -> None:
-    run = run_calibration(
-        str(drawn / "left*.png"),
-        str(drawn / "right*.png"),
-        BOARD,
-        load_config(None, QUICK),
-        out=tmp_path / "out",
-    )
-    names = {path.name for path in (tmp_path / "out").rglob("*.png")}
+def test_pictures_give_the_true_rig(run: CalibrationRun) -> None:
+    written = json.loads((Path(run.summary["out"]) / "summary.json").read_text())
+    assert written == json.loads(json.dumps(run.summary))
+    assert_true_rig(run)
+    assert_read_back(Path(run.summary["files"][0]), run)
+
+
+@pytest.mark.parametrize("form", ["recon", "opencv", "ros"])
+def test_the_rig_comes_back_from_every_format(
+    run: CalibrationRun, tmp_path: Path, form: CalibrationForm
+) -> None:
+    assert_read_back(write_calibration(tmp_path / "rig.yaml", run, form)[0], run)
+
+
+def test_pictures_give_the_true_rig_with_a_lens_that_kalibr_knows(
+    drawn: Path, tmp_path: Path
+) -> None:
+    run = calibrate(drawn, tmp_path, "kalibr")
+    assert_true_rig(run)
+    assert_read_back(Path(run.summary["files"][0]), run)
+
+
+def test_report_and_pictures_are_written(run: CalibrationRun) -> None:
+    out = Path(run.summary["out"])
+    names = {path.name for path in out.rglob("*.png")}
     assert {"coverage.png", "epipolar_raw.png", "epipolar_rectified.png"} <= names
-    html = (tmp_path / "out" / "report.html").read_text()
+    html = (out / "report.html").read_text()
     assert "Stereo calibration" in html
     # Eight views are too few to be sure of the forecast, however small it is.
     assert run.summary["verdict"] in ("usable", "repeat")
@@ -86,7 +113,7 @@ def test_report_and_pictures_are_written(drawn: Path, tmp_path: Path) -> None:
     assert "No warnings" not in html
     assert run.summary["findings"][0]["text"] in html
     assert f"{run.summary['stereo_rms_px']:.3f} px" in html
-    assert (tmp_path / "out" / "calibration.yaml").is_file()
+    assert (out / "calibration.yaml").is_file()
 
 
 def shrink(folder: Path) -> None:
@@ -157,7 +184,9 @@ def test_depth_errors_are_reported_in_words() -> None:
     known = {"calibration": 110.4, "low": -3.24, "high": 4.56, "matching": 2.251}
     unknown = dict.fromkeys(known) | {"matching": 0.01}
     working = {"distance_m": 3.548, "calibration_share": 0.0551}
-    told = tell_depths({"depth_error_cm": {"2": known, "0.1": unknown}, "working_error": working})
+    told = describe_depths(
+        {"depth_error_cm": {"2": known, "0.1": unknown}, "working_error": working}
+    )
     assert told == {
         "depth error at the working distance of 3.55 m": "5.5 %",
         "depth error at 2 m": "110 cm, in the middle -3.2 to 4.6; of matching 2.3 cm",
@@ -260,6 +289,7 @@ def test_the_published_chessboard_pairs_calibrate_as_they_should(
     assert (summary["views_used"], summary["views_repeated"]) == (13, [])
 
 
+@pytest.mark.slow
 @pytest.mark.real
 def test_the_published_views_captured_five_times_have_the_same_forecast(
     recon_data: Path, tmp_path: Path
