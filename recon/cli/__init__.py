@@ -1,4 +1,7 @@
-"""The command line: parse, build the configuration, call one pipeline function, print one table.
+"""The command line: parse, build the configuration, call one story of `commands/`, print one table.
+
+One file per command; `options.py` has what several of them take, `session.py` what an error looks
+like, and `show/` the tables and the progress.
 
 Nothing heavy is imported before a command runs, so ``recon --help`` answers at once.
 """

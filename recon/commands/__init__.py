@@ -1,1 +1,7 @@
-"""One story per command of the program, as functions of the library."""
+"""One story per command of the program, as functions of the library.
+
+`map.py` is `recon map`, and so on; each reads like the paragraph that explains it. What several of
+them share: `config.py` (settings of all stages), `map_options.py` (what is mapped with what),
+`resume.py` and `identity.py` (interrupted runs), `joined.py` (several drives in one map). `api.py`
+is for Python alone.
+"""

@@ -1,1 +1,9 @@
-"""From posed clouds to the map: fusion, occupancy, ground, and the store that keeps them."""
+"""From posed clouds to the map: fusion, occupancy, ground, and the store that keeps them.
+
+- `drive/sequence.py`: the loop over frames; `drive/mapper.py`: what it does with one;
+- `submaps.py`: consecutive frames with their part of the cloud and of the occupancy;
+- `fusion/builder.py`, `occupancy/builder.py`: how frames become those parts;
+- `store/map.py`: the file that keeps them; `store/session.py`: what one drive puts into it;
+- `tiles.py`: the map in squares, from which all products are made; `ground/grid.py`: the flat one;
+- `sessions/joining.py`: several drives in one map; `localize/localizer.py`: a drive found in a map.
+"""

@@ -1,4 +1,11 @@
-"""From frames to poses: visual odometry, corrected by kiss-icp where that helps."""
+"""From frames to poses: visual odometry, corrected by kiss-icp where that helps.
+
+- `protocol.py`: what every odometry takes and gives; `registry.py`: the odometries by name;
+- `visual.py`: features tracked (`tracking.py`) through a short window of frames (`window.py`);
+- `fused.py`: its poses corrected by `kiss_icp.py`, as far as `gate.py` lets them;
+- `checked.py`: poses that cannot be trusted are marked; `expected.py`: how far a path may be off;
+- `prior.py`: what wheels or an inertial unit say.
+"""
 
 from recon.odometry.expected import ExpectedDrift, expected_drift
 from recon.odometry.known import KnownPoses

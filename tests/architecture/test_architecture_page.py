@@ -43,6 +43,25 @@ def test_the_rooms_are_those_whose_order_is_enforced(page: str, pyproject: dict[
     assert ["__main__", *rooms] == layers
 
 
+def test_every_file_that_a_room_names_is_in_it(root: Path) -> None:
+    """The docstring of a room leads a reader to the files to begin with."""
+    rooms = [path.parent for path in (root / "recon").glob("*/__init__.py")]
+    named = {
+        room: re.findall(r"`([\w/]+(?:\.py|/))`", (room / "__init__.py").read_text())
+        for room in rooms
+    }
+
+    beside = {room.name for room in rooms}
+    missing = [
+        f"{room.name}: {name}"
+        for room, names in named.items()
+        for name in names
+        if not (room / name).exists() and name.strip("/") not in beside
+    ]
+    assert missing == []
+    assert sum(map(len, named.values())) > 60
+
+
 def test_a_story_fits_on_a_screen_or_two(root: Path) -> None:
     """The commands of the program; what several of them share stands beside them."""
     stories = {path.stem for path in (root / "recon" / "cli").glob("*.py")}
