@@ -30,7 +30,7 @@ _RANGE: Final = re.compile(r"bytes (\d+)-(\d+)/(\d+|\*)")
 #: What a server says that is too busy, or is started again.
 _PASSING: Final = frozenset({408, 425, 429, 500, 502, 503, 504})
 
-Tell = Callable[[int, int | None], None]
+OnBytes = Callable[[int, int | None], None]
 """Receives the number of bytes that are there and, if it is known, of those to come in all."""
 
 
@@ -52,7 +52,7 @@ class _BrokenOffError(Exception):
 
 
 def download(
-    address: str, path: Path, promise: Promise, tell: Tell = lambda done, total: None
+    address: str, path: Path, promise: Promise, on_bytes: OnBytes = lambda done, total: None
 ) -> None:
     """Download a file, or the rest of one that an earlier call began.
 
@@ -64,7 +64,7 @@ def download(
         address: Its address, with http or https.
         path: Where to; it appears when it is complete and is what was promised.
         promise: What it must be.
-        tell: Called after each megabyte.
+        on_bytes: Called after each megabyte.
 
     Raises:
         DownloadError: The server does not have the file or another one, sends more than it said,
@@ -76,7 +76,7 @@ def download(
     while True:
         before = _size(part)
         try:
-            _transfer(address, part, promise, tell)
+            _transfer(address, part, promise, on_bytes)
             break
         except _BrokenOffError as error:
             tries = 1 if _size(part) > before else tries + 1
@@ -115,7 +115,7 @@ def digest_of(path: Path, kind: str) -> str:
     return f"{kind}:{digest.hexdigest()}"
 
 
-def _transfer(address: str, part: Path, promise: Promise, tell: Tell) -> None:
+def _transfer(address: str, part: Path, promise: Promise, on_bytes: OnBytes) -> None:
     """Receive the rest of a file, or all of it where the server cannot go on."""
     version, known = _begun(part)
     if known is not None and _size(part) == known:
@@ -129,7 +129,7 @@ def _transfer(address: str, part: Path, promise: Promise, tell: Tell) -> None:
         _expect(address, total, promise)
         _need_room(part, (total or promise.size or 0) - begin)
         write_text(_note(part), json.dumps([_version(response), total]))
-        _receive(address, response, part, (begin, total or promise.size), tell)
+        _receive(address, response, part, (begin, total or promise.size), on_bytes)
         if total is not None and _size(part) < total:
             raise _BrokenOffError(f"{_size(part)} of {total} bytes")
 
@@ -139,7 +139,7 @@ def _receive(
     response: http.client.HTTPResponse,
     part: Path,
     span: tuple[int, int | None],
-    tell: Tell,
+    on_bytes: OnBytes,
 ) -> None:
     done, total = span
     try:
@@ -151,7 +151,7 @@ def _receive(
                     _forget(part)
                     raise DownloadError("the server sends more than it said", where=address)
                 out.write(piece)
-                tell(done, total)
+                on_bytes(done, total)
     except OSError as error:
         reason = error.strerror or str(error)
         raise OutputError("cannot write the download", where=part, got=reason) from error

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
-from contextlib import suppress
-from dataclasses import replace
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Final
@@ -14,10 +17,9 @@ from typing import Any, Final
 from recon.core.errors import DownloadError, FormatError, OutputError
 from recon.io.archives import FileFacts, unpack
 from recon.io.atomic import write_text
-from recon.io.download import digest_of, download, fetch_text
+from recon.io.download import OnBytes, digest_of, download, fetch_text
 from recon.io.files import read_text, reading
 from recon.io.lock import take_lock
-from recon.run.megabytes import Megabytes
 from recon.run.progress import SILENT, Progress
 from recon.sources.datasets import Download, Part
 
@@ -25,6 +27,27 @@ RECORD: Final = "dataset.json"
 """What was fetched, and size and hash of each file."""
 _RECORD_BYTES: Final = 1 << 28
 _PARTIAL: Final = ".partial"
+_MEGABYTE: Final = 1_000_000
+
+
+@dataclass(frozen=True)
+class Megabyte:
+    """A megabyte that has arrived; a `Step` of the progress.
+
+    Attributes:
+        number: Of how many, from 1.
+        seconds: Time since the one before.
+    """
+
+    number: int
+    seconds: float
+    ok: bool = True
+    state: str = ""
+
+    @property
+    def event(self) -> dict[str, Any]:
+        """Its figures for programs."""
+        return {"event": "megabyte", "number": self.number, "seconds": round(self.seconds, 3)}
 
 
 def is_fetched(place: Path) -> bool:
@@ -102,11 +125,34 @@ def _receive(one: Download, work: Path, mirror: str | None, progress: Progress) 
         promise = replace(promise, digest=_published(f"{address}.{one.digest_beside}", one))
     path = work / one.file
     if not path.is_file():
-        with Megabytes(one.file, promise.size, progress) as megabytes:
-            download(address, path, promise, megabytes.tell)
+        with _shown(one.file, promise.size, progress) as on_bytes:
+            download(address, path, promise, on_bytes)
     found = digest_of(path, "sha256")
     checked = promise.digest or ("size" if promise.size else "nothing")
     return {"address": address, "bytes": path.stat().st_size, "digest": found, "checked": checked}
+
+
+@contextmanager
+def _shown(name: str, size: int | None, progress: Progress) -> Iterator[OnBytes]:
+    """Yield what shows the megabytes of a file, also of those that an earlier call received."""
+    shown, last = -1, time.perf_counter()
+
+    def on_bytes(done: int, total: int | None) -> None:
+        nonlocal shown, last
+        if shown < 0:
+            progress.on_start(name, math.ceil((size or total or 0) / _MEGABYTE), "MB")
+            shown = 0
+        now = time.perf_counter()
+        while shown < done // _MEGABYTE:
+            shown += 1
+            progress.on_step(Megabyte(shown, now - last))
+            last = now
+
+    try:
+        yield on_bytes
+    finally:
+        if shown >= 0:
+            progress.on_finish()
 
 
 def _published(address: str, one: Download) -> str:
