@@ -83,7 +83,7 @@ def calibrate(
         from recon.commands.calibrate import run_calibration
         from recon.commands.config import load_config
         from recon.core.values.board import parse_board
-        from recon.rig.calibrate.summary import tell_depths
+        from recon.rig.calibrate.summary import describe_depths
 
         # kalibr's lens model has two radial terms.
         fitting = ["calibration.radial_terms=2"] if form == "kalibr" else []
@@ -104,7 +104,7 @@ def calibrate(
     if json:
         print_json(run.summary)
     else:
-        print_run(run.summary | tell_depths(run.summary) | {"warnings": ()}, stages=verbose)
+        print_run(run.summary | describe_depths(run.summary) | {"warnings": ()}, stages=verbose)
         for finding in run.summary["findings"]:
             typer.echo(f"{finding['severity']}: {finding['text']}")
         typer.echo(f"verdict: {run.summary['verdict']}")

@@ -52,11 +52,11 @@ def capture(
     with session(quiet=quiet):
         from recon.commands.capture import run_capture
         from recon.commands.config import capture_overrides, load_config
-        from recon.rig.capture import Recording
+        from recon.rig.capture import RecordingSettings
 
         known = load_config(config, [*(set_ or ()), *capture_overrides(size, rate)]).capture
         limits = {"frames": frames, "seconds": seconds, "preview_every": preview}
-        settings = Recording.parse({**dict(known), **limits})
+        settings = RecordingSettings.parse({**dict(known), **limits})
         devices = [left] if right is None else [left, right]
         with until_interrupted() as stopped:
             summary = run_capture(devices, out, settings, calibration=calib, stopped=stopped)

@@ -12,7 +12,7 @@ from typing import Any
 
 from recon.core.errors import FormatError
 from recon.io.atomic import write_text
-from recon.rig.capture import Recording, capture_pairs, warm_up
+from recon.rig.capture import RecordingSettings, capture_pairs, warm_up
 from recon.rig.capture_folder import CaptureFolder, CaptureLog, write_pairs
 from recon.sources.opencv_camera import Camera, OpenCvCamera
 
@@ -20,7 +20,7 @@ from recon.sources.opencv_camera import Camera, OpenCvCamera
 def run_capture(
     devices: Iterable[str],
     folder: Path,
-    settings: Recording,
+    settings: RecordingSettings,
     *,
     calibration: Path | None = None,
     stopped: Callable[[], bool] = lambda: False,
@@ -57,7 +57,7 @@ def run_capture(
 def record(
     cameras: tuple[Camera, ...],
     folder: Path,
-    settings: Recording,
+    settings: RecordingSettings,
     calibration: Path | None,
     stopped: Callable[[], bool],
 ) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from recon.core.errors import SettingsError
 from recon.evaluation.map import evaluate_map
-from recon.evaluation.map_run import (
+from recon.evaluation.map_comparison import (
     MapComparison,
     ReferenceFrame,
     add_within_reach,

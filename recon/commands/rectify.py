@@ -17,8 +17,8 @@ from recon.rig.rectification import (
 )
 from recon.run import Run
 from recon.run.machine import serial_algebra
-from recon.sources.files import read_pair
 from recon.sources.image_pairs import ImagePairs, pair_images
+from recon.sources.one_pair import read_pair
 
 _WARN_ROW_PX: Final = 0.5
 _KEPT_TYPES: Final = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})

@@ -15,7 +15,7 @@ from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.settings import Settings
 from recon.core.values import LengthErrors, Trajectory, TrajectoryMetrics
 from recon.core.values.arrays import Float64, Int32
-from recon.evaluation.straight import open_roll_axis, without_roll
+from recon.evaluation.roll import open_roll_axis, without_roll
 
 KITTI_LENGTHS_M: Final = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Segment lengths of the KITTI benchmark."""

@@ -7,7 +7,7 @@ from typing import Final
 
 from recon.core.values import PointCloud
 from recon.evaluation.map import nearest_distances
-from recon.evaluation.map_run import MapComparison
+from recon.evaluation.map_comparison import MapComparison
 from recon.io.models.ply import write_ply
 from recon.report.colour import ERROR_SCALE, colour_values
 from recon.run.directory import RunDirectory

@@ -54,7 +54,7 @@ class CaptureSettings(Settings):
     )
 
 
-class Recording(CaptureSettings):
+class RecordingSettings(CaptureSettings):
     """The settings of one recording, and when it ends."""
 
     frames: int | None = Field(default=None, ge=1, description="Stop after this many pairs.")
@@ -82,7 +82,7 @@ class CapturedPair:
 
 
 def capture_pairs(
-    cameras: tuple[Camera, ...], settings: Recording, stopped: Callable[[], bool]
+    cameras: tuple[Camera, ...], settings: RecordingSettings, stopped: Callable[[], bool]
 ) -> Iterator[CapturedPair]:
     """Yield pairs until the limit is reached, a file ends, or ``stopped`` returns True.
 

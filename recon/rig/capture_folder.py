@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final
 
 import numpy as np
@@ -18,7 +17,7 @@ from typing_extensions import Self
 from recon.core.errors import OutputError, ReconError
 from recon.io.frames_csv import FRAMES, HEADER, CapturedFrame
 from recon.io.images.image import write_image
-from recon.rig.capture import CapturedPair, Recording
+from recon.rig.capture import CapturedPair, RecordingSettings
 
 # Length of the write queue: a longer one would only hide that the disk is too slow.
 _WAITING: Final = 32
@@ -52,12 +51,7 @@ class CaptureFolder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         os.fsync(self._list)
         os.close(self._list)
         if kind is not None and self.frames == 0:
@@ -138,7 +132,10 @@ class CaptureLog:
 
 
 def write_pairs(
-    pairs: Iterable[CapturedPair], target: CaptureFolder, settings: Recording, log: CaptureLog
+    pairs: Iterable[CapturedPair],
+    target: CaptureFolder,
+    settings: RecordingSettings,
+    log: CaptureLog,
 ) -> None:
     """Write in a second thread, so that the disk does not block the cameras.
 

@@ -94,10 +94,10 @@ def check_package(name: str, module: str) -> Check:
         installed = version(name)
     except PackageNotFoundError:
         return Check(name, ok=False, found="not installed", hint=f"run: pip install {name}")
-    done, told = _run_python(f"import {module}")
+    done, printed = _run_python(f"import {module}")
     if done:
         return Check(name, ok=True, found=installed)
-    return Check(name, ok=False, found=f"{installed}, {told}", hint=_import_hint(name, told))
+    return Check(name, ok=False, found=f"{installed}, {printed}", hint=_import_hint(name, printed))
 
 
 def check_system_libraries(libraries: Mapping[str, str]) -> list[Check]:
@@ -125,8 +125,8 @@ def check_memory() -> Check:
 
 def check_opencv_threads() -> Check:
     """Ask OpenCV for its default number of threads."""
-    done, told = _run_python("import cv2; print(cv2.getNumThreads())")
-    found = told if done else "unknown"
+    done, printed = _run_python("import cv2; print(cv2.getNumThreads())")
+    found = printed if done else "unknown"
     return Check("OpenCV threads", done, found, "" if done else "see opencv", needed=False)
 
 
@@ -213,8 +213,8 @@ def _run_python(code: str) -> tuple[bool, str]:
     return done.returncode == 0, lines[-1] if lines else ""
 
 
-def _import_hint(name: str, told: str) -> str:
+def _import_hint(name: str, printed: str) -> str:
     for library, package in SYSTEM_LIBRARIES.items():
-        if library in told:
+        if library in printed:
             return f"run: apt-get install {package}"
     return f"run: pip install --force-reinstall {name}"

@@ -78,10 +78,10 @@ class OneBehind:
         Raises:
             Exception: Whatever the previous job raised; the new job is then not started.
         """
-        self.settle()
+        self.wait()
         self._job = self._pool.submit(job)
 
-    def settle(self) -> None:
+    def wait(self) -> None:
         """Wait until the last job has ended.
 
         Raises:

@@ -24,10 +24,10 @@ from recon.sources.bag_topics import (
     names_rectified,
     rig_of_messages,
 )
-from recon.sources.files import join_pair
+from recon.sources.calibration import as_rectified, read_rig
+from recon.sources.one_pair import join_pair
 from recon.sources.pairing import Roll, StampPairs, check_increasing, check_most, pair_stamps
 from recon.sources.protocol import Recording
-from recon.sources.rig import as_rectified, read_rig
 from recon.sources.rosbags import CAMERA_INFO, Bag, BagImage
 from recon.sources.settings import SourceSettings
 

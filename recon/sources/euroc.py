@@ -24,9 +24,9 @@ from recon.core.geometry.se3 import invert
 from recon.core.values import Rig, SequenceTruth, StereoCalibration, check_size
 from recon.core.values.arrays import Float64
 from recon.io.cameras.euroc import NS, read_euroc_camera, read_euroc_truth
+from recon.sources.calibration import as_rectified, find_calibration, read_rig
 from recon.sources.images import ImageSource, image_size, pair_listed
 from recon.sources.pairing import check_increasing
-from recon.sources.rig import as_rectified, find_calibration, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_stamped_names, truth_at
 

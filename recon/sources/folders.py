@@ -23,6 +23,7 @@ from recon.core.errors import SourceError
 from recon.core.values.arrays import Float64
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.frames_csv import FRAMES, read_frames
+from recon.sources.calibration import read_rig
 from recon.sources.images import (
     ImageFrame,
     ImageSource,
@@ -42,7 +43,6 @@ from recon.sources.pairing import (
     split_sides,
     stamps_of_names,
 )
-from recon.sources.rig import read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_times_of_pairs, read_tum_truth
 

@@ -49,7 +49,7 @@ def pair_images(left: str | Path, right: str | Path) -> ImagePairs:
     Raises:
         SourceError: A side has no images, most images have no partner, or the sides share files.
     """
-    sides = (list_images(left), list_images(right))
+    sides = (find_images(left), find_images(right))
     both = set(sides[0]) & set(sides[1])
     if both:
         raise SourceError(
@@ -71,7 +71,7 @@ def pair_images(left: str | Path, right: str | Path) -> ImagePairs:
     return ImagePairs(tuple(zip(*sides, strict=True)), by_order=len(sides[0]) > 1)
 
 
-def list_images(where: str | Path) -> list[Path]:
+def find_images(where: str | Path) -> list[Path]:
     """Return the images of a folder or pattern in natural order: 2 before 10.
 
     Raises:

@@ -18,7 +18,7 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float64, UInt8
 from recon.io.images.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
-from recon.sources.files import join_pair
+from recon.sources.one_pair import join_pair
 from recon.sources.pairing import Roll, check_most, natural_key, pair_stamps
 from recon.sources.protocol import Recording
 from recon.sources.settings import SourceSettings

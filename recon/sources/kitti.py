@@ -25,6 +25,7 @@ from recon.core.values.arrays import Float64
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offset, read_kitti_rig
 from recon.io.files import StrPath
 from recon.io.trajectory import read_kitti_poses
+from recon.sources.calibration import as_rectified, read_rig
 from recon.sources.images import (
     ImageFrame,
     ImageSource,
@@ -33,7 +34,6 @@ from recon.sources.images import (
     pair_named,
 )
 from recon.sources.pairing import Roll, natural_key
-from recon.sources.rig import as_rectified, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_times_of_pairs
 

@@ -18,10 +18,10 @@ from typing import Final
 from recon.core.errors import SourceError
 from recon.core.values import RectifiedCamera, Rig
 from recon.io.cameras.kitti import read_kitti_rig
+from recon.sources.calibration import as_rectified, read_rig
 from recon.sources.images import ImageSource, image_size, list_images, pair_listed
 from recon.sources.kitti import choose_cameras
 from recon.sources.pairing import check_increasing
-from recon.sources.rig import as_rectified, read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_dates
 

@@ -16,7 +16,7 @@ from recon.io.images.disparity_png import read_disparity
 from recon.io.images.exif import read_focal_length
 from recon.io.images.image import MAX_MEGAPIXELS
 from recon.io.middlebury.scene import stand_in_camera
-from recon.sources.files import read_pair
+from recon.sources.one_pair import read_pair
 
 UP_TO_SCALE: Final = "no baseline was given: all lengths are in baselines, not in metres"
 

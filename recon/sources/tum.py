@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from recon.core.errors import SourceError
+from recon.sources.calibration import read_rig
 from recon.sources.images import ImageSource, image_size, is_image, pair_listed
 from recon.sources.pairing import check_increasing, find_partners
-from recon.sources.rig import read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_stamped_names, read_tum_truth
 

@@ -13,9 +13,9 @@ from recon.core.errors import FormatError, SourceError
 from recon.core.values import StereoPair, check_size
 from recon.core.values.arrays import UInt8
 from recon.io.images.video import VIDEOS, VideoFile, open_video
+from recon.sources.calibration import read_rig
 from recon.sources.pairing import Roll, find_partners
 from recon.sources.protocol import Recording
-from recon.sources.rig import read_rig
 from recon.sources.settings import SourceSettings
 
 _STACKED: Final = frozenset({"top-bottom", "bottom-top"})

@@ -20,7 +20,7 @@ from recon.core.values import RectifiedCamera, StereoPair
 from recon.io import atomic
 from recon.io.frames_csv import FRAMES, HEADER
 from recon.rig import capture
-from recon.rig.capture import Recording
+from recon.rig.capture import RecordingSettings
 from recon.rig.capture_folder import CaptureFolder
 from recon.sources.registry import open_source
 from tests.sources import drives
@@ -78,7 +78,7 @@ def test_two_videos_are_recorded_and_mapped_at_once(
     devices = [str(folder / "left.avi"), str(folder / "right.avi")]
     out = tmp_path / "out"
     calibration = folder / "calib.txt"
-    summary = run_capture(devices, out, Recording(preview_every=4), calibration=calibration)
+    summary = run_capture(devices, out, RecordingSettings(preview_every=4), calibration=calibration)
     assert summary["frames"] == 12
     assert summary["rate_hz"] == pytest.approx(10, rel=1e-3)
     assert summary["skew_max_ms"] == 0
@@ -94,7 +94,7 @@ def test_two_videos_are_recorded_and_mapped_at_once(
 
 def test_one_device_with_both_views_is_halved(pairs: list[StereoPair], tmp_path: Path) -> None:
     video = drives.write_side_by_side(pairs, CAMERA, tmp_path / "in")
-    run_capture([str(video)], tmp_path / "out", Recording(frames=5))
+    run_capture([str(video)], tmp_path / "out", RecordingSettings(frames=5))
     drives.write_calib(tmp_path / "out", CAMERA)
     read = list(open_source(tmp_path / "out"))
     assert len(read) == 5
@@ -104,7 +104,7 @@ def test_one_device_with_both_views_is_halved(pairs: list[StereoPair], tmp_path:
 def test_skew_is_recorded(tmp_path: Path) -> None:
     times = [0.1 * k for k in range(8)]
     cameras = (FakeCamera("l", times), FakeCamera("r", [t + 0.003 for t in times]))
-    summary = record(cameras, tmp_path, Recording(frames=8), None, never)
+    summary = record(cameras, tmp_path, RecordingSettings(frames=8), None, never)
     assert summary["skew_mean_ms"] == pytest.approx(3)
     assert summary["gaps"] == 0
     rows = (tmp_path / FRAMES).read_text().splitlines()
@@ -115,7 +115,7 @@ def test_a_frame_lost_by_one_camera_is_dropped_of_the_other(tmp_path: Path) -> N
     times = [0.1 * k for k in range(10)]
     lossy = [t + 0.002 for t in times if round(10 * t) not in {3, 4}]
     cameras = (FakeCamera("l", times), FakeCamera("r", lossy))
-    summary = record(cameras, tmp_path, Recording(frames=8), None, never)
+    summary = record(cameras, tmp_path, RecordingSettings(frames=8), None, never)
     assert summary["skew_max_ms"] == pytest.approx(2)
     assert summary["gaps"] == 1
     drives.write_calib(tmp_path, SMALL_CAMERA)
@@ -130,7 +130,7 @@ def test_the_exposure_of_the_left_camera_is_held_on_both_sides(
     times = [0.1 * k for k in range(10)]
     cameras = (FakeCamera("l", times), FakeCamera("r", times))
     cameras[1].exposure = 7.0
-    summary = record(cameras, tmp_path, Recording(frames=3), None, never)
+    summary = record(cameras, tmp_path, RecordingSettings(frames=3), None, never)
     assert summary["exposure_locked"] is True
     assert cameras[1].exposure == cameras[0].exposure == 100.0
     assert "0.400000" in (tmp_path / FRAMES).read_text().splitlines()[1]
@@ -140,7 +140,7 @@ def test_a_camera_that_goes_silent_is_reported_and_what_was_recorded_stays(tmp_p
     times = [0.1 * k for k in range(6)]
     cameras = (FakeCamera("l", times), FakeCamera("/dev/video2", times[:4]))
     with pytest.raises(SourceError, match="/dev/video2: camera gives no more frames"):
-        record(cameras, tmp_path, Recording(), None, never)
+        record(cameras, tmp_path, RecordingSettings(), None, never)
     drives.write_calib(tmp_path, SMALL_CAMERA)
     assert len(open_source(tmp_path)) == 4
 
@@ -153,7 +153,7 @@ def test_a_full_disk_takes_the_pair_back_whole(
     fill_the_disk(monkeypatch, victim)
     devices = [str(folder / "left.avi"), str(folder / "right.avi")]
     with pytest.raises(OutputError, match=r"(No space left on device).*disk"):
-        run_capture(devices, tmp_path / "out", Recording())
+        run_capture(devices, tmp_path / "out", RecordingSettings())
     drives.write_calib(tmp_path / "out", CAMERA)
     read = list(open_source(tmp_path / "out"))
     assert len(read) == 5
@@ -198,7 +198,7 @@ def test_a_camera_that_is_not_there_is_one_line_and_leaves_no_folder(
     tmp_path: Path, devices: list[str], message: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(ReconError, match=message) as caught:
-        run_capture(devices, tmp_path / "out", Recording())
+        run_capture(devices, tmp_path / "out", RecordingSettings())
     assert "\n" not in str(caught.value)
     assert capfd.readouterr().err == ""
     assert not (tmp_path / "out").exists()
@@ -209,7 +209,7 @@ def test_cameras_of_different_size_are_reported(pairs: list[StereoPair], tmp_pat
     drives.write_video(tmp_path / "r.avi", [pair.right[:, :32] for pair in pairs])
     devices = [str(tmp_path / "l.avi"), str(tmp_path / "r.avi")]
     with pytest.raises(SourceError, match="left 64x32, right 32x32"):
-        run_capture(devices, tmp_path / "out", Recording())
+        run_capture(devices, tmp_path / "out", RecordingSettings())
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 60) -> None:

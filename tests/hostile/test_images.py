@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from recon.io.images.image import read_image, write_image
-from recon.io.images.image_integrity import image_size
+from recon.io.images.image_integrity import stated_size
 from recon.io.images.pfm import read_pfm, write_pfm
 from tests.hostile.calibrations import OURS
 from tests.hostile.refusals import assert_refused, refusal, run
@@ -88,7 +88,7 @@ def test_the_size_is_that_of_the_decoded_image(suffix: str) -> None:
     colour = (23, 31, 3) if suffix == ".ppm" else (23, 31)
     done, content = cv2.imencode(suffix, np.zeros(colour, np.uint8))
     assert done
-    assert image_size(content.tobytes()) == (31, 23)
+    assert stated_size(content.tobytes()) == (31, 23)
 
 
 def test_more_pixels_are_read_if_the_settings_allow_them(pair: tuple[Path, Path]) -> None:

@@ -79,10 +79,10 @@ def _watch(
     watch = LoopWatch(Keyframes(store))
     for number, (frame, T) in enumerate(zip(frames[:upto], path.T_world_camera, strict=False)):
         if number == committed:
-            watch.settle()
+            watch.wait()
             store.commit()
         watch.add(frame, T, measured=True)
-    watch.settle()
+    watch.wait()
     return watch
 
 

@@ -127,7 +127,7 @@ def test_jobs_behind_are_done_in_order() -> None:
     behind, done = OneBehind(), []
     for item in range(50):
         behind.begin(partial(done.append, item))
-    behind.settle()
+    behind.wait()
     assert done == list(range(50))
 
 
@@ -151,8 +151,8 @@ def test_an_error_of_a_job_is_raised_once_when_it_is_met() -> None:
     behind = OneBehind()
     behind.begin(partial(int, "no number"))
     with pytest.raises(ValueError, match="no number"):
-        behind.settle()
-    behind.settle()
+        behind.wait()
+    behind.wait()
 
 
 def test_leaving_off_waits_and_raises_nothing() -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from recon.core.errors import SourceError
-from recon.sources.image_pairs import list_images, pair_images
+from recon.sources.image_pairs import find_images, pair_images
 
 
 def touch(folder: Path, *names: str) -> None:
@@ -96,4 +96,4 @@ def test_a_pattern_that_takes_both_sides_is_refused(tmp_path: Path) -> None:
 def test_a_pattern_without_images_is_reported_and_to_be_quoted(tmp_path: Path) -> None:
     touch(tmp_path, "left1.txt")
     with pytest.raises(SourceError, match=r"no images found.*in quotes"):
-        list_images(str(tmp_path / "left*"))
+        find_images(str(tmp_path / "left*"))

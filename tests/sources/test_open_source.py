@@ -7,7 +7,7 @@ import pytest
 
 from recon.core.errors import CalibrationError, FormatError, ReconError, SourceError
 from recon.io.images.image import write_image
-from recon.sources.files import read_pair
+from recon.sources.one_pair import read_pair
 from recon.sources.pair_input import read_pair_input
 from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source, recognise_source

@@ -16,7 +16,7 @@ from recon.core.errors import FormatError, OutputError, ShapeError
 from recon.core.values.arrays import UInt8
 from recon.io.atomic import write_bytes
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_bytes, reader, reading
-from recon.io.images.image_integrity import check_image_bytes, image_size, is_tiff
+from recon.io.images.image_integrity import check_image_bytes, is_tiff, stated_size
 
 FULL_WHITE: Final = 65535
 MAX_MEGAPIXELS: Final = 100.0
@@ -103,7 +103,7 @@ def decode_levels(
         FormatError: As in `read_image`.
     """
     with reading(path):
-        _check_size(image_size(content), path, max_megapixels)
+        _check_size(stated_size(content), path, max_megapixels)
         check_image_bytes(content, path)
     try:
         with silent_opencv() if is_tiff(content) else nullcontext():

@@ -127,7 +127,7 @@ def _check_bmp(content: bytes, path: StrPath) -> None:
         raise _truncated("BMP", path, f"{len(content)} of {needed} bytes")
 
 
-def image_size(content: bytes) -> tuple[int, int] | None:
+def stated_size(content: bytes) -> tuple[int, int] | None:
     """Return the width and height that the header of an image states; None if it states none.
 
     The readers of Pillow are called directly: `PIL.Image.open` has a limit of its own.

@@ -161,7 +161,7 @@ class LoopWatch:
         self._wait(_BEHIND)
         self._waiting.append(self._pool.submit(look))
 
-    def settle(self) -> None:
+    def wait(self) -> None:
         """Wait until all frames so far have been processed.
 
         Raises:
@@ -190,7 +190,7 @@ class LoopWatch:
         Raises:
             OutputError: A keyframe cannot be written.
         """
-        self.settle()
+        self.wait()
         path_m = np.array(self._path_m)
         loops = self._detector.agreeing()
         return DriveLoops(

@@ -96,13 +96,13 @@ class Mapper:
             if builder.full:
                 self.session.submaps.add(builder.close())
 
-    def settle(self) -> None:
+    def wait(self) -> None:
         """Wait until all frames are integrated.
 
         Raises:
             ReconError: A frame cannot be integrated.
         """
-        self._behind.settle()
+        self._behind.wait()
 
     def abandon(self) -> None:
         """Stop after the integration in progress; required after an error, otherwise harmless."""
@@ -110,13 +110,13 @@ class Mapper:
 
     def close(self) -> None:
         """Close the current submap after the last frame."""
-        self._behind.settle()
+        self._behind.wait()
         if self._builder is not None and self._builder.frames:
             self.session.submaps.add(self._builder.close())
 
     def state(self) -> dict[str, Any]:
         """Return what later results depend on beside the session, as arrays and plain values."""
-        self._behind.settle()
+        self._behind.wait()
         return {
             "odometry": self._odometry.state(),
             "builder": None if self._builder is None else self._builder.state(),

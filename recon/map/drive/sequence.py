@@ -215,7 +215,7 @@ def map_sequence(
             pairs = source.frames(len(drive.mapper))
             for frame in look_ahead(reconstruct, pairs, depth=2 if live is None else 1):
                 progress.on_step(drive.add(frame, total=len(source)))
-            drive.settle()
+            drive.wait()
     finally:
         drive.stop()
         progress.on_finish()
@@ -257,10 +257,10 @@ class _Drive:
         seconds, self._last = now - self._last, now
         return replace(result, seconds=seconds)
 
-    def settle(self) -> None:
+    def wait(self) -> None:
         """Wait for background work: the integration of the last frame, and the search for loops."""
-        self.mapper.settle()
-        self._loops.settle()
+        self.mapper.wait()
+        self._loops.wait()
         self._last = time.perf_counter()
 
     def stop(self) -> None:
@@ -302,7 +302,7 @@ class _Drive:
     def _save(self) -> None:
         if self._map.store.path is None:
             return
-        self.settle()  # else keyframes that a resumed run needs might be missing
+        self.wait()  # else keyframes that a resumed run needs might be missing
         with self._stage("checkpoint"):
             seconds = time.perf_counter() - self._start
             self._session.set_state({"mapper": self.mapper.state(), "seconds": seconds})

@@ -233,9 +233,9 @@ class _Field:
                 expected, gap = self._path_z.ravel()[cells] - camera_height_m, np.zeros(len(cells))
             else:
                 expected, gap = self._from_neighbours(cells)
-            self._settle(cells, expected, gap, order[bounds[ring] : bounds[ring + 1]])
+            self._fill_ring(cells, expected, gap, order[bounds[ring] : bounds[ring + 1]])
 
-    def _settle(
+    def _fill_ring(
         self, cells: NDArray[np.intp], expected: Float64, gap: Float64, points: NDArray[np.intp]
     ) -> None:
         """Give the cells of a ring the height of their points, or carry the expected one."""

@@ -11,7 +11,7 @@ from recon.core.values import Disparity, Reason, StereoPair
 from recon.rig.audit.audit import audit_source
 from recon.rig.audit.findings import Finding
 from recon.rig.audit.settings import AuditedSettings
-from recon.sources.files import OnePair
+from recon.sources.one_pair import OnePair
 from recon.sources.pair_input import PairInput
 
 #: Findings that images alone support, and those that need a calibration. The inspection of the

@@ -64,7 +64,7 @@ def summarise(seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64
     }
 
 
-def tell_depths(summary: dict[str, Any]) -> dict[str, str]:
+def describe_depths(summary: dict[str, Any]) -> dict[str, str]:
     """Return the depth errors of a summary as text, one line per distance."""
     working = summary["working_error"]
     share = working["calibration_share"]

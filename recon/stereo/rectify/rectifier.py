@@ -56,7 +56,7 @@ class RectificationSettings(Settings):
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class RemapTables:
     """Remap tables of one rectified view.
 
     Attributes:
@@ -109,7 +109,7 @@ class Rectifier:
     ) -> None:
         self.settings = settings or RectificationSettings()
         self.valid: Bool | None = None
-        self._views: tuple[View, View] | None = None
+        self._views: tuple[RemapTables, RemapTables] | None = None
         if isinstance(calibration, RectifiedCamera):
             self.camera = calibration
             return
@@ -208,7 +208,7 @@ def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) 
 
 def plan_rectification(
     calibration: StereoCalibration, settings: RectificationSettings
-) -> tuple[RectifiedCamera, tuple[View, View]]:
+) -> tuple[RectifiedCamera, tuple[RemapTables, RemapTables]]:
     """Compute the rectified camera and the remap tables of its left and right view.
 
     Raises:
@@ -219,7 +219,7 @@ def plan_rectification(
     cameras, rotations = (calibration.left, calibration.right), (turns.R_left, turns.R_right)
     try:
         left, right = (
-            View(*rectifying_maps(camera, rotation, matrix, size))
+            RemapTables(*rectifying_maps(camera, rotation, matrix, size))
             for camera, rotation, matrix in zip(cameras, rotations, turns.matrices, strict=True)
         )
     except cv2.error as error:
