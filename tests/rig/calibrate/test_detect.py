@@ -3,6 +3,7 @@ from __future__ import annotations
 from functools import cache
 from itertools import chain
 
+import cv2
 import numpy as np
 import pytest
 
@@ -25,7 +26,9 @@ def rendered(text: str, lens: str = "radtan") -> list[tuple[BoardView, UInt8, UI
 
 
 def images(text: str) -> list[UInt8]:
-    return list(chain.from_iterable((left, right) for _, left, right in rendered(text)))
+    """The images at half size: which board they show is asked, not where its corners are."""
+    both = chain.from_iterable((left, right) for _, left, right in rendered(text))
+    return [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in both]
 
 
 @pytest.mark.parametrize("lens", ["radtan", "fisheye"])
