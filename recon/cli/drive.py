@@ -37,12 +37,19 @@ def open_drive(
     Raises:
         ReconError: It cannot be opened.
     """
+    drive, options = request.open(settings)
+    return drive, announced(drive, options, quiet=quiet, verbose=verbose)
+
+
+def announced(
+    drive: StereoSource, options: MapOptions, *, quiet: bool, verbose: bool
+) -> MapOptions:
+    """Say how a drive is read, and return the options of its run with a progress that is shown."""
     from recon.cli.show.announce import announce
     from recon.cli.show.progress import choose_viewer
 
-    drive, options = request.open(settings)
     announce(drive, quiet=quiet, verbose=verbose)
-    return drive, replace(options, progress=choose_viewer(quiet=quiet, verbose=verbose))
+    return replace(options, progress=choose_viewer(quiet=quiet, verbose=verbose))
 
 
 def read_start(text: str | None) -> tuple[StartPose | None, int | None]:

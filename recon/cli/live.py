@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from recon.cli import options as opt
-from recon.cli.drive import StartInMap, open_drive, read_start
+from recon.cli.drive import StartInMap, announced, open_drive, read_start
+from recon.cli.interrupt import until_interrupted
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
+if TYPE_CHECKING:
+    from recon.sources.protocol import StereoSource
+
 
 def live(
-    source: Annotated[Path, typer.Argument(help=opt.SOURCES_HELP)],
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="Left camera (0, /dev/video0, address of a stream) or one that has both views; or "
+            "a recording. " + opt.SOURCES_HELP
+        ),
+    ],
+    right_camera: Annotated[
+        str | None, typer.Argument(help="Right camera, or the right video as if it were one.")
+    ] = None,
     rate: Annotated[
-        float, typer.Option(help="How many times as fast as recorded the source is played.")
+        float, typer.Option(help="How many times as fast as recorded a recording is played.")
     ] = 1.0,
     map_: Annotated[
         Path | None,
@@ -46,29 +60,41 @@ def live(
     verbose: opt.Verbose = False,
     threads: opt.Threads = None,
 ) -> None:
-    """Map a drive while its images arrive: the source is played at its time stamps.
+    """Map a drive while its images arrive, from cameras or from a recording.
 
-    Where the machine is too slow, frames are tracked without being matched, and
-    if that does not help, dropped: summary.json counts both, and the time from
-    an image to its pose. With --map the drive is found in that map instead.
+    A recording is played at its time stamps. The pose of each frame comes first;
+    matching follows as far as there is time. Where even poses take too long,
+    frames are dropped. summary.json counts both, and the time from an image to
+    its pose. Ctrl-C ends the drive, and its map is completed.
 
     Examples:
-      recon live rides/today
+      recon live 0 2 --calib stereo.yaml
       recon live rides/today --rate 2
       recon live rides/today --map outputs/map/latest
     """
-    with session(quiet=quiet):
+    with session(quiet=quiet), ExitStack() as stack:
         from recon.commands.config import load_config, matching_overrides, source_overrides
         from recon.commands.live import run_live
-        from recon.commands.map_options import MapRequest
+        from recon.commands.map_options import MapOptions, MapRequest
+        from recon.rig.cameras import is_camera, open_camera_source
         from recon.run.memory import memory_overrides
 
+        stopped = stack.enter_context(until_interrupted())
         pose, first = read_start(start)
         views = source_overrides(calib, left, right, tolerance, (first, end, stride))
         overrides = [*(set_ or ()), *matching_overrides(matcher), *views]
         settings = load_config(config, [*overrides, *memory_overrides(memory_limit)])
-        request = MapRequest(source, kind, mesh=mesh)
-        drive, options = open_drive(request, settings, quiet=quiet, verbose=verbose)
+        drive: StereoSource
+        if right_camera is not None or is_camera(source):
+            devices = [source] if right_camera is None else [source, right_camera]
+            cameras = open_camera_source(devices, settings.capture, settings.source, stopped)
+            drive, options = stack.enter_context(cameras), MapOptions(mesh=mesh)
+            options = announced(drive, options, quiet=quiet, verbose=verbose)
+        else:
+            request = MapRequest(Path(source), kind, mesh=mesh)
+            drive, options = open_drive(request, settings, quiet=quiet, verbose=verbose)
         options = replace(options, command="live", out=out, threads=threads)
-        summary = run_live(drive, settings, options, rate=rate, map_path=map_, start=pose)
+        summary = run_live(
+            drive, settings, options, rate=rate, map_path=map_, start=pose, stopped=stopped
+        )
     print_json(summary) if json else print_run(summary, stages=verbose)

@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 from recon.core.errors import FormatError
 from recon.io.atomic import write_text
-from recon.rig.capture import RecordingSettings, capture_pairs, warm_up
+from recon.rig.capture import RecordingSettings, capture_pairs, open_cameras, warm_up
 from recon.rig.capture_folder import CaptureFolder, CaptureLog, write_pairs
-from recon.sources.opencv_camera import Camera, OpenCvCamera
+from recon.sources.opencv_camera import Camera
 
 
 def run_capture(
@@ -44,14 +43,8 @@ def run_capture(
     """
     if calibration is not None and not calibration.is_file():
         raise FormatError("file does not exist", where=calibration)
-    size = (settings.width_px, settings.height_px)
-    asked = None if None in size else (int(size[0] or 0), int(size[1] or 0))
-    with ExitStack() as stack:
-        cameras: list[Camera] = []
-        for device in devices:
-            cameras.append(OpenCvCamera(device, asked, settings.rate_hz))
-            stack.callback(cameras[-1].close)
-        return record(tuple(cameras), folder, settings, calibration, stopped)
+    with open_cameras(devices, settings) as cameras:
+        return record(cameras, folder, settings, calibration, stopped)
 
 
 def record(

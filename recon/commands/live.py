@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -18,11 +18,9 @@ from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.sequence import StartPose, localize_sequence
 from recon.map.store.map import Map
+from recon.rig.cameras import CameraSource
 from recon.sources.live import LiveSource
 from recon.sources.protocol import StereoSource
-
-_COMMIT_S: Final = 3.0
-"""Time between two commits of the map, as the drive goes."""
 
 _FIRST: Final = 3
 """Pairs that are worked on before the first one counts: the first use of a library takes long."""
@@ -36,32 +34,36 @@ def run_live(
     rate: float = 1.0,
     map_path: Path | None = None,
     start: StartPose | None = None,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
-    """Map a drive while its images arrive at their own time stamps: what `recon live` does.
+    """Map a drive while its images arrive: what `recon live` does.
 
-    Where the machine is too slow, frames are tracked without being matched, and if that does not
-    help, dropped; the summary counts both (``live``).
+    The pose of each frame comes first, from its features alone; matching follows as far as there
+    is time. Where even poses take too long, frames are dropped; the summary counts both (``live``).
 
     Args:
-        source: The recording that is played.
+        source: Cameras, or a recording, which is played at its own time stamps.
         config: The configuration; None = the defaults.
         options: Options of the run; None = the defaults.
-        rate: How many times as fast as recorded it is played.
+        rate: How many times as fast as recorded a recording is played.
         map_path: Find the drive in this map instead of making one: folder of a run, or map file.
         start: Where the drive begins in it, roughly; None = anywhere.
+        stopped: Asked now and then; True ends the drive, whose map is then completed.
 
     Returns:
         The figures of ``summary.json``.
 
     Raises:
-        ReconError: As for `run_map` and `run_localize`; or the rate is not positive.
+        ReconError: As for `run_map` and `run_localize`; the rate is not positive, or the odometry
+            needs exact disparities.
     """
     if not 0.0 < rate < float("inf"):
         raise SettingsError("a rate is positive", where="--rate", got=f"{rate:g}")
     config, options = config or load_config(), options or MapOptions(command="live")
-    config = _committed_often(config, source, rate)
-    _warm_up(_Beginning(source), config, map_path)
-    played = LiveSource(source, rate)
+    config = _pose_first(config)
+    _warm_up(LiveSource(_Beginning(source)), config, map_path)
+    live = isinstance(source, CameraSource) and source.live
+    played = LiveSource(source, None if live else rate, stopped)
     options = replace(options, audit=False, progress=played.timed(options.progress))
     if map_path is not None:
         return run_localize(played, map_path, config, options, start=start).summary
@@ -86,21 +88,21 @@ class _Beginning:
     truth = None
 
     def __init__(self, source: StereoSource) -> None:
-        self._source = source
+        self._pairs = list(islice(source.frames(), _FIRST))
         self.name, self.description = source.name, source.description
         self.calibration, self.files = source.calibration, source.files
 
     def __len__(self) -> int:
-        return min(_FIRST, len(self._source))
+        return len(self._pairs)
 
     def __iter__(self) -> Iterator[StereoPair]:
         return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        return islice(self._source.frames(start), len(self) - start)
+        return iter(self._pairs[start:])
 
 
-def _warm_up(source: StereoSource, config: ReconConfig, map_path: Path | None) -> None:
+def _warm_up(source: LiveSource, config: ReconConfig, map_path: Path | None) -> None:
     """Do once with the first pairs what comes, and forget it."""
     if map_path is None:
         with Map.temporary() as map_:
@@ -110,10 +112,18 @@ def _warm_up(source: StereoSource, config: ReconConfig, map_path: Path | None) -
             localize_sequence(source, Workspace(map_), config)
 
 
-def _committed_often(config: ReconConfig, source: StereoSource, rate: float) -> ReconConfig:
-    """Return the configuration with a commit every few seconds, by the times of the first pairs."""
-    times_s = [pair.timestamp_s for pair in _Beginning(source)]
-    period_s = (times_s[-1] - times_s[0]) / max(1, len(times_s) - 1) / rate if times_s else 0.0
-    every = min(config.checkpoints.every_frames, max(1, round(_COMMIT_S / max(period_s, 1e-3))))
-    checkpoints = config.checkpoints.model_copy(update={"every_frames": every})
-    return config.model_copy(update={"checkpoints": checkpoints})
+def _pose_first(config: ReconConfig) -> ReconConfig:
+    """Return the configuration with the odometry that needs no exact disparity.
+
+    Raises:
+        SettingsError: Another one is asked for.
+    """
+    if config.odometry.method == "kiss":
+        raise SettingsError(
+            "while images arrive, poses come before the points that kiss-icp needs",
+            where="odometry.method",
+            got="kiss",
+            expected="visual",
+        )
+    odometry = config.odometry.model_copy(update={"method": "visual"})
+    return config.model_copy(update={"odometry": odometry})

@@ -61,7 +61,7 @@ def run_map(
             progress=options.progress,
             resume=options.resume,
         ) as run,
-        with_resume_hint(run),
+        with_resume_hint(run, source),
         begin_or_resume(run, source, config, identity, options.arguments) as map_,
     ):
         mapped = map_sequence(

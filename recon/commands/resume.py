@@ -17,6 +17,7 @@ from recon.map.drive.workspace import ANEW, resuming, session_info
 from recon.map.store.map import Map
 from recon.run.directory import RECORD, STARTED, RunDirectory, state_folder
 from recon.run.memory import memory_overrides
+from recon.sources.live import LiveSource
 from recon.sources.protocol import StereoSource
 
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -73,15 +74,18 @@ def begin_or_resume(
         with resuming(path):
             return Map.open(path, read_only=False, cache_bytes=memory)
     map_ = Map.create(path, cache_bytes=memory)
-    start = {"identity": dict(identity), "arguments": dict(arguments)}
+    live = isinstance(source, LiveSource)  # what arrived then will not arrive again
+    start = {} if live else {"identity": dict(identity), "arguments": dict(arguments)}
     map_.begin(session_info(source, config, start))
     map_.commit()
     return map_
 
 
 @contextmanager
-def with_resume_hint(directory: RunDirectory) -> Iterator[None]:
+def with_resume_hint(directory: RunDirectory, source: StereoSource) -> Iterator[None]:
     """Add a hint on how to resume to errors after which the run can be resumed.
+
+    Of a live source, whose drive is over then, it says where the map is that was made so far.
 
     Raises:
         OutputError: The disk is full, or the folder can no longer be written.
@@ -90,15 +94,22 @@ def with_resume_hint(directory: RunDirectory) -> Iterator[None]:
     try:
         yield
     except (OutputError, MemoryLimitError, OSError, MemoryError, KeyboardInterrupt) as error:
-        hinted = _with_hint(error, directory.folder) if directory.resumable else None
+        hint = _way_on(directory.folder, source)
+        hinted = _with_hint(error, hint) if directory.resumable else None
         if hinted is None:
             raise
         raise hinted from error
 
 
-def _with_hint(error: BaseException, folder: Path) -> BaseException | None:
-    """Return the error with a hint on how to resume; None if it is raised unchanged."""
-    hint = f"recon map --resume {shlex.quote(str(folder))} goes on from there"
+def _way_on(folder: Path, source: StereoSource) -> str:
+    """Return how to go on after a run was interrupted."""
+    if isinstance(source, LiveSource):
+        return f"the map so far is in {state_folder(folder) / STARTED}"
+    return f"recon map --resume {shlex.quote(str(folder))} goes on from there"
+
+
+def _with_hint(error: BaseException, hint: str) -> BaseException | None:
+    """Return the error with a hint on how to go on; None if it is raised unchanged."""
     if isinstance(error, KeyboardInterrupt):
         return KeyboardInterrupt(hint)
     if isinstance(error, OutputError):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.values.arrays import Bool, Float32, UInt8
+from recon.stereo.match.sad import halve
 
 _CELL_PX: Final = 40
 """Edge of a cell of the image."""
@@ -29,7 +30,9 @@ _BORDER_PX: Final = 8
 """Corners nearer to the border are not used."""
 
 
-def find_corners(grey: UInt8, taken_uv: Float32) -> Float32:
+def find_corners(
+    grey: UInt8, taken_uv: Float32, *, cell_px: int = _CELL_PX, per_cell: int = _PER_CELL
+) -> Float32:
     """Return the best corners of each cell of an image, away from those already tracked.
 
     Cells keep one strongly textured region from taking all features: only features spread over the
@@ -39,6 +42,8 @@ def find_corners(grey: UInt8, taken_uv: Float32) -> Float32:
         grey: uint8 (H, W).
         taken_uv: float32 (N, 2), columns and rows of features already tracked; they count
             towards the limit of their cell.
+        cell_px: Edge of a cell of the image.
+        per_cell: Corners that a cell may hold.
 
     Returns:
         float32 (M, 2), columns and rows, pixels.
@@ -48,12 +53,23 @@ def find_corners(grey: UInt8, taken_uv: Float32) -> Float32:
     """
     score = cv2.cornerMinEigenVal(grey, _BLOCK_PX, ksize=3)
     v, u = np.nonzero(_peaks(score) & _free(grey.shape, taken_uv))
-    cells = _cell_of(np.stack([u, v], axis=1), grey.shape)
+    cells = _cell_of(np.stack([u, v], axis=1), grey.shape, cell_px)
     order = np.lexsort((u, v, -score[v, u], cells))
     rank = _rank_in_group(cells[order])
-    missing = _PER_CELL - _count_per_cell(taken_uv, grey.shape)
+    missing = per_cell - _count_per_cell(taken_uv, grey.shape, cell_px)
     keep = order[rank < missing[cells[order]]]
     return np.stack([u[keep], v[keep]], axis=1).astype(np.float32)
+
+
+def find_fewer_corners(grey: UInt8, taken_uv: Float32) -> Float32:
+    """Return corners like `find_corners`, a third as many, found at half size.
+
+    For who is in a hurry: that takes a quarter of the time, and so does all that is done with them.
+    """
+    taken = (0.5 * (taken_uv - np.float32(0.5))).astype(np.float32)
+    cells = {"cell_px": _CELL_PX * 3 // 5, "per_cell": _PER_CELL - 1}
+    uv: Float32 = 2 * find_corners(halve(grey), taken, **cells) + np.float32(0.5)
+    return uv
 
 
 def _peaks(score: Float32) -> Bool:
@@ -75,9 +91,8 @@ def _free(shape: tuple[int, ...], taken_uv: Float32) -> Bool:
     return free.astype(np.bool_)
 
 
-def _cell_of(uv: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.int64]:
+def _cell_of(uv: NDArray[np.generic], shape: tuple[int, ...], size: int) -> NDArray[np.int64]:
     """Return the number of the cell of each pixel (N, 2)."""
-    size = _CELL_PX
     columns = -(-shape[1] // size)
     u = np.clip(np.rint(uv[:, 0]).astype(np.int64), 0, shape[1] - 1)
     v = np.clip(np.rint(uv[:, 1]).astype(np.int64), 0, shape[0] - 1)
@@ -85,10 +100,9 @@ def _cell_of(uv: NDArray[np.generic], shape: tuple[int, ...]) -> NDArray[np.int6
     return cell
 
 
-def _count_per_cell(uv: Float32, shape: tuple[int, ...]) -> NDArray[np.int64]:
-    size = _CELL_PX
+def _count_per_cell(uv: Float32, shape: tuple[int, ...], size: int) -> NDArray[np.int64]:
     cells = -(-shape[0] // size) * -(-shape[1] // size)
-    return np.bincount(_cell_of(uv, shape), minlength=cells)
+    return np.bincount(_cell_of(uv, shape, size), minlength=cells)
 
 
 def _rank_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.geometry.se3 import apply
-from recon.core.values import Disparity, RectifiedCamera
+from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float64, UInt8
 from recon.odometry.kernels.patches import Placing, place_patches
 
@@ -21,6 +21,9 @@ _PLACING: Final = Placing(radius=6, steps=10, close=0.03, reach=3.0)
 
 _MIN_CORRELATION: Final = 0.75
 """Least correlation of a patch with the one it is found as."""
+
+_ROW_PX: Final = 1.0
+"""Largest difference between the rows of a feature in the two images of a pair."""
 
 _SLOPE_PX: Final = 6
 """Half width of the neighbourhood whose disparities give the slope of a surface; of which every
@@ -83,6 +86,26 @@ def warp_of(
     return np.asarray(
         (by_offset[:, :2] - image[:, :, None] * by_offset[:, 2:]) / moved[:, 2:, None]
     )
+
+
+def measure_disparity(pair: RectifiedPair, uv: Float64, near: Float64, slope: Float64) -> Float64:
+    """Return the disparity (N,) of features, measured in the images near a guess.
+
+    Args:
+        pair: The images.
+        uv: float64 (N, 2), columns and rows in the left one.
+        near: float64 (N,), rough disparities; NaN = unknown.
+        slope: float64 (N, 2), change of their surface's disparity per pixel to the right and down.
+
+    Returns:
+        float64 (N,), pixels; NaN where nothing alike is found on that row.
+    """
+    warp = np.tile(np.eye(2), (len(uv), 1, 1))
+    warp[:, 0] -= slope
+    there = find_again(pair.left, pair.right, uv, warp, uv - near[:, None] * [1.0, 0.0])
+    with np.errstate(invalid="ignore"):
+        same_row = np.abs(there[:, 1] - uv[:, 1]) <= _ROW_PX
+    return np.where(same_row, uv[:, 0] - there[:, 0], np.nan)
 
 
 def surface_slopes(disparity: Disparity, uv: Float64) -> Float64:

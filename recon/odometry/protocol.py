@@ -19,10 +19,13 @@ class OdometryFrame:
     Attributes:
         pair: The rectified images.
         disparity: Their disparity.
+        rough: Whether it is off by a quarter of a pixel or more: features are then measured in the
+            images themselves.
     """
 
     pair: RectifiedPair
     disparity: Disparity
+    rough: bool = False
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from recon.core.geometry.projection import depth_from_disparity, project, unproj
 from recon.core.geometry.se3 import apply, as_step, invert
 from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float32, Float64, UInt8
-from recon.odometry.corners import find_corners
+from recon.odometry.corners import find_corners, find_fewer_corners
 from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.motion import Motion
-from recon.odometry.patches import find_again, surface_slopes, warp_of
+from recon.odometry.patches import find_again, measure_disparity, surface_slopes, warp_of
 from recon.odometry.pose import MIN_INLIERS, REPROJECTION_PX, enough_agree, locate_camera
 from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in, tree_of
@@ -195,7 +195,7 @@ class VisualOdometry:
         uv, uv_now = found.left_uv, found.right_uv
         camera, T_world_then = frame.pair.camera, state.window.T_world_camera[-1]
         then = np.column_stack([uv, self._disparity(state.disparity, camera, uv)])
-        now = np.column_stack([uv_now, self._disparity(frame.disparity, camera, uv_now)])
+        now = np.column_stack([uv_now, self._measured(frame, uv_now)])
         known = np.isfinite(then[:, 2])
         then, now = then[known].astype(np.float64), now[known].astype(np.float64)
         window = _empty(T_world_then).with_points(then, _points(then, T_world_then, camera))
@@ -281,8 +281,16 @@ class VisualOdometry:
         uvd[alive, :2] = find_again(state.left, frame.pair.left, uv, warp, guess)
         there = alive[np.isfinite(uvd[alive, 0])]
         uv_now = uvd[there, :2].astype(np.float32)
-        uvd[there, 2] = self._disparity(frame.disparity, camera, uv_now)
+        uvd[there, 2] = self._measured(frame, uv_now)
         return uvd
+
+    def _measured(self, frame: OdometryFrame, uv: Float32) -> Float64:
+        """Return the disparity (N,) of features of a frame; see `_disparity`."""
+        d = self._disparity(frame.disparity, frame.pair.camera, uv)
+        if not frame.rough:
+            return d
+        at = uv.astype(np.float64)
+        return measure_disparity(frame.pair, at, d, surface_slopes(frame.disparity, at))
 
     def _disparity(self, disparity: Disparity, camera: RectifiedCamera, uv: Float32) -> Float64:
         """Return the disparity (N,) of features; NaN = unknown, or too small to give a depth."""
@@ -292,8 +300,8 @@ class VisualOdometry:
     def _replenish(self, window: TrackWindow, frame: OdometryFrame) -> TrackWindow:
         """Return the window with new points where the newest frame has too few."""
         taken = window.uvd[-1, window.seen[-1], :2].astype(np.float32)
-        uv = find_corners(frame.pair.left, taken)
-        d = self._disparity(frame.disparity, frame.pair.camera, uv)
+        uv = (find_fewer_corners if frame.rough else find_corners)(frame.pair.left, taken)
+        d = self._measured(frame, uv)
         uvd = np.column_stack([uv, d])[np.isfinite(d)]
         return window.with_points(uvd, _points(uvd, window.T_world_camera[-1], frame.pair.camera))
 

@@ -42,6 +42,12 @@ _MAX_DISPARITY_STEP_PX: Final = 1.0
 _COARSE_PX: Final = 8
 """Every n-th disparity of a row and column is kept."""
 
+_SAME_SCALE: Final = 0.1
+"""Share by which a scale may differ before features look different: half a step of the scales."""
+
+_MOST_ZOOM: Final = 4.0
+"""Images of a still larger or smaller scale are described as they are."""
+
 WORDS: Final = 4
 """Words per descriptor (hash tables)."""
 
@@ -81,13 +87,17 @@ def points_of(uvd: NDArray[Any], camera: RectifiedCamera) -> Float64:
     return unproject(uvd[:, 0].astype(np.float64), uvd[:, 1].astype(np.float64), depth, camera)
 
 
-def make_keyframe(frame: int, pair: RectifiedPair, disparity: Disparity) -> Keyframe:
+def make_keyframe(
+    frame: int, pair: RectifiedPair, disparity: Disparity, *, focal_px: float | None = None
+) -> Keyframe:
     """Describe a frame for recognition.
 
     Args:
         frame: Its number.
         pair: Its images.
         disparity: What the matcher found in them.
+        focal_px: Focal length of the frames that it will be compared with: features are described
+            as they look at that scale. None = its own.
 
     Ref:
         Rublee et al., "ORB: an efficient alternative to SIFT or SURF", ICCV 2011.
@@ -99,15 +109,30 @@ def make_keyframe(frame: int, pair: RectifiedPair, disparity: Disparity) -> Keyf
         edgeThreshold=_EDGE_PX,
         fastThreshold=_FAST_THRESHOLD,
     )
-    corners = _spread(orb.detect(pair.left), pair.left.shape)
-    described, descriptors = orb.compute(pair.left, corners)
+    image, zoom = _at_focal_length(pair, focal_px)
+    corners = _spread(orb.detect(image), image.shape)
+    described, descriptors = orb.compute(image, corners)
     uv = _places_of(described)
+    if image is not pair.left:
+        uv = ((uv + 0.5) / zoom - 0.5).astype(np.float32)
     if descriptors is None:
         descriptors = np.zeros((0, _DESCRIPTOR_BYTES), np.uint8)
     uvd = np.column_stack([uv, _disparity(disparity, uv, pair.camera)])
     half, step = _COARSE_PX // 2, _COARSE_PX
     coarse = np.ascontiguousarray(disparity.values[half::step, half::step])
     return Keyframe(frame, uvd.astype(np.float32), descriptors, coarse)
+
+
+def _at_focal_length(pair: RectifiedPair, focal_px: float | None) -> tuple[UInt8, Float32]:
+    """Return the left image as seen with a focal length, and the zoom (2,) along row and column."""
+    height, width = pair.left.shape
+    zoom = 1.0 if focal_px is None else focal_px / pair.camera.focal_px
+    if abs(zoom - 1.0) <= _SAME_SCALE or not 1 / _MOST_ZOOM <= zoom <= _MOST_ZOOM:
+        return pair.left, np.ones(2, np.float32)
+    size = (max(1, round(zoom * width)), max(1, round(zoom * height)))
+    how = cv2.INTER_CUBIC if zoom > 1 else cv2.INTER_AREA
+    image = np.asarray(cv2.resize(pair.left, size, interpolation=how), np.uint8)
+    return image, np.array([size[0] / width, size[1] / height], np.float32)
 
 
 def words_of(descriptors: UInt8) -> NDArray[np.uint32]:

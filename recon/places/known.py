@@ -58,15 +58,21 @@ class KnownPlaces:
 
     Args:
         views: The keyframes of the map, read once now, and again whenever one is compared.
+
+    Attributes:
+        T_world_camera: float64 (N, 4, 4), where the views were taken, in the world of the map.
+        focal_px: Focal length of most of them; None = there are none.
     """
 
     def __init__(self, views: Sequence[KnownView]) -> None:
         self._views = views
         self._words = WordIndex()
-        poses = []
+        poses, focals_px = [], []
         for view in views:
             self._words.add(words_of(view.keyframe.descriptors))
             poses.append(view.T_world_camera)
+            focals_px.append(view.camera.focal_px)
+        self.focal_px = float(np.median(focals_px)) if focals_px else None
         self.T_world_camera: Float64 = np.array(poses).reshape(-1, 4, 4)
         ahead = self.T_world_camera[:, :3, 2]
         self._stands = np.hstack([self.T_world_camera[:, :3, 3], _TURN_M * ahead])

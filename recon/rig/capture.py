@@ -7,7 +7,8 @@ last and marks it as complete.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -17,7 +18,7 @@ from pydantic import Field
 from recon.core.errors import SourceError
 from recon.core.settings import Settings
 from recon.core.values.arrays import UInt8
-from recon.sources.opencv_camera import Camera
+from recon.sources.opencv_camera import Camera, OpenCvCamera
 from recon.sources.settings import SourceSettings
 from recon.sources.video import split_views
 
@@ -79,6 +80,27 @@ class CapturedPair:
     right: UInt8
     left_s: float
     right_s: float
+
+
+@contextmanager
+def open_cameras(devices: Iterable[str], settings: CaptureSettings) -> Iterator[tuple[Camera, ...]]:
+    """Open the left and the right camera, or one with both views, for the body of a ``with``.
+
+    Args:
+        devices: Numbers, paths, addresses of streams, or video files.
+        settings: Image size and frame rate to ask for.
+
+    Raises:
+        SourceError: A camera cannot be opened, or does not support that size.
+    """
+    width, height = settings.width_px, settings.height_px
+    size = None if width is None or height is None else (width, height)
+    with ExitStack() as stack:
+        cameras: list[Camera] = []
+        for device in devices:
+            cameras.append(OpenCvCamera(device, size, settings.rate_hz))
+            stack.callback(cameras[-1].close)
+        yield tuple(cameras)
 
 
 def capture_pairs(

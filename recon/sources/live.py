@@ -1,10 +1,10 @@
-"""A recording played at its own time stamps, as if its images came from the cameras just now."""
+"""A source whose images arrive in their own time: from cameras, or a recording that is played."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Condition, Thread
@@ -16,67 +16,75 @@ from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair
 from recon.run.progress import Progress, Step
 from recon.sources.protocol import StereoSource
 
-_WAITING: Final = 3
-"""Pairs that may wait; where more come, the oldest is left out."""
+_WAITING: Final = 1
+"""Pairs that may wait; where another comes, the oldest is left out. With one, who is too slow gets
+the newest whenever he is ready: what is left out is spread evenly, and nothing is old."""
 
-_UNMATCHED: Final = 2
-"""Most pairs in a row that are not matched: tracking needs new points, and the map something."""
+_PATIENCE_S: Final = 0.2
+"""How long to wait for a pair before asking whether to stop."""
 
 
 @dataclass(frozen=True)
 class _Arrived:
-    """A pair, and when it arrived (on the clock of the process)."""
+    """A pair, and when it arrived (`time.monotonic`)."""
 
     pair: StereoPair
     due_s: float
 
 
 class LiveSource:
-    """Plays a source at its own time stamps; keeps up by leaving out, and counts what.
+    """Hands over the pairs of a source when they are due; what comes too fast is left out.
 
-    A thread reads each pair and hands it over when it is due. Where the consumer is behind, pairs
-    wait, but never more than a few. One behind which another waits already is `hurried`: it should
-    be tracked without being matched, but every third one is not. Where even that is too slow, the
-    oldest are dropped.
+    A thread reads each pair and hands it over when it is due. Where the consumer is not ready, one
+    pair waits, and the next takes its place: the older one is dropped.
 
     Args:
-        source: The recording.
-        rate: How many times as fast as recorded it is played.
+        source: A recording, or cameras.
+        rate: How many times as fast as recorded it is played; None = it is not recorded, and pairs
+            are due when they were taken, by the clock of `time.monotonic`.
+        stopped: Asked now and then; True ends the drive.
     """
 
     truth = None
 
-    def __init__(self, source: StereoSource, rate: float = 1.0) -> None:
+    def __init__(
+        self,
+        source: StereoSource,
+        rate: float | None = 1.0,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
         self._source = source
         self.rate = rate
+        self._stopped = stopped
         self._waiting: deque[_Arrived] = deque()
         self._news = Condition()
         self._ended = False
         self._error: BaseException | None = None
         self._due_s: list[float] = []
-        self._hurried: set[int] = set()
-        self._in_a_row = 0
         self._latency_s: list[float] = []
-        self._dropped = 0
+        self._unmatched = 0
+        self.dropped = 0
 
     @property
     def name(self) -> str:
-        """That of the recording."""
+        """That of the source."""
         return self._source.name
 
     @property
     def description(self) -> str:
-        """That of the recording, and how it is played."""
+        """That of the source, and how it is played."""
+        if self.rate is None:
+            return self._source.description
         return f"{self._source.description}, played at {self.rate:g} times its speed"
 
     @property
     def calibration(self) -> RectifiedCamera | StereoCalibration:
-        """That of the recording."""
+        """That of the source."""
         return self._source.calibration
 
     @property
     def files(self) -> Sequence[Path]:
-        """Those of the recording."""
+        """Those of the source."""
         return self._source.files
 
     def __len__(self) -> int:
@@ -100,9 +108,14 @@ class LiveSource:
         finally:
             self._ended = True
 
-    def hurried(self, pair: StereoPair) -> bool:
-        """Return whether a pair should not be matched: another one waited when it was taken."""
-        return pair.index in self._hurried
+    @property
+    def waits(self) -> bool:
+        """Whether the next pair is there already: who takes it is late."""
+        return bool(self._waiting)
+
+    def leave_unmatched(self) -> None:
+        """Note that there is no time to match a pair that was yielded."""
+        self._unmatched += 1
 
     def timed(self, progress: Progress) -> Progress:
         """Return a progress that notes when the result of each frame is there."""
@@ -110,7 +123,7 @@ class LiveSource:
 
     def done(self, index: int) -> None:
         """Note that the result of a frame that was yielded is there."""
-        self._latency_s.append(time.perf_counter() - self._due_s[index])
+        self._latency_s.append(time.monotonic() - self._due_s[index])
 
     def figures(self) -> dict[str, Any]:
         """Return what was late and what was left out."""
@@ -119,9 +132,9 @@ class LiveSource:
         known = bool(self._latency_s)
         return {
             "rate": self.rate,
-            "frames_arrived": len(self._due_s) + self._dropped,
-            "frames_dropped": self._dropped,
-            "frames_not_matched": len(self._hurried),
+            "frames_arrived": len(self._due_s) + self.dropped,
+            "frames_dropped": self.dropped,
+            "frames_not_matched": self._unmatched,
             "latency_ms": {
                 name: round(value, 1) if known else None
                 for name, value in (("p50", p50), ("p95", p95), ("max", float(latency_ms.max())))
@@ -131,21 +144,23 @@ class LiveSource:
     def warnings(self) -> list[str]:
         """Return what was left out, in words."""
         lines = []
-        if self._hurried:
+        if self._unmatched:
             what = "tracked, but not matched: the map lacks what they saw"
-            lines.append(f"{len(self._hurried)} frames came too fast and were {what}")
-        if self._dropped:
-            lines.append(f"{self._dropped} frames came too fast and were dropped")
+            lines.append(f"{self._unmatched} frames came too fast and were {what}")
+        if self.dropped:
+            lines.append(f"{self.dropped} frames came too fast and were dropped")
         return lines
 
     def _play(self, start: int) -> None:
         """Hand over each pair when it is due."""
-        begun_s, first_s = time.perf_counter(), None
+        begun_s, first_s = time.monotonic(), None
         try:
             for pair in self._source.frames(start):
                 first_s = pair.timestamp_s if first_s is None else first_s
-                due_s = begun_s + (pair.timestamp_s - first_s) / self.rate
-                time.sleep(max(0.0, due_s - time.perf_counter()))
+                due_s = pair.timestamp_s
+                if self.rate is not None:
+                    due_s = begun_s + (pair.timestamp_s - first_s) / self.rate
+                time.sleep(max(0.0, due_s - time.monotonic()))
                 if self._ended:
                     return
                 self._put(_Arrived(pair, due_s))
@@ -160,22 +175,22 @@ class LiveSource:
         with self._news:
             if len(self._waiting) == _WAITING:
                 self._waiting.popleft()
-                self._dropped += 1
+                self.dropped += 1
             self._waiting.append(arrived)
             self._news.notify()
 
     def _take(self) -> _Arrived | None:
         """Wait for the next pair; None = there is none any more."""
         with self._news:
-            self._news.wait_for(lambda: self._waiting or self._ended)
+            while not (self._waiting or self._ended or self._stopped()):
+                self._news.wait(_PATIENCE_S)
+            if self._stopped():
+                return None
             if not self._waiting:
                 if self._error is not None:
                     raise self._error
                 return None
             arrived = self._waiting.popleft()
-            self._in_a_row = self._in_a_row + 1 if self._waiting else 0
-            if self._in_a_row % (_UNMATCHED + 1):
-                self._hurried.add(arrived.pair.index)
         self._due_s.append(arrived.due_s)
         return arrived
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -20,6 +21,7 @@ from recon.run.stopwatch import Stopwatch
 from recon.stereo.cloud.back_project import back_project
 from recon.stereo.cloud.edges import remove_flying_edges
 from recon.stereo.cloud.filters import filter_cloud
+from recon.stereo.match.half_size import HalfSizeMatcher
 from recon.stereo.match.registry import make_matcher
 from recon.stereo.rectify.inspect import check_inspection, inspect_pair
 from recon.stereo.rectify.rectifier import Rectifier
@@ -71,33 +73,28 @@ class FrameReconstructor:
         self._stopwatch = stopwatch or Stopwatch()
         self._rectifier = Rectifier(calibration, config.rectification)
         self._matcher = make_matcher(config.matching.matcher, config.matching, threads)
+        self._rough_matcher = HalfSizeMatcher(config.matching, threads=1)
 
     @property
     def camera(self) -> RectifiedCamera:
         """The rectified camera of all frames."""
         return self._rectifier.camera
 
+    def rectify(self, pair: StereoPair) -> RectifiedPair:
+        """Rectify one pair."""
+        with self._stopwatch.stage("rectify"):
+            return self._rectifier.rectify(pair)
+
     def match(self, pair: StereoPair) -> tuple[RectifiedPair, Disparity]:
         """Rectify and match one pair, and remove flying edges."""
-        config, stage = self._config, self._stopwatch.stage
-        with stage("rectify"):
-            rectified = self._rectifier.rectify(pair)
-        with stage("match"):
-            disparity = self._matcher.match(rectified)
-        if config.cloud.remove_flying_edges:
-            with stage("edges"):
-                disparity = remove_flying_edges(disparity)
-        return rectified, disparity
+        rectified = self.rectify(pair)
+        return rectified, self._match(rectified)
 
-    def unmatched(self, pair: StereoPair) -> ReconstructedFrame:
-        """Return a frame that is rectified alone: every disparity is unknown, the cloud empty."""
-        with self._stopwatch.stage("rectify"):
-            rectified = self._rectifier.rectify(pair)
-        nothing = np.full(rectified.left.shape, np.nan, np.float32)
-        disparity = Disparity.from_values(nothing)
-        return ReconstructedFrame(
-            rectified, disparity, back_project(disparity, rectified, self._config.cloud)
-        )
+    def match_roughly(self, pair: StereoPair) -> tuple[RectifiedPair, Disparity]:
+        """Rectify one pair, and match it at half size; flying edges stay."""
+        rectified = self.rectify(pair)
+        with self._stopwatch.stage("match_roughly"):
+            return rectified, self._rough_matcher.match(rectified)
 
     def inspect(self, pair: RectifiedPair) -> tuple[str, ...]:
         """Return warnings about the geometry of a pair; every 50th frame is inspected.
@@ -117,11 +114,37 @@ class FrameReconstructor:
         Raises:
             CalibrationError: Left and right are swapped.
         """
+        return self.reconstruct_rectified(self.rectify(pair))
+
+    def reconstruct_rectified(self, rectified: RectifiedPair) -> ReconstructedFrame:
+        """Reconstruct one pair that is rectified; see `reconstruct`."""
         config, stage = self._config, self._stopwatch.stage
-        rectified, disparity = self.match(pair)
+        disparity = self._match(rectified)
         warnings = self.inspect(rectified)
         with stage("back_project"):
             cloud = back_project(disparity, rectified, config.cloud)
         with stage("filter"):
             cloud = filter_cloud(cloud, config.filters)
         return ReconstructedFrame(rectified, disparity, cloud, warnings)
+
+    def unmatched(self, rectified: RectifiedPair) -> ReconstructedFrame:
+        """Return a frame in which nothing is matched: no disparity, no point."""
+        return replace(self._nothing, pair=rectified)
+
+    @cached_property
+    def _nothing(self) -> ReconstructedFrame:
+        shape = (self.camera.height_px, self.camera.width_px)
+        grey = np.zeros(shape, np.uint8)
+        black = RectifiedPair(grey, grey, self.camera)
+        disparity = Disparity.from_values(np.full(shape, np.nan, np.float32))
+        cloud = back_project(disparity, black, self._config.cloud)
+        return ReconstructedFrame(black, disparity, cloud)
+
+    def _match(self, rectified: RectifiedPair) -> Disparity:
+        stage = self._stopwatch.stage
+        with stage("match"):
+            disparity = self._matcher.match(rectified)
+        if not self._config.cloud.remove_flying_edges:
+            return disparity
+        with stage("edges"):
+            return remove_flying_edges(disparity)

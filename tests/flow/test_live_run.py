@@ -14,11 +14,13 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError
 from recon.io.trajectory import read_tum
-from recon.map.store.map import Map
+from recon.map.drive.behind import MapBehind
+from recon.run.progress import Silent
 from recon.sources import live
 from recon.sources.live import LiveSource
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
+from tests.scenery.patience import be_patient
 
 STREET = StreetScene(
     frames=8, width_px=400, height_px=150, focal_px=225.0, smooth_edges=False, seed=1
@@ -45,39 +47,86 @@ def mapped(street: SyntheticSource, config: ReconConfig, tmp_path_factory) -> Pa
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """However slow the machine is, nothing is left out."""
+    be_patient(monkeypatch)
+
+
+@pytest.fixture
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of all frames but the first nothing is mapped but the pose."""
     monkeypatch.setattr(live, "_WAITING", 1000)
-    monkeypatch.setattr(LiveSource, "hurried", lambda self, pair: False)
+    monkeypatch.setattr(
+        MapBehind,
+        "_map",
+        lambda self, late, last: self._map_frame(late, late.pair.index == 0),
+    )
 
 
 def _live(source, config, out: Path, **options) -> dict:
     return run_live(source, config, MapOptions("live", out, mesh=False), rate=10.0, **options)
 
 
+def _off_m(run: Path, street: SyntheticSource) -> np.ndarray:
+    found = read_tum(run / "trajectory_tum.txt").positions_m
+    return np.linalg.norm(found - street.trajectory.positions_m, axis=1)
+
+
 def test_a_drive_that_is_kept_up_with_gives_the_same_map(
     street, config, mapped, patient, tmp_path
 ) -> None:
+    """But for the poses, which rest on features alone."""
     summary = _live(street, config, tmp_path / "live")
 
-    for name in ("trajectory_tum.txt", "map/cloud.ply", "map/grid.pgm"):
-        assert (tmp_path / "live" / name).read_bytes() == (mapped / name).read_bytes()
+    usual = json.loads((mapped / "summary.json").read_text())
+    assert summary["points"] == pytest.approx(usual["points"], rel=0.05)
+    assert summary["odometry"] == "visual"
+    assert _off_m(tmp_path / "live", street).max() < 0.1
     assert summary["live"]["frames_arrived"] == 8
-    assert summary["live"]["frames_dropped"] == 0
+    assert summary["live"]["frames_dropped"] == summary["live"]["frames_not_matched"] == 0
     assert summary["live"]["latency_ms"]["p95"] > 0
     assert json.loads((tmp_path / "live" / "summary.json").read_text()) == summary
 
 
-def test_frames_that_are_not_matched_are_tracked(
-    street, config, patient, monkeypatch, tmp_path
+def test_a_machine_that_is_much_too_slow_has_poses_and_is_told_why_there_is_no_map(
+    street, config, hurried, monkeypatch, tmp_path
 ) -> None:
-    monkeypatch.setattr(LiveSource, "hurried", lambda self, pair: pair.index % 2 == 1)
+    poses = []
+    monkeypatch.setattr(LiveSource, "warnings", lambda self: ["7 frames came too fast"])
 
-    _live(street, config, tmp_path / "live")
+    class Watch(Silent):
+        def on_step(self, step) -> None:
+            poses.append(step)
 
-    found = read_tum(tmp_path / "live" / "trajectory_tum.txt")
-    off = np.linalg.norm(found.positions_m - street.trajectory.positions_m, axis=1)
-    assert off.max() < 0.2
-    with Map.open(tmp_path / "live") as map_:
-        assert all(health.ok for health in map_.session().health)
+    options = MapOptions("live", tmp_path / "live", mesh=False, progress=Watch())
+    with pytest.raises(MappingError, match=r"the map is empty.*7 frames came too fast.*--rate"):
+        run_live(street, config, options, rate=10.0)
+
+    found = np.stack([pose.T_world_camera[:3, 3] for pose in poses])
+    assert np.linalg.norm(found - street.trajectory.positions_m, axis=1).max() < 0.2
+    assert all(pose.ok for pose in poses)
+    assert not (tmp_path / "live" / "summary.json").exists()
+
+
+def test_a_drive_ends_when_it_is_told_to_and_its_map_is_completed(
+    street, config, patient, tmp_path
+) -> None:
+    arrived = []
+
+    class Watch(Silent):
+        def on_step(self, step) -> None:
+            arrived.append(step)
+
+    options = MapOptions("live", tmp_path / "live", mesh=False, progress=Watch())
+    summary = run_live(street, config, options, rate=10.0, stopped=lambda: len(arrived) >= 5)
+
+    assert summary["frames"] == 5
+    assert (tmp_path / "live" / "map" / "cloud.ply").is_file()
+
+
+def test_kiss_icp_comes_too_late_for_live_poses(street, tmp_path) -> None:
+    config = load_config(None, ["odometry.method=kiss"])
+
+    with pytest.raises(SettingsError, match="the points that kiss-icp needs"):
+        _live(street, config, tmp_path / "live")
 
 
 def test_a_drive_is_found_in_a_map_while_it_arrives(
@@ -88,17 +137,6 @@ def test_a_drive_is_found_in_a_map_while_it_arrives(
     assert summary["frames_tracking"] >= 7
     assert summary["live"]["frames_arrived"] == 8
     assert (tmp_path / "live" / "states.csv").is_file()
-
-
-def test_a_machine_that_is_much_too_slow_is_told_so(street, config, monkeypatch, tmp_path) -> None:
-    """Of frames that were all tracked alone, there is no map."""
-    monkeypatch.setattr(live, "_WAITING", 1000)
-    monkeypatch.setattr(LiveSource, "hurried", lambda self, pair: pair.index > 0)
-    monkeypatch.setattr(LiveSource, "warnings", lambda self: ["7 frames came too fast"])
-
-    with pytest.raises(MappingError, match=r"the map is empty.*7 frames came too fast.*--rate"):
-        _live(street, config, tmp_path / "live")
-    assert not (tmp_path / "live" / "summary.json").exists()
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -86,7 +87,7 @@ def make_disparity(values: np.ndarray, sigma_px: float = 0.1) -> Disparity:
 
 
 def make_frame(grey: np.ndarray, values: np.ndarray, index: int = 0) -> OdometryFrame:
-    """A frame; odometry does not use the right image."""
+    """A frame; odometry on exact disparities does not use the right image."""
     pair = RectifiedPair(grey, grey, CAMERA, timestamp_s=0.1 * index, index=index)
     return OdometryFrame(pair, make_disparity(values))
 
@@ -103,6 +104,19 @@ def see() -> Callable[..., OdometryFrame]:
     def see_from(T_world_camera: np.ndarray, index: int = 0) -> OdometryFrame:
         grey, depth = _render(T_world_camera)
         return make_frame(grey, CAMERA.focal_px * CAMERA.baseline_m / depth, index)
+
+    return see_from
+
+
+@pytest.fixture(scope="session")
+def see_both(see: Callable[..., OdometryFrame]) -> Callable[..., OdometryFrame]:
+    """See the street from a pose with both cameras."""
+
+    def see_from(T_world_camera: np.ndarray, index: int = 0) -> OdometryFrame:
+        frame = see(T_world_camera, index)
+        T_left_right = make_transform(np.eye(3), np.array([CAMERA.baseline_m, 0.0, 0.0]))
+        right = _render(T_world_camera @ T_left_right)[0]
+        return replace(frame, pair=replace(frame.pair, right=right))
 
     return see_from
 

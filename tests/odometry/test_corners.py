@@ -2,11 +2,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
-import pytest
 
 from recon.odometry import corners
-from recon.odometry.corners import find_corners
+from recon.odometry.corners import find_corners, find_fewer_corners
 from recon.odometry.protocol import OdometryFrame
 
 NONE = np.zeros((0, 2), np.float32)
@@ -32,11 +32,10 @@ def test_features_already_followed_fill_their_cells(see: Callable[..., OdometryF
     assert distance.size == 0 or distance.min() >= corners._DISTANCE_PX
 
 
-def test_the_corners_of_a_square_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(corners, "_CELL_PX", 20)
+def test_the_corners_of_a_square_are_found() -> None:
     grey = np.full((100, 100), 50, np.uint8)
     grey[30:60, 30:60] = 200
-    uv = find_corners(grey, NONE)
+    uv = find_corners(grey, NONE, cell_px=20)
     square = np.array([[29.5, 29.5], [59.5, 29.5], [29.5, 59.5], [59.5, 59.5]])
     distance = np.linalg.norm(uv[:, None] - square[None], axis=2)
     assert len(uv) >= 4
@@ -47,3 +46,15 @@ def test_the_corners_of_a_square_are_found(monkeypatch: pytest.MonkeyPatch) -> N
 def test_nothing_is_found_where_nothing_is() -> None:
     assert find_corners(np.full((80, 90), 128, np.uint8), NONE).shape == (0, 2)
     assert find_corners(np.zeros((5, 5), np.uint8), NONE).shape == (0, 2)
+
+
+def test_fewer_corners_are_corners_too(see: Callable[..., OdometryFrame]) -> None:
+    grey = see(np.eye(4)).pair.left
+    many, few = find_corners(grey, NONE), find_fewer_corners(grey, NONE)
+
+    assert 0.15 < len(few) / len(many) < 0.6
+    score = cv2.cornerMinEigenVal(grey, 5)
+    column, row = few.astype(int).T
+    assert np.median(score[row, column]) > np.median(score)
+    more = find_fewer_corners(grey, few)
+    assert len(more) < 0.2 * len(few)

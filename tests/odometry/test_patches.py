@@ -11,7 +11,7 @@ from recon.core.geometry.projection import project, unproject
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
 from recon.odometry.corners import find_corners
-from recon.odometry.patches import find_again, surface_slopes, warp_of
+from recon.odometry.patches import find_again, measure_disparity, surface_slopes, warp_of
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.tracking import follow
 
@@ -105,3 +105,21 @@ def test_a_darker_image_changes_no_place(see: See, camera: RectifiedCamera) -> N
     found = find_again(frame.pair.left, darker, uv, warp, uv + 0.7)
     assert np.nanmax(np.abs(found - uv)) < 0.05
     assert np.isfinite(found).mean() > 0.9
+
+
+def test_disparities_are_measured_near_rough_ones(see_both: See) -> None:
+    frame = see_both(np.eye(4))
+    uv = find_corners(frame.pair.left, np.zeros((0, 2), np.float32)).astype(np.float64)
+    uv = uv[uv[:, 0] > 80]  # seen in the right image, too
+    column, row = uv.astype(int).T
+    true = frame.disparity.values[row, column].astype(np.float64)
+    off = np.random.default_rng(0).uniform(-1.0, 1.0, len(uv))
+
+    found = measure_disparity(frame.pair, uv, true + off, surface_slopes(frame.disparity, uv))
+
+    near = np.isfinite(found)
+    assert near.mean() > 0.6
+    assert np.median(np.abs(found - true)[near]) < 0.05
+    flat = np.zeros((len(uv), 2))
+    assert np.isnan(measure_disparity(frame.pair, uv, true + 30.0, flat)).mean() > 0.8
+    assert np.isnan(measure_disparity(frame.pair, uv, np.full(len(uv), np.nan), flat)).all()

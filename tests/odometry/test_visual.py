@@ -10,6 +10,8 @@ from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import RectifiedPair
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualOdometry
+from recon.stereo.match.half_size import HalfSizeMatcher
+from recon.stereo.match.registry import MatchingSettings
 
 See = Callable[..., OdometryFrame]
 
@@ -163,3 +165,16 @@ def test_health_says_how_sure_the_motion_is(street: tuple[OdometryFrame, ...]) -
 def _exposed(frame: OdometryFrame, gain: float) -> OdometryFrame:
     grey = np.clip(np.rint(gain * frame.pair.left), 0, 255).astype(np.uint8)
     return replace(frame, pair=replace(frame.pair, left=grey, right=grey))
+
+
+def test_rough_disparities_give_nearly_the_same_path(
+    see_both: See, street_poses: np.ndarray
+) -> None:
+    matcher = HalfSizeMatcher(MatchingSettings(), threads=1)
+    pairs = [see_both(T, index).pair for index, T in enumerate(street_poses)]
+
+    found = follow([OdometryFrame(pair, matcher.match(pair), rough=True) for pair in pairs])
+
+    truth = invert(street_poses[0]) @ street_poses
+    length_m = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
+    assert np.linalg.norm(found[-1, :3, 3] - truth[-1, :3, 3]) < 0.02 * length_m

@@ -12,7 +12,6 @@ import pytest
 from recon.core.errors import FormatError
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.run.progress import SILENT
-from recon.sources import live as live_file
 from recon.sources.live import LiveSource
 
 GREY = np.zeros((16, 16), np.uint8)
@@ -59,7 +58,7 @@ def test_who_keeps_up_gets_every_pair() -> None:
     assert len(pairs) + figures["frames_dropped"] == 6
 
 
-def test_who_is_slow_loses_the_oldest_and_is_told_to_hurry() -> None:
+def test_who_is_slow_gets_the_newest_and_is_told_what_was_dropped() -> None:
     recording = Recording(10)
     live = LiveSource(recording, rate=1e9)
     pairs = live.frames()
@@ -67,29 +66,47 @@ def test_who_is_slow_loses_the_oldest_and_is_told_to_hurry() -> None:
     first = next(pairs)
     recording.go.set()
     recording.read.wait(10)
+    while live.dropped < 8:  # the last pair is handed over after it was read
+        time.sleep(0.001)
+    assert live.waits
     rest = list(pairs)
 
-    assert [pair.index for pair in (first, *rest)] == [0, 7, 8, 9]
-    assert [live.hurried(pair) for pair in (first, *rest)] == [False, True, True, False]
+    assert [pair.index for pair in (first, *rest)] == [0, 9]
+    assert not live.waits
+    live.leave_unmatched()
     figures = live.figures()
     assert figures["frames_arrived"] == 10
-    assert figures["frames_dropped"] == 6
-    assert figures["frames_not_matched"] == 2
-    assert [text.split()[0] for text in live.warnings()] == ["2", "6"]
+    assert figures["frames_dropped"] == 8
+    assert figures["frames_not_matched"] == 1
+    assert [text.split()[0] for text in live.warnings()] == ["1", "8"]
 
 
-def test_of_pairs_that_hurry_every_third_is_matched(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_file, "_WAITING", 20)
-    recording = Recording(10)
-    live = LiveSource(recording, rate=1e9)
-    pairs = live.frames()
+def test_pairs_of_cameras_are_due_when_they_were_taken() -> None:
+    class Camera(Recording):
+        def frames(self, start: int = 0) -> Iterator[StereoPair]:
+            yield StereoPair(GREY, GREY, time.monotonic() - 0.05, 0)
+
+    live = LiveSource(Camera(1), rate=None)
+    progress = live.timed(SILENT)
+
+    for _ in live:
+        progress.on_step(None)
+
+    assert 50 <= live.figures()["latency_ms"]["p50"] < 5000
+    assert live.figures()["rate"] is None
+    assert live.description == "a recording"
+
+
+def test_a_drive_ends_when_it_is_told_to() -> None:
+    stop = Event()
+    recording = Recording(3)  # after the first pair it gives none
+    pairs = LiveSource(recording, stopped=stop.is_set).frames()
     next(pairs)
+
+    stop.set()
+
+    assert list(pairs) == []
     recording.go.set()
-    recording.read.wait(10)
-
-    hurried = [live.hurried(pair) for pair in pairs]
-
-    assert hurried == [True, True, False, True, True, False, True, True, False]
 
 
 def test_the_time_from_arrival_to_result_is_measured() -> None:

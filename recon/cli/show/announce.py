@@ -32,7 +32,8 @@ def announce(
         "frames": len(source),
     }
     if not quiet:
-        _write(f"{source.name}: {source.description}, {len(source)} pairs", event, verbose, stream)
+        many = f", {len(source)} pairs" if len(source) else ""
+        _write(f"{source.name}: {source.description}{many}", event, verbose, stream)
 
 
 def warn(

@@ -89,7 +89,7 @@ class ProgressBar:
             TextColumn("{task.fields[bad]}", style="bold red"),
             console=self._console,
         )
-        self._progress.add_task(name, total=total, rate="", state="", bad="")
+        self._progress.add_task(name, total=total or None, rate="", state="", bad="")
         self._progress.start()
 
     def on_step(self, step: Step) -> None:

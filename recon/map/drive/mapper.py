@@ -19,7 +19,7 @@ from recon.map.occupancy.rays import ray_grain, thin_rays
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.submaps import SubmapBuilder
-from recon.odometry import Odometry, OdometryFrame
+from recon.odometry import Odometry, OdometryFrame, OdometryResult
 from recon.run.lookahead import OneBehind
 from recon.run.stopwatch import Stopwatch
 from recon.stereo.frame import ReconstructedFrame
@@ -58,10 +58,15 @@ class Mapper:
         """Return the number of frames so far."""
         return len(self.session)
 
-    def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
-        """Register the next frame and start its integration."""
+    def register(self, frame: OdometryFrame) -> OdometryResult:
+        """Find the pose of the next frame."""
         with self._stage("odometry"):
-            registered = self._odometry.register(OdometryFrame(frame.pair, frame.disparity))
+            return self._odometry.register(frame)
+
+    def add(
+        self, frame: ReconstructedFrame, registered: OdometryResult, *, total: int
+    ) -> FrameResult:
+        """Add the next frame, whose pose is known, and start its integration."""
         T_world_camera = registered.T_world_camera
         health = replace(registered.health, warnings=(*frame.warnings, *registered.health.warnings))
         # A hole in the map is better than wrong geometry.
@@ -109,7 +114,7 @@ class Mapper:
         self._behind.abandon()
 
     def close(self) -> None:
-        """Close the current submap after the last frame."""
+        """Close the current submap; a frame that comes later begins a new one."""
         self._behind.wait()
         if self._builder is not None and self._builder.frames:
             self.session.submaps.add(self._builder.close())

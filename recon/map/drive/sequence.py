@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from recon.core.errors import RegistrationError
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import apply, invert
-from recon.core.values import OccupancyVoxels, PointCloud, RectifiedCamera, StereoPair, Trajectory
+from recon.core.values import (
+    OccupancyVoxels,
+    PointCloud,
+    RectifiedCamera,
+    Trajectory,
+)
 from recon.core.values.arrays import Bool, Float64
+from recon.map.drive.drive import Drive
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
-from recon.map.drive.frame_result import FrameResult
 from recon.map.drive.mapper import Mapper
-from recon.map.drive.workspace import Workspace, resuming
+from recon.map.drive.workspace import Workspace
 from recon.map.joined import join_clouds, join_voxels
-from recon.map.occupancy.rays import thin_rays
 from recon.map.settings import DriveSettings
 from recon.map.store.submaps import Submaps
 from recon.map.tiles import Tiles
@@ -37,10 +40,8 @@ from recon.odometry import (
     first_moving,
     make_odometry,
 )
-from recon.run.lookahead import look_ahead
 from recon.run.machine import serial_algebra
 from recon.run.progress import SILENT, Progress
-from recon.sources.live import LiveSource
 from recon.sources.protocol import IncompleteSource, StampedSource, StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 
@@ -170,7 +171,7 @@ def map_sequence(
     """Register and fuse all frames of a source, and close loops in the path.
 
     Matching of the next frames, registration of this one and integration of the last one overlap,
-    which does not change the result.
+    which does not change the result. Of a live source the poses come first (`poses_first`).
 
     Args:
         source: The source of stereo pairs.
@@ -190,16 +191,6 @@ def map_sequence(
     reconstructor = FrameReconstructor(
         source.calibration, config, threads=work.threads, stopwatch=work.stopwatch
     )
-
-    live = source if isinstance(source, LiveSource) else None
-
-    def reconstruct(pair: StereoPair) -> ReconstructedFrame:
-        if live is not None and live.hurried(pair):
-            return reconstructor.unmatched(pair)
-        frame = reconstructor.reconstruct(pair)
-        with work.stopwatch.stage("thin"):
-            return replace(frame, rays=thin_rays(frame.cloud, config.occupancy))
-
     used = None
     if prior is not None and known_poses is None:
         used = _axes_of(prior, source, reconstructor, config.odometry.prior)
@@ -208,113 +199,46 @@ def map_sequence(
     session = work.session(source, config)
     watch = LoopWatch(session.keyframes, work.stopwatch, search=looking)
     mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch)
-    drive = _Drive(mapper, watch, config, work)
+    drive = Drive(mapper, watch, config, work)
+    steps = drive.frames(source, reconstructor)
     progress.on_start(source.name, len(source))
     try:
-        with serial_algebra():
-            pairs = source.frames(len(drive.mapper))
-            for frame in look_ahead(reconstruct, pairs, depth=2 if live is None else 1):
-                progress.on_step(drive.add(frame, total=len(source)))
+        with serial_algebra(), closing(steps):
+            for step in steps:
+                progress.on_step(step)
             drive.wait()
     finally:
         drive.stop()
         progress.on_finish()
-    return replace(drive.finish(source, reconstructor), prior=used)
+    return replace(_mapped(drive, source, reconstructor), prior=used)
 
 
-class _Drive:
-    """Couples the mapper with the search for loops, commits and timing.
+def _mapped(
+    drive: Drive, source: StereoSource, reconstructor: FrameReconstructor
+) -> MappedSequence:
+    """Complete a drive."""
+    drive.finish()
+    session = drive.session
+    mapped = MappedSequence(
+        trajectory=session.odometry,
+        health=session.health,
+        submaps=session.submaps,
+        config=drive.config,
+        T_map_world=session.T_map_world,
+        camera=reconstructor.camera,
+        sample=drive.sample or _sample_again(len(session), source, reconstructor),
+        seconds=drive.seconds,
+    )
+    loops = drive.close_loops(mapped.trajectory)
+    return mapped if loops is None else mapped.closed(loops)
 
-    Goes on from the last commit if there is one; the time spent before it is included.
-    """
 
-    def __init__(
-        self, mapper: Mapper, loops: LoopWatch, config: DriveSettings, workspace: Workspace
-    ) -> None:
-        self.mapper = mapper
-        self._loops = loops
-        self._config = config
-        self._map = workspace.map
-        self._session = mapper.session
-        self._stage = workspace.stopwatch.stage
-        self._sample: ReconstructedFrame | None = None
-        self._saved = 0
-        self._start = self._last = time.perf_counter()
-        with resuming(self._map.store.name):
-            state = self._session.state()
-            if state is not None:
-                self._restore(state)
-
-    def add(self, frame: ReconstructedFrame, *, total: int) -> FrameResult:
-        result = self.mapper.add(frame, total=total)
-        self._loops.add(frame, result.T_world_camera, measured=result.health.ok)
-        if result.index <= total // 2 and (self._sample is None or len(frame.cloud)):
-            self._sample = frame
-        if len(self.mapper) - self._saved >= self._config.checkpoints.every_frames:
-            self._save()
-        self._config.memory.check(f"frame {result.index}")
-        now = time.perf_counter()
-        seconds, self._last = now - self._last, now
-        return replace(result, seconds=seconds)
-
-    def wait(self) -> None:
-        """Wait for background work: the integration of the last frame, and the search for loops."""
-        self.mapper.wait()
-        self._loops.wait()
-        self._last = time.perf_counter()
-
-    def stop(self) -> None:
-        """Stop background work, finished or not."""
-        self.mapper.abandon()
-        self._loops.stop()
-
-    def finish(self, source: StereoSource, reconstructor: FrameReconstructor) -> MappedSequence:
-        if not len(self.mapper):
-            raise RegistrationError("the source has no frame")
-        if len(self.mapper) > self._saved:
-            self._save()
-        self.mapper.close()
-        mapped = MappedSequence(
-            trajectory=self._session.odometry,
-            health=self._session.health,
-            submaps=self._session.submaps,
-            config=self._config,
-            T_map_world=self._session.T_map_world,
-            camera=reconstructor.camera,
-            sample=self._sample or self._sample_again(source, reconstructor),
-            seconds=self._last - self._start,
-        )
-        if not self._loops.searching:
-            return mapped
-        with self._stage("close_loops"):
-            loops = self._loops.close(mapped.trajectory)
-            self._session.set_loops(loops.record())
-            return mapped.closed(loops)
-
-    def _restore(self, state: dict[str, Any]) -> None:
-        self.mapper.restore(state["mapper"])
-        path, health = self._session.odometry, self._session.health
-        self._loops.restore(path.T_world_camera, [record.ok for record in health])
-        self._saved = len(self.mapper)
-        self._last = time.perf_counter()
-        self._start = self._last - state["seconds"]
-
-    def _save(self) -> None:
-        if self._map.store.path is None:
-            return
-        self.wait()  # else keyframes that a resumed run needs might be missing
-        with self._stage("checkpoint"):
-            seconds = time.perf_counter() - self._start
-            self._session.set_state({"mapper": self.mapper.state(), "seconds": seconds})
-            self._map.commit()
-        self._saved = len(self.mapper)
-
-    def _sample_again(
-        self, source: StereoSource, reconstructor: FrameReconstructor
-    ) -> ReconstructedFrame:
-        """Reconstruct the sample again if it was mapped before this process started."""
-        index = min(len(source) // 2, len(self.mapper) - 1)
-        return reconstructor.reconstruct(next(source.frames(index)))
+def _sample_again(
+    mapped: int, source: StereoSource, reconstructor: FrameReconstructor
+) -> ReconstructedFrame:
+    """Reconstruct the frame in the middle, which was mapped before this process started."""
+    index = min(len(source) // 2, mapped - 1)
+    return reconstructor.reconstruct(next(source.frames(index)))
 
 
 def _axes_of(

@@ -120,12 +120,15 @@ class Localizer:
         self._path_m = 0.0
         self._frames = 0
 
-    def add(self, frame: OdometryFrame) -> Located:
-        """Locate the next frame."""
+    def add(self, frame: OdometryFrame, *, hurry: bool = False) -> Located:
+        """Locate the next frame; in a hurry, by odometry alone if its place in the map is known."""
         visual = self._visual.track(frame)
         self._advance(visual)
-        keyframe = make_keyframe(self._frames, frame.pair, frame.disparity)
         self._frames += 1
+        if hurry and self._belief is not None:
+            return self._told(_Confirmed(self._belief, refused="no time to look at the map"))
+        focal_px = self._known.focal_px
+        keyframe = make_keyframe(self._frames - 1, frame.pair, frame.disparity, focal_px=focal_px)
         if self._belief is None:
             self._belief = self._first_fix(keyframe, frame)
         if self._belief is None:
@@ -166,8 +169,6 @@ class Localizer:
 
     def _confirm(self, belief: Belief, keyframe: Keyframe, frame: OdometryFrame) -> _Confirmed:
         """Return the belief, corrected by the nearest views of the map and its surfaces."""
-        if not frame.disparity.valid.any():
-            return _Confirmed(belief, refused="the frame was not matched")
         loops, refused = [], ""
         for number in self._known.near(belief.T_world_camera, _VIEWS):
             verdict = self._known.compare(number, keyframe, frame.pair.camera)

@@ -216,10 +216,9 @@ def localize_sequence(
     live = source if isinstance(source, LiveSource) else None
 
     def match(pair: StereoPair) -> OdometryFrame:
-        if live is not None and live.hurried(pair):
-            unmatched = reconstructor.unmatched(pair)
-            return OdometryFrame(unmatched.pair, unmatched.disparity)
-        return OdometryFrame(*reconstructor.match(pair))
+        if live is None:
+            return OdometryFrame(*reconstructor.match(pair))
+        return OdometryFrame(*reconstructor.match_roughly(pair), rough=True)
 
     frames: list[LocalizedFrame] = []
     progress.on_start(source.name, len(source))
@@ -228,7 +227,8 @@ def localize_sequence(
         with serial_algebra():
             for frame in look_ahead(match, source.frames(), depth=2 if live is None else 1):
                 with watch.stage("localize"):
-                    frames.append(_located(localizer, frame, len(frames)))
+                    hurry = live is not None and live.waits
+                    frames.append(_located(localizer, frame, len(frames), hurry=hurry))
                 progress.on_step(frames[-1])
                 config.memory.check(f"frame {len(frames) - 1}")
     finally:
@@ -239,9 +239,11 @@ def localize_sequence(
     return LocalizedDrive(tuple(frames), T_map_world, time.perf_counter() - begun)
 
 
-def _located(localizer: Localizer, frame: OdometryFrame, index: int) -> LocalizedFrame:
+def _located(
+    localizer: Localizer, frame: OdometryFrame, index: int, *, hurry: bool
+) -> LocalizedFrame:
     begun = time.perf_counter()
-    located = localizer.add(frame)
+    located = localizer.add(frame, hurry=hurry)
     return LocalizedFrame(index, frame.pair.timestamp_s, time.perf_counter() - begun, located)
 
 

@@ -1,0 +1,176 @@
+"""While images arrive poses come first; frames are matched behind, as far as there is time."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from threading import Condition, Thread
+from typing import Final
+
+import numpy as np
+
+from recon.core.values import RectifiedPair
+from recon.map.drive.frame_result import FrameResult
+from recon.odometry import OdometryFrame
+from recon.odometry.protocol import OdometryResult
+from recon.run.machine import work_in_background
+from recon.sources.live import LiveSource
+from recon.stereo.frame import FrameReconstructor
+
+_MOST_WAITING: Final = 50
+"""Frames that may wait to be mapped; where more do, the next pose waits, too. So many come only
+while the disk hangs."""
+
+_REST_S: Final = 0.25
+"""How long nothing is matched after a frame was dropped: then even poses are too late. Twice as
+long if that happens again."""
+
+_LONGEST_REST_S: Final = 0.5
+"""A longer rest would leave holes in the map."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """A frame that has its pose.
+
+    Attributes:
+        pair: The rectified images.
+        result: Where it was taken.
+    """
+
+    pair: RectifiedPair
+    result: OdometryResult
+
+
+def poses_first(
+    source: LiveSource,
+    reconstructor: FrameReconstructor,
+    register: Callable[[OdometryFrame], OdometryResult],
+    map_frame: Callable[[Registered, bool], None],
+) -> Generator[FrameResult]:
+    """Yield the pose of each frame as soon as it is known, by odometry on rough disparities.
+
+    Args:
+        source: Where the pairs come from.
+        reconstructor: Rectifies and matches them.
+        register: Finds the pose of the next frame.
+        map_frame: Puts a frame into the map, matched or not; called in another thread, in order.
+
+    Raises:
+        ReconError: A frame cannot be read, registered or mapped.
+    """
+    behind = MapBehind(source, map_frame)
+    try:
+        for index, pair in enumerate(source.frames()):
+            rectified, disparity = reconstructor.match_roughly(pair)
+            found = register(OdometryFrame(rectified, disparity, rough=True))
+            valid_share = float(np.mean(disparity.valid))
+            T = found.T_world_camera
+            yield FrameResult(index, len(source), 0.0, valid_share, 0, T, found.health)
+            behind.add(Registered(rectified, found))
+        behind.wait()
+    finally:
+        behind.stop()
+
+
+class MapBehind:
+    """Maps frames behind their poses, in a thread of lower priority.
+
+    When a frame is done, the newest of those that wait by then is matched; the ones before it are
+    mapped unmatched, which takes no time. After frames were dropped for lack of time nothing is
+    matched for a while.
+
+    Args:
+        source: Where the frames come from; it counts what is not matched.
+        map_frame: Puts a frame into the map, matched or not.
+    """
+
+    def __init__(self, source: LiveSource, map_frame: Callable[[Registered, bool], None]) -> None:
+        self._source = source
+        self._map_frame = map_frame
+        self._waiting: deque[Registered] = deque()
+        self._news = Condition()
+        self._busy = self._ended = False
+        self._error: BaseException | None = None
+        self._mapped = 0
+        self._dropped = 0
+        self._rest_s = 0.0
+        self._thread = Thread(target=self._work, name="map-behind", daemon=True)
+        self._thread.start()
+
+    def add(self, registered: Registered) -> None:
+        """Add the next frame.
+
+        Raises:
+            ReconError: An earlier one cannot be mapped.
+        """
+        with self._news:
+            self._news.wait_for(lambda: len(self._waiting) < _MOST_WAITING or self._error)
+            self._waiting.append(registered)
+            self._news.notify_all()
+        self._raise()
+
+    def wait(self) -> None:
+        """Wait until all frames are mapped, the newest of them matched.
+
+        Raises:
+            ReconError: One cannot be mapped.
+        """
+        with self._news:
+            self._news.wait_for(lambda: not (self._waiting or self._busy) or self._error)
+        self._raise()
+
+    def stop(self) -> None:
+        """End the thread after the frame that it works on; others that wait are forgotten."""
+        with self._news:
+            self._waiting.clear()
+            self._ended = True
+            self._news.notify_all()
+        self._thread.join()
+
+    def _raise(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def _work(self) -> None:
+        work_in_background()
+        try:
+            while batch := self._take():
+                for registered in batch:
+                    self._map(registered, last=registered is batch[-1])
+        except BaseException as error:  # noqa: BLE001 - raised where frames are added
+            self._error = error
+        finally:
+            with self._news:
+                self._busy = False
+                self._news.notify_all()
+
+    def _take(self) -> list[Registered]:
+        """Wait for frames, after a rest if that is due; empty = there are none any more."""
+        with self._news:
+            self._busy = False
+            self._news.notify_all()
+            self._news.wait_for(lambda: self._ended, self._due_rest_s())
+            self._news.wait_for(lambda: self._waiting or self._ended)
+            batch, self._busy = list(self._waiting), True
+            self._waiting.clear()
+            self._news.notify_all()
+        return batch
+
+    def _due_rest_s(self) -> float:
+        """Return how long to match nothing."""
+        dropped, self._dropped = self._source.dropped - self._dropped, self._source.dropped
+        if dropped:
+            self._rest_s = min(max(_REST_S, 2 * self._rest_s), _LONGEST_REST_S)
+        else:
+            self._rest_s = self._rest_s / 2 if self._rest_s > _REST_S else 0.0
+        return self._rest_s
+
+    def _map(self, registered: Registered, *, last: bool) -> None:
+        # The first frame says where the ground is, and with it the axes of the map.
+        matched = last or not self._mapped
+        if not matched:
+            self._source.leave_unmatched()
+        self._map_frame(registered, matched)
+        self._mapped += 1

@@ -1,0 +1,155 @@
+"""A drive while it is mapped: frames in, poses out, and a map on disk that grows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator
+from dataclasses import replace
+from typing import Any, Final
+
+from recon.core.errors import RegistrationError
+from recon.core.values import RectifiedPair, Trajectory
+from recon.map.drive.behind import Registered, poses_first
+from recon.map.drive.drive_loops import DriveLoops, LoopWatch
+from recon.map.drive.frame_result import FrameResult
+from recon.map.drive.mapper import Mapper
+from recon.map.drive.workspace import Workspace, resuming
+from recon.map.occupancy.rays import thin_rays
+from recon.map.settings import DriveSettings
+from recon.odometry import OdometryFrame, OdometryResult
+from recon.run.lookahead import look_ahead
+from recon.sources.live import LiveSource
+from recon.sources.protocol import StereoSource
+from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
+
+_COMMIT_S: Final = 3.0
+"""Time between two commits of a drive whose images arrive just now."""
+
+
+class Drive:
+    """Couples the mapper with the search for loops, commits and timing.
+
+    Goes on from the last commit if there is one; the time spent before it is included.
+
+    Attributes:
+        config: The settings.
+        session: Where it is kept.
+        sample: The frame in the middle; None = it was mapped before this process started.
+    """
+
+    def __init__(
+        self, mapper: Mapper, loops: LoopWatch, config: DriveSettings, workspace: Workspace
+    ) -> None:
+        self.mapper = mapper
+        self._loops = loops
+        self.config = config
+        self._map = workspace.map
+        self.session = mapper.session
+        self._stage = workspace.stopwatch.stage
+        self.sample: ReconstructedFrame | None = None
+        self._saved = 0
+        self._live = False
+        self._start = self._last = self._saved_s = time.perf_counter()
+        with resuming(self._map.store.name):
+            state = self.session.state()
+            if state is not None:
+                self._restore(state)
+
+    def frames(
+        self, source: StereoSource, reconstructor: FrameReconstructor
+    ) -> Generator[FrameResult]:
+        """Yield the pose of each frame that is left, which becomes part of the map."""
+
+        def reconstruct(pair: RectifiedPair) -> ReconstructedFrame:
+            frame = reconstructor.reconstruct_rectified(pair)
+            with self._stage("thin"):
+                return replace(frame, rays=thin_rays(frame.cloud, self.config.occupancy))
+
+        def map_behind(late: Registered, matched: bool) -> None:
+            frame = reconstruct(late.pair) if matched else reconstructor.unmatched(late.pair)
+            self._add(frame, late.result, total=len(source))
+
+        if isinstance(source, LiveSource):
+            self._live = True
+            yield from poses_first(source, reconstructor, self.mapper.register, map_behind)
+            return
+        pairs = map(reconstructor.rectify, source.frames(len(self.mapper)))
+        for frame in look_ahead(reconstruct, pairs):
+            found = self.mapper.register(OdometryFrame(frame.pair, frame.disparity))
+            yield self._add(frame, found, total=len(source))
+
+    def _add(self, frame: ReconstructedFrame, found: OdometryResult, *, total: int) -> FrameResult:
+        result = self.mapper.add(frame, found, total=total)
+        self._loops.add(frame, result.T_world_camera, measured=result.health.ok)
+        if result.index <= total // 2 and (self.sample is None or len(frame.cloud)):
+            self.sample = frame
+        if self._due():
+            self._save()
+        self.config.memory.check(f"frame {result.index}")
+        now = time.perf_counter()
+        seconds, self._last = now - self._last, now
+        return replace(result, seconds=seconds)
+
+    def wait(self) -> None:
+        """Wait for background work: the integration of the last frame, and the search for loops."""
+        self.mapper.wait()
+        self._loops.wait()
+        self._last = time.perf_counter()
+
+    def stop(self) -> None:
+        """Stop background work, finished or not."""
+        self.mapper.abandon()
+        self._loops.stop()
+
+    def finish(self) -> None:
+        """Save what is left of the drive.
+
+        Raises:
+            RegistrationError: There was no frame.
+        """
+        if not len(self.mapper):
+            raise RegistrationError("the source has no frame")
+        if len(self.mapper) > self._saved:
+            self._save()
+        self.mapper.close()
+
+    def close_loops(self, path: Trajectory) -> DriveLoops | None:
+        """Return the loops of the path, which the map keeps; None = they are not looked for."""
+        if not self._loops.searching:
+            return None
+        with self._stage("close_loops"):
+            loops = self._loops.close(path)
+            self.session.set_loops(loops.record())
+            return loops
+
+    @property
+    def seconds(self) -> float:
+        """Time from the first frame to the last."""
+        return self._last - self._start
+
+    def _due(self) -> bool:
+        """Return whether the map is to be committed."""
+        if self._live:
+            return time.perf_counter() - self._saved_s >= _COMMIT_S
+        return len(self.mapper) - self._saved >= self.config.checkpoints.every_frames
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        self.mapper.restore(state["mapper"])
+        path, health = self.session.odometry, self.session.health
+        self._loops.restore(path.T_world_camera, [record.ok for record in health])
+        self._saved = len(self.mapper)
+        self._last = time.perf_counter()
+        self._start = self._last - state["seconds"]
+
+    def _save(self) -> None:
+        if self._map.store.path is None:
+            return
+        self.wait()  # else keyframes that a resumed run needs might be missing
+        with self._stage("checkpoint"):
+            if self._live:
+                self.mapper.close()  # the map has all so far; what was dropped nobody can repeat
+            else:
+                seconds = time.perf_counter() - self._start
+                self.session.set_state({"mapper": self.mapper.state(), "seconds": seconds})
+            self._map.commit()
+        self._saved, self._saved_s = len(self.mapper), time.perf_counter()

@@ -1,0 +1,112 @@
+"""Two cameras, or one with both views, as a source of pairs that arrive while a drive goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+
+from recon.core.errors import SourceError
+from recon.core.values import Rig, StereoPair
+from recon.rig.capture import (
+    CaptureSettings,
+    RecordingSettings,
+    capture_pairs,
+    open_cameras,
+    warm_up,
+)
+from recon.sources.calibration import read_rig
+from recon.sources.opencv_camera import Camera
+from recon.sources.settings import SourceSettings
+
+
+class CameraSource:
+    """The pairs that cameras take from now on; a `StereoSource` whose length nobody knows.
+
+    Args:
+        cameras: Left and right one, or one with both views.
+        settings: How to take pairs, and how many.
+        calibration: Of the two views.
+        files: What the calibration was read from.
+        stopped: Called before each pair; True ends the drive.
+    """
+
+    truth = None
+
+    def __init__(
+        self,
+        cameras: tuple[Camera, ...],
+        settings: RecordingSettings,
+        calibration: Rig,
+        files: Sequence[Path] = (),
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._cameras, self._settings, self._stopped = cameras, settings, stopped
+        self.calibration, self.files = calibration, files
+        self.name = " and ".join(camera.name for camera in cameras)
+        self.description = "pairs from cameras"
+
+    @property
+    def live(self) -> bool:
+        """Whether all are cameras; video files take as long as one likes."""
+        return all(camera.live for camera in self._cameras)
+
+    def __len__(self) -> int:
+        """Return the largest number of pairs; 0 = not known."""
+        return self._settings.frames or 0
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        """Yield the pairs, like ``frames()``."""
+        return self.frames()
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """Yield the pairs from now on, numbered from 0; the first ``start`` are left out.
+
+        Raises:
+            SourceError: A camera gives no more frames, or the two differ in frame size.
+        """
+        taken = capture_pairs(self._cameras, self._settings, self._stopped)
+        for index, pair in islice(enumerate(taken), start, None):
+            yield StereoPair(pair.left, pair.right, pair.left_s, index, f"frame {index}")
+
+
+def is_camera(name: str) -> bool:
+    """Return whether a name is that of a camera, not of a recording: a number, a device, a URL."""
+    number = name.isdecimal() and not Path(name).exists()
+    return number or "://" in name or name.startswith("/dev/")
+
+
+@contextmanager
+def open_camera_source(
+    devices: Iterable[str],
+    settings: CaptureSettings,
+    source: SourceSettings,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Iterator[CameraSource]:
+    """Open cameras as a source, for the body of a ``with`` statement.
+
+    Args:
+        devices: See `open_cameras`.
+        settings: Image size, frame rate, arrangement of the views.
+        source: Names the calibration; its ``end`` is the number of pairs.
+        stopped: Called before each pair; True ends the drive.
+
+    Raises:
+        SourceError: A camera cannot be opened or gives no pair, or no calibration is named.
+        FormatError: The calibration is damaged.
+        CalibrationError: It cannot give depth, or is of another image size.
+    """
+    recording = RecordingSettings.parse({**dict(settings), "frames": source.end})
+    with open_cameras(devices, settings) as cameras:
+        where = " and ".join(camera.name for camera in cameras)
+        if source.calibration is None:
+            hint = "name one with --calib FILE"
+            raise SourceError("cameras need a calibration", where=where, hint=hint)
+        warm_up(cameras, recording)
+        first = next(capture_pairs(cameras, recording, stopped), None)
+        if first is None:
+            raise SourceError("the cameras give no pair", where=where)
+        height_px, width_px = first.left.shape[:2]
+        rig, files = read_rig(source, Path(), (width_px, height_px))
+        yield CameraSource(cameras, recording, rig, files, stopped)

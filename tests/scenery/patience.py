@@ -1,0 +1,20 @@
+"""A machine on which live drives lose nothing, however slow it is."""
+
+from __future__ import annotations
+
+import pytest
+
+from recon.map.drive.behind import MapBehind, Registered
+from recon.sources import live
+
+
+def be_patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let pairs wait for poses, and poses for the map."""
+    add = MapBehind.add
+
+    def add_and_wait(self: MapBehind, registered: Registered) -> None:
+        add(self, registered)
+        self.wait()
+
+    monkeypatch.setattr(live, "_WAITING", 1000)
+    monkeypatch.setattr(MapBehind, "add", add_and_wait)
