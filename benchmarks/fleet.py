@@ -9,8 +9,13 @@ divided by the number of jobs; the time of the whole run is that of the crowded 
 workers, and says nothing. Smaller numbers (``--workers``, ``--jobs``) give the cost per job nearly
 as well; the output says what was run.
 
+``long`` renders a drive of many small frames around a large block and maps it in one piece and on
+workers (``recon map --scheduler``): time, accuracy, peak memory of each process, and what went from
+the workers to others. Files are not counted: results stay in them.
+
 Examples:
     python benchmarks/fleet.py pairs --jobs 12
+    python benchmarks/fleet.py long --frames 2000 --workers 2
     python benchmarks/fleet.py scheduler --workers 1000 --jobs 100000
 """
 
@@ -18,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -28,13 +34,16 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-from distributed import Client, get_worker
+from distributed import Client, LocalCluster, get_worker
 
 from recon.core.values import RectifiedCamera
 from recon.io.images.image import write_image
-from recon.run.batch.cluster import Cluster, local_cluster
+from recon.run.batch.cluster import Cluster, local_cluster, topic_of
 from recon.run.batch.job import Job, Outcome
 from recon.run.machine import available_cores
+from recon.sources.synthetic import SyntheticSource
+from recon.street.settings import StreetScene
+from tests.scenery.kitti import write_kitti
 from tests.scenery.planes import slanted_pair
 
 CAMERA = RectifiedCamera(700.0, 310.0, 180.0, 310.0, 0.2, 620, 360, 96)
@@ -58,15 +67,19 @@ SHAPES = ((1, 1), (2, 1), (1, 2))
 
 def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(arguments)
-    result = pairs(options) if options.what == "pairs" else scheduler(options)
+    result = {"pairs": pairs, "scheduler": scheduler, "long": long}[options.what](options)
     print(json.dumps(result, indent=2))
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("what", choices=["pairs", "scheduler"])
+    parser.add_argument("what", choices=["pairs", "scheduler", "long"])
     parser.add_argument("--jobs", type=int, default=12)
-    parser.add_argument("--workers", type=int, default=1000, help="simulated workers")
+    parser.add_argument("--workers", type=int, default=2, help="workers, or simulated ones")
+    parser.add_argument("--frames", type=int, default=2000, help="of the long drive")
+    parser.add_argument("--width", type=int, default=256, help="of its frames, in pixels")
+    parser.add_argument("--drive", type=Path, help="folder of a long drive that is there already")
+    parser.add_argument("--threads", type=int, default=1, help="of each process that maps")
     parser.add_argument("--seconds", type=float, default=0.0, help="that a simulated job sleeps")
     return parser.parse_args(arguments)
 
@@ -123,6 +136,71 @@ def check(cluster: Cluster, jobs: list[Job], out: Path) -> float:
     return sum(outcome.seconds for outcome in outcomes)
 
 
+def long(options: argparse.Namespace) -> dict[str, Any]:
+    """A long drive in one piece, and in pieces on workers."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        drive = options.drive or folder / "drive"
+        if not drive.is_dir():
+            write_kitti(SyntheticSource(street(options)), drive, grey=False)
+        line = [sys.executable, "-m", "recon", "map", str(drive), "--no-mesh", "--json", "--quiet"]
+        line += ["--threads", str(options.threads)]
+        alone = run_of(line, folder / "alone", [])
+        with LocalCluster(options.workers, threads_per_worker=1, dashboard_address=None) as local:
+            where = ["--scheduler", local.scheduler_address]
+            spread = run_of(line, folder / "spread", where)
+            with Client(local) as client:
+                spread["bytes_given_by_workers"] = sum(client.run(given).values())
+    faster = round(alone["seconds"] / spread["seconds"], 2)
+    return {"frames": alone["frames"], "alone": alone, "spread": spread, "times as fast": faster}
+
+
+def street(options: argparse.Namespace) -> StreetScene:
+    """A drive around a block so large that its first street is seen again by another worker."""
+    long_m, short_m = 0.28 * options.frames, 0.2 * options.frames
+    return StreetScene(
+        path="block",
+        block_m=(max(100.0, long_m), max(70.0, short_m)),
+        frames=options.frames,
+        width_px=options.width,
+        height_px=options.width * 3 // 8,
+        focal_px=0.5625 * options.width,
+    )
+
+
+def run_of(line: list[str], out: Path, more: list[str]) -> dict[str, Any]:
+    """Map the drive; what it took, and how good it is."""
+    command = [*line, "--out", str(out), *more]
+    before = os.times()
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    after = os.times()
+    if done.returncode:
+        sys.exit(done.stderr)
+    summary = json.loads(done.stdout)
+    pieces = json.loads((out / "run.json").read_text()).get("pieces", [])
+    loops = summary.get("loops", {})
+    return {
+        "frames": summary["frames"],
+        "seconds": summary["seconds"],
+        "stages": summary["stages"],
+        "cpu_seconds_of_client": round(after[2] + after[3] - before[2] - before[3], 1),
+        "t_rel_percent": summary["trajectory"]["t_rel_percent"],
+        "ate_m": summary["trajectory"]["ate_m"],
+        "loops": loops.get("closed"),
+        "points": summary["points"],
+        "peak_memory_mb": summary["peak_memory_mb"],
+        "pieces": [
+            {name: piece[name] for name in ("first", "last", "seconds", "peak_memory_mb")}
+            for piece in pieces
+        ],
+    }
+
+
+def given(dask_worker: Any) -> int:
+    """Bytes of results that a worker has given to other workers and to the client."""
+    return int(dask_worker.transfer_outgoing_bytes_total)
+
+
 def scheduler(options: argparse.Namespace) -> dict[str, Any]:
     """Processor time of the scheduler for each of many jobs that sleep."""
     with crowd(options.workers) as (address, process), Client(address) as client:
@@ -155,9 +233,9 @@ def scheduler(options: argparse.Namespace) -> dict[str, Any]:
 
 def sleep(job: Job, folder: str, anew: bool, every_s: float) -> Outcome:
     """What a simulated worker does: it says that it begins, as a real one does, and sleeps."""
-    del folder, anew, every_s
+    del anew, every_s
     event = {"event": "job", "name": job.name, "state": "running"}
-    get_worker().log_event("recon-jobs", event)
+    get_worker().log_event(topic_of(folder), event)
     time.sleep(float(job.words[0]))
     return Outcome("succeeded")
 

@@ -31,6 +31,7 @@ from recon.cli.mesh import mesh
 from recon.cli.occupancy import occupancy
 from recon.cli.pair import disparity, pair
 from recon.cli.paper import paper
+from recon.cli.piece import piece
 from recon.cli.rectify import rectify
 from recon.cli.session import BUG, report_bug
 from recon.cli.settings import settings
@@ -68,6 +69,7 @@ app.command(rich_help_panel=_CAMERAS)(audit)
 app.add_typer(datasets.app, name="datasets", rich_help_panel=_CAMERAS)
 app.add_typer(evaluate.app, name="evaluate", rich_help_panel=_EVALUATE)
 app.command(rich_help_panel=_EVALUATE)(paper)
+app.command(hidden=True)(piece)
 
 
 def _print_version(wanted: bool) -> None:

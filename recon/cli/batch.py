@@ -21,14 +21,7 @@ def batch(
     resume: Annotated[
         Path | None, typer.Option(help="Do what is missing of the batch in this folder.")
     ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Dask scheduler whose workers run the jobs, such as tcp://host:8786.",
-            show_default="workers on this machine",
-        ),
-    ] = None,
+    scheduler: opt.Scheduler = None,
     workers: Annotated[
         int | None,
         typer.Option(min=1, help="Workers on this machine.", show_default="one per core"),

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
+from recon.cli.drive import open_workers
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
@@ -28,6 +29,8 @@ def export(
         float | None,
         typer.Option(help="Cell size of grid and OctoMap in metres.", show_default="as in the run"),
     ] = None,
+    workers: opt.Workers = None,
+    scheduler: opt.Scheduler = None,
     config: opt.Config = None,
     set_: opt.Set = None,
     json: opt.Json = False,
@@ -45,6 +48,7 @@ def export(
       recon export outputs/map/latest --to grid,mesh --format glb --out robot
       recon export outputs/map/latest --to grid --set grid.max_height_m=3.2
       recon export outputs/map/latest --to mesh --set mesh.depth=9
+      recon export outputs/city --to grid,octomap --workers 4
     """
     with session(quiet=quiet):
         from recon.commands.config import run_settings
@@ -58,5 +62,6 @@ def export(
             formats=tuple(formats or ("ply",)),
             out=out,
             threads=threads,
+            workers=open_workers(workers, scheduler, quiet=quiet, verbose=verbose),
         )
     print_json(summary) if json else print_run(summary, stages=verbose)

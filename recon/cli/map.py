@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from recon.cli import options as opt
-from recon.cli.drive import open_drive
+from recon.cli.drive import open_drive, open_workers
 from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
@@ -64,6 +64,8 @@ def map_(
             metavar="SESSION", help="With --into, without SOURCE: take a drive out of its map."
         ),
     ] = None,
+    workers: opt.Workers = None,
+    scheduler: opt.Scheduler = None,
     memory_limit: opt.MemoryLimit = None,
     config: opt.Config = None,
     set_: opt.Set = None,
@@ -84,12 +86,15 @@ def map_(
       recon map rides/today --prior wheels.txt
       recon map drive.bag --prior /odom
       recon map --resume outputs/kitti06
+      recon map rides/long --workers 4
       recon map rides/tomorrow --into outputs/map/latest
       recon map --into outputs/map/latest --remove 1
     """
     if poses is not None and prior is not None:
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
     _check_folders(source, out, resume, into, remove)
+    if into is not None and (workers or scheduler) is not None:
+        raise typer.BadParameter("--into maps the drive in one piece: no --workers, no --scheduler")
     with session(quiet=quiet):
         from recon.cli.show.announce import warn
         from recon.cli.show.progress import choose_viewer
@@ -105,6 +110,7 @@ def map_(
         from recon.commands.resume import resumed
         from recon.run.memory import memory_overrides
 
+        apart = open_workers(workers, scheduler, quiet=quiet, verbose=verbose)
         method = [] if odometry is None else [f"odometry.method={odometry}"]
         views = source_overrides(calib, left, right, tolerance, (start, end, stride))
         overrides = [*(set_ or ()), *method, *matching_overrides(matcher), *views]
@@ -125,7 +131,12 @@ def map_(
             tell = partial(warn, quiet=quiet, verbose=verbose)
             going_on = resume is not None
             options = replace(
-                options, out=resume or out, threads=threads, resume=going_on, tell=tell
+                options,
+                out=resume or out,
+                threads=threads,
+                resume=going_on,
+                tell=tell,
+                workers=apart,
             )
             if into is None:
                 summary = run_map(drive, settings, options).summary

@@ -61,6 +61,22 @@ Formats = Annotated[
     ),
 ]
 Mesh = Annotated[bool, typer.Option(help="Reconstruct the surface mesh.")]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Dask scheduler whose workers do the work, such as tcp://host:8786.",
+        show_default="workers on this machine",
+    ),
+]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Processes that share the work; they need the extra cluster.",
+        show_default="1: this process",
+    ),
+]
 Threads = Annotated[
     int | None,
     typer.Option(

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.commands.occupancy import REMADE
 from recon.core.errors import SettingsError
-from recon.export.remake import copy_file, from_rays, mesh_cloud, remake_map
+from recon.export.remake import Wanted, copy_file, from_rays, mesh_cloud, remake_map
 from recon.io.models.mesh import check_mesh_formats
+from recon.map.sessions.spread import place_map_on
+from recon.run.batch.cluster import connect
+from recon.run.batch.work import BatchOptions
 from recon.run.finished import (
     PAIR_CLOUD,
     camera_of_pair,
@@ -32,6 +36,7 @@ def run_export(
     formats: Sequence[str] = ("ply",),
     out: Path | None = None,
     threads: int | None = None,
+    workers: BatchOptions | None = None,
 ) -> dict[str, Any]:
     """Make products of a finished run, and write them.
 
@@ -43,6 +48,7 @@ def run_export(
         formats: Formats of the mesh, such as ``("ply", "glb")``.
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores.
+        workers: Where the tiles of grid and OctoMap are made; None = here. Changes no product.
 
     Returns:
         The figures of ``summary.json``.
@@ -55,6 +61,12 @@ def run_export(
     pair = is_pair_run(source)
     wanted = _known(products, _OF_A_PAIR if pair else PRODUCTS)
     refuse_as_target(source, out)
+    if workers is not None and not from_rays(wanted):
+        raise SettingsError(
+            "only grids and OctoMaps are made on workers",
+            got=", ".join(wanted),
+            hint="drop --workers and --scheduler; a mesh uses --threads",
+        )
     if pair:
         settings = config or run_settings(source)
         with Run("export", out, settings, threads=threads) as run:
@@ -63,7 +75,12 @@ def run_export(
     settings = config or ran
     check_changes(ran, settings, (*(REMADE if from_rays(wanted) else ()), "mesh"))
     with Run("export", out, settings, threads=threads) as run:
-        return remake_map(mapped, settings, wanted, run, settings.mesh, formats)
+        if workers is None:
+            return remake_map(mapped, settings, Wanted(wanted, settings.mesh, formats), run)
+        with connect(workers.scheduler, workers.workers_here) as cluster:
+            folder = run.state("tiles").resolve()
+            place = partial(place_map_on, folder=folder, each=cluster.each, workers=cluster.at_once)
+            return remake_map(mapped, settings, Wanted(wanted, settings.mesh, formats, place), run)
 
 
 def _export_pair(

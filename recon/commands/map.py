@@ -7,14 +7,14 @@ from typing import Any
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.identity import identity_of
 from recon.commands.map_options import MapOptions
+from recon.commands.map_pieces import map_drive, pieces_of
 from recon.commands.resume import begin_or_resume, with_resume_hint
 from recon.evaluation.drive import compare_with_truth
 from recon.export.paths import export_paths
 from recon.export.products import Products, write_products
 from recon.map.drive.empty import check_map
 from recon.map.drive.map_run import MapRun
-from recon.map.drive.sequence import MappedSequence, map_sequence
-from recon.map.drive.workspace import Workspace
+from recon.map.drive.sequence import MappedSequence
 from recon.map.store.finished import keep_map
 from recon.map.store.map import MAP_FILE
 from recon.odometry.health import health_warnings
@@ -64,14 +64,7 @@ def run_map(
         with_resume_hint(run, source),
         begin_or_resume(run, source, config, identity, options.arguments) as map_,
     ):
-        mapped = map_sequence(
-            source,
-            config,
-            known_poses=options.known_poses,
-            prior=options.prior,
-            progress=options.progress,
-            workspace=Workspace(map_, run.watch, run.threads),
-        )
+        mapped = map_drive(source, config, options, run, map_)
         with run.stage("cloud"):
             check_map(mapped, source.name)
         mesh = config.mesh if options.mesh else None
@@ -112,6 +105,7 @@ def run_map(
             "source_description": source.description,
             "T_map_world": mapped.T_map_world.tolist(),
             UNTRUSTED: untrusted,
+            **pieces_of(run, map_),
         }
         run.finish(result.summary, source=source.name, inputs=source.files, record=record)
     return result

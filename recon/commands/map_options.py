@@ -13,6 +13,7 @@ from recon.commands.config import ReconConfig
 from recon.core.errors import SettingsError
 from recon.core.values import Trajectory
 from recon.io.trajectory import read_trajectory
+from recon.run.batch.work import BatchOptions
 from recon.run.progress import SILENT, Progress
 from recon.sources.prior import read_prior
 from recon.sources.protocol import StereoSource
@@ -36,6 +37,8 @@ class MapOptions:
         tell: Given the findings of the audit, before the drive is mapped.
         resume: Resume the unfinished run in ``out``.
         arguments: Command-line arguments, stored so that resuming need not repeat them.
+        workers: Where pieces of the drive are mapped side by side; None = it is mapped here, in one
+            piece, unless a run that is resumed was begun in pieces.
     """
 
     command: str = "map"
@@ -50,6 +53,7 @@ class MapOptions:
     tell: Callable[[tuple[str, ...]], None] = lambda findings: None
     resume: bool = False
     arguments: Mapping[str, Any] = field(default_factory=dict)
+    workers: BatchOptions | None = None
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from recon.commands.config import ReconConfig, run_settings
-from recon.export.remake import mesh_cloud, remake_map
+from recon.export.remake import Wanted, mesh_cloud, remake_map
 from recon.io.models.mesh import check_mesh_formats
 from recon.run.finished import (
     PAIR_CLOUD,
@@ -57,7 +57,8 @@ def run_mesh(
             mapped = open_run(source)
     with Run("mesh", out, config, threads=threads) as run:
         if mapped is not None:
-            return remake_map(mapped, run_settings(source), ["mesh"], run, config.mesh, formats)
+            wanted = Wanted(["mesh"], config.mesh, formats)
+            return remake_map(mapped, run_settings(source), wanted, run)
         figures = mesh_cloud(cloud, camera, config.mesh, run, formats)
         figures = {"cloud": str(cloud), **figures}
         run.finish(figures, source=str(source), inputs=[cloud])

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
-from recon.export.remake import remake_map
+from recon.export.remake import Wanted, remake_map
 from recon.run.finished import open_run, refuse_as_target
 from recon.run.run import Run
 
@@ -42,4 +42,4 @@ def run_occupancy(
     settings = config or ran
     check_changes(ran, settings, REMADE)
     with Run("occupancy", out, settings, threads=threads) as made:
-        return remake_map(source, settings, ["octomap", "grid"], made, settings.mesh)
+        return remake_map(source, settings, Wanted(["octomap", "grid"], settings.mesh), made)

@@ -12,7 +12,13 @@ from typing import Any, Final
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.identity import refuse_others
 from recon.commands.map_options import MapRequest
-from recon.core.errors import FormatError, MemoryLimitError, OutputError, ReconError
+from recon.core.errors import (
+    ClusterError,
+    FormatError,
+    MemoryLimitError,
+    OutputError,
+    ReconError,
+)
 from recon.map.drive.workspace import ANEW, resuming, session_info
 from recon.map.store.map import Map
 from recon.run.directory import RECORD, STARTED, RunDirectory, state_folder
@@ -90,10 +96,12 @@ def with_resume_hint(directory: RunDirectory, source: StereoSource) -> Iterator[
     Raises:
         OutputError: The disk is full, or the folder can no longer be written.
         MemoryLimitError: Memory is exhausted.
+        ClusterError: Workers or their scheduler are gone.
     """
+    passing = (OutputError, MemoryLimitError, ClusterError, OSError, MemoryError)
     try:
         yield
-    except (OutputError, MemoryLimitError, OSError, MemoryError, KeyboardInterrupt) as error:
+    except (*passing, KeyboardInterrupt) as error:
         hint = _way_on(directory.folder, source)
         hinted = _with_hint(error, hint) if directory.resumable else None
         if hinted is None:
@@ -112,7 +120,7 @@ def _with_hint(error: BaseException, hint: str) -> BaseException | None:
     """Return the error with a hint on how to go on; None if it is raised unchanged."""
     if isinstance(error, KeyboardInterrupt):
         return KeyboardInterrupt(hint)
-    if isinstance(error, OutputError):
+    if isinstance(error, OutputError | ClusterError):
         return error.but(hint=hint)
     if isinstance(error, MemoryLimitError):
         return error.but(hint=f"{hint} with a larger --memory-limit")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from recon.core.values.arrays import Bool, Float64
 from recon.io.models.ply import read_ply_pieces
 from recon.io.occupancy.octomap import octomap_pieces
-from recon.map.sessions.placed import place_map
+from recon.map.sessions.placed import PlacedMap, place_map
 from recon.map.settings import DriveSettings
 from recon.map.store.map import MAP_FILE, Map
 from recon.map.tiles import Tiles
@@ -36,14 +37,28 @@ class FinishedMap:
     warnings: tuple[str, ...] = ()
 
 
-def map_from_rays(run: FinishedRun, config: DriveSettings) -> FinishedMap:
+Place = Callable[[Map, DriveSettings], PlacedMap]
+"""Cuts a map into tiles, without its cloud."""
+
+
+def place_here(map_: Map, config: DriveSettings) -> PlacedMap:
+    """Cut a map into tiles in this process, without its cloud."""
+    return place_map(map_, config, fuse=False)
+
+
+def map_from_rays(run: FinishedRun, config: DriveSettings, place: Place) -> FinishedMap:
     """Build the occupancy of a run again from the rays in its map; the cloud is that of the run.
+
+    Args:
+        run: The run.
+        config: Its settings.
+        place: Cuts its map into tiles, perhaps on several processes.
 
     Raises:
         FormatError: The run kept no rays, or is damaged.
         SettingsError: The settings need finer or longer rays than it kept.
     """
-    placed = place_map(Map.open(run.folder), config, fuse=False)
+    placed = place(Map.open(run.folder), config)
     for cloud in read_ply_pieces(run.folder / CLOUD):
         placed.tiles.put_cloud(cloud)
     files = tuple(run.folder / name for name in (MAP_FILE, CLOUD))

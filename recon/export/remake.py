@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
 
 from recon.core.values import FREE, OCCUPIED, OccupancyGrid, RectifiedCamera
 from recon.core.values.cloud import Frame
-from recon.export.finished import FinishedMap, map_as_written, map_from_rays
+from recon.export.finished import (
+    FinishedMap,
+    Place,
+    map_as_written,
+    map_from_rays,
+    place_here,
+)
 from recon.export.grid import export_grid
 from recon.export.mesh import (
     MeshSettings,
@@ -33,23 +40,33 @@ from recon.run.run import Run
 _LAYER = "mesh/cloud.ply"
 
 
+@dataclass(frozen=True)
+class Wanted:
+    """What is made of a map.
+
+    Attributes:
+        products: Any of ``cloud``, ``grid``, ``octomap``, ``mesh``.
+        mesh: Settings of the mesh.
+        formats: Formats of the mesh.
+        place: Cuts the map into tiles where its rays are needed.
+    """
+
+    products: Collection[str]
+    mesh: MeshSettings
+    formats: Sequence[str] = ("ply",)
+    place: Place = place_here
+
+
 def remake_map(
-    source: FinishedRun,
-    config: DriveSettings,
-    products: Collection[str],
-    run: Run,
-    mesh: MeshSettings,
-    formats: Sequence[str] = ("ply",),
+    source: FinishedRun, config: DriveSettings, wanted: Wanted, run: Run
 ) -> dict[str, Any]:
     """Make products of the map of a finished run, and write them with the record of the run.
 
     Args:
         source: The run that mapped the drive.
         config: Its settings; where the grid or the OctoMap is made, with changes.
-        products: What to make: ``cloud``, ``grid``, ``octomap``, ``mesh``.
-        run: The run that makes them.
-        mesh: Settings of the mesh.
-        formats: Formats of the mesh.
+        wanted: What to make.
+        run: The run that makes it.
 
     Returns:
         The figures of ``summary.json``.
@@ -58,10 +75,11 @@ def remake_map(
         ReconError: The run is damaged, lacks what a product is made from, or a file cannot be
             written.
     """
+    products, mesh = wanted.products, wanted.mesh
     anew = from_rays(products)
     with run.stage("map" if anew else "read"):
         found = (
-            map_from_rays(source, config)
+            map_from_rays(source, config, wanted.place)
             if anew
             else map_as_written(source, config, voxels="mesh" in products and mesh.free_space)
         )
@@ -78,7 +96,7 @@ def remake_map(
         with run.stage("grid"):
             figures |= _grid(source, found, run, warnings)
     if "mesh" in products:
-        figures |= _mesh(source, found, mesh, run, formats, warnings)
+        figures |= _mesh(source, found, mesh, run, wanted.formats, warnings)
     record: dict[str, Any] = {}
     if anew or "cloud" in products:
         T_map_world = source.T_map_world.tolist()

@@ -8,10 +8,10 @@ map take the same tiles, with a few of them in memory at a time.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -21,6 +21,7 @@ from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import apply
 from recon.core.values import OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64
+from recon.map.cut import Cut
 from recon.map.drive_chain import OCCUPANCY, DriveChain
 from recon.map.fusion.part import KNOWABLE, FusedPart, join_fused
 from recon.map.ground.floor import find_floors
@@ -90,6 +91,7 @@ class Tiles:
         config: The configuration.
         T_map_world: float64 (4, 4), from world to map axes.
         halvings: How often the tiles of the configuration are halved.
+        path: File that they are kept in, for others; None = a temporary one.
 
     Attributes:
         config: The configuration.
@@ -98,13 +100,19 @@ class Tiles:
         submap_of_frame: int64 (N,), number of the submap of each frame; -1 between two drives.
     """
 
-    def __init__(self, config: DriveSettings, T_map_world: Float64, halvings: int = 0) -> None:
+    def __init__(
+        self,
+        config: DriveSettings,
+        T_map_world: Float64,
+        halvings: int = 0,
+        path: Path | None = None,
+    ) -> None:
         self.config = config
         self._T_map_world = T_map_world
         cells = math.log2(config.submaps.tile_m / config.occupancy.resolution_m)
         # A power of two, so that a tile is a branch of an octree.
         self.edge_cells = 1 << max(BLOCK_BITS, round(cells) - halvings)
-        self._parts = TileParts(self.edge_m)
+        self._parts = TileParts(self.edge_m, path)
         self._chain = DriveChain(self._parts)
         self._known: tuple[str, ...] = KNOWABLE
         self.extent: tuple[TileKey, TileKey] = ((0, 0), (0, 0))
@@ -147,11 +155,35 @@ class Tiles:
             OutputError: There is no room for the tiles.
         """
         halvings, tiles = 0, cls(config, T_map_world)
-        while not tiles._cut(submaps, T_corrected_world, fuse=fuse):
+        while not tiles._take(tiles.cut(submaps, T_corrected_world, fuse=fuse), drives):
             halvings += 1
             tiles = cls(config, T_map_world, halvings)
-        tiles._divide(drives)
         return tiles
+
+    @classmethod
+    def of_files(
+        cls,
+        files: Iterable[Path],
+        config: DriveSettings,
+        T_map_world: Float64,
+        *,
+        halvings: int = 0,
+        drives: Sequence[int] = (),
+        path: Path | None = None,
+    ) -> Tiles | None:
+        """Return the tiles of submaps that others have cut; None = the tiles are too large.
+
+        Args:
+            files: What `save` wrote, in the order of the submaps; a damaged one is a `FormatError`.
+            config: As for `of_submaps`, like all that is not listed here.
+            T_map_world: As before.
+            halvings: How often the tiles were halved.
+            drives: Number of submaps of each drive.
+            path: File for what is made of them.
+        """
+        tiles = cls(config, T_map_world, halvings, path)
+        cut = Cut.joined([tiles._parts.adopt(file) for file in files])
+        return tiles if tiles._take(cut, drives) else None
 
     @property
     def resolution_m(self) -> float:
@@ -243,42 +275,72 @@ class Tiles:
         """Return float32 (N, 3), what `find_floors` finds in a window."""
         found = [np.zeros((0, 3), np.float32)]
         for key in self._parts.under(window):
-            if not self._parts.numbers(_FLOORS, key):
-                self._parts.put(_FLOORS, key, {"xyz": find_floors(self.voxels(key))})
+            self.make_voxels(key)
             found += [tree["xyz"] for _, tree in self._parts.read(_FLOORS, key)]
         xyz = np.concatenate(found)
         return xyz[window.contains(xyz)]
+
+    def make_voxels(self, key: TileKey) -> None:
+        """Make the voxels of a tile, and find the floors among them, unless that is done."""
+        if not self._parts.numbers(_FLOORS, key):
+            self._parts.put(_FLOORS, key, {"xyz": find_floors(self.voxels(key))})
 
     @property
     def _block_m(self) -> float:
         return BLOCK_EDGE * self.resolution_m
 
-    def _cut(
-        self, submaps: Iterable[Submap], T_corrected_world: Float64 | None, *, fuse: bool
-    ) -> bool:
-        """Cut all submaps; False where a tile that could be smaller does not fit into memory."""
-        limit = self.config.memory.tile_bytes
-        if self.edge_m < 2 * _LEAST_TILE_M or self.edge_cells == BLOCK_EDGE:
-            limit = None
-        known, frames, size = set(KNOWABLE), [0], Counter[tuple[str, TileKey]]()
-        for submap in submaps:
-            number = len(frames) - 1
-            T = None if T_corrected_world is None else T_corrected_world[number]
+    def cut(
+        self,
+        submaps: Iterable[Submap],
+        T_corrected_world: Float64 | None = None,
+        *,
+        first: int = 0,
+        fuse: bool = True,
+    ) -> Cut:
+        """Cut submaps into the tiles; it ends early where a tile does not fit into memory.
+
+        Args:
+            submaps: Consecutive submaps.
+            T_corrected_world: As for `of_submaps`, of these.
+            first: Number of the first one in its map.
+            fuse: As for `of_submaps`.
+        """
+        cut = Cut()
+        for place, submap in enumerate(submaps):
+            T = None if T_corrected_world is None else T_corrected_world[place]
             nothing = submap.fused.select(np.zeros(0, np.intp))
             moved = self._moved(submap if fuse else replace(submap, fused=nothing), T)
-            frames.append(submap.frames)
-            known &= set(moved.fused.known if len(moved.fused) else KNOWABLE)
-            self.extent = _wider(self.extent, moved.occupancy)
+            cut.add(moved)
             for kind, key, part, nbytes in self._pieces(moved):
-                self._parts.put(kind, key, part.to_tree(), number)
-                size[kind, key] += nbytes
-                if limit is not None and size[kind, key] > limit:
-                    return False
+                self._parts.put(kind, key, part.to_tree(), first + place)
+                cut.nbytes[kind, key] += nbytes
+            if not cut.fits(self._limit):
+                break
             del submap, moved  # before the next one is read
-        self.submap_of_frame = np.repeat(np.arange(-1, len(frames) - 1), frames)
+        return cut
+
+    def save(self, cut: Cut | None = None) -> None:
+        """Make the file of the tiles readable for `of_files` and `adopt`, or `OutputError`."""
+        self._parts.save({} if cut is None else cut.to_tree())
+
+    def adopt(self, files: Iterable[Path]) -> None:
+        """Take what others made of tiles from their files; a damaged one is a `FormatError`."""
+        for file in files:
+            self._parts.adopt(file)
+
+    @property
+    def _limit(self) -> int | None:
+        """Largest size of a tile in memory, if it could be smaller."""
+        small = self.edge_m < 2 * _LEAST_TILE_M or self.edge_cells == BLOCK_EDGE
+        return None if small else self.config.memory.tile_bytes
+
+    def _take(self, cut: Cut, drives: Sequence[int]) -> bool:
+        """Note what is known of all submaps, and of which drives they are; False = too large."""
+        self.extent, self.submap_of_frame = cut.extent, cut.submap_of_frame(drives)
+        self._chain.drive_of = np.repeat(np.arange(len(drives)), np.array(drives, np.int64))
         # Attributes missing in one submap are dropped, so that all tiles have the same fields.
-        self._known = tuple(name for name in KNOWABLE if name in known)
-        return True
+        self._known = tuple(name for name in KNOWABLE if name in cut.known)
+        return cut.fits(self._limit)
 
     def _moved(self, submap: Submap, T_corrected_world: Float64 | None) -> Submap:
         """Return a submap with its correction applied."""
@@ -303,12 +365,6 @@ class Tiles:
     def _centres_m(self, part: OccupancyPart) -> Float64:
         """Return float64 (B, 3), centres of the blocks of a part."""
         return np.asarray((part.blocks + 0.5) * self._block_m)
-
-    def _divide(self, drives: Sequence[int]) -> None:
-        """Note which submaps are of which drive."""
-        self._chain.drive_of = np.repeat(np.arange(len(drives)), np.array(drives, np.int64))
-        ends = np.searchsorted(self.submap_of_frame, np.cumsum(drives, dtype=np.int64)[:-1])
-        self.submap_of_frame = np.insert(self.submap_of_frame, ends, -1)
 
     def _fused(self, key: TileKey) -> tuple[PointCloud, PointCloud]:
         """Return the points of a tile, frame ``map``: the filtered ones, and those that moved."""
@@ -343,14 +399,3 @@ class Tiles:
         voxels = self.wide_voxels(key)
         passed = self._chain.passed(key, drive)
         return find_moved(fused, fusion.voxel_m, self._T_map_world, voxels, passed)
-
-
-def _wider(extent: tuple[TileKey, TileKey], part: OccupancyPart) -> tuple[TileKey, TileKey]:
-    """Return an extent of cells that holds those of a part as well."""
-    columns = part.cells[:, :2]
-    if not len(columns):
-        return extent
-    low, high = columns.min(axis=0), columns.max(axis=0) + 1
-    if extent[0] != extent[1]:
-        low, high = np.minimum(low, extent[0]), np.maximum(high, extent[1])
-    return (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))

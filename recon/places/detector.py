@@ -9,7 +9,7 @@ from typing import Final, Protocol, runtime_checkable
 import numpy as np
 
 from recon.core.geometry.se3 import angle_rad, invert
-from recon.core.values import Disparity, RectifiedPair
+from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float64
 from recon.places.agree import LOOP_SIGMAS, agreeing_loops
 from recon.places.drift import DriftModel, drift_over, is_possible
@@ -111,9 +111,11 @@ class LoopDetector:
         if not measured or not disparity.valid.any() or not self._is_due(T_world_camera):
             return ()
         keyframe = make_keyframe(frame, pair, disparity)
-        stored = StoredKeyframe(keyframe, T_world_camera, path_m)
-        if self._search:
-            stored = self._compared(stored, pair)
+        return self.look(StoredKeyframe(keyframe, T_world_camera, path_m), pair.camera)
+
+    def look(self, new: StoredKeyframe, camera: RectifiedCamera) -> tuple[Loop, ...]:
+        """Add the next keyframe; return its verified loops."""
+        stored = self._compared(new, camera) if self._search else new
         self._store.put(stored)
         self.restore(stored)
         return stored.loops
@@ -142,12 +144,12 @@ class LoopDetector:
         moved = float(np.linalg.norm(T[:3, 3])) >= _DISTANCE_M
         return moved or float(np.rad2deg(angle_rad(T))) >= _ANGLE_DEG
 
-    def _compared(self, new: StoredKeyframe, pair: RectifiedPair) -> StoredKeyframe:
+    def _compared(self, new: StoredKeyframe, camera: RectifiedCamera) -> StoredKeyframe:
         """Return the keyframe with the loop to the first candidate that is verified, if any is."""
         place, refused = self._place(new), []
         for old in self._candidates(place):
             known = self._store.get(self._places.frames[old]).keyframe
-            verdict = verify(known, new.keyframe, pair.camera)
+            verdict = verify(known, new.keyframe, camera)
             if verdict.loop is None:
                 refused.append(verdict.refused)
             elif self._possible(old, place, verdict.loop):

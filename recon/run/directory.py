@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Final
 
 from typing_extensions import Self
 
-from recon.core.errors import MemoryLimitError, OutputError
+from recon.core.errors import ClusterError, MemoryLimitError, OutputError
 from recon.io.atomic import exchange, write_text
 from recon.io.lock import take_lock
 
@@ -29,7 +29,9 @@ _PARTIAL: Final = ".partial"
 _STATE: Final = ".state"
 _LOCK: Final = ".lock"
 #: Errors that the input did not cause: the run can be resumed later.
-_PASSING: Final = (OutputError, MemoryLimitError, OSError, MemoryError, KeyboardInterrupt)
+_PASSING: Final = (
+    ClusterError, OutputError, MemoryLimitError, OSError, MemoryError, KeyboardInterrupt,
+)  # fmt: skip
 
 
 def state_folder(folder: Path) -> Path:

@@ -50,6 +50,10 @@ class ReconstructedFrame:
     warnings: tuple[str, ...] = ()
     rays: RayCloud | None = None
 
+    def unmapped(self) -> ReconstructedFrame:
+        """Return the frame with nothing for a map, only for odometry and place recognition."""
+        return replace(self, cloud=self.cloud.select(np.zeros(0, np.intp)), rays=None)
+
 
 class FrameReconstructor:
     """Reconstructs pairs: rectify, inspect, match, remove edges, back-project, filter.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from recon.core.values import OCCUPIED, RectifiedCamera, StereoPair
 from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import read_ply
 from recon.io.occupancy.nav2 import read_nav2
+from recon.run.batch.cluster import Cluster
+from recon.run.batch.work import BatchOptions
 from recon.sources.pair_input import PairInput
 from tests.hostile.refusals import assert_refused, run
 
@@ -47,6 +50,32 @@ def test_all_products_come_in_one_go(small_demo: Path, tmp_path: Path) -> None:
     assert record["command"] == "export"
     assert "map/octomap.ot" in record["files"]
     np.testing.assert_array_equal(record["T_map_world"], summary["T_map_world"])
+
+
+def test_products_whose_tiles_workers_make_are_the_same_files(
+    small_demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
+        ) as local,
+        distributed.Client(local) as client,
+    ):
+        there = contextlib.nullcontext(Cluster(client))
+        monkeypatch.setattr("recon.commands.export.connect", lambda scheduler, workers: there)
+        products, out = ["grid", "octomap"], tmp_path / "out"
+        run_export(small_demo, products=products, out=out, workers=BatchOptions(workers=2))
+    for name in ("map/grid.pgm", "map/grid.yaml", "map/octomap.bt", "map/octomap.ot"):
+        assert (out / name).read_bytes() == (small_demo / name).read_bytes()
+    assert not (out / ".partial").exists()
+
+
+def test_workers_that_would_have_nothing_to_do_are_refused(
+    small_demo: Path, tmp_path: Path
+) -> None:
+    words = ("export", small_demo, "--to", "mesh", "--workers", "2", "--out", tmp_path / "out")
+    assert_refused(run(*words), "only grids and OctoMaps")
 
 
 def test_only_what_is_asked_for_is_made(small_demo: Path, tmp_path: Path) -> None:

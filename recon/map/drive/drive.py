@@ -19,6 +19,7 @@ from recon.map.settings import DriveSettings
 from recon.odometry import OdometryFrame, OdometryResult
 from recon.run.lookahead import look_ahead
 from recon.sources.live import LiveSource
+from recon.sources.part import SourcePart
 from recon.sources.protocol import StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 
@@ -74,7 +75,9 @@ class Drive:
             yield from poses_first(source, reconstructor, self.mapper.register, map_behind)
             return
         pairs = map(reconstructor.rectify, source.frames(len(self.mapper)))
-        for frame in look_ahead(reconstruct, pairs):
+        lead = source.lead if isinstance(source, SourcePart) else 0
+        for seen in look_ahead(reconstruct, pairs):
+            frame = seen.unmapped() if len(self.mapper) < lead else seen
             found = self.mapper.register(OdometryFrame(frame.pair, frame.disparity))
             yield self._add(frame, found, total=len(source))
 

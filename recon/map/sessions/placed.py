@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from recon.core.geometry.se3 import apply
 from recon.core.values.arrays import Bool, Float64
 from recon.map.settings import DriveSettings
-from recon.map.store.finished import check_rays, with_occupancy
+from recon.map.store.finished import CastSubmaps, check_rays
 from recon.map.store.map import Map
 from recon.map.store.records import Store
 from recon.map.store.session import Session
@@ -58,40 +58,92 @@ def place_map(map_: Map, settings: DriveSettings, *, fuse: bool = True) -> Place
         SettingsError: The settings need finer or longer rays than were kept.
         OutputError: There is no room for the tiles.
     """
+    placed, made = PlacedSubmaps(map_, settings), _kept_once(settings)
+    for number in range(len(placed)):
+        submap = placed[number]
+        made.add(replace(submap, index=number, first_frame=made.frames))
+    tiles = Tiles.of_submaps(
+        made, settings, map_.first.T_map_world, placed.corrections, drives=placed.drives, fuse=fuse
+    )
+    return with_path(map_, tiles)
+
+
+class PlacedSubmaps:
+    """The submaps of all linked drives of a map, one drive after the other, where they lie.
+
+    Those of a single drive are in its world by odometry, to be corrected; those of several are in
+    the world of the first: sums are moved, rays cast where they were seen.
+
+    Args:
+        map_: The map.
+        settings: How occupancy is made.
+
+    Raises:
+        FormatError: A drive kept no rays, or the map is damaged.
+        SettingsError: The settings need finer or longer rays than were kept.
+
+    Attributes:
+        drives: Number of submaps of each drive.
+        corrections: float64 (S, 4, 4), what is still to be applied to each; None = nothing.
+    """
+
+    def __init__(self, map_: Map, settings: DriveSettings) -> None:
+        sessions = map_.linked
+        for session in sessions:
+            check_rays(session, settings)
+        self._settings = settings
+        self.drives = [len(session.submaps) for session in sessions]
+        alone = len(sessions) == 1
+        self.corrections = sessions[0].corrections() if alone else None
+        self._parts = (
+            [_alone(sessions[0], settings)]
+            if alone
+            else [_beside(map_, session, settings) for session in sessions]
+        )
+
+    def __len__(self) -> int:
+        return sum(self.drives)
+
+    def __getitem__(self, number: int) -> Submap:
+        """Return a submap by its number among those of all drives.
+
+        Raises:
+            FormatError: The map is damaged.
+        """
+        drive = int(np.searchsorted(np.cumsum(self.drives), number, side="right"))
+        own = number - sum(self.drives[:drive])
+        cast, T = self._parts[drive]
+        submap = cast[own]
+        if T is None or np.array_equal(T[own], np.eye(4)):
+            return submap
+        return replace(submap, fused=submap.fused.moved(T[own], self._settings.fusion.voxel_m))
+
+
+def with_path(map_: Map, tiles: Tiles) -> PlacedMap:
+    """Return the tiles of a map with the paths of its linked drives."""
     sessions = map_.linked
-    for session in sessions:
-        check_rays(session, settings)
-    T_map_world = map_.first.T_map_world
-    if len(sessions) == 1:
-        submaps, corrections = with_occupancy(sessions[0], settings), sessions[0].corrections()
-    else:
-        submaps, corrections = _joined(map_, sessions, settings), None
-    drives = [len(session.submaps) for session in sessions]
-    tiles = Tiles.of_submaps(submaps, settings, T_map_world, corrections, drives=drives, fuse=fuse)
     paths = [apply(s.T_map_world, s.trajectory.positions_m) for s in sessions]
     good = [np.array([health.ok for health in session.health]) for session in sessions]
     return PlacedMap(tiles, _with_gaps(paths, np.nan), _with_gaps(good, False))
 
 
-def _joined(map_: Map, sessions: Sequence[Session], settings: DriveSettings) -> Submaps:
-    """Return the submaps of several drives one after the other, in the world of the first."""
-    made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
-    for session in sessions:
-        for submap in _moved(map_, session, settings):
-            made.add(replace(submap, index=len(made), first_frame=made.frames))
-    return made
+def _kept_once(settings: DriveSettings) -> Submaps:
+    """Return room for submaps that may be cut several times, and are slow to make."""
+    return Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
 
 
-def _moved(map_: Map, session: Session, settings: DriveSettings) -> Iterator[Submap]:
-    """Put the submaps of a drive in its place: sums are moved, rays cast where they were seen."""
+def _alone(session: Session, settings: DriveSettings) -> tuple[CastSubmaps, Float64 | None]:
+    """Return the submaps of the only drive, none of which is moved."""
+    return CastSubmaps(session, settings), None
+
+
+def _beside(map_: Map, session: Session, settings: DriveSettings) -> tuple[CastSubmaps, Float64]:
+    """Return the submaps of one of several drives, and what moves the sums of each."""
     T_world_session, corrections = map_.T_world_session(session), session.corrections()
-    T_map_world = map_.first.T_map_world
     poses = T_world_session @ session.trajectory.T_world_camera
-    for number, submap in enumerate(with_occupancy(session, settings, T_map_world, poses)):
-        T = T_world_session if corrections is None else T_world_session @ corrections[number]
-        still = np.array_equal(T, np.eye(4))
-        fused = submap.fused if still else submap.fused.moved(T, settings.fusion.voxel_m)
-        yield replace(submap, fused=fused)
+    T = np.repeat(T_world_session[None], len(session.submaps), axis=0)
+    moves = T if corrections is None else T @ corrections
+    return CastSubmaps(session, settings, map_.first.T_map_world, poses), moves
 
 
 def _with_gaps(parts: Sequence[np.ndarray], gap: float) -> np.ndarray:

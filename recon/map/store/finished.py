@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from recon.core.errors import FormatError, SettingsError
 from recon.core.kernels import voxels
-from recon.core.values import PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64, Int32
 from recon.map.kernels import clamped
+from recon.map.occupancy.builder import OccupancyBuilder
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.map.store.keyframes import KEYFRAME
@@ -21,7 +21,8 @@ from recon.map.store.map import Map
 from recon.map.store.records import Store
 from recon.map.store.session import AXES, LOOPS, RAYS, Session
 from recon.map.store.submaps import Submaps
-from recon.map.submaps import Submap, SubmapBuilder
+from recon.map.submaps import Submap
+from recon.run.lookahead import side_by_side
 
 _PLACED: Final = slice(0, 4)
 _PLACE_BITS: Final = 12
@@ -61,35 +62,65 @@ def keep_map(mapped: Map, path: Path, settings: DriveSettings) -> None:
         kept.commit()
 
 
-def with_occupancy(
-    session: Session,
-    settings: DriveSettings,
-    T_map_world: Float64 | None = None,
-    T_world_camera: Float64 | None = None,
-) -> Submaps:
+@dataclass(frozen=True, eq=False)
+class CastSubmaps:
+    """The submaps of a finished drive, each with occupancy made from its rays when it is read.
+
+    Attributes:
+        session: The drive.
+        settings: How to make it.
+        T_map_world: float64 (4, 4), from world to the axes of the occupancy; None = its own.
+        T_world_camera: float64 (N, 4, 4), from where rays are cast; None = the path by odometry.
+    """
+
+    session: Session
+    settings: DriveSettings
+    T_map_world: Float64 | None = None
+    T_world_camera: Float64 | None = None
+
+    def __post_init__(self) -> None:
+        if self.session.submaps.frames != len(self.session):
+            raise FormatError("the map lacks submaps", where=self.session.where)
+
+    def __len__(self) -> int:
+        return len(self.session.submaps)
+
+    def __getitem__(self, number: int) -> Submap:
+        """Return a submap.
+
+        Raises:
+            FormatError: The map is damaged.
+            MappingError: A ray would spoil the map.
+        """
+        session, kept = self.session, self.session.submaps.get(number)
+        T_map_world = session.T_map_world if self.T_map_world is None else self.T_map_world
+        poses = self.T_world_camera
+        poses = session.odometry.T_world_camera if poses is None else poses
+        builder = OccupancyBuilder(self.settings.occupancy, T_map_world)
+        for frame in range(kept.first_frame, kept.first_frame + kept.frames):
+            builder.integrate(session.rays(frame)[0].cloud(), poses[frame])
+        return replace(kept, occupancy=builder.take())
+
+
+def with_occupancy(session: Session, settings: DriveSettings, *, threads: int = 1) -> Submaps:
     """Return the submaps of a finished drive in a temporary store, with occupancy from its rays.
 
     Args:
         session: The drive.
         settings: How to make it.
-        T_map_world: float64 (4, 4), from world to the axes of the occupancy; None = its own.
-        T_world_camera: float64 (N, 4, 4), from where rays are cast; None = the path by odometry.
+        threads: Submaps made at a time. Changes no result.
 
     Raises:
         FormatError: The map is damaged.
         MappingError: A ray would spoil the map.
     """
-    if session.submaps.frames != len(session):
-        raise FormatError("the map lacks submaps", where=session.where)
     made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
-    T_map_world = session.T_map_world if T_map_world is None else T_map_world
-    builder = SubmapBuilder(settings.submaps, settings.fusion, settings.occupancy, T_map_world)
-    unfused = PointCloud(np.zeros((0, 3), np.float32), frame="world")
-    poses = session.odometry.T_world_camera if T_world_camera is None else T_world_camera
-    for kept in session.submaps:
-        for frame in range(kept.first_frame, kept.first_frame + kept.frames):
-            builder.integrate(unfused, session.rays(frame)[0].cloud(), poses[frame])
-        made.add(replace(kept, occupancy=builder.close().occupancy))
+    cast = CastSubmaps(session, settings)
+    read, numbers = cast.__getitem__, range(len(cast))
+    for submap in (
+        map(read, numbers) if threads == 1 else side_by_side(read, numbers, threads=threads)
+    ):
+        made.add(submap)
     return made
 
 

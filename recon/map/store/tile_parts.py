@@ -6,7 +6,8 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,23 +17,26 @@ from recon.core.values.arrays import Bool
 from recon.map.store.records import Store
 from recon.map.window import Window
 
+_NOTE: Final = "note"
 TileKey = tuple[int, int]
 """Column and row of a tile; tile (0, 0) has its lower corner in the origin of the map."""
 
 
 class TileParts:
-    """Numbered parts of several kinds in each tile, in a temporary file.
+    """Numbered parts of several kinds in each tile, in a file; others' files can be looked into.
 
     Args:
         edge_m: Side of a tile.
+        path: The file, which `save` makes readable for others; None = a temporary one.
 
     Attributes:
         edge_m: Side of a tile.
     """
 
-    def __init__(self, edge_m: float) -> None:
+    def __init__(self, edge_m: float, path: Path | None = None) -> None:
         self.edge_m = edge_m
-        self._store = Store.temporary()
+        self._store = Store.temporary() if path is None else Store.create(path)
+        self._homes: dict[tuple[str, TileKey, int], Store] = {}
         self._numbers: dict[str, dict[TileKey, list[int]]] = defaultdict(dict)
         self._keys: dict[TileKey, None] = {}
 
@@ -92,9 +96,38 @@ class TileParts:
             FormatError: One is damaged.
         """
         # Past the cache: reading a tile again is faster than making it, and it may be large.
-        return ((n, self._store.read(kind, (*key, n))) for n in self.numbers(kind, key))
+        return (
+            (n, self._homes.get((kind, key, n), self._store).read(kind, (*key, n)))
+            for n in self.numbers(kind, key)
+        )
 
     def drop(self, kind: str, key: TileKey) -> None:
-        """Forget the parts of a kind in a tile."""
+        """Forget the parts of a kind in a tile; they stay in the files of others."""
         for number in self._numbers[kind].pop(key, ()):
-            self._store.delete(kind, (*key, number))
+            if self._homes.pop((kind, key, number), None) is None:
+                self._store.delete(kind, (*key, number))
+
+    def save(self, note: Mapping[str, Any]) -> None:
+        """Make the file readable for `adopt`, with a note, and close it.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        self._store.put(_NOTE, 0, {"keys": self.keys, "note": note})
+        self._store.commit()
+        self._store.close()
+
+    def adopt(self, path: Path) -> dict[str, Any]:
+        """Add the parts in a file that was saved, which is read but not copied; returns its note.
+
+        Raises:
+            FormatError: It is missing or damaged.
+        """
+        store = Store.open(path, read_only=True)
+        saved = store.read(_NOTE, 0)
+        self._keys.update(dict.fromkeys((x, y) for x, y in saved["keys"]))
+        for kind in store.kinds():
+            for x, y, number in (key for key in store.keys(kind) if isinstance(key, tuple)):
+                self._numbers[kind].setdefault((x, y), []).append(number)
+                self._homes[kind, (x, y), number] = store
+        return dict(saved["note"])

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Final
+from uuid import uuid4
 
-from recon.core.errors import ClusterError
+from recon.core.errors import ClusterError, ReconError
 from recon.core.optional import require
 from recon.run.batch.job import Job, Outcome
 from recon.run.batch.process import Tell, run_job
 
 EXTRA: Final = "cluster"
-_TOPIC: Final = "recon-jobs"
 _REACH_S: Final = 20.0
 _WORKERS_S: Final = 120.0
 _LOOK_S: Final = 30.0
@@ -28,11 +28,27 @@ Work = Callable[[Job, str, bool, float], Outcome]
 
 @dataclass(frozen=True)
 class Try:
-    """One try of a job, from 0."""
+    """One try of a job.
+
+    Attributes:
+        job: The job.
+        number: Its number, from 0.
+        anew: Whether what an earlier try left is not used.
+        only: Addresses of the workers that may run it; none = all.
+    """
 
     job: Job
     number: int = 0
     anew: bool = False
+    only: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class _Running:
+    """A try that has not ended, and Dask's future of it."""
+
+    one: Try
+    future: Any
 
 
 class Cluster:
@@ -57,6 +73,11 @@ class Cluster:
         """The workers by address, with their threads and what they declare to have."""
         return dict(self._client.scheduler_info(n_workers=-1)["workers"])
 
+    @property
+    def at_once(self) -> int:
+        """How many jobs run at once, as far as workers are known now."""
+        return sum(worker["nthreads"] for worker in self.workers.values())
+
     def run(
         self, jobs: Sequence[Job], folder: Path, tell: Tell = lambda event: None
     ) -> Iterator[tuple[Try, Outcome]]:
@@ -74,46 +95,81 @@ class Cluster:
             ClusterError: The scheduler or all workers are gone.
         """
         every_s = max(1.0, len(self.workers) / 50)
-        self._client.subscribe_topic(_TOPIC, lambda event: tell(event[1]))
-        ended, tries = SimpleQueue[Any](), dict[str, Try]()
+        self._client.subscribe_topic(topic_of(folder), lambda event: tell(event[1]))
+        ended, tries = SimpleQueue[Any](), dict[str, _Running]()
+
+        def submit(one: Try) -> None:
+            future = self._submit(one, folder, every_s)
+            tries[future.key] = _Running(one, future)
+            future.add_done_callback(ended.put)
+
         for job in jobs:
-            self._submit(Try(job), folder, every_s, ended, tries)
+            submit(Try(job))
         while tries:
-            for key, outcome in self._outcomes(ended):
-                done = tries.pop(key)
+            for key, outcome in self._outcomes(ended, tries):
+                done = tries.pop(key).one
                 if outcome.state == "broken" and done.number < done.job.retries:
-                    last = done.number + 1 == done.job.retries
-                    again = Try(done.job, done.number + 1, anew=last and outcome.resumed)
-                    self._submit(again, folder, every_s, ended, tries)
+                    submit(self._again(done, outcome))
                 else:
                     yield done, outcome
+            for orphan in self._orphans(tries):
+                tries.pop(orphan.future.key)
+                orphan.future.cancel()
+                submit(replace(orphan.one, only=frozenset()))
 
-    def _outcomes(self, ended: SimpleQueue[Any]) -> Iterator[tuple[str, Outcome]]:
+    def each(self, function: Callable[[Any], None], items: Sequence[Any]) -> None:
+        """Run a function with each item on some worker, and wait until all is done.
+
+        What it makes it leaves in files. One whose worker dies is called again on another, at most
+        as often as Dask allows.
+
+        Raises:
+            ReconError: As the function.
+            ClusterError: The scheduler or too many workers are gone.
+        """
+        futures = self._client.map(function, items, key=f"{function.__name__}-{uuid4().hex[:12]}")
+        for future in require("distributed", extra=EXTRA).as_completed(futures):
+            if future.status == "finished":
+                continue
+            error = future.exception() if future.status == "error" else None
+            if isinstance(error, ReconError):
+                raise error
+            raise ClusterError("workers or their scheduler are gone", got=error or future.status)
+
+    def _again(self, done: Try, outcome: Outcome) -> Try:
+        """Return the next try of a job: on another worker, if the disk is full where it ran."""
+        last = done.number + 1 == done.job.retries
+        others = frozenset(self.workers) - {outcome.worker} if outcome.full else frozenset()
+        return Try(done.job, done.number + 1, last and outcome.resumed, others)
+
+    def _orphans(self, tries: Mapping[str, _Running]) -> list[_Running]:
+        """Return tries of which all workers have died that may run them: Dask would wait."""
+        tied = [running for running in tries.values() if running.one.only]
+        alive = self.workers if tied else {}
+        return [running for running in tied if not running.one.only & alive.keys()]
+
+    def _outcomes(
+        self, ended: SimpleQueue[Any], tries: Mapping[str, _Running]
+    ) -> Iterator[tuple[str, Outcome]]:
         """Wait for futures that have ended; yield how, by key, of all that have by now."""
         futures = [self._next(ended)]
         while not ended.empty():
             futures.append(ended.get())
+        futures = [one for one in futures if one is not None and one.key in tries]
         finished = {one.key: one for one in futures if one.status == "finished"}
         found = self._client.gather(finished, errors="skip")  # at once: each takes a round trip
         for one in futures:
             yield one.key, found[one.key] if one.key in found else _without_result(one)
 
     def _next(self, ended: SimpleQueue[Any]) -> Any:
-        """Return the next future that has ended."""
-        while True:
-            with suppress(Empty):
-                return ended.get(timeout=_LOOK_S)
-            if self._final and not self.workers:
-                raise ClusterError("all workers of this machine have died")
+        """Return the next future that has ended; None = none did for a while."""
+        with suppress(Empty):
+            return ended.get(timeout=_LOOK_S)
+        if self._final and not self.workers:
+            raise ClusterError("all workers of this machine have died")
+        return None
 
-    def _submit(
-        self,
-        one: Try,
-        folder: Path,
-        every_s: float,
-        ended: SimpleQueue[Any],
-        tries: dict[str, Try],
-    ) -> None:
+    def _submit(self, one: Try, folder: Path, every_s: float) -> Any:
         workers = self.workers if one.job.needs else {}
         declared = [worker["resources"] for worker in workers.values()]
         needs = {
@@ -121,19 +177,18 @@ class Cluster:
             for name, amount in one.job.needs.items()
             if declared and all(name in have for have in declared)
         }
-        future = self._client.submit(
+        return self._client.submit(
             self._work,
             one.job,
             str(folder),
             one.anew,
             every_s,
-            key=f"{one.job.name}-{one.number}",
+            # Others on this scheduler may have jobs of the same name.
+            key=f"{one.job.name}-{one.number}-{uuid4().hex[:12]}",
             pure=False,
-            # Not tied to other workers than the last: when those die, Dask never starts it.
             resources=needs or None,
+            workers=list(one.only) or None,
         )
-        tries[future.key] = one
-        future.add_done_callback(ended.put)
 
 
 @contextmanager
@@ -199,12 +254,18 @@ def connect(scheduler: str | None, workers: int) -> Any:
     return local_cluster(workers) if scheduler is None else join_cluster(scheduler)
 
 
+def topic_of(folder: Path | str) -> str:
+    """Return the topic of Dask's events under which the jobs of a batch are told of."""
+    return f"recon-jobs {folder}"
+
+
 def _work(job: Job, folder: str, anew: bool, every_s: float) -> Outcome:
     """Run a job on a worker."""
     distributed = require("distributed", extra=EXTRA)
     worker = distributed.get_worker()
     key = distributed.worker.thread_state.key
-    tell: Callable[[dict[str, Any]], None] = lambda event: worker.log_event(_TOPIC, event)  # noqa: E731
+    topic = topic_of(folder)
+    tell: Callable[[dict[str, Any]], None] = lambda event: worker.log_event(topic, event)  # noqa: E731
 
     def stopped() -> bool:
         """Return whether the task was cancelled, or its client is gone."""

@@ -77,6 +77,7 @@ class Outcome:
         seconds: Its time.
         worker: Where it ran.
         resumed: Whether it went on with what an earlier try had left.
+        full: Whether a disk is full there.
     """
 
     state: State
@@ -84,6 +85,7 @@ class Outcome:
     seconds: float = 0.0
     worker: str = ""
     resumed: bool = False
+    full: bool = False
 
 
 def is_done(out: Path) -> bool:

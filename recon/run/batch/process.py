@@ -71,9 +71,13 @@ def run_job(
                 _keep(job, out, json.loads(printed.read()))
         except (OSError, OutputError, ValueError) as failure:
             code, error = -1, str(failure)
-    state = _state(job, out, code)
+    full = code != 0 and any(
+        shutil.disk_usage(place).free < _LEAST_FREE_BYTES
+        for place in (out.parent, tempfile.gettempdir())
+    )
+    state = _state(job, out, code, full=full)
     seconds = round(time.monotonic() - begun, 3)
-    return Outcome(state, "" if state == "succeeded" else error, seconds, where, resumed)
+    return Outcome(state, "" if state == "succeeded" else error, seconds, where, resumed, full)
 
 
 def _wait_for_others(out: Path, stopped: Callable[[], bool]) -> None:
@@ -143,11 +147,10 @@ def _died(code: int) -> str:
     return f"its process was killed by signal {-code}{memory}"
 
 
-def _state(job: Job, out: Path, code: int) -> State:
+def _state(job: Job, out: Path, code: int, *, full: bool) -> State:
     """Tell a job that failed by its input from one that broke."""
     if code == 0:
         return "succeeded" if is_done(out) else "broken"
-    full = shutil.disk_usage(out.parent).free < _LEAST_FREE_BYTES
     return "failed" if code in _INPUT and not job.resumes(out) and not full else "broken"
 
 

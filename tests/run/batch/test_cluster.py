@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from recon.core.errors import ClusterError, MissingDependencyError
-from recon.run.batch.cluster import Cluster, Try, join_cluster, local_cluster
+from recon.core.errors import ClusterError, FormatError, MissingDependencyError
+from recon.run.batch.cluster import Cluster, Try, _Running, join_cluster, local_cluster
 from recon.run.batch.job import Job, Outcome
 from tests.run.batch.jobs import job, stand_in, tries
 
@@ -62,6 +62,46 @@ def test_a_broken_job_goes_on_and_its_retries_have_a_limit(
     assert tries(tmp_path, "c") == ["begun", "resumed", "begun"]
 
 
+def test_a_job_that_finds_a_disk_full_is_tried_on_another_worker(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    def full_at_first(job: Job, folder: str, anew: bool, every_s: float) -> Outcome:
+        here, tried = distributed.get_worker().address, Path(folder) / job.name
+        before = tried.read_text().split() if tried.is_file() else []
+        tried.write_text(" ".join([*before, here]))
+        if len(before) < 2:
+            return Outcome("broken", worker=here, full=True)
+        return Outcome("succeeded", worker=here)
+
+    jobs = [job(f"j{n}") for n in range(6)]
+    ended = run(Cluster(cluster._client, full_at_first), jobs, tmp_path)
+    assert {outcome.state for _, outcome in ended.values()} == {"succeeded"}
+    for one in jobs:
+        first, second, third = (tmp_path / one.name).read_text().split()
+        assert first != second != third
+
+
+def test_a_try_whose_workers_have_all_died_is_not_waited_for(cluster: Cluster) -> None:
+    alive, gone = next(iter(cluster.workers)), "tcp://192.0.2.1:9"
+    tries = {
+        name: _Running(Try(job(name), 1, only=frozenset(only)), None)
+        for name, only in (("a", ()), ("b", (alive, gone)), ("c", (gone,)))
+    }
+    assert [running.one.job.name for running in cluster._orphans(tries)] == ["c"]
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_two_batches_with_jobs_of_the_same_name_share_a_scheduler(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    for number in range(2):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        told: list[Any] = []
+        assert [o.state for _, o in cluster.run([job("a")], folder, told.append)] == ["succeeded"]
+        assert (folder / "a" / "run.json").is_file()
+
+
 @pytest.mark.usefixtures("stand_in")
 def test_events_of_running_jobs_arrive(cluster: Cluster, tmp_path: Path) -> None:
     told: list[Any] = []
@@ -75,6 +115,20 @@ def test_needs_that_no_worker_declares_do_not_keep_a_job_waiting(
 ) -> None:
     ended = run(cluster, [job("a", needs={"threads": 64.0})], tmp_path)
     assert ended["a"][1].state == "succeeded"
+
+
+def test_a_function_is_called_with_each_item_and_its_error_is_raised(
+    cluster: Cluster, tmp_path: Path
+) -> None:
+    def touch(name: str) -> None:
+        if name == "bad":
+            raise FormatError("damaged", where=name)
+        (tmp_path / name).touch()
+
+    cluster.each(touch, ["a", "b", "c"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
+    with pytest.raises(FormatError, match="bad: damaged"):
+        cluster.each(touch, ["d", "bad"])
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

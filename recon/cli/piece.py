@@ -1,0 +1,38 @@
+"""`recon piece`: what a worker of `recon map --workers` runs; not for people."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recon.cli import options as opt
+from recon.cli.session import session
+from recon.cli.show.tables import print_json, print_run
+
+
+def piece(
+    plan: Annotated[Path, typer.Argument(help="Plan of the pieces, in the folder of the run.")],
+    number: Annotated[int, typer.Argument(help="Number of the piece.")],
+    out: Annotated[Path, typer.Option(help="Folder of the piece.")],
+    json: opt.Json = False,
+    quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
+    threads: opt.Threads = None,
+) -> None:
+    """Map one piece of a drive, or go on with it.
+
+    The workers of recon map --workers run this. Its result is the map of the
+    piece, which that command joins with the others.
+
+    Examples:
+      recon piece outputs/long/.partial/.state/pieces.json 0 --out piece0
+    """
+    with session(quiet=quiet):
+        from recon.cli.show.progress import choose_viewer
+        from recon.commands.piece import run_piece
+
+        viewer = choose_viewer(quiet=quiet, verbose=verbose)
+        summary = run_piece(plan, number, out, threads, viewer)
+    print_json(summary) if json else print_run(summary, stages=verbose)

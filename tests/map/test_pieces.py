@@ -1,0 +1,92 @@
+"""A drive that is mapped in pieces becomes one drive: every frame once, and the same map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from recon.commands.config import ReconConfig, load_config
+from recon.map.drive.pieces import LEAD, Piece, cut_drive, join_pieces, joined_drive
+from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.map.drive.workspace import Workspace, session_info
+from recon.map.store.map import Map
+from recon.sources.part import SourcePart
+from recon.sources.synthetic import SyntheticSource
+from recon.street.settings import StreetSettings
+
+STREET = StreetSettings(frames=26, width_px=256, height_px=96, focal_px=150.0, seed=5)
+PIECES = [Piece(0, 10), Piece(5, 18, 5), Piece(12, 26, 6)]
+
+
+@pytest.mark.parametrize("frames", [1, 79, 80, 144, 999, 2000, 36_000])
+@pytest.mark.parametrize("workers", [1, 2, 3, 64])
+def test_pieces_have_every_frame_once_behind_their_leads(frames: int, workers: int) -> None:
+    pieces = cut_drive(frames, workers)
+    own = [n for piece in pieces for n in range(piece.first + piece.lead, piece.last)]
+    assert own == list(range(frames))
+    assert pieces[0].lead == 0
+    assert all(piece.lead == LEAD for piece in pieces[1:])
+    assert len(pieces) == 1 or len(pieces) % workers == 0 or len(pieces) == frames // (2 * LEAD)
+
+
+def test_a_part_of_a_source_has_its_frames() -> None:
+    source = SyntheticSource(STREET)
+    part = SourcePart(source, 5, 9, 2)
+    times = [pair.timestamp_s for pair in source.frames(5)][:4]
+    assert [pair.timestamp_s for pair in part] == times
+    assert [pair.timestamp_s for pair in part.frames(3)] == times[3:]
+    assert (len(part), part.truth, list(part.frames(4))) == (4, None, [])
+
+
+@pytest.fixture(scope="module")
+def config() -> ReconConfig:
+    return load_config(None, ["submaps.length_m=4", "submaps.tile_m=12.8"])
+
+
+@pytest.fixture(scope="module")
+def whole(config: ReconConfig) -> MappedSequence:
+    return map_sequence(SyntheticSource(STREET), config, workspace=Workspace(threads=1))
+
+
+@pytest.fixture(scope="module")
+def joined(config: ReconConfig) -> MappedSequence:
+    source, work = SyntheticSource(STREET), Workspace(threads=1)
+
+    def mapped() -> Iterator[Map]:
+        for piece in PIECES:
+            work = Workspace(threads=1)
+            map_sequence(piece.of(source), config, workspace=work)
+            yield work.map
+
+    work.map.begin(session_info(source, config))
+    join_pieces(work.map, PIECES, mapped(), config)
+    work.map.session().set_state({"seconds": 1.0})
+    return joined_drive(source, config, work)
+
+
+def test_the_path_has_every_frame_once_and_is_that_of_one_run(
+    whole: MappedSequence, joined: MappedSequence
+) -> None:
+    np.testing.assert_array_equal(joined.trajectory.timestamps_s, whole.trajectory.timestamps_s)
+    assert joined.submaps.frames == len(joined.health) == STREET.frames
+    # The first piece is the drive itself; behind it only the odometry has begun elsewhere.
+    poses = joined.trajectory.T_world_camera
+    np.testing.assert_array_equal(poses[:10], whole.trajectory.T_world_camera[:10])
+    apart_m = np.linalg.norm(joined.path_m - whole.path_m, axis=1)
+    assert 0 < apart_m.max() < 0.01 * whole.trajectory.path_length_m
+    np.testing.assert_array_equal(joined.T_map_world, whole.T_map_world)
+
+
+def test_the_map_is_about_that_of_one_run(whole: MappedSequence, joined: MappedSequence) -> None:
+    # Voxels that are turned into others share some of these: fewer points for the same surface.
+    assert 0.8 < len(joined.cloud) / len(whole.cloud) < 1.05
+    assert len(joined.voxels) == pytest.approx(len(whole.voxels), rel=0.05)
+    assert joined.camera == whole.camera
+    assert joined.sample.pair.timestamp_s == whole.sample.pair.timestamp_s
+
+
+def test_keyframes_lie_on_the_path_of_the_drive(joined: MappedSequence) -> None:
+    assert joined.loops is not None
+    assert joined.loops.keyframes >= STREET.frames // 2
