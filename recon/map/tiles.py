@@ -26,13 +26,7 @@ from recon.map.drive_chain import OCCUPANCY, DriveChain
 from recon.map.fusion.part import KNOWABLE, FusedPart, join_fused
 from recon.map.ground.floor import find_floors
 from recon.map.ground.grid import JOINED_CELLS
-from recon.map.joined import (
-    cloud_tree,
-    in_window,
-    join_clouds,
-    join_voxels,
-    voxel_tree,
-)
+from recon.map.joined import cloud_tree, in_window, join_clouds, join_voxels, voxel_tree
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
 from recon.map.occupancy.moving import find_moved
 from recon.map.occupancy.part import OccupancyPart
@@ -85,13 +79,13 @@ class Tile:
 class Tiles:
     """A map cut into tiles; iterating gives them along the drive.
 
-    `of_submaps` cuts the map of a drive; `put_cloud` and `put_voxels` add what is fused already.
+    `of_submaps` cuts a drive; `put_cloud` and `put_voxels` add what is fused already.
 
     Args:
         config: The configuration.
         T_map_world: float64 (4, 4), from world to map axes.
         halvings: How often the tiles of the configuration are halved.
-        path: File that they are kept in, for others; None = a temporary one.
+        path: File for what is in them; None = a temporary one.
 
     Attributes:
         config: The configuration.
@@ -308,8 +302,8 @@ class Tiles:
         cut = Cut()
         for place, submap in enumerate(submaps):
             T = None if T_corrected_world is None else T_corrected_world[place]
-            nothing = submap.fused.select(np.zeros(0, np.intp))
-            moved = self._moved(submap if fuse else replace(submap, fused=nothing), T)
+            fused = submap.fused if fuse else submap.fused.select(np.zeros(0, np.intp))
+            moved = self._moved(replace(submap, fused=fused), T)
             cut.add(moved)
             for kind, key, part, nbytes in self._pieces(moved):
                 self._parts.put(kind, key, part.to_tree(), first + place)
