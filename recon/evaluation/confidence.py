@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -10,6 +11,11 @@ from recon.core.errors import EvaluationError
 from recon.core.values import Disparity, DisparityTruth
 from recon.core.values.arrays import Bool, Float32, Float64, freeze
 from recon.evaluation.disparity import compared_pixels
+
+_BINS: Final = 10
+"""Equal bins of confidence between 0 and 1."""
+_STEPS: Final = 100
+"""Points of a sparsification curve."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +72,7 @@ class Sparsification:
 
 
 def measure_reliability(
-    estimate: Disparity, truth: DisparityTruth, limit_px: float = 1.0, bins: int = 10
+    estimate: Disparity, truth: DisparityTruth, limit_px: float = 1.0
 ) -> Reliability:
     """Compare the confidence of pixels with the share of them that is correct.
 
@@ -74,7 +80,6 @@ def measure_reliability(
         estimate: The disparity, with its confidence.
         truth: Ground truth at the same size; occluded pixels count too.
         limit_px: Largest error of a correct pixel.
-        bins: Number of equal bins between 0 and 1.
 
     Raises:
         EvaluationError: The sizes differ, or no pixel has both a value and a known truth.
@@ -83,19 +88,19 @@ def measure_reliability(
     """
     confidence, error_px = _pixels(estimate, truth)
     right = error_px <= limit_px
-    place = np.minimum((confidence.astype(np.float64) * bins).astype(np.int64), bins - 1)
-    pixels = np.bincount(place, minlength=bins).astype(np.float64)
+    place = np.minimum((confidence.astype(np.float64) * _BINS).astype(np.int64), _BINS - 1)
+    pixels = np.bincount(place, minlength=_BINS).astype(np.float64)
     with np.errstate(invalid="ignore"):
         return Reliability(
-            edges=np.linspace(0, 1, bins + 1),
-            confidence=np.bincount(place, weights=confidence, minlength=bins) / pixels,
-            right=np.bincount(place, weights=right, minlength=bins) / pixels,
+            edges=np.linspace(0, 1, _BINS + 1),
+            confidence=np.bincount(place, weights=confidence, minlength=_BINS) / pixels,
+            right=np.bincount(place, weights=right, minlength=_BINS) / pixels,
             pixels=pixels,
         )
 
 
 def measure_sparsification(
-    estimate: Disparity, truth: DisparityTruth, limit_px: float = 1.0, steps: int = 100
+    estimate: Disparity, truth: DisparityTruth, limit_px: float = 1.0
 ) -> Sparsification:
     """Remove the least confident pixels step by step, and measure the share of wrong ones left.
 
@@ -109,7 +114,7 @@ def measure_sparsification(
     """
     confidence, error_px = _pixels(estimate, truth)
     wrong = (error_px > limit_px).astype(np.float64)
-    removed = np.arange(steps) / steps
+    removed = np.arange(_STEPS) / _STEPS
     kept = np.maximum(np.ceil((1 - removed) * wrong.size).astype(np.int64), 1)
     return Sparsification(
         removed=removed,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from recon.core.errors import MappingError
 from recon.core.values import UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Bool, Float64
+from recon.core.values.grid import log_odds
 from recon.io.occupancy.nav2 import write_nav2
 from recon.map.ground.driven import DrivenPath, is_driven, sweep
 from recon.map.ground.floor import add_floors
@@ -25,7 +26,6 @@ from recon.map.ground.surface import (
     measure_camera_height,
 )
 from recon.map.occupancy.builder import MIN_PROBABILITY
-from recon.map.occupancy.log_odds import log_odds
 from recon.map.occupancy.part import OccupancyPart, free_part
 from recon.map.store.tile_parts import TileKey
 from recon.map.tiles import Tiles

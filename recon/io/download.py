@@ -26,6 +26,8 @@ _AGENT: Final = "recon-datasets/1"
 _TRIES: Final = 5
 _PAUSE_S: Final = 1.0
 _TIMEOUT_S: Final = 60.0
+_SMALL_BYTES: Final = 4096
+"""Most that is read of a small text file."""
 _RANGE: Final = re.compile(r"bytes (\d+)-(\d+)/(\d+|\*)")
 #: What a server says that is too busy, or is started again.
 _PASSING: Final = frozenset({408, 425, 429, 500, 502, 503, 504})
@@ -93,7 +95,7 @@ def download(
     _note(part).unlink(missing_ok=True)
 
 
-def fetch_text(address: str, at_most: int = 4096) -> str:
+def fetch_text(address: str) -> str:
     """Read a small text file, such as one with a hash.
 
     Raises:
@@ -101,7 +103,7 @@ def fetch_text(address: str, at_most: int = 4096) -> str:
     """
     try:
         with _open(address, {}) as response:
-            return str(response.read(at_most).decode("utf-8", "replace"))
+            return str(response.read(_SMALL_BYTES).decode("utf-8", "replace"))
     except _BrokenOffError as error:
         raise DownloadError("cannot be downloaded", where=address, got=error) from error
 

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import OccupancyVoxels
+from recon.core.values.grid import log_odds
 from recon.map.joined import grown_blocks, join_voxels
 from recon.map.kernels.raycast import BLOCK_BITS
-from recon.map.occupancy.log_odds import log_odds
 from recon.map.occupancy.moving import passed_cells
 from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.store.tile_parts import TileKey, TileParts

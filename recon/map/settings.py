@@ -12,7 +12,6 @@ from recon.map.ground.surface import GroundSettings
 from recon.map.occupancy.builder import OccupancySettings
 from recon.map.submaps import SubmapSettings
 from recon.odometry import OdometrySettings
-from recon.places import LoopSettings
 from recon.run.memory import MemorySettings
 from recon.stereo.cloud.filters import FilterSettings
 from recon.stereo.settings import StereoSettings
@@ -23,6 +22,16 @@ class CheckpointSettings(Settings):
 
     every_frames: int = Field(
         50, ge=1, le=1_000_000, description="Number of frames between two checkpoints."
+    )
+
+
+class LoopSettings(Settings):
+    """Loop closure: recognising a place, verifying it and correcting the path."""
+
+    enabled: bool = Field(
+        True,
+        description="Look for loops and close them. Turn it off where the path has none, for "
+        "speed.",
     )
 
 

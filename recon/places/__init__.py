@@ -5,7 +5,3 @@
 - `agree.py`: loops that confirm each other; `graph.py`: the path corrected by them;
 - `detector.py`: all this during a drive; `known.py`: in a map that is there already.
 """
-
-from recon.places.settings import LoopSettings
-
-__all__ = ["LoopSettings"]

@@ -102,7 +102,7 @@ def _drawn(result: ExperimentResult) -> dict[str, Any]:
     return {
         "pair": pair_figure(first.pair),
         "methods": [_drawn_method(result, one) for one in result.methods],
-        "patches": patches_figure(result.patches, BAD_PX),
+        "patches": patches_figure(result.patches),
         "curve": depth_curve_figure(camera, believed_camera(camera), first.disparity.values),
     }
 
@@ -205,11 +205,11 @@ def depth_curve_figure(
 
 
 @styled
-def patches_figure(patches: Mapping[str, Sequence[PatchFigure]], bad_px: float) -> bytes:
+def patches_figure(patches: Mapping[str, Sequence[PatchFigure]]) -> bytes:
     """Draw the effect of the patch size: wrong pixels, mean error, pixels with a value."""
     figure = Figure((WIDE_IN, 3.8))
     panels = (
-        (f"off by more than {bad_px:g} px (%)", "bad_percent"),
+        (f"off by more than {BAD_PX:g} px (%)", "bad_percent"),
         ("mean error (px)", "avgerr_px"),
         ("pixels with a value (%)", "valid_percent"),
     )

@@ -82,18 +82,15 @@ class Scene:
     eye_m: tuple[float, float, float] | None = None
 
 
-def plot_scene(
-    scene: Scene, max_points: int = MAX_POINTS, max_faces: int = MAX_FACES
-) -> Json | None:
+def plot_scene(scene: Scene, max_points: int = MAX_POINTS) -> Json | None:
     """Return the ``data`` and ``layout`` that plotly.js draws, as plain JSON values.
 
     ``layout.meta`` lists the colourings of the cloud, the first trace: a ``label``, and the
     ``marker`` that it gets when that one is chosen.
 
     Args:
-        scene: What to draw. The mesh is initially hidden if there is also a cloud.
+        scene: What to draw. The mesh is simplified, and initially hidden if there is a cloud.
         max_points: The cloud is thinned evenly to at most this number.
-        max_faces: The mesh is simplified to about this number of triangles.
 
     Returns:
         The plot; None if there is neither a point nor a triangle.
@@ -108,7 +105,7 @@ def plot_scene(
         figure.layout.meta = colourings
     if scene.mesh is not None and len(scene.mesh.faces):
         hidden = bool(figure.data)
-        figure.add_trace(_mesh_trace(thin_mesh(scene.mesh, max_faces), T, hidden=hidden))
+        figure.add_trace(_mesh_trace(thin_mesh(scene.mesh, MAX_FACES), T, hidden=hidden))
     if not figure.data:
         return None
     for number, (name, path) in enumerate(scene.paths):

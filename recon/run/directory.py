@@ -44,10 +44,10 @@ def lock_file(folder: Path) -> Path:
     return folder / _PARTIAL / _LOCK
 
 
-def default_folder(command: str, base: Path = Path("outputs")) -> Path:
+def default_folder(command: str) -> Path:
     """Return ``outputs/<command>/<UTC stamp>``."""
     stamp = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%S.%fZ")
-    return base / command / stamp
+    return Path("outputs") / command / stamp
 
 
 class RunDirectory:

@@ -9,12 +9,12 @@ from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import FREE, OCCUPIED, OccupancyGrid, PointCloud
+from recon.core.values.grid import log_odds
 from recon.map.ground.axes import AXES_MAP_WORLD, AxesSettings, GroundPlane, base_axes, map_axes
 from recon.map.ground.driven import DrivenPath, is_driven, sweep
 from recon.map.ground.grid import GridSettings, flatten
 from recon.map.ground.surface import GroundSurface
 from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
-from recon.map.occupancy.log_odds import log_odds
 from recon.map.occupancy.part import OccupancyPart, free_part, join_occupancy
 
 HEIGHT_M, CELL_M = 1.6, 0.2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,6 +14,11 @@ from recon.core.values.arrays import Bool, Float32, Float64, Int32, freeze, size
 FREE: Final = 0
 OCCUPIED: Final = 100
 UNKNOWN: Final = -1
+
+
+def log_odds(probability: float) -> float:
+    """Return ``ln(p / (1 - p))`` of a probability in (0, 1): independent evidence adds up."""
+    return math.log(probability / (1.0 - probability))
 
 
 @dataclass(frozen=True, eq=False)

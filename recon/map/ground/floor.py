@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Bool, Float32, Int32
+from recon.core.values.grid import log_odds
 from recon.map.ground.surface import CELL_M, MAX_TILT_DEG, MIN_POINTS
-from recon.map.occupancy.log_odds import log_odds
 
 _FULL: Final = log_odds(0.6)
 _EMPTY: Final = log_odds(0.45)

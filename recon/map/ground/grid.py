@@ -14,8 +14,8 @@ from recon.core.errors import MappingError
 from recon.core.settings import Settings
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
 from recon.core.values.arrays import Bool, Float64
+from recon.core.values.grid import log_odds
 from recon.map.ground.surface import GroundSurface
-from recon.map.occupancy.log_odds import log_odds
 
 JOINED_CELLS: Final = 2
 """Cells that were hit, but not surely, belong to an obstacle that they hang together with over so

@@ -13,8 +13,8 @@ from recon.core.kernels import voxels
 from recon.core.settings import Settings
 from recon.core.values import OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Float32, Float64, Int32
+from recon.core.values.grid import log_odds
 from recon.map.kernels import clamped, raycast
-from recon.map.occupancy.log_odds import log_odds
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.occupancy.surface_points import points_of, sum_points
 

@@ -18,10 +18,10 @@ from recon.core.geometry.se3 import apply
 from recon.core.kernels.voxels import pack_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float32, Float64
+from recon.core.values.grid import log_odds
 from recon.map.fusion.part import FusedPart
 from recon.map.occupancy.builder import FREE_MARGIN_SIGMAS
 from recon.map.occupancy.free_space import looked_through
-from recon.map.occupancy.log_odds import log_odds
 from recon.map.occupancy.part import OccupancyPart
 
 _FREE: Final = np.float32(log_odds(0.35))
