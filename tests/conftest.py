@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
 import pytest
-
-BLANK_PNG = base64.b64decode(
-    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR4nGP4DwABAQEAG7buVgAAAABJRU5ErkJggg=="
-)
 
 # The same examples on every machine and in every run: a failure is one of the change at hand.
 # A deadline would fail examples that compile, and any of them on a busy machine.
@@ -37,8 +32,8 @@ def recon_data() -> Path:
 @pytest.fixture(scope="module")
 def blank_figures() -> Iterator[None]:
     """Leave the figures of reports blank where nobody looks at them: a page takes seconds."""
-    from matplotlib.figure import Figure
+    from tests.scenery.figures import leave_figures_blank
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", lambda _, file, **options: file.write(BLANK_PNG))
+        leave_figures_blank(patch)
         yield

@@ -13,6 +13,7 @@ from recon.commands.demo import demo_source
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.sources import synthetic
+from tests.scenery.figures import leave_figures_blank
 
 SMALL_STREET = {"frames": 12, "width_px": 256, "height_px": 96, "focal_px": 150.0}
 
@@ -31,7 +32,8 @@ def small_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run; it must not be changed."""
     config = load_config(None, [f"street.{key}={value}" for key, value in SMALL_STREET.items()])
     out = tmp_path_factory.mktemp("demo") / "run"
-    run_map(
-        demo_source(config), config, MapOptions(audit=False, command="demo", out=out, mesh=False)
-    )
+    options = MapOptions(audit=False, command="demo", out=out, mesh=False)
+    with pytest.MonkeyPatch.context() as patch:
+        leave_figures_blank(patch)
+        run_map(demo_source(config), config, options)
     return out

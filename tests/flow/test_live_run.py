@@ -22,6 +22,8 @@ from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.scenery.patience import be_patient
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 STREET = StreetScene(
     frames=8, width_px=400, height_px=150, focal_px=225.0, smooth_edges=False, seed=1
 )

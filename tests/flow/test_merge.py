@@ -24,6 +24,8 @@ from recon.map.store.map import Map
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 RIG = {"width_px": 320, "height_px": 120, "focal_px": 180.0, "smooth_edges": False}
 """Large enough that places are recognised."""
 FIRST, FRAMES = 5, 14

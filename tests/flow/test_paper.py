@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.commands.paper import headline, run_paper
@@ -48,10 +49,12 @@ def write_scene(folder: Path, scene: PlanePair) -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def coarse_surfaces() -> Iterator[None]:
-    """Draw few facets: matplotlib takes most of the time of these tests for them."""
+def coarse_figures() -> Iterator[None]:
+    """Draw few facets and few pixels: matplotlib takes most of the time of these tests for them."""
+    draw = Figure.savefig
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper_page, "_SURFACE_COLUMNS", 30)
+        patch.setattr(Figure, "savefig", lambda *to, **options: draw(*to, **options, dpi=30))
         yield
 
 

@@ -50,7 +50,7 @@ class CalibrationFinding:
 
 
 def verdict_of_calibration(findings: Sequence[CalibrationFinding]) -> Verdict:
-    """Repeat with a fatal finding, usable with a warning, else good."""
+    """Return repeat with a fatal finding, usable with a warning, else good."""
     found = {finding.severity for finding in findings}
     if "fatal" in found:
         return "repeat"
