@@ -272,6 +272,7 @@ STAND_INS = (
     StandIn("results/baseline", results),
     StandIn("pip install ./block-matcher", plugin, "site"),
     StandIn("rides/today", recording),
+    StandIn("rides/long", drive),
     StandIn("drives/*", drive, "drives/monday"),
     StandIn("recon batch jobs.toml", scene, "scene"),
     StandIn("recon batch jobs.toml", job_file, "jobs.toml"),

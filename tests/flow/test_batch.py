@@ -191,6 +191,29 @@ def test_a_job_that_fails_by_its_input_is_reported_and_the_exit_code_is_1(
     assert_refused(run(*words), "not empty", "--resume goes on with it")
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_first_failure_ends_a_batch_that_fails_fast(batches: Batches, tmp_path: Path) -> None:
+    place, out = batches.jobs.parent, tmp_path / "out"
+    sources = [str(tmp_path / "nowhere"), *(str(place / f"drive{n}") for n in range(DRIVES))]
+    words = ["batch", "map", *sources, "--option=--no-mesh", "--out", str(out), "--workers", "1"]
+    command = [sys.executable, "-m", "recon", *words, "--fail-fast", "--json"]
+    done = subprocess.run(command, capture_output=True, check=False, text=True)
+    assert done.returncode == 1, done.stderr
+    summary = json.loads(done.stdout)
+    assert (summary["succeeded"], summary["failed"], summary["not_run"]) == (0, 1, DRIVES)
+    # A job that had begun is killed; what it left is gone on with.
+    resumed = subprocess.run(
+        [*command[:3], "batch", "--resume", str(out), "--workers", "1", "--json"],
+        capture_output=True,
+        check=False,
+        text=True,
+    )
+    assert resumed.returncode == 1
+    summary = json.loads(resumed.stdout)
+    assert (summary["succeeded"], summary["failed"], summary["not_run"]) == (DRIVES, 1, 0)
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
