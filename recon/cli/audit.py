@@ -16,7 +16,7 @@ def audit(
     source: Annotated[Path, typer.Argument(help=opt.SOURCES_HELP)],
     mend: Annotated[
         Path | None,
-        typer.Option(help="Write a calibration with corrected row alignment to this file."),
+        typer.Option(help="Write a calibration that fits rows and motion to this file."),
     ] = None,
     out: Annotated[
         Path | None,
@@ -40,6 +40,7 @@ def audit(
 
     Looks at row alignment, swapped, delayed or frozen cameras, missing and
     repeated frames, exposure, focus and baseline, and predicts the depth error.
+    The motion of the drive shows how the right camera is turned; not the scale.
     With --out, sample pairs, row errors and disparities are drawn in a report.
 
     Examples:

@@ -12,13 +12,13 @@ from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Float64
 from recon.odometry.protocol import OdometryHealth
 
-_RIG_DISPARITY_PX: Final = 0.1
+RIG_DISPARITY_PX: Final = 0.1
 """Standard deviation of an error common to all disparities, of a rig that was calibrated well."""
 
-_RIG_YAW_DEG: Final = 0.02
+RIG_YAW_DEG: Final = 0.02
 """That of the angle between the cameras, which shifts all disparities, too."""
 
-_RIG_BASELINE: Final = 0.002
+RIG_BASELINE: Final = 0.002
 """That of the baseline, as a share of it."""
 
 _SEGMENT_M: Final = 100.0
@@ -81,7 +81,7 @@ def expected_drift(
         return None
     scale_px, sigma_m, sigma_deg = figures[known].T
     share = _scale_share(scale_px, camera)
-    rig = float(np.hypot(steps_m[known] @ share / length_m, _RIG_BASELINE))
+    rig = float(np.hypot(steps_m[known] @ share / length_m, RIG_BASELINE))
     random = _random_share(length_m / known.sum(), length_m, sigma_m, np.deg2rad(sigma_deg))
     rests_on_px = length_m / float(steps_m[known] @ (1.0 / scale_px))
     return ExpectedDrift(
@@ -93,8 +93,8 @@ def expected_drift(
 
 def _scale_share(scale_px: Float64, camera: RectifiedCamera) -> Float64:
     """Return what an error of all disparities does to the lengths (N,) of steps, as a share."""
-    yaw_px = camera.focal_px * np.deg2rad(_RIG_YAW_DEG)
-    return np.asarray(np.hypot(_RIG_DISPARITY_PX, yaw_px) / scale_px)
+    yaw_px = camera.focal_px * np.deg2rad(RIG_YAW_DEG)
+    return np.asarray(np.hypot(RIG_DISPARITY_PX, yaw_px) / scale_px)
 
 
 def _random_share(step_m: float, length_m: float, sigma_m: Float64, sigma_rad: Float64) -> float:

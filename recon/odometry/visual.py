@@ -127,6 +127,11 @@ class VisualOdometry:
         self._state = VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
         return self._estimate(seen, frame.pair.camera)
 
+    @property
+    def window(self) -> TrackWindow:
+        """The last frames that were registered; without points before the first one."""
+        return _empty(np.eye(4)) if self._state is None else self._state.window
+
     def state(self) -> dict[str, Any]:
         """Return everything that later poses depend on."""
         last = self._state
@@ -310,7 +315,7 @@ class VisualOdometry:
         window = seen.window
         information = _information(window, camera)
         newest = window.seen[-1]
-        error = reprojection(window, camera)[newest, :2]
+        error = reprojection(window, camera)[-1, newest, :2]
         sigma = np.sqrt(np.diag(covariance_of(information)))
         health = OdometryHealth(
             tracks=seen.tracks,

@@ -26,14 +26,16 @@ _MIN_GAIN: Final = 1e-3
 _SIGMA_UV_PX: Final = 0.3
 """Standard deviation of a tracked column or row."""
 
-_SIGMA_D_PX: Final = 1.5
+SIGMA_D_PX: Final = 1.5
 """Standard deviation of a disparity; larger than that of a single match, because its error stays
 with a feature from frame to frame and does not average out."""
 
-_CAUCHY_SIGMAS: Final = 3.0
-"""Residual at which the weight of an observation is one half."""
+CAUCHY_SIGMAS: Final = 0.5
+"""Residual at which the weight of an observation is one half: most are far smaller than the
+standard deviations, which hold for what stays with a feature; those that are not are on something
+that moves, or slide along an edge."""
 
-_MAX_SIGMAS: Final = 6.0
+_MAX_SIGMAS: Final = 2.0
 """Residual above which an observation ends its track."""
 
 
@@ -98,25 +100,37 @@ class TrackWindow:
 
 
 def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
-    """Return observed minus predicted column, row, disparity (N, 3), newest frame; NaN = none."""
-    xyz = apply(invert(window.T_world_camera[-1]), window.xyz_world)
-    z = np.maximum(xyz[:, 2], bundle.MIN_DEPTH_M)
+    """Return observed minus predicted column, row, disparity (W, N, 3); NaN = unseen."""
+    xyz = np.stack([apply(T, window.xyz_world) for T in invert(window.T_world_camera)])
+    z = np.maximum(xyz[:, :, 2], bundle.MIN_DEPTH_M)
     f = camera.focal_px
     predicted = np.stack(
         [
-            f * xyz[:, 0] / z + camera.cx_px,
-            f * xyz[:, 1] / z + camera.cy_px,
+            f * xyz[:, :, 0] / z + camera.cx_px,
+            f * xyz[:, :, 1] / z + camera.cy_px,
             f * camera.baseline_m / z - camera.doffs_px,
         ],
         axis=-1,
     )
-    return np.asarray(window.uvd[-1] - predicted)
+    return np.asarray(window.uvd - predicted)
+
+
+def weighted(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Float64]:
+    """Return residuals in standard deviations, and the weight of each observation.
+
+    Returns:
+        float64 (W, N, 3), 0 where nothing is seen; float64 (W, N), Cauchy weights, likewise.
+    """
+    sigmas = np.array([_SIGMA_UV_PX, _SIGMA_UV_PX, SIGMA_D_PX])
+    residual = np.nan_to_num(reprojection(window, camera) / sigmas)
+    square = np.square(residual).sum(axis=2)
+    return residual, window.seen / (1.0 + square / CAUCHY_SIGMAS**2)
 
 
 def misfits(window: TrackWindow, camera: RectifiedCamera) -> Bool:
     """Return bool (N,), points whose newest observation is an outlier."""
-    residual = np.nan_to_num(reprojection(window, camera))
-    sigmas = [_SIGMA_UV_PX, _SIGMA_UV_PX, _SIGMA_D_PX]
+    residual = np.nan_to_num(reprojection(window, camera)[-1])
+    sigmas = [_SIGMA_UV_PX, _SIGMA_UV_PX, SIGMA_D_PX]
     square = np.square(residual / np.array(sigmas)).sum(axis=1)
     return np.asarray(square > _MAX_SIGMAS**2)
 
@@ -162,11 +176,16 @@ def pose_information(window: TrackWindow, camera: RectifiedCamera) -> Float64:
     """
     usable = window.seen[-1] & (window.seen.sum(axis=0) >= 2)
     part = TrackWindow(window.T_world_camera, window.uvd[:, usable], window.xyz_world[usable])
-    normal = _linearise(part, _model(camera))
+    normal = normal_equations(part, camera)
     inverse = np.linalg.inv(normal.H_point + bundle.RIDGE * np.eye(3))
     cross = normal.H_cross[-1]
     folded = (cross @ inverse) @ cross.transpose(0, 2, 1)
     return np.asarray(normal.H_pose[-1] - folded.sum(axis=0))
+
+
+def normal_equations(window: TrackWindow, camera: RectifiedCamera) -> bundle.NormalEquations:
+    """Return the normal equations of all poses and points of a window, as `bundle.linearise`."""
+    return _linearise(window, _model(camera))
 
 
 def _linearise(window: TrackWindow, model: bundle.BundleModel) -> bundle.NormalEquations:
@@ -194,6 +213,6 @@ def _model(camera: RectifiedCamera) -> bundle.BundleModel:
         fb=camera.focal_px * camera.baseline_m,
         doffs=camera.doffs_px,
         sigma_uv=_SIGMA_UV_PX,
-        sigma_d=_SIGMA_D_PX,
-        cauchy=_CAUCHY_SIGMAS,
+        sigma_d=SIGMA_D_PX,
+        cauchy=CAUCHY_SIGMAS,
     )

@@ -35,11 +35,34 @@ def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
         )
         or _UNKNOWN,
     }
+    by_motion = summary.get("rig_by_motion")
+    if by_motion is not None:
+        lines["by its motion"] = _by_motion(by_motion)
     mended = summary.get("mended")
     if mended is not None:
-        turn = f"{mended['pitch_deg']:+.3f} deg pitch, {mended['roll_deg']:+.3f} deg roll"
-        lines["mended"] = f"{mended['calibration']}: right camera rotated by {turn}"
+        turn = ", ".join(f"{mended[f'{x}_deg']:+.3f} deg {x}" for x in ("pitch", "yaw", "roll"))
+        lines["mended"] = (
+            f"{mended['calibration']}: right camera rotated by {turn}, its focal length changed by "
+            f"{mended['focal_percent']:+.2f} %"
+        )
     return lines
+
+
+def _by_motion(found: Mapping[str, Any]) -> str:
+    off = {name: _interval(found[name]) for name in ("disparity_px", "focal_percent", "lens_px")}
+    depths = ", ".join(
+        f"{percent:+.1f} % at {z} m" for z, percent in found["depth_percent"].items()
+    )
+    return (
+        f"disparities lack {off['disparity_px']} px (depth {depths}), at the sides another "
+        f"{off['lens_px']} px by the lenses; right focal length {off['focal_percent']} %; the "
+        "baseline cannot be seen"
+    )
+
+
+def _interval(figure: Mapping[str, float]) -> str:
+    """Return a value with the half width of its 95 % interval."""
+    return f"{figure['value']:+.2f} ± {1.96 * figure['sigma']:.2f}"
 
 
 def _frames(summary: Mapping[str, Any]) -> str:

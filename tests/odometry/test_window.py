@@ -81,7 +81,7 @@ def test_a_track_without_disparity_still_counts(camera: RectifiedCamera) -> None
     uvd[1:, :, 2] = np.nan
     found = adjust(disturbed(TrackWindow(right.T_world_camera, uvd, right.xyz_world)), camera)
     assert newest_error(found, right)[0] < 1e-3
-    assert np.isnan(reprojection(found, camera)[:, 2]).all()
+    assert np.isnan(reprojection(found, camera)[-1, :, 2]).all()
 
 
 def test_information_predicts_the_scatter(camera: RectifiedCamera) -> None:
@@ -89,7 +89,7 @@ def test_information_predicts_the_scatter(camera: RectifiedCamera) -> None:
     right = truth(camera, frames=2)
     rng = np.random.default_rng(13)
     sigmas = np.array(
-        [bundle_window._SIGMA_UV_PX, bundle_window._SIGMA_UV_PX, bundle_window._SIGMA_D_PX]
+        [bundle_window._SIGMA_UV_PX, bundle_window._SIGMA_UV_PX, bundle_window.SIGMA_D_PX]
     )
     offs = []
     for _ in range(60):

@@ -47,9 +47,9 @@ class RowAlignment:
     roll_rad: float
 
     @property
-    def rotation(self) -> Float64:
-        """float64 (3, 3): rotates rays of the right camera so that rows are aligned."""
-        return exp_so3(np.array([self.pitch_rad, 0.0, self.roll_rad]))
+    def turn(self) -> Float64:
+        """float64 (4,), what aligns the rows, as `correct_rig` takes it."""
+        return np.array([self.pitch_rad, 0.0, self.roll_rad, 0.0])
 
     def turned_rows(self, right_uv: Float32, camera: RectifiedCamera) -> Float64:
         """Return float64 (N,): rows of features of the right image after correction."""
@@ -122,21 +122,29 @@ def count_aligned(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) 
     return int(_consensus(*_linear(left_uv, right_uv, camera), camera.focal_px).sum())
 
 
-def correct_rig(rig: Rig, alignment: RowAlignment, R_rect_left: Float64) -> StereoCalibration:
-    """Return the calibration with the right camera rotated in place so that rows are aligned.
+def correct_rig(rig: Rig, turn: Float64, R_rect_left: Float64) -> StereoCalibration:
+    """Return the calibration with the right camera turned in place, and its focal length changed.
 
     Args:
         rig: The calibration that the images were rectified with.
-        alignment: Row errors of the rectified images.
+        turn: float64 (4,): pitch, yaw and roll, radians, by which rays of the rectified right
+            camera are turned, and the share by which its image is enlarged.
         R_rect_left: float64 (3, 3), rotation from the left camera to the rectified camera; the
             identity for a rectified rig.
     """
     raw = _as_raw(rig)
     R, t = raw.T_right_left[:3, :3], raw.T_right_left[:3, 3]
     centre = -R.T @ t
-    # Rectified right rays are R_rect_left @ R.T @ ray; the alignment rotates them further.
-    turned = R @ R_rect_left.T @ alignment.rotation.T @ R_rect_left
-    return replace(raw, T_right_left=make_transform(turned, -turned @ centre))
+    # Rectified right rays are R_rect_left @ R.T @ ray; the correction turns them further.
+    turned = R @ R_rect_left.T @ exp_so3(turn[:3]).T @ R_rect_left
+    # An image that is to be enlarged is that of a shorter focal length than was believed.
+    matrix = raw.right.matrix.copy()
+    matrix[[0, 1], [0, 1]] /= 1.0 + turn[3]
+    return replace(
+        raw,
+        right=replace(raw.right, matrix=matrix),
+        T_right_left=make_transform(turned, -turned @ centre),
+    )
 
 
 def _as_raw(rig: Rig) -> StereoCalibration:

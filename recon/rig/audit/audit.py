@@ -10,7 +10,7 @@ import numpy as np
 
 from recon.core.errors import CalibrationError
 from recon.core.geometry.projection import depth_sigma
-from recon.core.values import RectifiedCamera
+from recon.core.values import RectifiedCamera, Rig, StereoCalibration
 from recon.core.values.arrays import Float64
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.rig.audit.alignment import RowAlignment, correct_rig
@@ -22,12 +22,15 @@ from recon.rig.audit.findings import (
     find_image_faults,
     find_range_faults,
     find_series_faults,
+    find_turn_faults,
     verdict_of,
 )
 from recon.rig.audit.geometry import Geometry, measure_geometry
 from recon.rig.audit.measures import Gaps, find_gaps
 from recon.rig.audit.sample import Look, Sample, take_sample
 from recon.rig.audit.settings import AuditedSettings
+from recon.rig.audit.turn import measure_turn, turn_figures
+from recon.rig.audit.turn_fit import RightTurn
 from recon.run.summary import plain
 from recon.sources.protocol import IncompleteSource, StereoSource
 from recon.stereo.match.registry import MatchingSettings, settings_of
@@ -36,6 +39,9 @@ from recon.stereo.rectify.rectifier import Rectifier, plan_turns
 
 RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)
 """Distances for which the depth error is predicted."""
+
+_MATCHED_ROWS_PX: Final = 0.3
+"""Rms row error that does not spoil matching."""
 
 # No matcher is more accurate than a twentieth of a pixel on real images.
 _LEAST_SIGMA_PX: Final = 0.05
@@ -50,6 +56,8 @@ class Audit:
         findings: Problems found, fatal ones first.
         figures: All measures, ready for JSON.
         alignment: Row errors of all pairs together; None if there are too few features.
+        turn: How the right camera is turned by the motion of the drive, rows aligned; None if it
+            was not measured.
         looks: What was measured in each pair, and a few of the images.
         corrected: What `correct_calibration` did, if it was asked to.
     """
@@ -58,6 +66,7 @@ class Audit:
     findings: tuple[Finding, ...]
     figures: dict[str, Any]
     alignment: RowAlignment | None
+    turn: RightTurn | None = None
     looks: tuple[Look, ...] = ()
     corrected: dict[str, Any] | None = None
 
@@ -94,17 +103,27 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     geometry = measure_geometry(sample, camera)
     gaps = find_gaps(source)
     reach_px = _reach_px(camera, config.matching)
+    turn = None if quick else _measure_turn(source, config, geometry.alignment)
     findings = [
         *find_image_faults(sample, config.matching.matcher),
         *find_series_faults(sample, gaps),
         *find_geometry_faults(geometry),
+        *find_turn_faults(turn, camera),
         *find_range_faults(geometry, reach_px, camera),
         *find_calibration_faults(sample, source.calibration, camera, settings.baseline_m),
     ]
     findings.sort(key=lambda finding: not finding.fatal)
     figures = _figures(source, sample, geometry, gaps, camera)
-    looks = tuple(sample.looks)
-    return Audit(verdict_of(findings), tuple(findings), figures, geometry.alignment, looks)
+    if turn is not None:
+        figures["rig_by_motion"] = turn_figures(turn, camera)
+    return Audit(
+        verdict_of(findings),
+        tuple(findings),
+        figures,
+        geometry.alignment,
+        turn,
+        tuple(sample.looks),
+    )
 
 
 def quick_warnings(source: StereoSource, config: AuditedSettings) -> tuple[str, ...]:
@@ -124,34 +143,67 @@ def quick_warnings(source: StereoSource, config: AuditedSettings) -> tuple[str, 
 def correct_calibration(
     source: StereoSource, config: AuditedSettings, audit: Audit, path: Path
 ) -> dict[str, Any]:
-    """Write the calibration with the right camera rotated so that rows correspond.
+    """Write the calibration with the right camera turned so that rows and motion agree with it.
+
+    What the drive does not show beyond two standard deviations stays as it is; the baseline always
+    does.
 
     Returns:
-        The rotation in degrees, and the remaining row error.
+        The turn of the right camera in degrees, the change of its focal length in per cent, and
+        the row error before.
 
     Raises:
         CalibrationError: There are too few features to measure the row error.
         OutputError: The file cannot be written.
     """
-    alignment = audit.alignment
-    if alignment is None:
+    if audit.alignment is None:
         raise CalibrationError(
             "too few features to correct the calibration",
             where=source.name,
             hint="record scenes with more texture, or recalibrate the cameras",
         )
+    turns = []
+    if audit.turn is None or _rows_off(audit.alignment):
+        turns.append(audit.alignment.turn)
+    if audit.turn is not None:
+        turns.append(audit.turn.telling)
     rig = source.calibration
-    if isinstance(rig, RectifiedCamera):
-        left = np.eye(3)
-    else:
-        left = plan_turns(rig, config.rectification).R_left
+    for turn in turns:
+        rig = _turned(rig, turn, config)
+    pitch, yaw, roll, enlarged = np.sum(turns, axis=0).tolist()
     figures = {
-        "pitch_deg": float(np.degrees(alignment.pitch_rad)),
-        "roll_deg": float(np.degrees(alignment.roll_rad)),
-        "row_error_before_px": alignment.rms_px,
+        "pitch_deg": float(np.degrees(pitch)),
+        "yaw_deg": float(np.degrees(yaw)),
+        "roll_deg": float(np.degrees(roll)),
+        "focal_percent": -100.0 * enlarged,
+        "row_error_before_px": audit.alignment.rms_px,
     }
-    write_recon_calibration(path, correct_rig(rig, alignment, left), figures)
+    write_recon_calibration(path, rig, figures)
     return {**figures, "calibration": str(path)}
+
+
+def _measure_turn(
+    source: StereoSource, config: AuditedSettings, alignment: RowAlignment | None
+) -> RightTurn | None:
+    """Return how the right camera is turned; rows that are off are aligned first, to match."""
+    if alignment is None:
+        return None
+    rig = source.calibration
+    if _rows_off(alignment):
+        rig = _turned(rig, alignment.turn, config)
+    return measure_turn(source, rig, config)
+
+
+def _rows_off(alignment: RowAlignment) -> bool:
+    return alignment.rms_px > _MATCHED_ROWS_PX
+
+
+def _turned(rig: Rig, turn: Float64, config: AuditedSettings) -> StereoCalibration:
+    """Return a calibration after a turn of its rectified right camera."""
+    left = np.eye(3)
+    if isinstance(rig, StereoCalibration):
+        left = plan_turns(rig, config.rectification).R_left
+    return correct_rig(rig, turn, left)
 
 
 def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None:

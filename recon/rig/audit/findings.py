@@ -12,6 +12,8 @@ from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
 from recon.rig.audit.geometry import MIN_FEATURES, Geometry
 from recon.rig.audit.measures import Gaps
 from recon.rig.audit.sample import BLANK_DN, Sample
+from recon.rig.audit.turn import turn_figures
+from recon.rig.audit.turn_fit import RightTurn
 from recon.stereo.match.protocol import Matcher
 
 Verdict = Literal["good", "usable", "not usable"]
@@ -26,6 +28,9 @@ _ROW_PX: Final = 0.75
 
 _BAD_ROW_PX: Final = 1.5
 """Rms row error above which that finding is fatal."""
+
+_DISPARITY_PX: Final = 0.75
+"""Error common to all disparities above which it is reported."""
 
 _GAIN: Final = 1.2
 """Brightness ratio above which a finding is reported."""
@@ -211,6 +216,23 @@ def _find_row_faults(geometry: Geometry) -> Iterator[Finding]:
             f"{alignment.mean_px:+.2f} px, spread {alignment.spread_px:.2f} px; rotating the right "
             f"camera by {pitch:+.3f} deg pitch and {roll:+.3f} deg roll corrects this: "
             "recon audit --mend FILE",
+        )
+
+
+def find_turn_faults(turn: RightTurn | None, camera: RectifiedCamera) -> Iterator[Finding]:
+    """Yield a right camera that is turned about the vertical, as the motion shows it."""
+    if turn is None:
+        return
+    figures = turn_figures(turn, camera)
+    off, sigma = figures["disparity_px"]["value"], figures["disparity_px"]["sigma"]
+    if abs(off) > max(_DISPARITY_PX, 4 * sigma):
+        depths = ", ".join(f"{p:+.1f} % at {z} m" for z, p in figures["depth_percent"].items())
+        yield Finding(
+            "yaw",
+            False,
+            f"disparities are {-off:+.2f} ± {1.96 * sigma:.2f} px off, as the motion shows: depth "
+            f"is off by {depths}; turning the right camera by {figures['yaw_deg']['value']:+.3f} "
+            "deg yaw corrects this: recon audit --mend FILE",
         )
 
 

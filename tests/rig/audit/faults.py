@@ -68,13 +68,19 @@ def changed(
     return Spoiled(rectified(source), len(source), take)
 
 
-def turned(source: StereoSource, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Spoiled:
-    """The right camera turned about x and z: its image is another view from the same place."""
+def turned(
+    source: StereoSource,
+    pitch_deg: float = 0.0,
+    roll_deg: float = 0.0,
+    yaw_deg: float = 0.0,
+    enlarged: float = 1.0,
+) -> Spoiled:
+    """The right camera turned, and its lens changed: another view from the same place."""
     camera = rectified(source)
     K = camera.matrix.copy()
     K[0, 2] = camera.cx_right_px
-    R = exp_so3(np.radians([pitch_deg, 0.0, roll_deg]))
-    H = K @ R @ np.linalg.inv(K)
+    R = exp_so3(np.radians([pitch_deg, yaw_deg, roll_deg]))
+    H = K @ np.diag([enlarged, enlarged, 1.0]) @ R @ np.linalg.inv(K)
     size = (camera.width_px, camera.height_px)
     return changed(source, lambda left, right: (left, warped(right, H, size)))
 

@@ -126,6 +126,58 @@ def test_a_frozen_camera_is_found(street: faults.Spoiled) -> None:
     assert "the right camera is frozen for 5 frames" in frozen.text
 
 
+@pytest.fixture(scope="module")
+def longer_street() -> faults.Spoiled:
+    """A drive long enough for its motion to show the rig."""
+    size = StreetScene(seed=3, frames=48, width_px=400, height_px=136, focal_px=225.0, threads=1)
+    source = SyntheticSource(size)
+    pairs: list[StereoPair] = list(source)
+    return faults.Spoiled(source.calibration, len(pairs), pairs.__getitem__)
+
+
+@pytest.mark.slow
+def test_the_motion_of_a_clean_drive_shows_no_fault(longer_street: faults.Spoiled) -> None:
+    audit = audit_source(longer_street, CONFIG)
+    assert audit.findings == ()
+    found = audit.figures["rig_by_motion"]
+    assert abs(found["disparity_px"]["value"]) < 0.05
+    assert np.abs(audit.turn.values[:4]).max() * longer_street.camera.focal_px < 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("yaw_deg", "enlarged", "pitch_deg"), [(0.25, 1.0, 0.0), (-0.25, 1.005, 0.0), (0.25, 1.0, 0.3)]
+)
+def test_a_turn_that_only_motion_shows_is_mended(
+    longer_street: faults.Spoiled,
+    tmp_path: Path,
+    yaw_deg: float,
+    enlarged: float,
+    pitch_deg: float,
+) -> None:
+    spoiled = faults.turned(longer_street, pitch_deg, yaw_deg=yaw_deg, enlarged=enlarged)
+    before = audit_source(spoiled, CONFIG)
+    assert "yaw" in {finding.code for finding in before.findings}
+    found = correct_calibration(spoiled, CONFIG, before, tmp_path / "mended.yaml")
+    assert found["yaw_deg"] == pytest.approx(-yaw_deg, rel=0.2)
+    assert found["focal_percent"] == pytest.approx(100 * (enlarged - 1), abs=0.1)
+    mended = read_calibration(tmp_path / "mended.yaml", 400, 136)
+    after = audit_source(replace(spoiled, camera=mended), CONFIG)
+    assert after.findings == ()
+    assert abs(after.figures["rig_by_motion"]["disparity_px"]["value"]) < 0.1
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_a_turn_planted_in_a_real_drive_is_found(recon_data: Path) -> None:
+    source = open_source(recon_data / "driven" / "kitti_raw_0013")
+    yaw = [
+        audit_source(drive, CONFIG).turn.values[1]
+        for drive in (source, faults.turned(source, yaw_deg=0.06))
+    ]
+    assert np.degrees(yaw[1] - yaw[0]) == pytest.approx(-0.06, rel=0.2)
+
+
 @pytest.mark.real
 @pytest.mark.slow
 @pytest.mark.parametrize("drive", ["kitti_raw_0013", "kitti_06_51"])

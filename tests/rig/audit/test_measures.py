@@ -84,7 +84,7 @@ def test_a_mended_rig_projects_to_the_same_rows() -> None:
     left, right = features(np.random.default_rng(3), *turn)
     alignment = align_rows(left, right, CAMERA)
     assert alignment is not None
-    rig = correct_rig(CAMERA, alignment, np.eye(3))
+    rig = correct_rig(CAMERA, alignment.turn, np.eye(3))
     # Where the mended calibration says that a point lies is where the turned camera saw it.
     xyz = np.array([[0.4, -0.3, 6.0], [-1.0, 0.8, 9.0], [2.0, 0.1, 20.0]])
     seen = xyz @ rig.T_right_left[:3, :3].T + rig.T_right_left[:3, 3]

@@ -1,0 +1,120 @@
+"""How the right camera is turned against its calibration, as the motion of a drive shows it.
+
+Pitch and roll move rows, which correspond in each pair. Yaw and another focal length move columns,
+and in one pair nothing distinguishes that from depth. Over a motion something does: a tracked point
+has a depth by the motion alone, and the disparities of all points must fit these depths by one
+factor. The factor itself, the length of the baseline, is what no motion shows.
+
+Lenses that are calibrated badly bend both: disparities then misfit by the square of the distance
+from the middle of the image (kitti_raw_0013: 1.3 px at its sides). That is estimated with the turn,
+which would take it for yaw otherwise, but no turn can correct it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from typing import Any, Final
+
+import numpy as np
+
+from recon.core.values import RectifiedCamera, Rig
+from recon.core.values.arrays import Float64
+from recon.odometry.patches import find_again, surface_slopes
+from recon.odometry.protocol import OdometryFrame
+from recon.odometry.visual import VisualOdometry
+from recon.odometry.window import TrackWindow
+from recon.rig.audit.sample import plan_stretches
+from recon.rig.audit.turn_fit import MIN_WINDOWS, RightTurn, StereoTracks, estimate_turn
+from recon.run.machine import serial_algebra
+from recon.sources.protocol import StereoSource
+from recon.stereo.frame import FrameReconstructor
+from recon.stereo.settings import StereoSettings
+
+_MIN_FRAMES: Final = 4
+"""Windows of fewer frames, after a loss, are left out."""
+
+DEPTHS_M: Final = (10.0, 30.0)
+"""Distances for which the depth error is stated."""
+
+_FRAMES: Final = 6
+"""Frames in a window."""
+
+_READ: Final = 72
+"""Frames to read in all, in several runs."""
+
+
+def measure_turn(source: StereoSource, rig: Rig, config: StereoSettings) -> RightTurn | None:
+    """Measure how the right camera of a drive is turned against a calibration.
+
+    Args:
+        source: The drive.
+        rig: The calibration, with which rows meet to a pixel or so.
+        config: How pairs are rectified and matched.
+
+    Returns:
+        None if the drive is too short, or too few of its frames can be tracked.
+    """
+    if len(source) < MIN_WINDOWS * _FRAMES:
+        return None
+    reconstructor = FrameReconstructor(rig, config)
+    tracks: list[StereoTracks] = []
+    with serial_algebra():
+        for start, stop in plan_stretches(len(source), _READ, quick=False):
+            pairs = islice(source.frames(start), stop - start)
+            tracks += stereo_tracks(OdometryFrame(*reconstructor.match(pair)) for pair in pairs)
+        return estimate_turn(tracks, reconstructor.camera)
+
+
+def turn_figures(turn: RightTurn, camera: RectifiedCamera) -> dict[str, Any]:
+    """Return what a turn means, with standard deviations, ready for JSON."""
+    degrees, sigmas = np.degrees(turn.values[:3]), np.degrees(turn.sigmas[:3])
+    named = zip(("pitch_deg", "yaw_deg", "roll_deg"), degrees, sigmas, strict=True)
+    # Disparities grow where the right image moves to the left.
+    offset_px, sigma_px = camera.focal_px * np.array([-turn.values[1], turn.sigmas[1]])
+    side = (camera.width_px / 2 / camera.focal_px) ** 2
+    return {
+        "windows": turn.windows,
+        **{name: {"value": float(x), "sigma": float(s)} for name, x, s in named},
+        "focal_percent": {
+            "value": -100.0 * float(turn.values[3]),
+            "sigma": 100.0 * float(turn.sigmas[3]),
+        },
+        "disparity_px": {"value": float(offset_px), "sigma": float(sigma_px)},
+        "lens_px": {
+            "value": -camera.focal_px * side * float(turn.values[4]),
+            "sigma": camera.focal_px * side * float(turn.sigmas[4]),
+        },
+        "depth_percent": {
+            f"{z:g}": 100.0 * float(offset_px) * z / (camera.focal_px * camera.baseline_m)
+            for z in DEPTHS_M
+        },
+        "not_visible": "baseline",
+    }
+
+
+def stereo_tracks(frames: Iterable[OdometryFrame]) -> Iterator[StereoTracks]:
+    """Track features through consecutive frames, in windows without common frames."""
+    odometry, recent = VisualOdometry(), list[OdometryFrame]()
+    for frame in frames:
+        result = odometry.register(frame)
+        recent = [*recent, frame] if result.health.ok else []
+        if len(recent) == _FRAMES:
+            window = odometry.window
+            if len(window.T_world_camera) >= _MIN_FRAMES:
+                yield StereoTracks(window, _in_right(window, recent))
+            recent = []
+
+
+def _in_right(window: TrackWindow, frames: Sequence[OdometryFrame]) -> Float64:
+    """Return where the features of a window are in the right images: float64 (W, N, 2)."""
+    right_uv = np.full((*window.uvd.shape[:2], 2), np.nan)
+    for k, frame in enumerate(frames[-len(window.uvd) :]):
+        seen = np.isfinite(window.uvd[k, :, 2])
+        uv, d = window.uvd[k, seen, :2], window.uvd[k, seen, 2]
+        slope = surface_slopes(frame.disparity, uv)
+        warp = np.tile(np.eye(2), (len(uv), 1, 1))
+        warp[:, 0] -= slope
+        guess = uv - np.column_stack([d, np.zeros(len(d))])
+        right_uv[k, seen] = find_again(frame.pair.left, frame.pair.right, uv, warp, guess)
+    return right_uv
