@@ -15,7 +15,8 @@ from recon.cli.show.tables import print_json, print_run
 def piece(
     plan: Annotated[Path, typer.Argument(help="Plan of the pieces, in the folder of the run.")],
     number: Annotated[int, typer.Argument(help="Number of the piece.")],
-    out: Annotated[Path, typer.Option(help="Folder of the piece.")],
+    out: Annotated[Path | None, typer.Option(help="New folder of the piece.")] = None,
+    resume: Annotated[Path | None, typer.Option(help="Folder of one to go on with.")] = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
@@ -29,10 +30,14 @@ def piece(
     Examples:
       recon piece outputs/long/.partial/.state/pieces.json 0 --out piece0
     """
+    folder = resume or out
+    if folder is None:
+        raise typer.BadParameter("give --out FOLDER or --resume FOLDER")
     with session(quiet=quiet):
         from recon.cli.show.progress import choose_viewer
         from recon.commands.piece import run_piece
 
         viewer = choose_viewer(quiet=quiet, verbose=verbose)
-        summary = run_piece(plan, number, out, threads, viewer)
+        going_on = resume is not None
+        summary = run_piece(plan, number, folder, resume=going_on, threads=threads, progress=viewer)
     print_json(summary) if json else print_run(summary, stages=verbose)

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from recon.commands.config import ReconConfig
 from recon.commands.map_options import MapOptions
-from recon.commands.piece import PiecePlan, read_plan, write_plan
+from recon.commands.piece import PiecePlan, piece_job, read_plan, write_plan
 from recon.core.errors import ClusterError, RegistrationError, SettingsError
 from recon.map.drive.pieces import Piece, cut_drive, join_pieces, joined_drive
 from recon.map.drive.sequence import MappedSequence, map_sequence
@@ -20,7 +20,6 @@ from recon.map.drive.workspace import Workspace
 from recon.map.store.map import Map
 from recon.run.batch.cluster import Cluster, connect
 from recon.run.batch.figures import result_of
-from recon.run.batch.job import Job
 from recon.run.batch.plan import Limits
 from recon.run.batch.work import BatchOptions, JobStep
 from recon.run.run import Run
@@ -85,15 +84,15 @@ def _refuse_what_does_not_combine(config: ReconConfig, options: MapOptions) -> N
     Raises:
         SettingsError: It cannot.
     """
-    wrong = None
     if options.known_poses is not None or options.prior is not None:
-        wrong = "a drive with --poses or --prior is mapped in one", "drop --workers and --scheduler"
-    elif not config.occupancy.keep_rays:
-        wrong = "pieces are joined by their rays", "drop occupancy.keep_rays=false"
-    elif not options.arguments.get("source"):
-        wrong = "workers open the source by its path", "map a file or folder"
-    if wrong:
-        raise SettingsError(wrong[0], hint=wrong[1])
+        what = "a drive with --poses or --prior is mapped in one piece"
+        raise SettingsError(what, hint="drop --workers and --scheduler")
+    if not config.occupancy.keep_rays:
+        what = "pieces are joined by their rays"
+        raise SettingsError(what, hint="drop occupancy.keep_rays=false")
+    if not options.arguments.get("source"):
+        what = "workers open the source by its path"
+        raise SettingsError(what, hint="map a file or folder")
 
 
 def _planned(
@@ -112,7 +111,7 @@ def _work_off(
 ) -> list[dict[str, Any]]:
     """Map pieces on workers; returns where, and what each took."""
     progress, results = spread.progress, {}
-    jobs = [_job(number, piece, plan, limits) for number, piece in enumerate(pieces)]
+    jobs = [piece_job(plan, number, piece, limits) for number, piece in enumerate(pieces)]
     workers, dashboard = len(cluster.workers), cluster.dashboard
     spread.tell({"event": "cluster", "workers": workers, "dashboard": dashboard})
     progress.on_start("pieces", len(jobs), "pieces")
@@ -137,19 +136,6 @@ def _work_off(
         }
         for piece, one in zip(pieces, found, strict=True)
     ]
-
-
-def _job(number: int, piece: Piece, plan: Path, limits: Limits) -> Job:
-    """Return what a worker does for a piece."""
-    threads = () if limits.threads is None else ("--threads", str(limits.threads))
-    return Job(
-        name=str(number),
-        command="piece",
-        source=f"{piece.first} to {piece.last - 1}",
-        words=("piece", str(plan.resolve()), str(number), *threads),
-        writes=True,
-        folder=str(Path.cwd()),
-    )
 
 
 def _opened(plan: Path, count: int) -> Iterator[Map]:

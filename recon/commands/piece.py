@@ -19,7 +19,8 @@ from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
 from recon.map.sessions.copying import copy_sessions
 from recon.map.store.map import MAP_FILE, Map
-from recon.run.directory import STARTED, state_folder
+from recon.run.batch.job import Job
+from recon.run.batch.plan import Limits
 from recon.run.progress import SILENT, Progress
 from recon.run.run import Run
 
@@ -62,15 +63,35 @@ def read_plan(path: Path) -> PiecePlan:
         return PiecePlan(pieces, content["arguments"], content["config"])
 
 
+def piece_job(plan: Path, number: int, piece: Piece, limits: Limits) -> Job:
+    """Return what a worker does for a piece: it runs `run_piece`."""
+    threads = () if limits.threads is None else ("--threads", str(limits.threads))
+    return Job(
+        name=str(number),
+        command="piece",
+        source=f"{piece.first} to {piece.last - 1}",
+        words=("piece", str(plan.resolve()), str(number), *threads),
+        writes=True,
+        folder=str(Path.cwd()),
+    )
+
+
 def run_piece(
-    plan: Path, number: int, out: Path, threads: int | None = None, progress: Progress = SILENT
+    plan: Path,
+    number: int,
+    out: Path,
+    *,
+    resume: bool = False,
+    threads: int | None = None,
+    progress: Progress = SILENT,
 ) -> dict[str, Any]:
-    """Map a piece of a drive into a folder, or go on with it.
+    """Map a piece of a drive into a folder.
 
     Args:
         plan: What the pieces are of.
         number: Number of the piece.
         out: Its folder, which gets its map.
+        resume: Go on with what is in the folder.
         threads: Threads to use; None = all cores. Changes no result.
         progress: Shown each frame.
 
@@ -87,7 +108,7 @@ def run_piece(
     config = config.model_copy(update={"loops": loops})
     source, _ = MapRequest.of(planned.arguments).open(config)
     part = planned.pieces[number].of(source)
-    identity, resume = identity_of(part, config, None), (state_folder(out) / STARTED).is_file()
+    identity = identity_of(part, config, None)
     with (
         Run("piece", out, config, threads=threads, progress=progress, resume=resume) as run,
         begin_or_resume(run, part, config, identity, {}) as map_,

@@ -12,7 +12,8 @@ from recon.run.run import SUMMARY
 
 State = Literal["succeeded", "failed", "broken"]
 """``failed``: by its input, so that another try would fail too. ``broken``: by anything else."""
-_RESUMABLE: Final = "map"
+_DRIVE: Final = "map"
+_PIECE: Final = "piece"
 
 
 @dataclass(frozen=True)
@@ -58,13 +59,16 @@ class Job:
         if not self.writes:
             return [*self.words, *shown]
         if self.resumes(out) and not anew:
+            # A drive knows what it was begun with; a piece of one is told again.
+            if self.command == _PIECE:
+                return [*self.words, "--resume", str(out), *shown]
             kept = [*_option(self.words, "--threads"), *_option(self.words, "--memory-limit")]
-            return [_RESUMABLE, "--resume", str(out), *kept, *shown]
+            return [_DRIVE, "--resume", str(out), *kept, *shown]
         return [*self.words, "--out", str(out), *shown]
 
     def resumes(self, out: Path) -> bool:
         """Return whether an earlier try left something to go on with."""
-        return self.command == _RESUMABLE and (state_folder(out) / STARTED).is_file()
+        return self.command in (_DRIVE, _PIECE) and (state_folder(out) / STARTED).is_file()
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from recon.cli.program import known_program
+from recon.commands.piece import piece_job
 from recon.core.errors import ReconError, SettingsError
+from recon.map.drive.pieces import Piece
 from recon.run.batch.job_file import Entry
 from recon.run.batch.plan import Limits, plan_jobs, read_plan, write_plan
 from recon.run.directory import STARTED, state_folder
@@ -80,6 +82,15 @@ def test_a_run_that_was_begun_is_resumed_with_its_limits(tmp_path: Path) -> None
         "--verbose",
     ]  # fmt: skip
     assert job.command_line(tmp_path, anew=True)[:2] == ["map", "drive"]
+
+
+def test_a_piece_that_was_begun_is_told_again_what_it_is_of(tmp_path: Path) -> None:
+    job = piece_job(tmp_path / "pieces.json", 3, Piece(80, 140, 20), Limits(threads=2))
+    words = ["piece", str(tmp_path / "pieces.json"), "3", "--threads", "2"]
+    assert job.command_line(tmp_path / "3")[:7] == [*words, "--out", str(tmp_path / "3")]
+    state_folder(tmp_path / "3").mkdir(parents=True)
+    (state_folder(tmp_path / "3") / STARTED).touch()
+    assert job.command_line(tmp_path / "3")[:7] == [*words, "--resume", str(tmp_path / "3")]
 
 
 def test_a_plan_is_read_as_it_was_written(tmp_path: Path) -> None:
