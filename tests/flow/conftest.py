@@ -23,8 +23,13 @@ def streets_built_once() -> Iterator[None]:
     """Let sources of equal settings share their street, which takes seconds to lay out."""
     with pytest.MonkeyPatch.context() as patch:
         for name in ("build_street", "StreetCamera"):
-            patch.setattr(synthetic, name, lru_cache(maxsize=4)(getattr(synthetic, name)))
+            patch.setattr(synthetic, name, lru_cache(maxsize=8)(getattr(synthetic, name)))
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_figures(blank_figures: None) -> None:
+    """Draw the figures of reports only where a command runs in a process of its own."""
 
 
 @pytest.fixture(scope="session")

@@ -29,8 +29,6 @@ from recon.stereo.match.registry import make_matcher
 from recon.street.settings import StreetSettings
 from tests.scenery.kitti import write_kitti
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 CAMERA = RectifiedCamera(
     focal_px=260.0,
     cx_px=199.5,

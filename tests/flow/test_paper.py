@@ -161,7 +161,6 @@ def test_the_report_loads_nothing_and_shows_each_experiment(
         assert words in text
 
 
-@pytest.mark.usefixtures("blank_figures")
 def test_its_configuration_gives_the_same_figures(
     scenes: Path, run: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
@@ -170,7 +169,6 @@ def test_its_configuration_gives_the_same_figures(
     assert json.loads(json.dumps(again.summary["experiments"])) == run[1]["experiments"]
 
 
-@pytest.mark.usefixtures("blank_figures")
 def test_without_the_option_only_the_corrected_method_is_tried(
     scenes: Path, tmp_path: Path
 ) -> None:
@@ -181,7 +179,6 @@ def test_without_the_option_only_the_corrected_method_is_tried(
     assert not (tmp_path / "out/experiment_2_ArtL/as_printed").exists()
 
 
-@pytest.mark.usefixtures("blank_figures")
 def test_a_scene_without_truth_is_reconstructed_and_told(scenes: Path, tmp_path: Path) -> None:
     copy = tmp_path / "scenes"
     for file in scenes.rglob("*"):

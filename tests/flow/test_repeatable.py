@@ -12,8 +12,6 @@ from recon.commands.map_options import MapOptions
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 STREET = StreetSettings(frames=4, width_px=320, height_px=120, focal_px=180.0)
 
 

@@ -24,8 +24,6 @@ from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 from tests.scenery.kitti import write_kitti
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 STREET = StreetSettings(frames=24, width_px=192, height_px=72, focal_px=110.0)
 SETTINGS = ["checkpoints.every_frames=5", "submaps.length_m=4", "submaps.tile_m=12.8"]
 FILES = [
