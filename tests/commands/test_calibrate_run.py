@@ -291,6 +291,7 @@ def test_the_published_chessboard_pairs_calibrate_as_they_should(
 
 @pytest.mark.slow
 @pytest.mark.real
+@pytest.mark.slow
 def test_the_published_views_captured_five_times_have_the_same_forecast(
     recon_data: Path, tmp_path: Path
 ) -> None:
