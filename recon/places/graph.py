@@ -178,6 +178,8 @@ def _begun_at(T_world_camera: Float64, path: Trajectory) -> Trajectory:
 
 def loop_bias(loop: Loop) -> Drift:
     """Return the standard deviations of a loop that more matches do not improve."""
+    if loop.same_frame:
+        return Drift(0.0, 0.0)
     apart_m = float(np.linalg.norm(loop.T_first_last[:3, 3]))
     position_m = math.hypot(_LOOP_SIGMA_M, _LOOP_SHARE * apart_m)
     return Drift(position_m, math.radians(_LOOP_SIGMA_DEG))

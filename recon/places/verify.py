@@ -61,6 +61,7 @@ class Loop:
             in the axes of the later frame.
         inliers: Matches that agree in both frames.
         dense_share: Share of the coarse disparities that agree.
+        same_frame: Whether the two are one frame, in two recordings that overlap.
     """
 
     first: int
@@ -69,6 +70,7 @@ class Loop:
     information: Float64
     inliers: int
     dense_share: float
+    same_frame: bool = False
 
     def __post_init__(self) -> None:
         freeze(self, "T_first_last", np.float64, (4, 4))

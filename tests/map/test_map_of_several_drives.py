@@ -18,8 +18,9 @@ from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.joined import join_clouds, join_voxels
 from recon.map.occupancy.rays import ray_grain, thin_rays
 from recon.map.sessions.copying import check_session, copy_sessions
-from recon.map.sessions.joining import join_sessions
+from recon.map.sessions.joining import join_new, join_sessions
 from recon.map.sessions.placed import place_map
+from recon.map.sessions.shared import seen_before, shared_frames
 from recon.map.store.links import Link
 from recon.map.store.map import Map
 from recon.map.store.session import Session, SessionInfo
@@ -51,18 +52,29 @@ def _wall(T_true: Float64, seed: int) -> PointCloud:
     return transform_cloud(replace(cloud, frame="world"), invert(T_true), frame="camera")
 
 
-def _drive(map_: Map, true: Float64, seed: int, name: str = "wall", drift: float = 0.0) -> Session:
-    """Map a drive whose own world begins with its first camera; ``drift`` stretches its path."""
+def _drive(
+    map_: Map,
+    true: Float64,
+    seed: int,
+    name: str = "wall",
+    drift: float = 0.0,
+    first: int = 0,
+    noise: int = 0,
+) -> Session:
+    """Map a drive whose own world begins with its first camera; ``drift`` stretches its path.
+
+    Drives of one ``seed`` without other ``noise`` have the same images, from frame ``first`` on.
+    """
     session = map_.begin(SessionInfo(name, "of a test", FRAMES, CONFIG.model_dump(mode="json")))
     session.set_axes(T_MAP_WORLD, CAMERA)
     builder = SubmapBuilder(CONFIG.submaps, CONFIG.fusion, CONFIG.occupancy, T_MAP_WORLD)
     for frame, T_true in enumerate(true):
         T = invert(true[0]) @ T_true
         T[:3, 3] *= 1 + drift
-        cloud = _wall(T_true, 1000 * seed + frame)
+        cloud = _wall(T_true, 1000 * seed + first + frame + 500 * noise)
         rays = thin_rays(cloud, CONFIG.occupancy)
         builder.integrate(transform_cloud(cloud, T, frame="world"), rays.cloud(), T)
-        session.add_frame(T, 0.1 * frame + seed, OdometryHealth())
+        session.add_frame(T, 0.1 * (first + frame) + seed, OdometryHealth())
         session.add_rays(frame, rays, ray_grain(CONFIG.occupancy))
         if builder.full or frame == FRAMES - 1:
             session.submaps.add(builder.close())
@@ -118,6 +130,29 @@ def test_links_correct_what_a_drive_has_drifted() -> None:
     join_sessions(map_, [*_links(0, 1, TRUE[:2]), *_links(0, 2, (TRUE[0], TRUE[2]))])
     assert before > 19.15
     assert _off_m(map_, 2) < 0.12
+
+
+def test_frames_that_both_drives_have_link_them_exactly() -> None:
+    map_, behind = Map.temporary(), 12
+    later = _poses(float(behind))
+    for number, (true, first) in enumerate(((TRUE[0], 0), (later, behind))):
+        _drive(map_, true, seed=0, name=str(number), first=first)
+    map_.commit()
+    one, other = map_.sessions
+    shared = shared_frames(one, other)
+    assert shared.tolist() == [[frame + behind, frame] for frame in range(FRAMES - behind)]
+    join_new(map_, [1])
+    assert [link.loop.same_frame for link in map_.links] == [True]
+    assert np.abs(_path(map_, 1) - later[:, :3, 3]).max() < 1e-6
+    assert seen_before(map_, other) == set(range(FRAMES - behind))
+    assert not seen_before(map_, one)
+
+
+def test_frames_of_one_time_with_other_images_are_not_shared() -> None:
+    map_ = Map.temporary()
+    _drive(map_, TRUE[0], seed=0)
+    other = _drive(map_, TRUE[0], seed=0, noise=1)
+    assert not len(shared_frames(map_.session(0), other))
 
 
 def test_a_drive_that_is_linked_through_another_is_placed_too() -> None:

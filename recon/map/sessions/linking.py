@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 
 from recon.core.values.arrays import Float64
+from recon.map.sessions.shared import link_by_frame, shared_frames
 from recon.map.store.links import Link
 from recon.map.store.map import Map
 from recon.map.store.session import Session
 from recon.map.store.views import MapViews
 from recon.places.agree import agreeing_loops
 from recon.places.drift import DriftModel, path_lengths
-from recon.places.known import KnownPlaces
+from recon.places.known import KnownPlaces, KnownView
 from recon.places.verify import Loop
 
 DRIFT = DriftModel()
@@ -23,9 +24,10 @@ DRIFT = DriftModel()
 def find_links(map_: Map, new: Collection[int]) -> list[Link]:
     """Return the places that new drives of a map and the drives before them saw.
 
-    Each keyframe of a new drive is looked for among those of the others. What is recognised counts
-    only where neighbouring keyframes say the same and none of them anything else, so that streets
-    that look alike give no link.
+    Drives that have frames in common are linked by them. Besides, each keyframe of a new drive is
+    looked for among those of the others; what is recognised counts only where neighbouring
+    keyframes say the same and none of them anything else, so that streets that look alike give no
+    link.
 
     Args:
         map_: The map, with the drives that share its axes marked as linked.
@@ -53,23 +55,51 @@ def path_up_to(session: Session) -> Float64:
 
 def _between(map_: Map, group: Sequence[int], new: Session) -> list[Link]:
     """Return the links from drives that share axes to a new one."""
+    links, theirs, own = [], set(), set()
+    for number in group:
+        shared = shared_frames(map_.session(number), new).tolist()
+        if shared:
+            links.append(
+                Link((number, new.number), link_by_frame(map_.session(number), *shared[-1]))
+            )
+        theirs |= {(number, first) for first, _ in shared}
+        own |= {last for _, last in shared}
     views = MapViews(map_, group)
+    # What a frame that both have shows again is a loop of either drive alone, which knows it.
+    loops = [
+        loop for loop in _recognised(views, new, own) if _frame_of(views[loop.first]) not in theirs
+    ]
+    return links + _confirmed(loops, views, new)
+
+
+def _recognised(views: MapViews, new: Session, without: Collection[int]) -> list[Loop]:
+    """Return what keyframes of a drive show of the places of others; ``first`` is a view."""
     known = KnownPlaces(views)
-    if not len(known) or not len(new):
-        return []
     loops: list[Loop] = []
-    for stored in new.keyframes:
-        loops += known.recognise(stored.keyframe, new.camera).loops
+    if len(known):
+        for stored in new.keyframes:
+            if stored.keyframe.frame not in without:
+                loops += known.recognise(stored.keyframe, new.camera).loops
+    return loops
+
+
+def _confirmed(loops: Sequence[Loop], views: MapViews, new: Session) -> list[Link]:
+    """Return links by the loops that neighbouring ones confirm."""
     if not loops:
         return []
     path_m, poses = path_up_to(new), new.odometry.T_world_camera
     # The other drives are finished: what they drifted is corrected as far as it is known.
-    firsts = {loop.first: (known.T_world_camera[loop.first], 0.0) for loop in loops}
+    firsts = {loop.first: (views[loop.first].T_world_camera, 0.0) for loop in loops}
     lasts = {loop.last: (poses[loop.last], float(path_m[loop.last])) for loop in loops}
     return [
         Link((views[loop.first].session, new.number), _of_frames(loop, views))
         for loop in agreeing_loops(loops, firsts, lasts, DRIFT)
     ]
+
+
+def _frame_of(view: KnownView) -> tuple[int, int]:
+    """Return the drive and the frame of a view."""
+    return view.session, view.keyframe.frame
 
 
 def _of_frames(loop: Loop, views: MapViews) -> Loop:

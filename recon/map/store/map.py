@@ -18,12 +18,9 @@ from recon.map.store.records import CACHE_BYTES, Store
 from recon.map.store.session import SESSION, Session, SessionInfo
 
 if TYPE_CHECKING:
-    from recon.map.settings import DriveSettings
-    from recon.map.tiles import Tiles
-
-if TYPE_CHECKING:
     from recon.map.localize.localizer import Located
     from recon.map.settings import DriveSettings
+    from recon.map.tiles import Tiles
 
 MAP_FILE: Final = "map/map.recon"
 """Where a finished run keeps its map."""

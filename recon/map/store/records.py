@@ -196,6 +196,21 @@ class Store:
         with self._lock, self._reading():
             return self._database.execute(query, (kind, _name(key))).fetchone() is not None
 
+    def alike(self, kind: str, one: Key, other: Key) -> bool:
+        """Return whether two records of a kind are there and equal to the last bit.
+
+        Raises:
+            FormatError: The file is damaged.
+        """
+        query = (
+            "SELECT one.tree = other.tree AND one.content = other.content"
+            " FROM record AS one, record AS other"
+            " WHERE one.kind = ? AND one.key = ? AND other.kind = one.kind AND other.key = ?"
+        )
+        with self._lock, self._reading():
+            found = self._database.execute(query, (kind, _name(one), _name(other))).fetchone()
+        return found is not None and bool(found[0])
+
     def items(self, kind: str) -> Iterator[tuple[Key, dict[str, Any]]]:
         """Read the records of a kind in the order of their keys, one at a time, past the cache.
 

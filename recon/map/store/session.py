@@ -231,6 +231,15 @@ class Session:
                 places, content["sigma_m"], content["confidence"], content["count"], grain.unit_m
             ), grain
 
+    def same_rays(self, frame: int, other: Session, other_frame: int) -> bool:
+        """Return whether this drive and another of the map kept the same rays, and any at all.
+
+        Raises:
+            FormatError: The map is damaged.
+        """
+        keys = (self.number, frame), (other.number, other_frame)
+        return self._store.alike(RAYS, *keys) and len(self.rays(frame)[0].sigma_m) > 0
+
     def set_loops(self, content: Mapping[str, Any]) -> None:
         """Keep the result of loop closure.
 
