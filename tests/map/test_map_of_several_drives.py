@@ -12,6 +12,7 @@ from recon.commands.config import load_config
 from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
+from recon.core.kernels.voxels import pack_keys
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.map.ground.axes import AXES_MAP_WORLD
@@ -19,7 +20,7 @@ from recon.map.joined import join_clouds, join_voxels
 from recon.map.occupancy.rays import ray_grain, thin_rays
 from recon.map.sessions.copying import check_session, copy_sessions
 from recon.map.sessions.joining import join_new, join_sessions
-from recon.map.sessions.placed import place_map
+from recon.map.sessions.placed import PlacedSubmaps, place_map
 from recon.map.sessions.shared import seen_before, shared_frames
 from recon.map.store.links import Link
 from recon.map.store.map import Map
@@ -65,7 +66,7 @@ def _drive(
 
     Drives of one ``seed`` without other ``noise`` have the same images, from frame ``first`` on.
     """
-    session = map_.begin(SessionInfo(name, "of a test", FRAMES, CONFIG.model_dump(mode="json")))
+    session = map_.begin(SessionInfo(name, "of a test", len(true), CONFIG.model_dump(mode="json")))
     session.set_axes(T_MAP_WORLD, CAMERA)
     builder = SubmapBuilder(CONFIG.submaps, CONFIG.fusion, CONFIG.occupancy, T_MAP_WORLD)
     for frame, T_true in enumerate(true):
@@ -76,7 +77,7 @@ def _drive(
         builder.integrate(transform_cloud(cloud, T, frame="world"), rays.cloud(), T)
         session.add_frame(T, 0.1 * (first + frame) + seed, OdometryHealth())
         session.add_rays(frame, rays, ray_grain(CONFIG.occupancy))
-        if builder.full or frame == FRAMES - 1:
+        if builder.full or frame == len(true) - 1:
             session.submaps.add(builder.close())
     return session
 
@@ -146,6 +147,30 @@ def test_frames_that_both_drives_have_link_them_exactly() -> None:
     assert np.abs(_path(map_, 1) - later[:, :3, 3]).max() < 1e-6
     assert seen_before(map_, other) == set(range(FRAMES - behind))
     assert not seen_before(map_, one)
+
+
+def test_a_drive_cut_in_two_that_overlap_gives_the_voxels_of_one() -> None:
+    whole, halves = Map.temporary(), Map.temporary()
+    true = np.concatenate([TRUE[0], _poses(float(FRAMES))])
+    _drive(whole, true, seed=0)
+    _drive(halves, true[:25], seed=0, name="first")
+    _drive(halves, true[15:], seed=0, name="second", first=15)
+    for map_ in (whole, halves):
+        map_.commit()
+    join_new(halves, [1])
+    placed = PlacedSubmaps(halves, CONFIG)
+    first, second = (placed[number].occupancy for number in (0, placed.drives[0]))
+    assert len(first.rows.blocks)
+    assert not len(second.rows.blocks)  # all of its frames are the first drive's, too
+    seen = [
+        join_voxels((tile.voxels for tile in place_map(map_, CONFIG).tiles), 0.2)
+        for map_ in (whole, halves)
+    ]
+    keys = [pack_keys(voxels.keys) for voxels in seen]
+    states = [np.sign(v.log_odds[np.argsort(key)]) for v, key in zip(seen, keys, strict=True)]
+    assert np.array_equal(*map(np.sort, keys))
+    # Not to the last bit: what a later drive sees counts more than what an earlier one has.
+    assert (states[0] == states[1]).mean() > 0.99
 
 
 def test_frames_of_one_time_with_other_images_are_not_shared() -> None:

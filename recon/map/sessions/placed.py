@@ -9,6 +9,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import apply
 from recon.core.values.arrays import Bool, Float64
+from recon.map.sessions.shared import seen_before
 from recon.map.settings import DriveSettings
 from recon.map.store.finished import CastSubmaps, check_rays
 from recon.map.store.map import Map
@@ -143,7 +144,9 @@ def _beside(map_: Map, session: Session, settings: DriveSettings) -> tuple[CastS
     poses = T_world_session @ session.trajectory.T_world_camera
     T = np.repeat(T_world_session[None], len(session.submaps), axis=0)
     moves = T if corrections is None else T @ corrections
-    return CastSubmaps(session, settings, map_.first.T_map_world, poses), moves
+    # What an earlier drive has seen in the same images is no evidence of its own.
+    without = seen_before(map_, session)
+    return CastSubmaps(session, settings, map_.first.T_map_world, poses, without), moves
 
 
 def _with_gaps(parts: Sequence[np.ndarray], gap: float) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -71,12 +72,14 @@ class CastSubmaps:
         settings: How to make it.
         T_map_world: float64 (4, 4), from world to the axes of the occupancy; None = its own.
         T_world_camera: float64 (N, 4, 4), from where rays are cast; None = the path by odometry.
+        without: Frames whose rays are not cast.
     """
 
     session: Session
     settings: DriveSettings
     T_map_world: Float64 | None = None
     T_world_camera: Float64 | None = None
+    without: Collection[int] = ()
 
     def __post_init__(self) -> None:
         if self.session.submaps.frames != len(self.session):
@@ -98,7 +101,8 @@ class CastSubmaps:
         poses = session.odometry.T_world_camera if poses is None else poses
         builder = OccupancyBuilder(self.settings.occupancy, T_map_world)
         for frame in range(kept.first_frame, kept.first_frame + kept.frames):
-            builder.integrate(session.rays(frame)[0].cloud(), poses[frame])
+            if frame not in self.without:
+                builder.integrate(session.rays(frame)[0].cloud(), poses[frame])
         return replace(kept, occupancy=builder.take())
 
 
