@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
 from recon.cli.show.tables import print_json, print_run
 
 
+@opt.takes_shared
 def calibrate(
     left: Annotated[
         str,
@@ -61,12 +61,8 @@ def calibrate(
             show_default="outputs/calibrate/<UTC time stamp>",
         ),
     ] = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Calibrate a stereo rig from images of a board, predict its depth error, and judge it.
 
@@ -79,7 +75,7 @@ def calibrate(
       recon calibrate left/ right/ --board charuco:8x6:30mm:22mm:5x5_100
       recon calibrate both.mp4 --board chess:9x6:25mm
     """
-    with session(quiet=quiet):
+    with shared.session():
         from recon.commands.calibrate import run_calibration
         from recon.commands.config import load_config
         from recon.core.values.board import parse_board
@@ -90,7 +86,7 @@ def calibrate(
         chosen = [] if model is None else [f"calibration.model={model}"]
         if distance is not None:
             chosen.append(f"calibration.working_m={distance}")
-        settings = load_config(config, [*fitting, *(set_ or ()), *chosen])
+        settings = load_config(shared.config, [*fitting, *shared.changes, *chosen])
         run = run_calibration(
             left,
             right,
@@ -99,12 +95,13 @@ def calibrate(
             file=out,
             form=form,
             out=report,
-            threads=threads,
+            threads=shared.threads,
         )
-    if json:
+    if shared.json:
         print_json(run.summary)
     else:
-        print_run(run.summary | describe_depths(run.summary) | {"warnings": ()}, stages=verbose)
+        figures = run.summary | describe_depths(run.summary) | {"warnings": ()}
+        print_run(figures, stages=shared.verbose)
         for finding in run.summary["findings"]:
             typer.echo(f"{finding['severity']}: {finding['text']}")
         typer.echo(f"verdict: {run.summary['verdict']}")

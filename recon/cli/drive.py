@@ -31,7 +31,7 @@ StartInMap = Annotated[
 
 
 def open_drive(
-    request: MapRequest, settings: ReconConfig, *, quiet: bool, verbose: bool
+    request: MapRequest, settings: ReconConfig, shared: opt.Shared
 ) -> tuple[StereoSource, MapOptions]:
     """Open a drive, say how it is read, and return it with the options of its run.
 
@@ -39,22 +39,19 @@ def open_drive(
         ReconError: It cannot be opened.
     """
     drive, options = request.open(settings)
-    return drive, announced(drive, options, quiet=quiet, verbose=verbose)
+    return drive, announced(drive, options, shared)
 
 
-def announced(
-    drive: StereoSource, options: MapOptions, *, quiet: bool, verbose: bool
-) -> MapOptions:
+def announced(drive: StereoSource, options: MapOptions, shared: opt.Shared) -> MapOptions:
     """Say how a drive is read, and return the options of its run with a progress that is shown."""
     from recon.cli.show.announce import announce
-    from recon.cli.show.progress import choose_viewer
 
-    announce(drive, quiet=quiet, verbose=verbose)
-    return replace(options, progress=choose_viewer(quiet=quiet, verbose=verbose))
+    announce(drive, quiet=shared.quiet, verbose=shared.verbose)
+    return replace(options, progress=shared.viewer())
 
 
 def open_workers(
-    workers: int | None, scheduler: str | None, *, quiet: bool, verbose: bool
+    workers: int | None, scheduler: str | None, shared: opt.Shared
 ) -> BatchOptions | None:
     """Return where work is shared by several processes, shown on standard error; None = nowhere."""
     from recon.cli.show.jobs import choose_job_viewer
@@ -64,7 +61,7 @@ def open_workers(
         raise typer.BadParameter("--scheduler has workers of its own; drop --workers")
     if scheduler is None and (workers or 1) == 1:
         return None
-    viewer = choose_job_viewer(quiet=quiet, verbose=verbose)
+    viewer = choose_job_viewer(quiet=shared.quiet, verbose=shared.verbose)
     return BatchOptions(None, scheduler, workers, progress=viewer, tell=viewer.on_job)
 
 

@@ -9,10 +9,9 @@ import typer
 
 from recon.cli import options as opt
 from recon.cli.drive import open_workers
-from recon.cli.session import session
-from recon.cli.show.tables import print_json, print_run
 
 
+@opt.takes_shared
 def export(
     run: Annotated[Path, typer.Argument(help="Folder of a run of map, demo or pair.")],
     to: Annotated[
@@ -31,12 +30,8 @@ def export(
     ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Make the cloud, grid, OctoMap or mesh of a run again, with other settings or formats.
 
@@ -50,18 +45,18 @@ def export(
       recon export outputs/map/latest --to mesh --set mesh.depth=9
       recon export outputs/city --to grid,octomap --workers 4
     """
-    with session(quiet=quiet):
+    with shared.session():
         from recon.commands.config import run_settings
         from recon.commands.export import run_export
 
         cells = [] if resolution is None else [f"occupancy.resolution_m={resolution}"]
         summary = run_export(
             run,
-            run_settings(run, config, [*(set_ or ()), *cells]),
+            run_settings(run, shared.config, [*shared.changes, *cells]),
             products=[name.strip() for text in to or () for name in text.split(",")],
             formats=tuple(formats or ("ply",)),
             out=out,
-            threads=threads,
-            workers=open_workers(workers, scheduler, quiet=quiet, verbose=verbose),
+            threads=shared.threads,
+            workers=open_workers(workers, scheduler, shared),
         )
-    print_json(summary) if json else print_run(summary, stages=verbose)
+    shared.show(summary)

@@ -12,13 +12,12 @@ import typer
 from recon.cli import options as opt
 from recon.cli.drive import StartInMap, announced, open_drive, read_start
 from recon.cli.interrupt import until_interrupted
-from recon.cli.session import session
-from recon.cli.show.tables import print_json, print_run
 
 if TYPE_CHECKING:
     from recon.sources.protocol import StereoSource
 
 
+@opt.takes_shared
 def live(
     source: Annotated[
         str,
@@ -53,12 +52,8 @@ def live(
     matcher: opt.Matcher = None,
     mesh: opt.Mesh = False,
     memory_limit: opt.MemoryLimit = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Map a drive while its images arrive, from cameras or from a recording.
 
@@ -72,7 +67,7 @@ def live(
       recon live rides/today --rate 2
       recon live rides/today --map outputs/map/latest
     """
-    with session(quiet=quiet), ExitStack() as stack:
+    with shared.session(), ExitStack() as stack:
         from recon.commands.config import load_config, matching_overrides, source_overrides
         from recon.commands.live import run_live
         from recon.commands.map_options import MapOptions, MapRequest
@@ -82,19 +77,19 @@ def live(
         stopped = stack.enter_context(until_interrupted())
         pose, first = read_start(start)
         views = source_overrides(calib, left, right, tolerance, (first, end, stride))
-        overrides = [*(set_ or ()), *matching_overrides(matcher), *views]
-        settings = load_config(config, [*overrides, *memory_overrides(memory_limit)])
+        overrides = [*shared.changes, *matching_overrides(matcher), *views]
+        settings = load_config(shared.config, [*overrides, *memory_overrides(memory_limit)])
         drive: StereoSource
         if right_camera is not None or is_camera(source):
             devices = [source] if right_camera is None else [source, right_camera]
             cameras = open_camera_source(devices, settings.capture, settings.source, stopped)
             drive, options = stack.enter_context(cameras), MapOptions(mesh=mesh)
-            options = announced(drive, options, quiet=quiet, verbose=verbose)
+            options = announced(drive, options, shared)
         else:
             request = MapRequest(Path(source), kind, mesh=mesh)
-            drive, options = open_drive(request, settings, quiet=quiet, verbose=verbose)
-        options = replace(options, command="live", out=out, threads=threads)
+            drive, options = open_drive(request, settings, shared)
+        options = replace(options, command="live", out=out, threads=shared.threads)
         summary = run_live(
             drive, settings, options, rate=rate, map_path=map_, start=pose, stopped=stopped
         )
-    print_json(summary) if json else print_run(summary, stages=verbose)
+    shared.show(summary)

@@ -10,10 +10,9 @@ import typer
 
 from recon.cli import options as opt
 from recon.cli.drive import StartInMap, open_drive, read_start
-from recon.cli.session import session
-from recon.cli.show.tables import print_json, print_run
 
 
+@opt.takes_shared
 def localize(
     source: Annotated[Path, typer.Argument(help=opt.SOURCES_HELP)],
     map_: Annotated[
@@ -33,12 +32,8 @@ def localize(
     stride: opt.Stride = None,
     matcher: opt.Matcher = None,
     memory_limit: opt.MemoryLimit = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Find a drive in a map that is there already: the pose of each frame.
 
@@ -50,7 +45,7 @@ def localize(
       recon localize rides/today --map outputs/map/latest
       recon localize rides/today --map outputs/map/latest --start 12.5,-3,90
     """
-    with session(quiet=quiet):
+    with shared.session():
         from recon.commands.config import load_config, matching_overrides, source_overrides
         from recon.commands.localize import run_localize
         from recon.commands.map_options import MapRequest
@@ -58,10 +53,10 @@ def localize(
 
         pose, first = read_start(start)
         views = source_overrides(calib, left, right, tolerance, (first, end, stride))
-        overrides = [*(set_ or ()), *matching_overrides(matcher), *views]
-        settings = load_config(config, [*overrides, *memory_overrides(memory_limit)])
+        overrides = [*shared.changes, *matching_overrides(matcher), *views]
+        settings = load_config(shared.config, [*overrides, *memory_overrides(memory_limit)])
         request = MapRequest(source, kind)
-        drive, options = open_drive(request, settings, quiet=quiet, verbose=verbose)
-        options = replace(options, command="localize", out=out, threads=threads)
+        drive, options = open_drive(request, settings, shared)
+        options = replace(options, command="localize", out=out, threads=shared.threads)
         run = run_localize(drive, map_, settings, options, start=pose)
-    print_json(run.summary) if json else print_run(run.summary, stages=verbose)
+    shared.show(run.summary)

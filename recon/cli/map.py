@@ -11,10 +11,9 @@ import typer
 
 from recon.cli import options as opt
 from recon.cli.drive import open_drive, open_workers
-from recon.cli.session import session
-from recon.cli.show.tables import print_json, print_run
 
 
+@opt.takes_shared
 def map_(
     source: opt.SourceArgument = None,
     out: opt.Out = None,
@@ -67,12 +66,8 @@ def map_(
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
     memory_limit: opt.MemoryLimit = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Map a stereo drive: trajectory, point cloud, Nav2 grid, OctoMap, mesh, report.
 
@@ -95,9 +90,8 @@ def map_(
     _check_folders(source, out, resume, into, remove)
     if into is not None and (workers or scheduler) is not None:
         raise typer.BadParameter("--into maps the drive in one piece: no --workers, no --scheduler")
-    with session(quiet=quiet):
+    with shared.session():
         from recon.cli.show.announce import warn
-        from recon.cli.show.progress import choose_viewer
         from recon.commands.config import (
             load_config,
             matching_overrides,
@@ -110,30 +104,30 @@ def map_(
         from recon.commands.resume import resumed
         from recon.run.memory import memory_overrides
 
-        apart = open_workers(workers, scheduler, quiet=quiet, verbose=verbose)
+        apart = open_workers(workers, scheduler, shared)
         method = [] if odometry is None else [f"odometry.method={odometry}"]
         views = source_overrides(calib, left, right, tolerance, (start, end, stride))
-        overrides = [*(set_ or ()), *method, *matching_overrides(matcher), *views]
+        overrides = [*shared.changes, *method, *matching_overrides(matcher), *views]
         request = MapRequest(source, kind, poses, prior, mesh)
         limit = memory_overrides(memory_limit)
         if into is not None:
-            settings = run_settings(into, config, [*overrides, *limit], without=["source"])
+            settings = run_settings(into, shared.config, [*overrides, *limit], without=["source"])
         elif resume is None:
-            settings = load_config(config, [*overrides, *limit])
+            settings = load_config(shared.config, [*overrides, *limit])
         else:
-            request, settings = resumed(resume, request, config, overrides, memory_limit)
+            request, settings = resumed(resume, request, shared.config, overrides, memory_limit)
         if into is not None and remove is not None:
-            viewer = choose_viewer(quiet=quiet, verbose=verbose)
-            options = MapOptions(threads=threads, mesh=mesh, progress=viewer)
+            viewer = shared.viewer()
+            options = MapOptions(threads=shared.threads, mesh=mesh, progress=viewer)
             summary = run_remove(into, remove, settings, options)
         else:
-            drive, options = open_drive(request, settings, quiet=quiet, verbose=verbose)
-            tell = partial(warn, quiet=quiet, verbose=verbose)
+            drive, options = open_drive(request, settings, shared)
+            tell = partial(warn, quiet=shared.quiet, verbose=shared.verbose)
             going_on = resume is not None
             options = replace(
                 options,
                 out=resume or out,
-                threads=threads,
+                threads=shared.threads,
                 resume=going_on,
                 tell=tell,
                 workers=apart,
@@ -142,7 +136,7 @@ def map_(
                 summary = run_map(drive, settings, options).summary
             else:
                 summary = run_map_into(into, drive, settings, options)
-    print_json(summary) if json else print_run(summary, stages=verbose)
+    shared.show(summary)
 
 
 def _check_folders(

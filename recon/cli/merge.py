@@ -8,10 +8,9 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
-from recon.cli.show.tables import print_json, print_run
 
 
+@opt.takes_shared
 def merge(
     runs: Annotated[
         list[Path],
@@ -19,12 +18,8 @@ def merge(
     ],
     out: opt.Out = None,
     mesh: opt.Mesh = True,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Make one map of several runs: linked by places that two of them saw.
 
@@ -36,14 +31,13 @@ def merge(
       recon merge outputs/monday outputs/friday --out outputs/week
       recon merge outputs/week outputs/sunday --no-mesh
     """
-    with session(quiet=quiet):
-        from recon.cli.show.progress import choose_viewer
+    with shared.session():
         from recon.commands.config import run_settings
         from recon.commands.map_options import MapOptions
         from recon.commands.merge import run_merge
 
-        settings = run_settings(runs[0], config, set_ or ())
-        viewer = choose_viewer(quiet=quiet, verbose=verbose)
-        options = MapOptions("merge", out, threads, mesh=mesh, progress=viewer)
+        settings = run_settings(runs[0], shared.config, shared.changes)
+        viewer = shared.viewer()
+        options = MapOptions("merge", out, shared.threads, mesh=mesh, progress=viewer)
         summary = run_merge(runs, settings, options)
-    print_json(summary) if json else print_run(summary, stages=verbose)
+    shared.show(summary)

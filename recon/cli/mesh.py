@@ -8,10 +8,9 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
-from recon.cli.show.tables import print_json, print_run
 
 
+@opt.takes_shared
 def mesh(
     source: Annotated[
         Path,
@@ -22,12 +21,8 @@ def mesh(
     ],
     out: opt.Out = None,
     formats: opt.Formats = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Reconstruct a surface mesh from a PLY point cloud, or from a run of map or pair.
 
@@ -39,14 +34,14 @@ def mesh(
       recon mesh cloud.ply --format obj --format glb
       recon mesh outputs/map/latest --set mesh.target_faces=500000
     """
-    with session(quiet=quiet):
+    with shared.session():
         from recon.commands.config import PAIR_DEFAULTS, load_config
         from recon.commands.mesh import run_mesh
         from recon.run.finished import is_pair_run
 
         defaults = PAIR_DEFAULTS if source.is_dir() and is_pair_run(source) else None
-        settings = load_config(config, set_ or (), defaults)
+        settings = load_config(shared.config, shared.changes, defaults)
         summary = run_mesh(
-            source, settings, formats=tuple(formats or ("ply",)), out=out, threads=threads
+            source, settings, formats=tuple(formats or ("ply",)), out=out, threads=shared.threads
         )
-    print_json(summary) if json else print_run(summary, stages=verbose)
+    shared.show(summary)

@@ -8,10 +8,9 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
-from recon.cli.show.tables import print_json, print_run
 
 
+@opt.takes_shared
 def occupancy(
     run: Annotated[Path, typer.Argument(help="Folder of a recon map or recon demo run.")],
     out: opt.Out = None,
@@ -29,12 +28,8 @@ def occupancy(
         float | None,
         typer.Option(help="Ignore obstacles farther than this from the camera, in metres."),
     ] = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Make another Nav2 grid and OctoMap of a run: cell size, height band, range.
 
@@ -45,7 +40,7 @@ def occupancy(
       recon occupancy outputs/map/latest --resolution 0.1
       recon occupancy outputs/map/latest --min-height 0.5 --max-height 3.2
     """
-    with session(quiet=quiet):
+    with shared.session():
         from recon.commands.config import run_settings
         from recon.commands.occupancy import run_occupancy
 
@@ -56,6 +51,6 @@ def occupancy(
             "occupancy.max_range_m": max_range,
         }
         named = [f"{key}={value}" for key, value in given.items() if value is not None]
-        settings = run_settings(run, config, [*(set_ or ()), *named])
-        summary = run_occupancy(run, settings, out=out, threads=threads)
-    print_json(summary) if json else print_run(summary, stages=verbose)
+        settings = run_settings(run, shared.config, [*shared.changes, *named])
+        summary = run_occupancy(run, settings, out=out, threads=shared.threads)
+    shared.show(summary)

@@ -1,13 +1,23 @@
-"""Options shared by commands, each defined once."""
+"""Options shared by commands, each defined once; those of nearly every command as one value."""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, fields
+from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from recon.cli.session import session
+from recon.cli.show.tables import print_json, print_run
 from recon.core.errors import SettingsError
+
+if TYPE_CHECKING:
+    from recon.run.progress import Progress
 
 Out = Annotated[
     Path | None,
@@ -165,3 +175,58 @@ MemoryLimit = Annotated[
         show_default="none",
     ),
 ]
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What nearly every command takes, last in its help: settings, threads, and what is shown."""
+
+    config: Config = None
+    set_: Set = None
+    json: Json = False
+    quiet: Quiet = False
+    verbose: Verbose = False
+    threads: Threads = None
+
+    @property
+    def changes(self) -> Sequence[str]:
+        """The settings of ``--set``."""
+        return self.set_ or ()
+
+    def session(self) -> AbstractContextManager[None]:
+        """Open the session that the command works in."""
+        return session(quiet=self.quiet)
+
+    def viewer(self) -> Progress:
+        """Choose what shows the progress."""
+        from recon.cli.show.progress import choose_viewer
+
+        return choose_viewer(quiet=self.quiet, verbose=self.verbose)
+
+    def show(self, summary: Mapping[str, Any]) -> None:
+        """Print the figures of a run."""
+        print_json(summary) if self.json else print_run(summary, stages=self.verbose)
+
+
+def takes_shared(command: Callable[..., None]) -> Callable[..., None]:
+    """Let typer see the options of `Shared` one by one; the command gets them as ``shared``."""
+    own, hints = inspect.signature(command, eval_str=True), get_type_hints(Shared, None, None, True)
+    options = [
+        inspect.Parameter(
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=field.default,
+            annotation=hints[field.name],
+        )
+        for field in fields(Shared)
+    ]
+    others = [one for name, one in own.parameters.items() if name != "shared"]
+
+    @wraps(command)
+    def with_options(**given: Any) -> None:
+        shared = Shared(**{one.name: given.pop(one.name) for one in options})
+        command(**given, shared=shared)
+
+    seen: Any = with_options
+    seen.__signature__ = own.replace(parameters=[*others, *options])
+    return with_options

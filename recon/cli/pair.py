@@ -8,8 +8,6 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
-from recon.cli.show.tables import print_json, print_run
 
 Left = Annotated[Path, typer.Argument(help="Left image.")]
 Right = Annotated[Path, typer.Argument(help="Right image.")]
@@ -24,6 +22,7 @@ Ndisp = Annotated[
 _CALIB_HELP = "Calibration file: recon, KITTI, Middlebury, OpenCV, ROS CameraInfo or kalibr."
 
 
+@opt.takes_shared
 def pair(
     left: Left,
     right: Right,
@@ -73,12 +72,8 @@ def pair(
     formats: opt.Formats = None,
     matcher: opt.Matcher = None,
     ndisp: Ndisp = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Reconstruct one stereo pair: disparity, depth, point cloud, mesh, report.
 
@@ -92,13 +87,12 @@ def pair(
       recon pair im0.png im1.png --calib calib.txt --format glb
       recon pair left.png right.png --focal 721.5 --baseline 0.54
     """
-    with session(quiet=quiet):
-        from recon.cli.show.progress import choose_viewer
+    with shared.session():
         from recon.commands.config import pair_config
         from recon.commands.pair import run_pair
         from recon.sources.pair_input import KnownCamera, read_pair_input, with_truth
 
-        settings = pair_config(config, set_ or (), matcher, ndisp)
+        settings = pair_config(shared.config, shared.changes, matcher, ndisp)
         given = read_pair_input(
             left,
             right,
@@ -112,12 +106,13 @@ def pair(
             settings,
             out=out,
             formats=formats or (),
-            threads=threads,
-            progress=choose_viewer(quiet=quiet, verbose=verbose),
+            threads=shared.threads,
+            progress=shared.viewer(),
         )
-    print_json(run.summary) if json else print_run(run.summary, stages=verbose)
+    shared.show(run.summary)
 
 
+@opt.takes_shared
 def disparity(
     left: Left,
     right: Right,
@@ -128,12 +123,8 @@ def disparity(
     out: opt.Out = None,
     matcher: opt.Matcher = None,
     ndisp: Ndisp = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Compute the disparity of one pair: PFM, 16-bit PNG, confidence, reason codes.
 
@@ -143,13 +134,12 @@ def disparity(
       recon disparity left.png right.png --ndisp 128
       recon disparity raw_left.png raw_right.png --calib rig.yaml --matcher sgm
     """
-    with session(quiet=quiet):
-        from recon.cli.show.progress import choose_viewer
+    with shared.session():
         from recon.commands.config import pair_config
         from recon.commands.pair import run_disparity
         from recon.sources.pair_input import read_pair_input
 
-        settings = pair_config(config, set_ or (), matcher, ndisp)
+        settings = pair_config(shared.config, shared.changes, matcher, ndisp)
         given = read_pair_input(
             left,
             right,
@@ -157,6 +147,6 @@ def disparity(
             metres_per_unit=settings.source.metres_per_unit,
             max_megapixels=settings.readable_megapixels,
         )
-        viewer = choose_viewer(quiet=quiet, verbose=verbose)
-        run = run_disparity(given, settings, out=out, threads=threads, progress=viewer)
-    print_json(run.summary) if json else print_run(run.summary, stages=verbose)
+        viewer = shared.viewer()
+        run = run_disparity(given, settings, out=out, threads=shared.threads, progress=viewer)
+    shared.show(run.summary)

@@ -8,10 +8,9 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
-from recon.cli.show.tables import print_json, print_run
 
 
+@opt.takes_shared
 def paper(
     scenes: Annotated[
         Path | None,
@@ -25,12 +24,8 @@ def paper(
         typer.Option("--as-printed", help="Also run the method as printed, and compare the two."),
     ] = False,
     out: opt.Out = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Repeat experiments 2 to 4 of the paper that this project is based on.
 
@@ -41,14 +36,11 @@ def paper(
       recon paper MiddEval3/trainingQ
       recon paper MiddEval3/trainingQ --as-printed --out outputs/paper-as-printed
     """
-    with session(quiet=quiet):
+    with shared.session():
         from recon.commands.config import PAIR_DEFAULTS, load_config
         from recon.commands.paper import headline, run_paper
 
-        overrides = [*(set_ or ()), *(["paper.as_printed=true"] if as_printed else ())]
-        settings = load_config(config, overrides, PAIR_DEFAULTS)
-        run = run_paper(scenes, settings, out=out, threads=threads)
-    if json:
-        print_json(run.summary)
-    else:
-        print_run({**headline(run.summary), **run.summary}, stages=verbose)
+        overrides = [*shared.changes, *(["paper.as_printed=true"] if as_printed else ())]
+        settings = load_config(shared.config, overrides, PAIR_DEFAULTS)
+        run = run_paper(scenes, settings, out=out, threads=shared.threads)
+    shared.show(run.summary if shared.json else {**headline(run.summary), **run.summary})

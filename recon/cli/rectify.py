@@ -8,10 +8,9 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
-from recon.cli.show.tables import print_json, print_run
 
 
+@opt.takes_shared
 def rectify(
     left: Annotated[
         str, typer.Argument(help='Left image, folder, or pattern in quotes such as "left*.png".')
@@ -28,12 +27,8 @@ def rectify(
         float, typer.Option(min=1e-6, help="Metres per unit in an OpenCV file, e.g. 0.001 for mm.")
     ] = 1.0,
     out: opt.Out = None,
-    config: opt.Config = None,
-    set_: opt.Set = None,
-    json: opt.Json = False,
-    quiet: opt.Quiet = False,
-    verbose: opt.Verbose = False,
-    threads: opt.Threads = None,
+    *,
+    shared: opt.Shared,
 ) -> None:
     """Rectify a pair or two folders of images, with or without a calibration.
 
@@ -44,17 +39,17 @@ def rectify(
       recon rectify left/ right/ --calib rig.yaml --out rectified
       recon rectify left.png right.png
     """
-    with session(quiet=quiet):
+    with shared.session():
         from recon.commands.config import load_config
         from recon.commands.rectify import run_rectify
 
         run = run_rectify(
             left,
             right,
-            load_config(config, set_ or ()),
+            load_config(shared.config, shared.changes),
             calibration=calib,
             metres_per_unit=unit_m,
             out=out,
-            threads=threads,
+            threads=shared.threads,
         )
-    print_json(run.summary) if json else print_run(run.summary, stages=verbose)
+    shared.show(run.summary)
