@@ -17,7 +17,7 @@ from recon.map.sessions.placed import place_map
 from recon.map.store.map import MAP_FILE, Map
 from recon.report.joined_page import write_joined_page
 from recon.run.finished import open_run
-from recon.run.run import ReplacingRun, Run
+from recon.run.run import Run, WholeRun
 
 REMADE = ("occupancy", "grid", "ground", "submaps", "mesh", "memory")
 """Sections of the configuration that may differ from those of the first run."""
@@ -34,12 +34,14 @@ def make_joined(
 ) -> dict[str, Any]:
     """Fill the map of a run, link and place its drives, and make its products and its report.
 
+    The folder appears, or takes the place of an earlier run, in one step when all is done.
+
     Args:
         options: Folder, threads, mesh and progress of the run.
         settings: Its settings.
         fill: Puts the drives into its map.
         inputs: The files that are read.
-        replaced: The run whose place it takes in one step; None = it is a new one.
+        replaced: The run whose place it takes; None = it is a new one.
 
     Returns:
         The figures of ``summary.json``.
@@ -47,11 +49,10 @@ def make_joined(
     Raises:
         ReconError: A drive is damaged or does not fit, or the folder cannot be written.
     """
-    kind, out = (Run, options.out) if replaced is None else (ReplacingRun, replaced)
     with (
-        kind(
+        WholeRun(
             options.command,
-            out,
+            replaced or options.out,
             settings,
             threads=options.threads,
             progress=options.progress,

@@ -164,7 +164,13 @@ class RunDirectory:
     def _publish(self) -> None:
         if self.whole:
             self._swap()
-            return
+        else:
+            self._move()
+        if self._latest:
+            _link_latest(self.folder)
+
+    def _move(self) -> None:
+        """Move the files to their places one by one."""
         files = [Path(name) for name in self.files()]
         for stale in set(_earlier_files(self.folder)) - set(files):
             (self.folder / stale).unlink(missing_ok=True)
@@ -175,8 +181,6 @@ class RunDirectory:
         # A state that is only half removed must not be resumable.
         (state_folder(self.folder) / STARTED).unlink(missing_ok=True)
         shutil.rmtree(self._partial)
-        if self._latest:
-            _link_latest(self.folder)
 
     def _swap(self) -> None:
         """Put the new folder in the place of the old one, with files in it that are of no run."""

@@ -137,7 +137,7 @@ class Run(RunDirectory):
         }
 
 
-class ReplacingRun(Run):
-    """A run that takes the place of an earlier one in its folder in one step."""
+class WholeRun(Run):
+    """A run whose folder appears, or takes the place of an earlier one, in one step."""
 
     whole = True

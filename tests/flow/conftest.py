@@ -13,7 +13,9 @@ from recon.commands.demo import demo_source
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.sources import synthetic
+from recon.street.settings import StreetScene
 from tests.scenery.figures import leave_figures_blank
+from tests.scenery.film import RIG, Film, film
 
 SMALL_STREET = {"frames": 12, "width_px": 256, "height_px": 96, "focal_px": 150.0}
 
@@ -30,6 +32,12 @@ def streets_built_once() -> Iterator[None]:
 @pytest.fixture(scope="module", autouse=True)
 def no_figures(blank_figures: None) -> None:
     """Draw the figures of reports only where a command runs in a process of its own."""
+
+
+@pytest.fixture(scope="session")
+def street_film() -> Film:
+    """A drive whose places are recognised, rendered once."""
+    return film(StreetScene(frames=12, seed=1, **RIG))
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,25 +18,20 @@ from recon.rig.cameras import CameraSource, is_camera, open_camera_source
 from recon.rig.capture import CaptureSettings, RecordingSettings
 from recon.sources.live import LiveSource
 from recon.sources.settings import SourceSettings
-from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetScene
 from tests.commands.test_capture import FakeCamera
+from tests.scenery.film import Film
 from tests.scenery.patience import be_patient
 from tests.sources import drives
 
-STREET = StreetScene(
-    frames=10, width_px=400, height_px=150, focal_px=225.0, smooth_edges=False, seed=1
-)
 SMALL = RectifiedCamera(10.0, 5.5, 3.5, 5.5, 0.5, 12, 8)
 """Of the images of `FakeCamera`."""
 
 
 @pytest.fixture(scope="module")
-def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    street = SyntheticSource(STREET)
+def videos(street_film: Film, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("videos")
-    grey = [replace(p, left=p.left[..., 1].copy(), right=p.right[..., 1].copy()) for p in street]
-    return drives.write_two_videos(grey, street.calibration, folder)
+    grey = street_film.taken(slice(None), lambda image: image[..., 1].copy())
+    return drives.write_two_videos(grey.pairs, grey.calibration, folder)
 
 
 def _live(*words: object) -> tuple[int, str]:
@@ -46,7 +40,7 @@ def _live(*words: object) -> tuple[int, str]:
 
 
 def test_two_cameras_are_mapped(
-    videos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    videos: Path, street_film: Film, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     be_patient(monkeypatch)
     out = tmp_path / "run"
@@ -60,8 +54,8 @@ def test_two_cameras_are_mapped(
     summary = json.loads((out / "summary.json").read_text())
     path = read_tum(out / "trajectory_tum.txt")
     # The first pair gives the image size, three more warm up.
-    assert summary["frames"] == len(path) == STREET.frames - 4
-    truth = SyntheticSource(STREET).trajectory.positions_m
+    assert summary["frames"] == len(path) == len(street_film) - 4
+    truth = street_film.trajectory.positions_m
     length_m = np.linalg.norm(np.diff(truth[4:], axis=0), axis=1).sum()
     assert path.path_length_m == pytest.approx(length_m, rel=0.05)
     assert (out / "map" / "cloud.ply").stat().st_size > 10_000

@@ -18,15 +18,10 @@ from recon.map.drive.behind import MapBehind
 from recon.run.progress import Silent
 from recon.sources import live
 from recon.sources.live import LiveSource
-from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetScene
+from tests.scenery.film import Film
 from tests.scenery.patience import be_patient
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
-
-STREET = StreetScene(
-    frames=8, width_px=400, height_px=150, focal_px=225.0, smooth_edges=False, seed=1
-)
 
 
 @pytest.fixture(scope="module")
@@ -35,12 +30,12 @@ def config() -> ReconConfig:
 
 
 @pytest.fixture(scope="module")
-def street() -> SyntheticSource:
-    return SyntheticSource(STREET)
+def street(street_film: Film) -> Film:
+    return street_film.taken(slice(0, 8))
 
 
 @pytest.fixture(scope="module")
-def mapped(street: SyntheticSource, config: ReconConfig, tmp_path_factory) -> Path:
+def mapped(street: Film, config: ReconConfig, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("mapped") / "run"
     run_map(street, config, MapOptions(out=out, mesh=False, audit=False))
     return out
@@ -67,7 +62,7 @@ def _live(source, config, out: Path, **options) -> dict:
     return run_live(source, config, MapOptions("live", out, mesh=False), rate=10.0, **options)
 
 
-def _off_m(run: Path, street: SyntheticSource) -> np.ndarray:
+def _off_m(run: Path, street: Film) -> np.ndarray:
     found = read_tum(run / "trajectory_tum.txt").positions_m
     return np.linalg.norm(found - street.trajectory.positions_m, axis=1)
 

@@ -12,13 +12,9 @@ from typer.testing import CliRunner
 
 from recon.cli import app
 from recon.io.trajectory import read_tum
-from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
+from tests.scenery.film import RIG, Film, film
 from tests.scenery.kitti import write_kitti
-
-STREET = StreetScene(
-    frames=12, width_px=400, height_px=150, focal_px=225.0, smooth_edges=False, seed=1
-)
 
 
 def _run(*words: object) -> tuple[int, str]:
@@ -27,9 +23,9 @@ def _run(*words: object) -> tuple[int, str]:
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drive(street_film: Film, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("drive")
-    write_kitti(SyntheticSource(STREET), folder)
+    write_kitti(street_film, folder)
     return folder
 
 
@@ -91,7 +87,7 @@ def test_a_drive_elsewhere_ends_well_with_a_warning_and_no_pose(
     mapped: Path, tmp_path: Path
 ) -> None:
     other = tmp_path / "other"
-    write_kitti(SyntheticSource(STREET.model_copy(update={"seed": 7, "frames": 3})), other)
+    write_kitti(film(StreetScene(frames=3, seed=7, **RIG)), other)
 
     code, text = _run("localize", other, "--map", mapped, "--out", tmp_path / "found")
 

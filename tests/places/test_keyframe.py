@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
-from recon.core.values import Disparity, Reason, RectifiedPair
-from recon.places.keyframe import FEATURES, make_keyframe, words_of
+from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
+from recon.places.keyframe import FEATURES, Keyframe, make_keyframe, words_of
 from recon.places.places import WordIndex
 from tests.places.conftest import LAP
 from tests.places.test_verify import CAMERA
@@ -53,3 +54,53 @@ def test_an_image_without_texture_gives_a_keyframe_without_features():
 
     assert keyframe.uvd.shape == (0, 3)
     assert words_of(keyframe.descriptors).size == 0
+
+
+def _textured(size: tuple[int, int]) -> RectifiedPair:
+    """A wall of patches of all sizes, seen at some size (width, height)."""
+    rng = np.random.default_rng(3)
+    grey = np.zeros((400, 800))
+    for cell in (4, 8, 16, 32):
+        noise = rng.uniform(0, 255, (400 // cell, 800 // cell))
+        grey += cv2.resize(noise, (800, 400), interpolation=cv2.INTER_CUBIC)
+    image = np.clip(grey / 4, 0, 255).astype(np.uint8)
+    seen = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    camera = RectifiedCamera(400.0, 399.5, 199.5, 399.5, 0.5, 800, 400).resized(*size)
+    return RectifiedPair(seen, seen, camera)
+
+
+def _flat(pair: RectifiedPair) -> Disparity:
+    return Disparity.from_values(np.full(pair.left.shape, 20.0, np.float32))
+
+
+def _agreeing(first: Keyframe, last: Keyframe, scale: float) -> int:
+    """Count mutually best matches that lie where they should."""
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(
+        first.descriptors, last.descriptors
+    )
+    there = (first.uvd[[m.queryIdx for m in pairs], :2] + 0.5) * scale - 0.5
+    off = np.abs(last.uvd[[m.trainIdx for m in pairs], :2] - there).max(axis=1)
+    return int((off < 1.5).sum())
+
+
+def test_features_can_be_described_at_the_focal_length_of_another_camera():
+    large, small = _textured((800, 400)), _textured((400, 200))
+    known = make_keyframe(0, large, _flat(large))
+
+    as_it_is = make_keyframe(1, small, _flat(small))
+    zoomed = make_keyframe(1, small, _flat(small), focal_px=large.camera.focal_px)
+
+    assert _agreeing(known, zoomed, 0.5) > 1.5 * _agreeing(known, as_it_is, 0.5)
+    assert _agreeing(known, zoomed, 0.5) > 100
+    assert zoomed.coarse.shape == as_it_is.coarse.shape
+    assert (zoomed.uvd[:, :2] < [400, 200]).all()
+
+
+def test_nearly_the_same_focal_length_changes_nothing():
+    pair = _textured((400, 200))
+    plain = make_keyframe(0, pair, _flat(pair))
+
+    for focal_px in (0.95 * pair.camera.focal_px, 10.0 * pair.camera.focal_px):
+        near = make_keyframe(0, pair, _flat(pair), focal_px=focal_px)
+        np.testing.assert_array_equal(near.uvd, plain.uvd)
+        np.testing.assert_array_equal(near.descriptors, plain.descriptors)

@@ -13,11 +13,12 @@ from recon.io.files import StrPath
 from recon.io.images.image import write_image
 from recon.io.trajectory import write_kitti_poses
 from recon.sources.synthetic import SyntheticSource
+from tests.scenery.film import Film
 
 _BT601 = np.array([0.299, 0.587, 0.114])
 
 
-def write_kitti(source: SyntheticSource, folder: StrPath, *, grey: bool = True) -> None:
+def write_kitti(source: SyntheticSource | Film, folder: StrPath, *, grey: bool = True) -> None:
     """Write a drive as a KITTI odometry sequence.
 
     ::
