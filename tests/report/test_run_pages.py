@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +19,9 @@ from recon.map.drive.drive_loops import DriveLoops
 from recon.odometry.protocol import OdometryHealth
 from recon.places.graph import Closure
 from recon.places.verify import Loop
-from recon.report.map_page import map_content
+from recon.report.map_page import map_content, write_map_page
+from recon.report.pair_page import write_pair_page
+from recon.run.directory import RunDirectory
 from tests.report.pages import blocks, key_figures, map_html, pair_html, rows
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -109,3 +112,22 @@ def test_truth_of_another_size_gives_no_error_map(view: SimpleNamespace) -> None
     half = view.disparity.values[::2, ::2].copy()
     view.truth = DisparityTruth(half, np.isfinite(half))
     assert "Disparity error" not in blocks(pair_html(view))
+
+
+def test_drive_leaves_its_page(drive: SimpleNamespace, tmp_path: Path) -> None:
+    with RunDirectory(tmp_path / "run") as directory:
+        write_map_page(drive, directory)  # type: ignore[arg-type]
+        directory.write_json("run.json", {})
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "Map of drive &lt;1&gt;" in page
+    assert "Versions" in page
+
+
+def test_pair_leaves_its_page_and_images_in_colour(view: SimpleNamespace, tmp_path: Path) -> None:
+    with RunDirectory(tmp_path / "run") as directory:
+        write_pair_page(view, directory)  # type: ignore[arg-type]
+        directory.write_json("run.json", {})
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "Stereo pair im0.png" in page
+    assert "a warning" in page
+    assert (tmp_path / "run" / "disparity" / "disparity_colour.png").is_file()

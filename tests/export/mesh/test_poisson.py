@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import cache
 
 import numpy as np
 import pytest
@@ -37,15 +38,20 @@ def boundary_edges(mesh: TriangleMesh) -> int:
 WHOLE = MeshSettings(depth=6, trim_density_quantile=0)
 
 
+@cache
+def whole_sphere() -> TriangleMesh:
+    return reconstruct_mesh(sphere(), WHOLE)
+
+
 def test_the_mesh_of_a_sphere_lies_on_it_and_is_closed() -> None:
-    mesh = reconstruct_mesh(sphere(), WHOLE)
+    mesh = whole_sphere()
     # Cells of 2.2 m / 2^6 = 34 mm; the surface is placed far better than a cell.
     assert np.abs(radii(mesh) - 1).max() < 0.005
     assert boundary_edges(mesh) == 0
 
 
 def test_normals_and_faces_of_the_mesh_point_out() -> None:
-    mesh = reconstruct_mesh(sphere(), WHOLE)
+    mesh = whole_sphere()
     outwards = mesh.vertices - np.float32([3, 0, 5])
     assert mesh.normals is not None
     assert (np.einsum("ij,ij->i", mesh.normals, outwards) > 0.99).all()
@@ -55,7 +61,7 @@ def test_normals_and_faces_of_the_mesh_point_out() -> None:
 
 
 def test_colours_come_from_the_nearest_points() -> None:
-    mesh = reconstruct_mesh(sphere(), WHOLE)
+    mesh = whole_sphere()
     assert mesh.rgb is not None
     side = mesh.vertices[:, 0] - 3
     assert (mesh.rgb[side > 0.05] == [200, 0, 0]).all()

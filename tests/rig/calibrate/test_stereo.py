@@ -239,7 +239,9 @@ def again(views: list[View], times: int, sigma_px: float, seed: int = 9) -> list
     ]
 
 
-@pytest.mark.parametrize("fresh_px", [0.0, 0.05, 0.5])
+@pytest.mark.parametrize(
+    "fresh_px", [0.05, *(pytest.param(k, marks=pytest.mark.slow) for k in (0.0, 0.5))]
+)
 def test_views_captured_five_times_do_not_make_the_forecast_better(
     make_views, fresh_px: float
 ) -> None:

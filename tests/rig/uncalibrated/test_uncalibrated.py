@@ -21,6 +21,9 @@ SIZE = (640, 480)
 K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
 
 
+SLOW = pytest.mark.slow
+
+
 def scene(
     baseline: tuple[float, float, float] = (-0.15, 0.01, 0.02),
     turn: tuple[float, float, float] = (0.03, -0.05, 0.04),
@@ -226,8 +229,10 @@ def test_matches_of_images_made_alike_are_places_in_those_recorded() -> None:
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("reach", [0.0, 0.06, 0.12])
-@pytest.mark.parametrize("name", ["Jadeplant", "Motorcycle", "Pipes", "Teddy"])
+@pytest.mark.parametrize("reach", [0.06, *(pytest.param(k, marks=SLOW) for k in (0.0, 0.12))])
+@pytest.mark.parametrize(
+    "name", ["Motorcycle", *(pytest.param(k, marks=SLOW) for k in ("Jadeplant", "Pipes", "Teddy"))]
+)
 def test_warped_middlebury_pairs_come_back_onto_rows_by_their_truth(
     recon_data: Path, name: str, reach: float
 ) -> None:
