@@ -71,7 +71,10 @@ class Cluster:
     @property
     def workers(self) -> dict[str, Any]:
         """The workers by address, with their threads and what they declare to have."""
-        return dict(self._client.scheduler_info(n_workers=-1)["workers"])
+        try:
+            return dict(self._client.scheduler_info(n_workers=-1)["workers"])
+        except OSError as error:  # a timeout is one as well
+            raise ClusterError("the scheduler is gone", got=error) from error
 
     @property
     def at_once(self) -> int:

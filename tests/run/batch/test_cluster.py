@@ -137,6 +137,15 @@ def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPat
         join_cluster("tcp://127.0.0.1:9").__enter__()
 
 
+def test_a_scheduler_that_goes_while_it_is_asked_for_its_workers_is_one_line() -> None:
+    class Gone:
+        def scheduler_info(self, n_workers: int) -> None:
+            raise OSError("Timed out trying to connect to tcp://127.0.0.1:9 after 20 s")
+
+    with pytest.raises(ClusterError, match="the scheduler is gone"):
+        list(Cluster(Gone()).run([job("a")], Path()))
+
+
 def test_without_dask_the_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     for there in (join_cluster("tcp://127.0.0.1:9"), local_cluster(1)):
