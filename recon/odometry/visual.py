@@ -196,7 +196,10 @@ class VisualOdometry:
         self, state: VisualState, frame: OdometryFrame, predicted: Float64
     ) -> _Seen | None:
         """Return the frame, registered by matching over the whole image; None = that fails."""
-        found = match_features(state.left, frame.pair.left, _RELOCATE_FEATURES, any_scale=True)
+        # Who is in a hurry would lose more frames to SIFT than it saves.
+        found = match_features(
+            state.left, frame.pair.left, _RELOCATE_FEATURES, any_scale=not frame.rough
+        )
         uv, uv_now = found.left_uv, found.right_uv
         camera, T_world_then = frame.pair.camera, state.window.T_world_camera[-1]
         then = np.column_stack([uv, self._disparity(state.disparity, camera, uv)])

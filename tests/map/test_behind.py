@@ -19,7 +19,7 @@ CAMERA = RectifiedCamera(10.0, 8.0, 8.0, 8.0, 0.5, 16, 16)
 class Counted:
     """What a live source tells of itself."""
 
-    dropped, unmatched = 0, 0
+    unmatched = 0
 
     def leave_unmatched(self) -> None:
         self.unmatched += 1
@@ -71,18 +71,6 @@ def test_the_first_frame_is_matched_however_late_it_is() -> None:
     behind.stop()
 
     assert mapper.done == [(0, True), (1, False), (2, True)]
-
-
-def test_the_longer_frames_are_dropped_the_longer_nothing_is_matched() -> None:
-    source = Counted()
-    behind = MapBehind(source, Mapper())
-    behind.stop()
-    rests = []
-    for dropped in (0, 1, 2, 3, 3, 3, 3):
-        source.dropped = dropped
-        rests.append(behind._due_rest_s())
-
-    assert rests == [0.0, 0.25, 0.5, 0.5, 0.25, 0.0, 0.0]
 
 
 def test_what_goes_wrong_is_raised_where_frames_are_added() -> None:

@@ -18,16 +18,9 @@ from recon.run.machine import work_in_background
 from recon.sources.live import LiveSource
 from recon.stereo.frame import FrameReconstructor
 
-_MOST_WAITING: Final = 50
+_MOST_WAITING: Final = 20
 """Frames that may wait to be mapped; where more do, the next pose waits, too. So many come only
 while the disk hangs."""
-
-_REST_S: Final = 0.25
-"""How long nothing is matched after a frame was dropped: then even poses are too late. Twice as
-long if that happens again."""
-
-_LONGEST_REST_S: Final = 0.5
-"""A longer rest would leave holes in the map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +71,8 @@ class MapBehind:
     """Maps frames behind their poses, in a thread of lower priority.
 
     When a frame is done, the newest of those that wait by then is matched; the ones before it are
-    mapped unmatched, which takes no time. After frames were dropped for lack of time nothing is
-    matched for a while.
+    mapped unmatched, which takes no time. So matching gets what time poses leave, and keeps none
+    from them.
 
     Args:
         source: Where the frames come from; it counts what is not matched.
@@ -94,8 +87,6 @@ class MapBehind:
         self._busy = self._ended = False
         self._error: BaseException | None = None
         self._mapped = 0
-        self._dropped = 0
-        self._rest_s = 0.0
         self._thread = Thread(target=self._work, name="map-behind", daemon=True)
         self._thread.start()
 
@@ -147,25 +138,15 @@ class MapBehind:
                 self._news.notify_all()
 
     def _take(self) -> list[Registered]:
-        """Wait for frames, after a rest if that is due; empty = there are none any more."""
+        """Wait for frames; empty = there are none any more."""
         with self._news:
             self._busy = False
             self._news.notify_all()
-            self._news.wait_for(lambda: self._ended, self._due_rest_s())
             self._news.wait_for(lambda: self._waiting or self._ended)
             batch, self._busy = list(self._waiting), True
             self._waiting.clear()
             self._news.notify_all()
         return batch
-
-    def _due_rest_s(self) -> float:
-        """Return how long to match nothing."""
-        dropped, self._dropped = self._source.dropped - self._dropped, self._source.dropped
-        if dropped:
-            self._rest_s = min(max(_REST_S, 2 * self._rest_s), _LONGEST_REST_S)
-        else:
-            self._rest_s = self._rest_s / 2 if self._rest_s > _REST_S else 0.0
-        return self._rest_s
 
     def _map(self, registered: Registered, *, last: bool) -> None:
         # The first frame says where the ground is, and with it the axes of the map.
