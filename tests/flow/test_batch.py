@@ -43,7 +43,7 @@ class Batches:
         self.jobs = folder / "jobs.toml"
         self.jobs.write_text(JOBS + PAIR)
         for n in range(DRIVES):
-            settings = StreetSettings(frames=24, width_px=192, height_px=72, focal_px=110.0, seed=n)
+            settings = StreetSettings(frames=24, width_px=256, height_px=96, focal_px=144.0, seed=n)
             write_kitti(SyntheticSource(settings), folder / f"drive{n}")
         write_scene(folder / "scene", slanted_pair(CAMERA, 1.5, (0.1, -0.1), seed=1))
         done = subprocess.run(self.command(folder / "unbroken"), capture_output=True, check=False)

@@ -46,7 +46,7 @@ def cluster(folder: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
 def test_a_scheduler_that_is_killed_is_one_line_and_another_one_finishes(tmp_path: Path) -> None:
     drives = [tmp_path / "drive0", tmp_path / "drive1"]
     for seed, drive in enumerate(drives):
-        street = StreetSettings(frames=16, width_px=192, height_px=72, focal_px=110.0, seed=seed)
+        street = StreetSettings(frames=16, width_px=256, height_px=96, focal_px=144.0, seed=seed)
         write_kitti(SyntheticSource(street), drive)
     program, out = [sys.executable, "-m", "recon", "batch"], tmp_path / "out"
     with cluster(tmp_path / "first") as (scheduler, *workers):

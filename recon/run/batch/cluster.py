@@ -71,10 +71,8 @@ class Cluster:
     @property
     def workers(self) -> dict[str, Any]:
         """The workers by address, with their threads and what they declare to have."""
-        try:
+        with _reaching():
             return dict(self._client.scheduler_info(n_workers=-1)["workers"])
-        except OSError as error:  # a timeout is one as well
-            raise ClusterError("the scheduler is gone", got=error) from error
 
     @property
     def at_once(self) -> int:
@@ -160,7 +158,9 @@ class Cluster:
             futures.append(ended.get())
         futures = [one for one in futures if one is not None and one.key in tries]
         finished = {one.key: one for one in futures if one.status == "finished"}
-        found = self._client.gather(finished, errors="skip")  # at once: each takes a round trip
+        # At once, as each takes a round trip; that of none takes one as well.
+        with _reaching():
+            found = self._client.gather(finished, errors="skip") if finished else {}
         for one in futures:
             yield one.key, found[one.key] if one.key in found else _without_result(one)
 
@@ -285,6 +285,15 @@ def _without_result(future: Any) -> Outcome:
     if future.status != "error":
         raise ClusterError("the scheduler is gone", got=future.status)
     return Outcome("broken", f"its worker died ({type(future.exception()).__name__})")
+
+
+@contextmanager
+def _reaching() -> Iterator[None]:
+    """Say in one line that the scheduler does not answer."""
+    try:
+        yield
+    except (OSError, TimeoutError) as error:
+        raise ClusterError("the scheduler is gone", got=error) from error
 
 
 def _be_quiet() -> None:
