@@ -100,12 +100,17 @@ def measure_disparity(pair: RectifiedPair, uv: Float64, near: Float64, slope: Fl
     Returns:
         float64 (N,), pixels; NaN where nothing alike is found on that row.
     """
-    warp = np.tile(np.eye(2), (len(uv), 1, 1))
-    warp[:, 0] -= slope
-    there = find_again(pair.left, pair.right, uv, warp, uv - near[:, None] * [1.0, 0.0])
+    there = find_in_right(pair, uv, near, slope)
     with np.errstate(invalid="ignore"):
         same_row = np.abs(there[:, 1] - uv[:, 1]) <= _ROW_PX
     return np.where(same_row, uv[:, 0] - there[:, 0], np.nan)
+
+
+def find_in_right(pair: RectifiedPair, uv: Float64, near: Float64, slope: Float64) -> Float64:
+    """Return columns and rows (N, 2) of features in the right image; see `measure_disparity`."""
+    warp = np.tile(np.eye(2), (len(uv), 1, 1))
+    warp[:, 0] -= slope
+    return find_again(pair.left, pair.right, uv, warp, uv - near[:, None] * [1.0, 0.0])
 
 
 def surface_slopes(disparity: Disparity, uv: Float64) -> Float64:

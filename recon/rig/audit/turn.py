@@ -20,7 +20,7 @@ import numpy as np
 
 from recon.core.values import RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
-from recon.odometry.patches import find_again, surface_slopes
+from recon.odometry.patches import find_in_right, surface_slopes
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualOdometry
 from recon.odometry.window import TrackWindow
@@ -112,9 +112,5 @@ def _in_right(window: TrackWindow, frames: Sequence[OdometryFrame]) -> Float64:
     for k, frame in enumerate(frames[-len(window.uvd) :]):
         seen = np.isfinite(window.uvd[k, :, 2])
         uv, d = window.uvd[k, seen, :2], window.uvd[k, seen, 2]
-        slope = surface_slopes(frame.disparity, uv)
-        warp = np.tile(np.eye(2), (len(uv), 1, 1))
-        warp[:, 0] -= slope
-        guess = uv - np.column_stack([d, np.zeros(len(d))])
-        right_uv[k, seen] = find_again(frame.pair.left, frame.pair.right, uv, warp, guess)
+        right_uv[k, seen] = find_in_right(frame.pair, uv, d, surface_slopes(frame.disparity, uv))
     return right_uv
