@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
@@ -33,6 +34,9 @@ _MAX_SIGMA_M: Final = 0.15
 
 _MAX_SIGMA_DEG: Final = 1.0
 """The same of the rotation."""
+
+_SURE_SIGMA_M: Final = 0.5 * _MAX_SIGMA_M
+"""Poses that are more certain than this need not be compared with the map if time is short."""
 
 _LOST_SIGMA_M: Final = 0.05
 """Standard deviation of a motion without features, beside the drift over it."""
@@ -120,12 +124,18 @@ class Localizer:
         self._path_m = 0.0
         self._frames = 0
 
-    def add(self, frame: OdometryFrame, *, hurry: bool = False) -> Located:
-        """Locate the next frame; in a hurry, by odometry alone if its place in the map is known."""
+    def add(self, frame: OdometryFrame, *, hurried: Callable[[], bool] = lambda: False) -> Located:
+        """Locate the next frame.
+
+        Args:
+            frame: The frame.
+            hurried: Asked once odometry has moved it; if True and it is certain enough where that
+                is, the frame is not compared with the map.
+        """
         visual = self._visual.track(frame)
         self._advance(visual)
         self._frames += 1
-        if hurry and self._belief is not None:
+        if self._belief is not None and self._belief.sigma_m <= _SURE_SIGMA_M and hurried():
             return self._told(_Confirmed(self._belief, refused="no time to look at the map"))
         focal_px = self._known.focal_px
         keyframe = make_keyframe(self._frames - 1, frame.pair, frame.disparity, focal_px=focal_px)

@@ -225,10 +225,11 @@ def localize_sequence(
     begun = time.perf_counter()
     try:
         with serial_algebra():
-            for frame in look_ahead(match, source.frames(), depth=2 if live is None else 1):
+            # What is matched ahead of its turn would be old when it is located.
+            pairs = source.frames()
+            for frame in look_ahead(match, pairs) if live is None else map(match, pairs):
                 with watch.stage("localize"):
-                    hurry = live is not None and live.waits
-                    frames.append(_located(localizer, frame, len(frames), hurry=hurry))
+                    frames.append(_located(localizer, frame, len(frames), live))
                 progress.on_step(frames[-1])
                 config.memory.check(f"frame {len(frames) - 1}")
     finally:
@@ -240,10 +241,10 @@ def localize_sequence(
 
 
 def _located(
-    localizer: Localizer, frame: OdometryFrame, index: int, *, hurry: bool
+    localizer: Localizer, frame: OdometryFrame, index: int, live: LiveSource | None
 ) -> LocalizedFrame:
     begun = time.perf_counter()
-    located = localizer.add(frame, hurry=hurry)
+    located = localizer.add(frame, hurried=lambda: live is not None and live.waits)
     return LocalizedFrame(index, frame.pair.timestamp_s, time.perf_counter() - begun, located)
 
 
