@@ -30,12 +30,16 @@ SIGMA_D_PX: Final = 1.5
 """Standard deviation of a disparity; larger than that of a single match, because its error stays
 with a feature from frame to frame and does not average out."""
 
-CAUCHY_SIGMAS: Final = 0.5
+CAUCHY_SIGMAS: Final = 0.7
 """Residual at which the weight of an observation is one half: most are far smaller than the
 standard deviations, which hold for what stays with a feature; those that are not are on something
 that moves, or slide along an edge."""
 
-_MAX_SIGMAS: Final = 2.0
+_DOUBTED_SIGMAS: Final = 3.0
+"""The same where only the certainty of a pose is asked for: there an observation that fits as
+stated counts in full."""
+
+_MAX_SIGMAS: Final = 3.0
 """Residual above which an observation ends its track."""
 
 
@@ -176,7 +180,7 @@ def pose_information(window: TrackWindow, camera: RectifiedCamera) -> Float64:
     """
     usable = window.seen[-1] & (window.seen.sum(axis=0) >= 2)
     part = TrackWindow(window.T_world_camera, window.uvd[:, usable], window.xyz_world[usable])
-    normal = normal_equations(part, camera)
+    normal = _linearise(part, _model(camera)._replace(cauchy=_DOUBTED_SIGMAS))
     inverse = np.linalg.inv(normal.H_point + bundle.RIDGE * np.eye(3))
     cross = normal.H_cross[-1]
     folded = (cross @ inverse) @ cross.transpose(0, 2, 1)
