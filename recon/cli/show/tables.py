@@ -54,6 +54,8 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
     shown = {key: value for key, value in summary.items() if key != "out"}
     for group in ("live", "prior", "loops", "links", "trajectory", "map", "disparity"):
         shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
+    latency_ms = summary.get("live", {}).get("latency_ms", {})
+    shown |= {f"live.latency_ms.{key}": value for key, value in latency_ms.items()}
     for part in ("voxels", "grid"):
         figures = summary.get("occupancy", {}).get(part, {})
         shown |= {f"occupancy.{part}.{key}": value for key, value in figures.items()}
