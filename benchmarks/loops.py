@@ -37,7 +37,7 @@ from recon.map.ground.grid import flatten
 from recon.map.ground.surface import estimate_ground_surface
 from recon.odometry import Odometry, OdometryFrame, OdometryResult, make_odometry
 from recon.places.drift import DriftModel
-from recon.report.paths import grid_figure, loops_figure, seen_from_above
+from recon.report.drive_figures import grid_figure, loops_figure, seen_from_above
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from recon.street.truth import true_surface

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
+from recon.map.joined import join_clouds
 
 from recon.commands.config import ReconConfig, load_config
 from recon.core.geometry import se3
@@ -26,7 +27,6 @@ from recon.core.values import PointCloud, StereoPair
 from recon.core.values.arrays import Bool, Float64
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.fusion.builder import fusion_range_m
-from recon.map.joined import join_clouds
 from recon.map.tiles import Tiles
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
-from recon.core.values import PointCloud
+from recon.core.values import PointCloud, join_clouds
 from recon.io.models.ply import write_ply_tiles
-from recon.map.joined import join_clouds
 from recon.map.tiles import Tiles
 
 SAMPLE_POINTS: Final = 300_000

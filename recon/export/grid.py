@@ -27,9 +27,9 @@ from recon.map.ground.surface import (
 )
 from recon.map.occupancy.builder import MIN_PROBABILITY
 from recon.map.occupancy.part import OccupancyPart, free_part
+from recon.map.rectangle import Rectangle
 from recon.map.store.tile_parts import TileKey
 from recon.map.tiles import Tiles
-from recon.map.window import Window
 
 _MOST_CELLS: Final = 1_000_000_000
 """A city of 6 by 6 km at 0.2 m; each is a byte of memory and of the file."""
@@ -122,24 +122,24 @@ class _Flattening:
         self, key: TileKey, settings: GroundSettings, path: DrivenPath | None
     ) -> OccupancyGrid | None:
         """Return the grid of a tile and its margin; None without voxels or a path nearby."""
-        window = self._tiles.window(key).wider(settings.reach_m)
-        path_m = window.path(self._path_m)
+        area = self._tiles.bounds(key).wider(settings.reach_m)
+        path_m = area.path(self._path_m)
         if not len(path_m):
             return None
-        ground = estimate_ground_surface(self._ground_points(window), path_m, settings)
+        ground = estimate_ground_surface(self._ground_points(area), path_m, settings)
         passed = {} if path is None else self._passed(key, path, ground)
         voxels = self._tiles.wide_voxels(key, passed)
         return flatten(voxels, ground, self._config.grid) if len(voxels) else None
 
-    def _ground_points(self, window: Window) -> PointCloud:
+    def _ground_points(self, area: Rectangle) -> PointCloud:
         """Return points in which ground is looked for: those of the cloud, and floors of voxels."""
-        return add_floors(self._tiles.cloud_in(window), self._tiles.floors_in(window))
+        return add_floors(self._tiles.cloud_in(area), self._tiles.floors_in(area))
 
     def _passed(
         self, key: TileKey, path: DrivenPath, ground: GroundSurface
     ) -> dict[int, OccupancyPart]:
         """Return the space that the vehicle took up in a tile and its margin, by submap."""
-        path = path.select(self._tiles.window(key).wider(_MARGIN_M).contains(path.points_m))
+        path = path.select(self._tiles.bounds(key).wider(_MARGIN_M).contains(path.points_m))
         width_m = self._config.grid.vehicle_width_m
         free = log_odds(MIN_PROBABILITY)
         passed = {}
@@ -169,8 +169,8 @@ class _Flattening:
         """Return the settings with one camera height for the drive, and whether it is driven."""
         settings, heights, drops = self._config.ground, [], [np.zeros(0)]
         for key in self._crossed(0.0):
-            window = self._tiles.window(key)
-            cloud, path_m = self._ground_points(window), window.path(self._path_m)
+            area = self._tiles.bounds(key)
+            cloud, path_m = self._ground_points(area), area.path(self._path_m)
             height, along = measure_camera_height(cloud, path_m, settings)
             heights.append(height)
             drops.append(along)

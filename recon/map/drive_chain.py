@@ -5,24 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from functools import reduce
 from heapq import merge
-from itertools import groupby
+from itertools import groupby, product
 from operator import itemgetter
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.voxels import pack_keys
-from recon.core.values import OccupancyVoxels
+from recon.core.kernels.voxels import pack_keys, unpack_keys
+from recon.core.values import OccupancyVoxels, join_voxels
 from recon.core.values.grid import log_odds
-from recon.map.joined import grown_blocks, join_voxels
+from recon.map.cut import OCCUPANCY
 from recon.map.kernels.raycast import BLOCK_BITS
 from recon.map.occupancy.moving import passed_cells
 from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.store.tile_parts import TileKey, TileParts
 
-OCCUPANCY: Final = "occupancy"
-"""Kind of the parts of submaps in the tiles."""
 _PASSED: Final = "passed"
 _OLD: Final = log_odds(0.85)
 """Log-odds that count at most for a later drive: five rays of it free what was surely occupied."""
@@ -62,7 +60,7 @@ class DriveChain:
         """Make the voxels of a tile again where ``after`` the end of submaps more was observed."""
         blocks = np.unique(np.concatenate([part.rows.blocks for part in after.values()]))
         # Whether a surface crosses a voxel depends on what hit those that touch it.
-        changed, needed = grown_blocks(blocks, 1), grown_blocks(blocks, 2)
+        changed, needed = _grown(blocks, 1), _grown(blocks, 2)
         joined = _outdone(part for _, part in self._drives(key, after, needed))
         anew = joined.voxels(seen.resolution_m)
         return join_voxels(
@@ -109,3 +107,10 @@ def _in_blocks(part: OccupancyPart, blocks: NDArray[np.int64] | None) -> Occupan
 def _outdone(drives: Iterable[OccupancyPart]) -> OccupancyPart:
     """Chain what drives observed; little of the older counts for a later one."""
     return reduce(lambda old, new: join_occupancy([old, new.outdoing(_OLD)]), drives)
+
+
+def _grown(blocks: NDArray[np.int64], by: int) -> NDArray[np.int64]:
+    """Return packed blocks with those up to ``by`` blocks away from one on each axis."""
+    steps = np.array(list(product(range(-by, by + 1), repeat=3)))
+    around = unpack_keys(blocks)[:, None] + steps
+    return np.unique(pack_keys(around.reshape(-1, 3)))

@@ -67,12 +67,26 @@ class Submap:
     fused: FusedPart
     occupancy: OccupancyPart
 
-    def moved(self, motion: SubmapMotion) -> Submap:
-        """Return the submap after a correction of its pose."""
+    def moved(
+        self,
+        T_corrected_world: Float64,
+        T_map_world: Float64,
+        voxel_m: float,
+        resolution_m: float,
+    ) -> Submap:
+        """Return the submap after a correction of its pose.
+
+        Args:
+            T_corrected_world: float64 (4, 4), from the world of the odometry to the corrected one.
+            T_map_world: float64 (4, 4), from world to map axes.
+            voxel_m: Edge of a voxel of the fused cloud.
+            resolution_m: Edge of a cell of the occupancy.
+        """
+        T_corrected_map = T_map_world @ T_corrected_world @ invert(T_map_world)
         return replace(
             self,
-            fused=self.fused.moved(motion.T_corrected_world, motion.voxel_m),
-            occupancy=self.occupancy.moved(motion.T_corrected_map, motion.resolution_m),
+            fused=self.fused.moved(T_corrected_world, voxel_m),
+            occupancy=self.occupancy.moved(T_corrected_map, resolution_m),
         )
 
     def to_tree(self) -> dict[str, Any]:
@@ -95,28 +109,6 @@ class Submap:
             FusedPart.from_tree(tree["fused"]),
             OccupancyPart.from_tree(tree["occupancy"]),
         )
-
-
-@dataclass(frozen=True, eq=False)
-class SubmapMotion:
-    """A correction of a submap's pose.
-
-    Attributes:
-        T_corrected_world: float64 (4, 4), from the world of the odometry to the corrected one.
-        T_map_world: float64 (4, 4), from world to map axes.
-        voxel_m: Edge of a voxel of the fused cloud.
-        resolution_m: Edge of a cell of the occupancy.
-    """
-
-    T_corrected_world: Float64
-    T_map_world: Float64
-    voxel_m: float
-    resolution_m: float
-
-    @property
-    def T_corrected_map(self) -> Float64:
-        """The same motion in map axes."""
-        return np.asarray(self.T_map_world @ self.T_corrected_world @ invert(self.T_map_world))
 
 
 class SubmapBuilder:

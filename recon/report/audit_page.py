@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Float64
 from recon.report.audit_table import audit_lines
-from recon.report.images import disparity_figure, is_wide, pair_figure
 from recon.report.page import write_page
+from recon.report.pair_figures import disparity_figure, is_wide, pair_figure
 from recon.report.style import ESTIMATE, INK, WIDE_IN, bare_figure, show_image, styled, to_png
 from recon.rig.audit.audit import Audit
 from recon.rig.audit.sample import Look

@@ -8,8 +8,8 @@ import numpy as np
 
 from recon.core.geometry.se3 import apply
 from recon.export.joined import JoinedMap
+from recon.report.drive_figures import grid_figure, seen_from_above
 from recon.report.page import write_page
-from recon.report.paths import grid_figure, seen_from_above
 from recon.report.scene import Scene, plot_scene
 from recon.run.directory import RunDirectory
 

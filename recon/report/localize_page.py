@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from recon.map.localize.localize_run import LocalizeRun
 from recon.map.localize.localizer import State
 from recon.map.localize.sequence import LocalizedDrive
+from recon.report.drive_figures import grid_figure, path_figure, seen_from_above
 from recon.report.page import write_page
-from recon.report.paths import grid_figure, path_figure, seen_from_above
 from recon.report.style import BAD, FAINT, WIDE_IN, styled, to_png
 from recon.run.directory import RunDirectory
 

@@ -6,9 +6,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import apply
 from recon.map.drive.map_run import MapRun
-from recon.report.images import stereo_figures
-from recon.report.page import write_page
-from recon.report.paths import (
+from recon.report.drive_figures import (
     drift_figure,
     grid_figure,
     health_figure,
@@ -16,6 +14,8 @@ from recon.report.paths import (
     path_figure,
     seen_from_above,
 )
+from recon.report.page import write_page
+from recon.report.pair_figures import stereo_figures
 from recon.report.scene import Json, Scene, plot_scene
 from recon.run.directory import RunDirectory
 

@@ -14,9 +14,9 @@ from recon.evaluation.middlebury.bench import SceneResult
 from recon.io.atomic import write_text
 from recon.io.images.image import write_image
 from recon.report.colour import colour_disparity, colour_error, value_range
-from recon.report.images import ERROR_LIMIT_PX
 from recon.report.middlebury_tables import csv_table, middlebury_tables, scene_names
 from recon.report.page import write_page
+from recon.report.pair_figures import ERROR_LIMIT_PX
 from recon.report.style import FAINT, HALF_IN, styled, to_png
 from recon.report.table import Table, join
 from recon.run.directory import RunDirectory

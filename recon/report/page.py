@@ -19,7 +19,7 @@ from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from recon.io.atomic import write_text
-from recon.report.paths import timing_figure
+from recon.report.drive_figures import timing_figure
 from recon.report.table import NOT_KNOWN
 from recon.run.directory import RunDirectory
 from recon.run.machine import versions

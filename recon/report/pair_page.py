@@ -7,8 +7,8 @@ import numpy as np
 from recon.core.geometry.projection import depth_from_disparity
 from recon.io.images.image import write_image
 from recon.report.colour import colour_confidence, colour_disparity, colour_reasons
-from recon.report.images import ERROR_LIMIT_PX, error_figure, stereo_figures
 from recon.report.page import write_page
+from recon.report.pair_figures import ERROR_LIMIT_PX, error_figure, stereo_figures
 from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
 from recon.run.directory import RunDirectory
 from recon.stereo.pair_run import PairRun

@@ -29,7 +29,8 @@ from recon.evaluation.paper.result import ExperimentResult, PaperRun
 from recon.evaluation.paper.scenes import camera_of_table_1
 from recon.io.images.image import write_image
 from recon.report.colour import DISPARITY_SCALE, colour_disparity, colour_values, value_range
-from recon.report.images import (
+from recon.report.page import write_page
+from recon.report.pair_figures import (
     ERROR_LIMIT_PX,
     depth_figure,
     disparity_figure,
@@ -37,7 +38,6 @@ from recon.report.images import (
     is_wide,
     pair_figure,
 )
-from recon.report.page import write_page
 from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
 from recon.report.style import (
     BAD,

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from recon.evaluation.trajectory import TrajectoryRun
 from recon.io.atomic import write_bytes
+from recon.report.drive_figures import (
+    compared_paths_figure,
+    errors_by_length_figure,
+    pose_errors_figure,
+)
 from recon.report.page import write_page
-from recon.report.paths import compared_paths_figure, errors_by_length_figure, pose_errors_figure
 from recon.run.directory import RunDirectory
 
 

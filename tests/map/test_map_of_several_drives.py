@@ -13,10 +13,9 @@ from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.kernels.voxels import pack_keys
-from recon.core.values import PointCloud, RectifiedCamera
+from recon.core.values import PointCloud, RectifiedCamera, join_clouds, join_voxels
 from recon.core.values.arrays import Float64
 from recon.map.ground.axes import AXES_MAP_WORLD
-from recon.map.joined import join_clouds, join_voxels
 from recon.map.occupancy.rays import ray_grain, thin_rays
 from recon.map.sessions.copying import check_session, copy_sessions
 from recon.map.sessions.joining import join_new, join_sessions

@@ -10,10 +10,9 @@ import pytest
 from recon.commands.config import load_config
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import make_transform
-from recon.core.values import PointCloud
+from recon.core.values import PointCloud, join_clouds
 from recon.core.values.arrays import Bool
 from recon.map.ground.axes import AXES_MAP_WORLD
-from recon.map.joined import join_clouds
 from recon.map.occupancy.rays import thin_rays
 from recon.map.submaps import Submap, SubmapBuilder
 from recon.map.tiles import Tiles

@@ -56,8 +56,8 @@ def assert_same(made: PlacedMap, expected: PlacedMap) -> None:
         ):
             np.testing.assert_array_equal(one.keys, other.keys)
             np.testing.assert_array_equal(one.log_odds, other.log_odds)
-        window = tiles.window(tile.key)
-        np.testing.assert_array_equal(tiles.floors_in(window), others.floors_in(window))
+        bounds = tiles.bounds(tile.key)
+        np.testing.assert_array_equal(tiles.floors_in(bounds), others.floors_in(bounds))
 
 
 @pytest.mark.parametrize("workers", [1, 3])

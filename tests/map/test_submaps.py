@@ -15,7 +15,7 @@ from recon.map.fusion.part import join_fused
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
 from recon.map.occupancy.part import OccupancyPart, join_occupancy
-from recon.map.submaps import Submap, SubmapBuilder, SubmapMotion, SubmapSettings
+from recon.map.submaps import Submap, SubmapBuilder, SubmapSettings
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
 FUSION, OCCUPANCY = FusionSettings(min_count=1), OccupancySettings()
@@ -161,9 +161,9 @@ def test_the_points_of_submaps_add_up_to_those_of_the_whole_drive() -> None:
 def test_a_corrected_submap_keeps_its_wall_thin() -> None:
     [submap] = _submaps(_builder(length_m=1000.0), _noisy(_frames()))
     T = make_transform(exp_so3(np.array([0.0, 0.2, 0.0])), np.array([0.7, -0.2, 3.0]))
-    motion = SubmapMotion(T, T_MAP_WORLD, FUSION.voxel_m, OCCUPANCY.resolution_m)
-    places = _occupied(submap.moved(motion).occupancy)
-    back = apply(np.linalg.inv(motion.T_corrected_map), places)
+    moved = submap.moved(T, T_MAP_WORLD, FUSION.voxel_m, OCCUPANCY.resolution_m)
+    places = _occupied(moved.occupancy)
+    back = apply(T_MAP_WORLD @ np.linalg.inv(T) @ np.linalg.inv(T_MAP_WORLD), places)
     assert len(places) > 0.8 * len(_occupied(submap.occupancy))
     # A voxel that a plane crosses has its centre at most half a diagonal from it.
     assert (np.abs(back[:, 1] + 2.03) < 0.18).mean() > 0.99
@@ -181,7 +181,7 @@ def test_a_submap_comes_back_from_its_tree() -> None:
 def test_a_corrected_submap_has_its_points_where_the_correction_puts_them() -> None:
     [submap] = _submaps(_builder(length_m=1000.0), _frames())
     T = make_transform(exp_so3(np.array([0.0, 0.03, 0.0])), np.array([0.7, -0.2, 3.0]))
-    moved = submap.moved(SubmapMotion(T, T_MAP_WORLD, FUSION.voxel_m, OCCUPANCY.resolution_m))
+    moved = submap.moved(T, T_MAP_WORLD, FUSION.voxel_m, OCCUPANCY.resolution_m)
     before, after = (s.fused.cloud(FUSION.voxel_m, 1) for s in (submap, moved))
     assert 0.8 * len(before) < len(after) <= len(before)
     gaps = np.linalg.norm(apply(T, before.xyz)[:, None] - after.xyz[None], axis=2).min(axis=1)
@@ -197,7 +197,7 @@ def test_a_corrected_submap_has_its_points_where_the_correction_puts_them() -> N
 def test_a_corrected_submap_has_its_walls_where_the_correction_puts_them() -> None:
     [submap] = _submaps(_builder(length_m=1000.0), _frames())
     T = make_transform(np.eye(3), np.array([0.8, 0.0, 2.0]))
-    moved = submap.moved(SubmapMotion(T, T_MAP_WORLD, FUSION.voxel_m, OCCUPANCY.resolution_m))
+    moved = submap.moved(T, T_MAP_WORLD, FUSION.voxel_m, OCCUPANCY.resolution_m)
     before, after = (s.occupancy.voxels(OCCUPANCY.resolution_m) for s in (submap, moved))
     # 2 m forward and 0.8 m to the right: map x + 10 cells, y - 4 cells.
     expected = {(i + 10, j - 4, k) for i, j, k in before.keys.tolist()}

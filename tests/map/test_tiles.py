@@ -11,18 +11,17 @@ from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import FormatError
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import exp_so3, make_transform
-from recon.core.values import OccupancyVoxels, PointCloud
+from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
 from recon.core.values.arrays import Float32, Float64
 from recon.map.fusion.part import join_fused
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.ground.floor import find_floors
-from recon.map.joined import join_clouds, join_voxels
 from recon.map.occupancy.part import free_part, join_occupancy
+from recon.map.rectangle import Rectangle
 from recon.map.store.records import Store
 from recon.map.store.submaps import Submaps
 from recon.map.submaps import SubmapBuilder
 from recon.map.tiles import Tiles
-from recon.map.window import Window
 from recon.stereo.cloud.filters import filter_cloud
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
@@ -114,7 +113,7 @@ def test_what_is_observed_later_changes_a_tile_as_in_one_long_drive(store: Subma
     expected = whole.voxels(0.2)
     changed = join_voxels(
         (
-            wide.select(tiles.window(tile.key).contains(wide.centres_m))
+            wide.select(tiles.bounds(tile.key).contains(wide.centres_m))
             for tile in tiles
             for wide in [tiles.wide_voxels(tile.key, {number: free_part(hit, free)})]
         ),
@@ -126,17 +125,17 @@ def test_what_is_observed_later_changes_a_tile_as_in_one_long_drive(store: Subma
     assert (expected.log_odds < 0).sum() > (seen.log_odds < 0).sum()
 
 
-def test_a_window_has_the_points_and_voxels_of_all_tiles_below_it(store: Submaps) -> None:
+def test_a_rectangle_has_the_points_and_voxels_of_all_tiles_below_it(store: Submaps) -> None:
     tiles = _tiles(store)
     cloud, voxels = _cloud(tiles), _voxels(tiles)
-    window = Window((3.0, -4.0), (14.5, 3.0))
-    inside = window.contains(cloud.xyz)
+    rectangle = Rectangle((3.0, -4.0), (14.5, 3.0))
+    inside = rectangle.contains(cloud.xyz)
     assert 0 < inside.sum() < len(cloud)
-    assert len(tiles.cloud_in(window)) == inside.sum()
-    assert len(tiles.voxels_in(window)) == window.contains(voxels.centres_m).sum() > 0
+    assert len(tiles.cloud_in(rectangle)) == inside.sum()
+    assert len(tiles.voxels_in(rectangle)) == rectangle.contains(voxels.centres_m).sum() > 0
     floors = find_floors(voxels)
-    assert len(tiles.floors_in(window)) == window.contains(floors).sum()
-    assert len(tiles.cloud_in(Window((600.0, 600.0), (610.0, 610.0)))) == 0
+    assert len(tiles.floors_in(rectangle)) == rectangle.contains(floors).sum()
+    assert len(tiles.cloud_in(Rectangle((600.0, 600.0), (610.0, 610.0)))) == 0
 
 
 def test_points_and_voxels_that_are_put_in_come_out(store: Submaps) -> None:
@@ -164,7 +163,7 @@ def test_a_tile_without_points_takes_nothing_from_the_others() -> None:
     far = np.int32([[40, 3, 0]])
     tiles.put_voxels(OccupancyVoxels(far, np.ones(1, np.float32), tiles.resolution_m))
     assert len(tiles) == 2
-    assert tiles.cloud_in(Window((0.0, 0.0), (12.0, 6.0))).rgb is not None
+    assert tiles.cloud_in(Rectangle((0.0, 0.0), (12.0, 6.0))).rgb is not None
 
 
 def test_an_identity_for_every_submap_changes_nothing(store: Submaps) -> None:
@@ -183,9 +182,9 @@ def test_corrections_move_the_submaps_apart(store: Submaps) -> None:
     assert 0.3 < np.mean(to_right_m < 3) < 0.7
 
 
-def test_a_path_that_leaves_a_window_and_comes_back_is_in_pieces() -> None:
+def test_a_path_that_leaves_a_rectangle_and_comes_back_is_in_pieces() -> None:
     path = np.array([[-5, 1, 0], [1, 1, 0], [2, 1, 0], [12, 1, 0], [15, 1, 0], [3, 2, 0]], float)
-    inside = Window((0.0, 0.0), (10.0, 10.0)).path(path)
+    inside = Rectangle((0.0, 0.0), (10.0, 10.0)).path(path)
     gap = [np.nan] * 3
     np.testing.assert_array_equal(inside, [[1, 1, 0], [2, 1, 0], gap, [3, 2, 0]])
 

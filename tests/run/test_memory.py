@@ -14,9 +14,8 @@ from recon.commands.map_options import MapRequest
 from recon.commands.resume import resumed
 from recon.core.errors import MemoryLimitError, SettingsError
 from recon.core.geometry.se3 import make_transform
-from recon.core.values import PointCloud
+from recon.core.values import PointCloud, join_clouds, join_voxels
 from recon.map.ground.axes import AXES_MAP_WORLD
-from recon.map.joined import join_clouds, join_voxels
 from recon.map.store.records import Store
 from recon.map.store.submaps import Submaps
 from recon.map.submaps import SubmapBuilder

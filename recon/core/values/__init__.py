@@ -11,9 +11,16 @@ from recon.core.values.camera import (
     check_unsized,
     other_size,
 )
-from recon.core.values.cloud import Frame, PointCloud
+from recon.core.values.cloud import Frame, PointCloud, join_clouds
 from recon.core.values.disparity import Disparity, Reason
-from recon.core.values.grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
+from recon.core.values.grid import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    OccupancyGrid,
+    OccupancyVoxels,
+    join_voxels,
+)
 from recon.core.values.image import RectifiedPair, StereoPair
 from recon.core.values.mesh import TriangleMesh
 from recon.core.values.metrics import (
@@ -65,5 +72,7 @@ __all__ = [
     "VoxelMetrics",
     "check_size",
     "check_unsized",
+    "join_clouds",
+    "join_voxels",
     "other_size",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
@@ -66,3 +67,18 @@ class PointCloud:
             if isinstance(getattr(self, field.name), np.ndarray)
         }
         return replace(self, **arrays)
+
+
+def join_clouds(clouds: Iterable[PointCloud], frame: Frame = "map") -> PointCloud:
+    """Concatenate clouds of one frame; attributes that one with points lacks are dropped."""
+    parts = [cloud for cloud in clouds if len(cloud)]
+    if not parts:
+        return PointCloud(np.zeros((0, 3), np.float32), frame=frame)
+    names = [field.name for field in fields(PointCloud) if field.name != "frame"]
+    columns = {name: [getattr(cloud, name) for cloud in parts] for name in names}
+    shared = {
+        name: np.concatenate(arrays)
+        for name, arrays in columns.items()
+        if all(array is not None for array in arrays)
+    }
+    return PointCloud(**shared, frame=frame)

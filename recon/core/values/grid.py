@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -55,6 +56,15 @@ class OccupancyVoxels:
     def centres_m(self) -> Float64:
         """float64 (N, 3), centres of the voxels, map axes."""
         return (self.keys.astype(np.float64) + 0.5) * self.resolution_m
+
+
+def join_voxels(parts: Iterable[OccupancyVoxels], resolution_m: float) -> OccupancyVoxels:
+    """Concatenate voxels of one resolution; none is in two parts."""
+    keys, log_odds = [np.zeros((0, 3), np.int32)], [np.zeros(0, np.float32)]
+    for part in parts:
+        keys.append(part.keys)
+        log_odds.append(part.log_odds)
+    return OccupancyVoxels(np.concatenate(keys), np.concatenate(log_odds), resolution_m)
 
 
 @dataclass(frozen=True, eq=False)

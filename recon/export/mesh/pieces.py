@@ -24,8 +24,8 @@ from recon.export.mesh import (
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.map.occupancy.free_space import looked_through
+from recon.map.rectangle import Rectangle
 from recon.map.tiles import Tiles
-from recon.map.window import Window
 from recon.run.directory import RunDirectory
 from recon.run.lookahead import side_by_side
 from recon.run.machine import available_cores
@@ -184,7 +184,7 @@ class _Mesher:
 
     def _cut(self, key: PieceKey) -> TriangleMesh:
         """Return the surface of a piece with its margin, cut at the sides of the piece."""
-        wide = self._window(key).wider(_OVERLAP_M)
+        wide = self._bounds(key).wider(_OVERLAP_M)
         cloud = self.tiles.cloud_in(wide)
         wrong = None
         if self.settings.free_space:
@@ -220,14 +220,14 @@ class _Mesher:
                 self.borders[key, plane] = open_edges(mesh, plane)
         return mesh
 
-    def _window(self, key: PieceKey) -> Window:
+    def _bounds(self, key: PieceKey) -> Rectangle:
         """Return the bounds of a piece."""
         (x, y), edge_m = key, self.settings.tile_m
-        return Window(
+        return Rectangle(
             (x * edge_m - edge_m / 2, y * edge_m - edge_m / 2),
             (x * edge_m + edge_m / 2, y * edge_m + edge_m / 2),
         )
 
     def _plane(self, key: PieceKey, axis: int, far: int) -> Plane:
-        window = self._window(key)
-        return Plane(axis, (window.high if far else window.low)[axis])
+        sides = self._bounds(key)
+        return Plane(axis, (sides.high if far else sides.low)[axis])

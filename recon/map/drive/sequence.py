@@ -17,13 +17,14 @@ from recon.core.values import (
     PointCloud,
     RectifiedCamera,
     Trajectory,
+    join_clouds,
+    join_voxels,
 )
 from recon.core.values.arrays import Bool, Float64
 from recon.map.drive.drive import Drive
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.mapper import Mapper
 from recon.map.drive.workspace import Workspace
-from recon.map.joined import join_clouds, join_voxels
 from recon.map.settings import DriveSettings
 from recon.map.store.submaps import Submaps
 from recon.map.tiles import Tiles

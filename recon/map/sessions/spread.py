@@ -16,10 +16,11 @@ from typing import Any, Final
 
 from recon.core.errors import MappingError
 from recon.core.values.arrays import Float64
+from recon.map.cut import Cutter
 from recon.map.sessions.placed import PlacedMap, PlacedSubmaps, with_path
 from recon.map.settings import DriveSettings
 from recon.map.store.map import Map
-from recon.map.store.tile_parts import TileKey
+from recon.map.store.tile_parts import TileKey, TileParts
 from recon.map.tiles import Tiles
 
 Each = Callable[[Callable[[Any], None], Sequence[Any]], None]
@@ -123,14 +124,16 @@ def cut_submaps(task: SubmapTask) -> None:
     with closing(Map.open(task.map)) as map_:
         placed = PlacedSubmaps(map_, task.settings)
         T = placed.corrections
-        tiles = Tiles(task.settings, map_.first.T_map_world, task.halvings, task.file)
-        cut = tiles.cut(
+        cutter = Cutter(task.settings, map_.first.T_map_world, task.halvings)
+        parts = TileParts(cutter.edge_m, task.file)
+        cut = cutter.cut(
             (placed[number] for number in task.numbers),
+            parts,
             None if T is None else T[task.numbers.start : task.numbers.stop],
             first=task.numbers.start,
             fuse=False,
         )
-        tiles.save(cut)
+        parts.save(cut.to_tree())
 
 
 def make_voxels(task: TileTask) -> None:

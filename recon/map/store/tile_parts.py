@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.values.arrays import Bool
+from recon.map.rectangle import Rectangle
 from recon.map.store.records import Store
-from recon.map.window import Window
 
 _NOTE: Final = "note"
 TileKey = tuple[int, int]
@@ -45,10 +45,10 @@ class TileParts:
         """The tiles in which there is something, in the order in which they were begun."""
         return list(self._keys)
 
-    def window(self, key: TileKey) -> Window:
+    def bounds(self, key: TileKey) -> Rectangle:
         """Return the bounds of a tile."""
-        (column, row), edge_m = key, self.edge_m
-        return Window((column * edge_m, row * edge_m), ((column + 1) * edge_m, (row + 1) * edge_m))
+        (x, y), edge_m = key, self.edge_m
+        return Rectangle((x * edge_m, y * edge_m), ((x + 1) * edge_m, (y + 1) * edge_m))
 
     def near(
         self, places_m: NDArray[np.floating[Any]], margin_m: float
@@ -61,14 +61,14 @@ class TileParts:
         steps = range(-reach, reach + 1)
         found = {(x + i, y + j) for x, y, _ in homes.tolist() for i, j in product(steps, repeat=2)}
         for key in sorted(found):
-            inside = self.window(key).wider(margin_m).contains(places_m)
+            inside = self.bounds(key).wider(margin_m).contains(places_m)
             if inside.any():
                 yield key, inside
 
-    def under(self, window: Window) -> list[TileKey]:
-        """Return the tiles that a window touches and in which there is something."""
-        low = np.floor(np.array(window.low) / self.edge_m).astype(int).tolist()
-        high = np.floor(np.array(window.high) / self.edge_m).astype(int).tolist()
+    def under(self, rectangle: Rectangle) -> list[TileKey]:
+        """Return the tiles that a rectangle touches and in which there is something."""
+        low = np.floor(np.array(rectangle.low) / self.edge_m).astype(int).tolist()
+        high = np.floor(np.array(rectangle.high) / self.edge_m).astype(int).tolist()
         columns, rows = (range(a, b + 1) for a, b in zip(low, high, strict=True))
         return [key for key in product(columns, rows) if key in self._keys]
 

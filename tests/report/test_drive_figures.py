@@ -7,7 +7,7 @@ import pytest
 from recon.core.values import OccupancyGrid, Trajectory
 from recon.core.values.arrays import Float64
 from recon.odometry.protocol import OdometryHealth
-from recon.report.paths import (
+from recon.report.drive_figures import (
     drift_figure,
     grid_figure,
     health_figure,

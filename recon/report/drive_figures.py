@@ -17,7 +17,7 @@ from recon.core.values.arrays import Float64
 from recon.evaluation.trajectory import TrajectoryComparison
 from recon.odometry.protocol import OdometryHealth
 from recon.report.colour import GRID_FREE, GRID_OCCUPIED, GRID_UNKNOWN, colour_grid, unit_colour
-from recon.report.images import colour_key
+from recon.report.pair_figures import colour_key
 from recon.report.style import (
     BAD,
     ESTIMATE,
