@@ -8,10 +8,12 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
+from recon.cli.drive import SourceOptions, Start
 from recon.cli.session import session
 from recon.cli.show.tables import print_figures, print_json
 
 
+@opt.takes_groups
 def audit(
     source: Annotated[Path, typer.Argument(help=opt.SOURCES_HELP)],
     mend: Annotated[
@@ -22,19 +24,14 @@ def audit(
         Path | None,
         typer.Option("--out", "-o", help="Folder for a report with images.", show_default="none"),
     ] = None,
-    kind: opt.SourceKind = None,
-    calib: opt.Calib = None,
-    left: opt.LeftView = None,
-    right: opt.RightView = None,
-    tolerance: opt.Tolerance = None,
-    start: opt.Start = None,
-    end: opt.End = None,
-    stride: opt.Stride = None,
+    start: Start = None,
     config: opt.Config = None,
     set_: opt.Set = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
     verbose: opt.Verbose = False,
+    *,
+    reading: SourceOptions,
 ) -> None:
     """Check a recording before a long run: good, usable or not usable, and why.
 
@@ -51,13 +48,12 @@ def audit(
     with session(quiet=quiet):
         from recon.cli.show.announce import announce
         from recon.commands.audit import run_audit
-        from recon.commands.config import load_config, source_overrides
+        from recon.commands.config import load_config
         from recon.report.audit_table import audit_lines
         from recon.sources.registry import open_source
 
-        asked = source_overrides(calib, left, right, tolerance, (start, end, stride))
-        settings = load_config(config, [*(set_ or ()), *asked])
-        drive = open_source(source, kind, settings.source)
+        settings = load_config(config, [*(set_ or ()), *reading.overrides(start)])
+        drive = open_source(source, reading.kind, settings.source)
         announce(drive, quiet=quiet, verbose=verbose)
         found = run_audit(drive, settings, mend=mend, out=out)
     if json:

@@ -11,7 +11,7 @@ from recon.cli import options as opt
 from recon.cli.show.tables import print_json, print_run
 
 
-@opt.takes_shared
+@opt.takes_groups
 def calibrate(
     left: Annotated[
         str,
@@ -76,7 +76,7 @@ def calibrate(
       recon calibrate both.mp4 --board chess:9x6:25mm
     """
     with shared.session():
-        from recon.commands.calibrate import run_calibration
+        from recon.commands.calibrate import run_calibrate
         from recon.commands.config import load_config
         from recon.core.values.board import parse_board
         from recon.rig.calibrate.summary import describe_depths
@@ -87,7 +87,7 @@ def calibrate(
         if distance is not None:
             chosen.append(f"calibration.working_m={distance}")
         settings = load_config(shared.config, [*fitting, *shared.changes, *chosen])
-        run = run_calibration(
+        run = run_calibrate(
             left,
             right,
             parse_board(board),

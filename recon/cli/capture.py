@@ -47,8 +47,9 @@ def capture(
       recon capture /dev/video4 --out rides/today --set capture.suffix=jpg
     """
     with session(quiet=quiet):
+        from recon.cli.overrides import capture_overrides
         from recon.commands.capture import run_capture
-        from recon.commands.config import capture_overrides, load_config
+        from recon.commands.config import load_config
         from recon.rig.capture import RecordingSettings
 
         known = load_config(config, [*(set_ or ()), *capture_overrides(size, rate)]).capture

@@ -9,7 +9,7 @@ import typer
 from recon.cli import options as opt
 
 
-@opt.takes_shared
+@opt.takes_groups
 def demo(
     out: opt.Out = None,
     frames: Annotated[

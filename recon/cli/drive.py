@@ -1,9 +1,11 @@
-"""What commands that take a drive share: how it is opened, and where it begins in a map."""
+"""What commands that take a drive share: how it is read, opened, and where it begins in a map."""
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from recon.run.batch.work import BatchOptions
     from recon.sources.protocol import StereoSource
 
+Start = Annotated[int | None, typer.Option("--start", help="First frame to use.", show_default="0")]
 StartInMap = Annotated[
     str | None,
     typer.Option(
@@ -28,6 +31,100 @@ StartInMap = Annotated[
         show_default="anywhere in the map, frame 0",
     ),
 ]
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """How the pairs of a source are found, where its files leave that open."""
+
+    kind: Annotated[
+        str | None,
+        typer.Option(
+            "--source",
+            help="Kind of source: kitti, kitti-raw, euroc, tum, folders, video, bag or middlebury.",
+            show_default="detected from its files",
+        ),
+    ] = None
+    calib: Annotated[
+        Path | None,
+        typer.Option(help="Calibration file.", show_default="the one that comes with the source"),
+    ] = None
+    left: Annotated[
+        str | None, typer.Option(help="Left image folder or topic.", show_default="found by name")
+    ] = None
+    right: Annotated[
+        str | None,
+        typer.Option(
+            help="Right image folder or topic, or the right video where SOURCE is the left one.",
+            show_default="found by name",
+        ),
+    ] = None
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            help="Largest difference between the time stamps of a pair, in seconds.",
+            show_default="0.01",
+        ),
+    ] = None
+    end: Annotated[
+        int | None, typer.Option(help="Frame at which to stop.", show_default="after the last")
+    ] = None
+    stride: Annotated[
+        int | None, typer.Option(help="Use every so many frames.", show_default="1")
+    ] = None
+
+    def overrides(self, start: int | None) -> list[str]:
+        """Return the settings that they stand for.
+
+        Args:
+            start: First frame to use; None = unchanged, like the options.
+        """
+        given = {
+            "calibration": None if self.calib is None else str(self.calib),
+            "left": self.left,
+            "right": self.right,
+            "tolerance_s": self.tolerance,
+            "start": start,
+            "end": self.end,
+            "stride": self.stride,
+        }
+        # Quoted, since a topic or folder may be named 0 or null.
+        return [
+            f"source.{key}={json.dumps(value)}" for key, value in given.items() if value is not None
+        ]
+
+
+@dataclass(frozen=True)
+class DriveOptions(SourceOptions):
+    """How a drive is read and matched, and how much memory that may take."""
+
+    matcher: opt.Matcher = None
+    memory_limit: Annotated[
+        str | None,
+        typer.Option(
+            help="Memory limit of the process, e.g. 2G or 1500M. A run that exceeds it stops and "
+            "can be resumed.",
+            show_default="none",
+        ),
+    ] = None
+
+    def overrides(self, start: int | None) -> list[str]:
+        """Return the settings that all but the memory limit stand for; see `SourceOptions`."""
+        from recon.cli.overrides import matching_overrides
+
+        return [*matching_overrides(self.matcher), *super().overrides(start)]
+
+    def settings(self, shared: opt.Shared, start: int | None) -> ReconConfig:
+        """Return the configuration of a command.
+
+        Raises:
+            SettingsError: An option or a setting is invalid.
+        """
+        from recon.commands.config import load_config
+        from recon.run.memory import memory_overrides
+
+        limit = memory_overrides(self.memory_limit)
+        return load_config(shared.config, [*shared.changes, *self.overrides(start), *limit])
 
 
 def open_drive(

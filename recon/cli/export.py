@@ -11,7 +11,7 @@ from recon.cli import options as opt
 from recon.cli.drive import open_workers
 
 
-@opt.takes_shared
+@opt.takes_groups
 def export(
     run: Annotated[Path, typer.Argument(help="Folder of a run of map, demo or pair.")],
     to: Annotated[

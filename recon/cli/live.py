@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.drive import StartInMap, announced, open_drive, read_start
+from recon.cli.drive import DriveOptions, StartInMap, announced, open_drive, read_start
 from recon.cli.interrupt import until_interrupted
 
 if TYPE_CHECKING:
     from recon.sources.protocol import StereoSource
 
 
-@opt.takes_shared
+@opt.takes_groups
 def live(
     source: Annotated[
         str,
@@ -41,18 +41,10 @@ def live(
         ),
     ] = None,
     out: opt.Out = None,
-    kind: opt.SourceKind = None,
-    calib: opt.Calib = None,
-    left: opt.LeftView = None,
-    right: opt.RightView = None,
-    tolerance: opt.Tolerance = None,
     start: StartInMap = None,
-    end: opt.End = None,
-    stride: opt.Stride = None,
-    matcher: opt.Matcher = None,
     mesh: opt.Mesh = False,
-    memory_limit: opt.MemoryLimit = None,
     *,
+    reading: DriveOptions,
     shared: opt.Shared,
 ) -> None:
     """Map a drive while its images arrive, from cameras or from a recording.
@@ -68,17 +60,13 @@ def live(
       recon live rides/today --map outputs/map/latest
     """
     with shared.session(), ExitStack() as stack:
-        from recon.commands.config import load_config, matching_overrides, source_overrides
         from recon.commands.live import run_live
         from recon.commands.map_options import MapOptions, MapRequest
         from recon.rig.cameras import is_camera, open_camera_source
-        from recon.run.memory import memory_overrides
 
         stopped = stack.enter_context(until_interrupted())
         pose, first = read_start(start)
-        views = source_overrides(calib, left, right, tolerance, (first, end, stride))
-        overrides = [*shared.changes, *matching_overrides(matcher), *views]
-        settings = load_config(shared.config, [*overrides, *memory_overrides(memory_limit)])
+        settings = reading.settings(shared, first)
         drive: StereoSource
         if right_camera is not None or is_camera(source):
             devices = [source] if right_camera is None else [source, right_camera]
@@ -86,7 +74,7 @@ def live(
             drive, options = stack.enter_context(cameras), MapOptions(mesh=mesh)
             options = announced(drive, options, shared)
         else:
-            request = MapRequest(Path(source), kind, mesh=mesh)
+            request = MapRequest(Path(source), reading.kind, mesh=mesh)
             drive, options = open_drive(request, settings, shared)
         options = replace(options, command="live", out=out, threads=shared.threads)
         summary = run_live(

@@ -9,10 +9,10 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.drive import StartInMap, open_drive, read_start
+from recon.cli.drive import DriveOptions, StartInMap, open_drive, read_start
 
 
-@opt.takes_shared
+@opt.takes_groups
 def localize(
     source: Annotated[Path, typer.Argument(help=opt.SOURCES_HELP)],
     map_: Annotated[
@@ -22,17 +22,9 @@ def localize(
         ),
     ],
     out: opt.Out = None,
-    kind: opt.SourceKind = None,
-    calib: opt.Calib = None,
-    left: opt.LeftView = None,
-    right: opt.RightView = None,
-    tolerance: opt.Tolerance = None,
     start: StartInMap = None,
-    end: opt.End = None,
-    stride: opt.Stride = None,
-    matcher: opt.Matcher = None,
-    memory_limit: opt.MemoryLimit = None,
     *,
+    reading: DriveOptions,
     shared: opt.Shared,
 ) -> None:
     """Find a drive in a map that is there already: the pose of each frame.
@@ -46,16 +38,12 @@ def localize(
       recon localize rides/today --map outputs/map/latest --start 12.5,-3,90
     """
     with shared.session():
-        from recon.commands.config import load_config, matching_overrides, source_overrides
         from recon.commands.localize import run_localize
         from recon.commands.map_options import MapRequest
-        from recon.run.memory import memory_overrides
 
         pose, first = read_start(start)
-        views = source_overrides(calib, left, right, tolerance, (first, end, stride))
-        overrides = [*shared.changes, *matching_overrides(matcher), *views]
-        settings = load_config(shared.config, [*overrides, *memory_overrides(memory_limit)])
-        request = MapRequest(source, kind)
+        settings = reading.settings(shared, first)
+        request = MapRequest(source, reading.kind)
         drive, options = open_drive(request, settings, shared)
         options = replace(options, command="localize", out=out, threads=shared.threads)
         run = run_localize(drive, map_, settings, options, start=pose)

@@ -10,21 +10,14 @@ from typing import Annotated, Literal
 import typer
 
 from recon.cli import options as opt
-from recon.cli.drive import open_drive, open_workers
+from recon.cli.drive import DriveOptions, Start, open_drive, open_workers
 
 
-@opt.takes_shared
+@opt.takes_groups
 def map_(
-    source: opt.SourceArgument = None,
+    source: Annotated[Path | None, typer.Argument(help=opt.SOURCES_HELP)] = None,
     out: opt.Out = None,
-    kind: opt.SourceKind = None,
-    calib: opt.Calib = None,
-    left: opt.LeftView = None,
-    right: opt.RightView = None,
-    tolerance: opt.Tolerance = None,
-    start: opt.Start = None,
-    end: opt.End = None,
-    stride: opt.Stride = None,
+    start: Start = None,
     odometry: Annotated[
         Literal["fused", "visual", "kiss"] | None,
         typer.Option(
@@ -44,7 +37,6 @@ def map_(
             "file on the clock of the images, or a topic of the bag, such as /odom.",
         ),
     ] = None,
-    matcher: opt.Matcher = None,
     mesh: opt.Mesh = True,
     resume: Annotated[
         Path | None,
@@ -65,8 +57,8 @@ def map_(
     ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
-    memory_limit: opt.MemoryLimit = None,
     *,
+    reading: DriveOptions,
     shared: opt.Shared,
 ) -> None:
     """Map a stereo drive: trajectory, point cloud, Nav2 grid, OctoMap, mesh, report.
@@ -92,44 +84,37 @@ def map_(
         raise typer.BadParameter("--into maps the drive in one piece: no --workers, no --scheduler")
     with shared.session():
         from recon.cli.show.announce import warn
-        from recon.commands.config import (
-            load_config,
-            matching_overrides,
-            run_settings,
-            source_overrides,
-        )
+        from recon.commands.config import load_config, run_settings
         from recon.commands.map import run_map
         from recon.commands.map_options import MapOptions, MapRequest
         from recon.commands.merge import run_map_into, run_remove
         from recon.commands.resume import resumed
         from recon.run.memory import memory_overrides
 
-        apart = open_workers(workers, scheduler, shared)
+        request = MapRequest(source, reading.kind, poses, prior, mesh)
         method = [] if odometry is None else [f"odometry.method={odometry}"]
-        views = source_overrides(calib, left, right, tolerance, (start, end, stride))
-        overrides = [*shared.changes, *method, *matching_overrides(matcher), *views]
-        request = MapRequest(source, kind, poses, prior, mesh)
-        limit = memory_overrides(memory_limit)
-        if into is not None:
-            settings = run_settings(into, shared.config, [*overrides, *limit], without=["source"])
-        elif resume is None:
-            settings = load_config(shared.config, [*overrides, *limit])
+        changes = [*shared.changes, *method, *reading.overrides(start)]
+        if resume is not None:
+            limit = reading.memory_limit
+            request, settings = resumed(resume, request, shared.config, changes, limit)
         else:
-            request, settings = resumed(resume, request, shared.config, overrides, memory_limit)
+            changes += memory_overrides(reading.memory_limit)
+            if into is None:
+                settings = load_config(shared.config, changes)
+            else:
+                settings = run_settings(into, shared.config, changes, without=["source"])
         if into is not None and remove is not None:
-            viewer = shared.viewer()
-            options = MapOptions(threads=shared.threads, mesh=mesh, progress=viewer)
+            options = MapOptions(threads=shared.threads, mesh=mesh, progress=shared.viewer())
             summary = run_remove(into, remove, settings, options)
         else:
+            apart = open_workers(workers, scheduler, shared)
             drive, options = open_drive(request, settings, shared)
-            tell = partial(warn, quiet=shared.quiet, verbose=shared.verbose)
-            going_on = resume is not None
             options = replace(
                 options,
                 out=resume or out,
                 threads=shared.threads,
-                resume=going_on,
-                tell=tell,
+                resume=resume is not None,
+                tell=partial(warn, quiet=shared.quiet, verbose=shared.verbose),
                 workers=apart,
             )
             if into is None:

@@ -10,7 +10,7 @@ import typer
 from recon.cli import options as opt
 
 
-@opt.takes_shared
+@opt.takes_groups
 def occupancy(
     run: Annotated[Path, typer.Argument(help="Folder of a recon map or recon demo run.")],
     out: opt.Out = None,

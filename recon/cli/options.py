@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -101,53 +101,6 @@ SOURCES_HELP = (
     "ROS bag, MCAP file, or Middlebury scene."
 )
 SourceArgument = Annotated[Path | None, typer.Argument(help=SOURCES_HELP)]
-SourceKind = Annotated[
-    str | None,
-    typer.Option(
-        "--source",
-        help="Kind of source: kitti, kitti-raw, euroc, tum, folders, video, bag or middlebury.",
-        show_default="detected from its files",
-    ),
-]
-Calib = Annotated[
-    Path | None,
-    typer.Option(
-        "--calib", help="Calibration file.", show_default="the one that comes with the source"
-    ),
-]
-LeftView = Annotated[
-    str | None,
-    typer.Option("--left", help="Left image folder or topic.", show_default="found by name"),
-]
-RightView = Annotated[
-    str | None,
-    typer.Option(
-        "--right",
-        help="Right image folder or topic, or the right video where SOURCE is the left one.",
-        show_default="found by name",
-    ),
-]
-Tolerance = Annotated[
-    float | None,
-    typer.Option(
-        "--tolerance",
-        help="Largest difference between the time stamps of a pair, in seconds.",
-        show_default="0.01",
-    ),
-]
-
-Start = Annotated[
-    int | None,
-    typer.Option("--start", help="First frame to use.", show_default="0"),
-]
-End = Annotated[
-    int | None,
-    typer.Option("--end", help="Frame at which to stop.", show_default="after the last"),
-]
-Stride = Annotated[
-    int | None,
-    typer.Option("--stride", help="Use every so many frames.", show_default="1"),
-]
 
 
 def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:
@@ -164,17 +117,6 @@ def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:
         raise SettingsError(
             "not numbers separated by commas", where=option, got=text, expected="0.1,0.2,0.5"
         ) from error
-
-
-MemoryLimit = Annotated[
-    str | None,
-    typer.Option(
-        "--memory-limit",
-        help="Memory limit of the process, e.g. 2G or 1500M. A run that exceeds it stops and can "
-        "be resumed.",
-        show_default="none",
-    ),
-]
 
 
 @dataclass(frozen=True)
@@ -208,25 +150,28 @@ class Shared:
         print_json(summary) if self.json else print_run(summary, stages=self.verbose)
 
 
-def takes_shared(command: Callable[..., None]) -> Callable[..., None]:
-    """Let typer see the options of `Shared` one by one; the command gets them as ``shared``."""
-    own, hints = inspect.signature(command, eval_str=True), get_type_hints(Shared, None, None, True)
-    options = [
-        inspect.Parameter(
-            field.name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=field.default,
-            annotation=hints[field.name],
-        )
-        for field in fields(Shared)
-    ]
-    others = [one for name, one in own.parameters.items() if name != "shared"]
+def takes_groups(command: Callable[..., None]) -> Callable[..., None]:
+    """Let typer see the options of groups, such as `Shared`, one by one.
+
+    The command gets each group, a dataclass, as one value.
+    """
+    own = inspect.signature(command, eval_str=True)
+    kinds: dict[str, Any] = {name: one.annotation for name, one in own.parameters.items()}
+    groups: dict[str, Any] = {name: kind for name, kind in kinds.items() if is_dataclass(kind)}
+    named = {name: [field.name for field in fields(group)] for name, group in groups.items()}
+    options = [one for name, one in own.parameters.items() if name not in groups]
+    for group in groups.values():
+        hints = get_type_hints(group, None, None, True)
+        for field in fields(group):
+            one = inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY)
+            options.append(one.replace(default=field.default, annotation=hints[field.name]))
 
     @wraps(command)
     def with_options(**given: Any) -> None:
-        shared = Shared(**{one.name: given.pop(one.name) for one in options})
-        command(**given, shared=shared)
+        for name, group in groups.items():
+            given[name] = group(**{each: given.pop(each) for each in named[name]})
+        command(**given)
 
     seen: Any = with_options
-    seen.__signature__ = own.replace(parameters=[*others, *options])
+    seen.__signature__ = own.replace(parameters=options)
     return with_options

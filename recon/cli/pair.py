@@ -22,7 +22,7 @@ Ndisp = Annotated[
 _CALIB_HELP = "Calibration file: recon, KITTI, Middlebury, OpenCV, ROS CameraInfo or kalibr."
 
 
-@opt.takes_shared
+@opt.takes_groups
 def pair(
     left: Left,
     right: Right,
@@ -88,7 +88,7 @@ def pair(
       recon pair left.png right.png --focal 721.5 --baseline 0.54
     """
     with shared.session():
-        from recon.commands.config import pair_config
+        from recon.cli.overrides import pair_config
         from recon.commands.pair import run_pair
         from recon.sources.pair_input import KnownCamera, read_pair_input, with_truth
 
@@ -112,7 +112,7 @@ def pair(
     shared.show(run.summary)
 
 
-@opt.takes_shared
+@opt.takes_groups
 def disparity(
     left: Left,
     right: Right,
@@ -135,7 +135,7 @@ def disparity(
       recon disparity raw_left.png raw_right.png --calib rig.yaml --matcher sgm
     """
     with shared.session():
-        from recon.commands.config import pair_config
+        from recon.cli.overrides import pair_config
         from recon.commands.pair import run_disparity
         from recon.sources.pair_input import read_pair_input
 

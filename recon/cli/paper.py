@@ -10,7 +10,7 @@ import typer
 from recon.cli import options as opt
 
 
-@opt.takes_shared
+@opt.takes_groups
 def paper(
     scenes: Annotated[
         Path | None,

@@ -10,7 +10,7 @@ import typer
 from recon.cli import options as opt
 
 
-@opt.takes_shared
+@opt.takes_groups
 def rectify(
     left: Annotated[
         str, typer.Argument(help='Left image, folder, or pattern in quotes such as "left*.png".')

@@ -25,7 +25,7 @@ from recon.run.machine import serial_algebra
 from recon.sources.image_pairs import ImagePairs, pair_images
 
 
-def run_calibration(
+def run_calibrate(
     left: str,
     right: str | None,
     board: CalibrationBoard,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +21,7 @@ from recon.run.run import CONFIG
 from recon.sources.settings import SourceSettings
 from recon.stereo.cloud.filters import ANY_SCALE
 from recon.stereo.match.foreign import name_of
-from recon.stereo.match.registry import MATCHERS, MatchingSettings, field_of, settings_of
+from recon.stereo.match.registry import MATCHERS, field_of
 from recon.street.settings import StreetSettings
 
 _MOST_DOTS: Final = 10
@@ -180,81 +179,6 @@ def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[st
                 expected=f"settings of {', '.join(sections)}",
                 hint="recon map takes it",
             )
-
-
-def matching_overrides(matcher: str | None = None, ndisp: int | None = None) -> list[str]:
-    """Return overrides for the matcher and its disparity range; None = unchanged."""
-    chosen = [] if matcher is None else [f"matching.matcher={matcher}"]
-    fields = MatchingSettings.model_fields
-    ranged = [
-        name
-        for name, field in fields.items()
-        if "ndisp" in getattr(field.annotation, "model_fields", ())
-    ]
-    return chosen + ([] if ndisp is None else [f"matching.{name}.ndisp={ndisp}" for name in ranged])
-
-
-def pair_config(
-    path: Path | None, overrides: Sequence[str], matcher: str | None, ndisp: int | None
-) -> ReconConfig:
-    """Return the configuration of one pair, with its matcher and disparity range; None = unchanged.
-
-    Raises:
-        SettingsError: As for `load_config`, or the matcher searches no range.
-    """
-    config = load_config(path, [*overrides, *matching_overrides(matcher, ndisp)], PAIR_DEFAULTS)
-    used = config.matching.matcher
-    if ndisp is not None and not hasattr(settings_of(used, config.matching), "ndisp"):
-        raise SettingsError(
-            "the matcher has no such setting", where="--ndisp", got=f"matcher {name_of(used)!r}"
-        )
-    return config
-
-
-def source_overrides(
-    calib: Path | None,
-    left: str | None,
-    right: str | None,
-    tolerance_s: float | None,
-    frames: tuple[int | None, int | None, int | None] = (None, None, None),
-) -> list[str]:
-    """Return overrides for facts that the files of a source do not contain; None = unchanged.
-
-    Args:
-        calib: Calibration file.
-        left: Folder or topic of the left camera.
-        right: That of the right one.
-        tolerance_s: Largest difference within a pair.
-        frames: First frame, frame at which to stop, and stride.
-    """
-    given = {
-        "calibration": None if calib is None else str(calib),
-        "left": left,
-        "right": right,
-        "tolerance_s": tolerance_s,
-        **dict(zip(("start", "end", "stride"), frames, strict=True)),
-    }
-    # Quoted, since a topic or folder may be named 0 or null.
-    return [
-        f"source.{key}={json.dumps(value)}" for key, value in given.items() if value is not None
-    ]
-
-
-def capture_overrides(size: str | None, rate_hz: float | None) -> list[str]:
-    """Return overrides for a recording; None = unchanged.
-
-    Raises:
-        SettingsError: The size is not of the form 1280x720.
-    """
-    width, cross, height = (size or "").partition("x")
-    if size is not None and not (cross and width.isdigit() and height.isdigit()):
-        raise SettingsError("cannot read this size", got=size, expected="WIDTHxHEIGHT: 1280x720")
-    given = {
-        "width_px": width or None,
-        "height_px": height or None,
-        "rate_hz": rate_hz,
-    }
-    return [f"capture.{key}={value}" for key, value in given.items() if value is not None]
 
 
 def _recorded(settings: Settings, usual: Sequence[Settings]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What must be unchanged for a resumed run to end like one that was not interrupted."""
+"""What a run was started with: unchanged, a resumed run ends like one that was not interrupted."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig
-from recon.core.errors import SettingsError
+from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.core.values import Trajectory
+from recon.map.drive.workspace import ANEW
+from recon.map.store.map import Map
+from recon.run.directory import RECORD, STARTED, state_folder
+from recon.run.fingerprint import fingerprint
 from recon.run.machine import versions
-from recon.run.record import fingerprint
 from recon.sources.protocol import StereoSource
 
 _OTHER: Final = {
@@ -41,6 +44,41 @@ def identity_of(
         "prior": _digest(prior),
         "versions": versions(),
     }
+
+
+def read_started(folder: Path) -> dict[str, Any]:
+    """Read what an unfinished run was started with: its ``identity`` and ``arguments``.
+
+    Raises:
+        OutputError: The folder holds no unfinished run.
+    """
+    path = state_folder(folder) / STARTED
+    try:
+        with Map.open(path) as map_:
+            return _checked(map_.session().info.start)
+    except (ReconError, LookupError, TypeError) as error:
+        if path.is_file():
+            raise FormatError(
+                "the unfinished map cannot be read", where=path, got=error, hint=ANEW
+            ) from error
+        finished = "it is finished; without --resume it runs again"
+        hint = finished if (folder / RECORD).is_file() else "start it without --resume"
+        raise OutputError(
+            "there is no unfinished run to resume", where=folder, hint=hint
+        ) from error
+
+
+def _checked(started: Any) -> dict[str, Any]:
+    """Check that it has the form that `begin_or_resume` writes.
+
+    Raises:
+        TypeError: A part has another type; a `LookupError` if it is missing.
+    """
+    parts = (started["identity"], started["identity"]["config"], started["arguments"])
+    plain = all(isinstance(part, dict) for part in parts)
+    if not plain or not all(isinstance(v, str | bool | None) for v in parts[-1].values()):
+        raise TypeError("not what a run is started with")
+    return {"identity": parts[0], "arguments": parts[-1]}
 
 
 def refuse_others(now: Mapping[str, Any], then: Mapping[str, Any], folder: Path) -> None:

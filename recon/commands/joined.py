@@ -7,6 +7,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from recon.commands import occupancy
 from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.commands.map_options import MapOptions
 from recon.export.joined import JoinedMap, export_sessions, joined_figures, joined_warnings
@@ -19,7 +20,7 @@ from recon.report.joined_page import write_joined_page
 from recon.run.finished import open_run
 from recon.run.run import Run, WholeRun
 
-REMADE = ("occupancy", "grid", "ground", "submaps", "mesh", "memory")
+REMADE = (*occupancy.REMADE, "mesh", "memory")
 """Sections of the configuration that may differ from those of the first run."""
 Fill = Callable[[Run, Map], Sequence[int]]
 """Puts drives into the empty map of a run; gives the numbers of those that are new in it."""
@@ -65,10 +66,7 @@ def make_joined(
         map_.commit()
         with run.stage("map"):
             placed = place_map(map_, settings)
-        mesh = settings.mesh if options.mesh else None
-        made = write_products(
-            placed, run, run.watch, mesh=mesh, threads=options.threads, progress=options.progress
-        )
+        made = write_products(placed, run, settings.mesh if options.mesh else None)
         joined = JoinedMap(
             map_, settings, made, None if made.mesh is None else made.mesh.to_show(run)
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map_options import MapOptions
 from recon.core.values import OccupancyGrid
-from recon.export.localized import export_localized
+from recon.export.trajectories import export_localized
 from recon.io.occupancy.nav2 import read_nav2
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.localize_run import LocalizeRun

@@ -10,8 +10,8 @@ from recon.commands.map_options import MapOptions
 from recon.commands.map_pieces import map_drive, pieces_of
 from recon.commands.resume import begin_or_resume, with_resume_hint
 from recon.evaluation.drive import compare_with_truth
-from recon.export.paths import export_paths
 from recon.export.products import Products, write_products
+from recon.export.trajectories import export_paths
 from recon.map.drive.empty import check_map
 from recon.map.drive.map_run import MapRun
 from recon.map.drive.sequence import MappedSequence
@@ -67,15 +67,7 @@ def run_map(
         mapped = map_drive(source, config, options, run, map_)
         with run.stage("cloud"):
             check_map(mapped, source.name)
-        mesh = config.mesh if options.mesh else None
-        made = write_products(
-            mapped,
-            run,
-            run.watch,
-            mesh=mesh,
-            threads=options.threads,
-            progress=options.progress,
-        )
+        made = write_products(mapped, run, config.mesh if options.mesh else None)
         with run.stage("compare"):
             given = options.known_poses is not None
             errors = compare_with_truth(source, mapped, made.grid, poses_given=given)

@@ -10,18 +10,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
-from recon.commands.identity import refuse_others
+from recon.commands.identity import read_started, refuse_others
 from recon.commands.map_options import MapRequest
-from recon.core.errors import (
-    ClusterError,
-    FormatError,
-    MemoryLimitError,
-    OutputError,
-    ReconError,
-)
-from recon.map.drive.workspace import ANEW, resuming, session_info
+from recon.core.errors import ClusterError, MemoryLimitError, OutputError
+from recon.map.drive.workspace import resuming, session_info
 from recon.map.store.map import Map
-from recon.run.directory import RECORD, STARTED, RunDirectory, state_folder
+from recon.run.directory import STARTED, RunDirectory, state_folder
 from recon.run.memory import memory_overrides
 from recon.sources.live import LiveSource
 from recon.sources.protocol import StereoSource
@@ -129,38 +123,3 @@ def _with_hint(error: BaseException, hint: str) -> BaseException | None:
     if isinstance(error, OSError) and error.errno in _NO_ROOM:
         return OutputError("the disk is full", where=error.filename, got=error.strerror, hint=hint)
     return None
-
-
-def read_started(folder: Path) -> dict[str, Any]:
-    """Read what an unfinished run was started with: its ``identity`` and ``arguments``.
-
-    Raises:
-        OutputError: The folder holds no unfinished run.
-    """
-    path = state_folder(folder) / STARTED
-    try:
-        with Map.open(path) as map_:
-            return _checked(map_.session().info.start)
-    except (ReconError, LookupError, TypeError) as error:
-        if path.is_file():
-            raise FormatError(
-                "the unfinished map cannot be read", where=path, got=error, hint=ANEW
-            ) from error
-        finished = "it is finished; without --resume it runs again"
-        hint = finished if (folder / RECORD).is_file() else "start it without --resume"
-        raise OutputError(
-            "there is no unfinished run to resume", where=folder, hint=hint
-        ) from error
-
-
-def _checked(started: Any) -> dict[str, Any]:
-    """Check that it has the form that `begin_or_resume` writes.
-
-    Raises:
-        TypeError: A part has another type; a `LookupError` if it is missing.
-    """
-    parts = (started["identity"], started["identity"]["config"], started["arguments"])
-    plain = all(isinstance(part, dict) for part in parts)
-    if not plain or not all(isinstance(v, str | bool | None) for v in parts[-1].values()):
-        raise TypeError("not what a run is started with")
-    return {"identity": parts[0], "arguments": parts[-1]}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from recon.core.errors import EvaluationError, FormatError, SettingsError
+from recon.core.errors import EvaluationError, SettingsError
 from recon.core.geometry.alignment import fit_paths
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import angle_rad, invert
@@ -21,6 +20,7 @@ from recon.evaluation.map import evaluate_map, register_cloud, within_reach
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import holds_times, read_trajectory
 from recon.run.directory import RECORD
+from recon.run.finished import CLOUD, open_run
 
 ReferenceFrame = Literal["camera", "map"]
 _PATH: Final = "trajectory_tum.txt"
@@ -72,15 +72,10 @@ def read_mapped_cloud(run: Path) -> MappedCloud:
         FormatError: A file cannot be read, or the folder does not contain a finished run.
     """
     folder = run if run.is_dir() else run.parent.parent
-    if run.is_dir():
-        if not (run / RECORD).is_file():
-            raise FormatError(
-                "folder does not contain a finished run", where=run, expected=f"a {RECORD}"
-            )
-    elif run.parent.name != "map" or not (folder / RECORD).is_file():
+    if not run.is_dir() and (run.parent.name != "map" or not (folder / RECORD).is_file()):
         return MappedCloud(read_ply(run))
-    T_map_world = _read_axes(folder / RECORD)
-    cloud = read_ply(run / "map" / "cloud.ply" if run.is_dir() else run)
+    T_map_world = open_run(folder).T_map_world
+    cloud = read_ply(run / CLOUD if run.is_dir() else run)
     path = read_trajectory(folder / _PATH) if (folder / _PATH).is_file() else None
     return MappedCloud(cloud, path, folder, T_map_world)
 
@@ -214,14 +209,3 @@ def _moved(path: Trajectory | None, T: Float64) -> Trajectory | None:
 def _size(name: str, T: Float64) -> dict[str, Any]:
     moved_m, turned_deg = np.linalg.norm(T[:3, 3]), np.degrees(angle_rad(T))
     return {f"{name}_moved_m": float(moved_m), f"{name}_turned_deg": float(turned_deg)}
-
-
-def _read_axes(record: Path) -> Float64:
-    """Return T_map_world as the run recorded it."""
-    try:
-        T_map_world = np.array(json.loads(record.read_text(encoding="utf-8"))["T_map_world"], float)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FormatError("record of the run has no T_map_world", where=record) from error
-    if T_map_world.shape != (4, 4) or not np.isfinite(T_map_world).all():
-        raise FormatError("T_map_world is not a 4x4 matrix", where=record)
-    return T_map_world

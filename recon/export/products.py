@@ -14,9 +14,7 @@ from recon.export.mesh import MeshSettings
 from recon.export.mesh.pieces import WrittenMesh, export_mesh
 from recon.export.octomap import export_octomap
 from recon.map.tiles import Tiles
-from recon.run.directory import RunDirectory
-from recon.run.progress import SILENT, Progress
-from recon.run.stopwatch import Stopwatch
+from recon.run.run import Run
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,44 +61,33 @@ class Placed(Protocol):
         ...
 
 
-def write_products(
-    mapped: Placed,
-    directory: RunDirectory,
-    watch: Stopwatch,
-    *,
-    mesh: MeshSettings | None = None,
-    threads: int | None = None,
-    progress: Progress = SILENT,
-) -> Products:
+def write_products(mapped: Placed, run: Run, mesh: MeshSettings | None = None) -> Products:
     """Write ``map/cloud.ply``, ``removed.ply``, ``octomap.*`` and ``grid.*``, and ``mesh/``.
 
     Args:
         mapped: The mapped drives.
-        directory: Result folder of the run.
-        watch: Times each stage.
+        run: The run, whose folder they go to.
         mesh: Settings of the mesh; None = no mesh.
-        threads: Pieces of the mesh made at a time; None = one per core. Changes no result.
-        progress: Told when the map and when the mesh is begun.
 
     Raises:
         MappingError: Nothing was observed, or the height band of the grid is empty.
         OutputError: A file cannot be written.
     """
-    progress.on_stage("map")
+    run.progress.on_stage("map")
     tiles = mapped.tiles
-    with watch.stage("cloud"):
-        files = [directory.path(f"map/{name}.ply") for name in ("cloud", "removed")]
+    with run.stage("cloud"):
+        files = [run.path(f"map/{name}.ply") for name in ("cloud", "removed")]
         cloud = export_cloud(tiles, *files)
-    with watch.stage("octomap"):
-        voxels, warnings = export_octomap(tiles, directory.path("map/octomap"))
-    with watch.stage("grid"):
-        flat = export_grid(tiles, mapped.path_m, mapped.trusted, directory.path("map/grid"))
+    with run.stage("octomap"):
+        voxels, warnings = export_octomap(tiles, run.path("map/octomap"))
+    with run.stage("grid"):
+        flat = export_grid(tiles, mapped.path_m, mapped.trusted, run.path("map/grid"))
     warnings += flat.warnings
     surface = None
     if mesh is not None:
-        progress.on_stage("mesh")
-        with watch.stage("mesh"):
-            surface = _mesh(tiles, mesh, directory, threads, warnings)
+        run.progress.on_stage("mesh")
+        with run.stage("mesh"):
+            surface = _mesh(tiles, mesh, run, warnings)
         tiles.config.memory.check("mesh")
     return Products(
         cloud.sample,
@@ -115,18 +102,13 @@ def write_products(
 
 
 def _mesh(
-    tiles: Tiles,
-    settings: MeshSettings,
-    directory: RunDirectory,
-    threads: int | None,
-    warnings: list[str],
+    tiles: Tiles, settings: MeshSettings, run: Run, warnings: list[str]
 ) -> WrittenMesh | None:
     """Write the surface; failure is only a warning, since the map is usable without one."""
     # Each piece being meshed takes memory of its own.
-    at_once = threads if tiles.config.memory.limit_mb is None else 1
-    layer = directory.path("map/cloud.ply")
+    at_once = run.threads if tiles.config.memory.limit_mb is None else 1
     try:
-        written = export_mesh(tiles, settings, directory, layer, at_once)
+        written = export_mesh(tiles, settings, run, run.path("map/cloud.ply"), at_once)
     except MeshingError as error:
         warnings.append(f"no mesh: {error}")
         return None

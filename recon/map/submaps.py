@@ -17,7 +17,7 @@ from recon.core.geometry.se3 import invert
 from recon.core.settings import Settings
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64
-from recon.map.fusion.builder import FusionSettings, MapBuilder
+from recon.map.fusion.builder import CloudBuilder, FusionSettings
 from recon.map.fusion.part import FusedPart
 from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
 from recon.map.occupancy.part import OccupancyPart
@@ -132,7 +132,7 @@ class SubmapBuilder:
     ) -> None:
         self._settings = settings
         self._max_bytes = max_bytes
-        self._fused = MapBuilder(fusion)
+        self._fused = CloudBuilder(fusion)
         self._occupancy = OccupancyBuilder(occupancy, T_map_world)
         self._index = 0
         self._first_frame = 0

@@ -14,9 +14,9 @@ from typing_extensions import Self
 from recon.core.settings import Settings
 from recon.io.yaml_file import write_yaml
 from recon.run.directory import RECORD, RunDirectory, default_folder
+from recon.run.fingerprint import fingerprint
 from recon.run.machine import peak_memory_mb, use_threads, versions
 from recon.run.progress import SILENT, Progress
-from recon.run.record import fingerprint
 from recon.run.stopwatch import Stopwatch
 
 CONFIG: Final = "config.yaml"

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.commands.calibrate import run_calibration
+from recon.commands.calibrate import run_calibrate
 from recon.commands.config import load_config
 from recon.core.errors import CalibrationError, OutputError, ReconError, SourceError
 from recon.core.values import StereoCalibration
@@ -42,7 +42,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def calibrate(folder: Path, out: Path, form: str = "recon", board: str = "chess:9x6:25mm"):
     terms = ["calibration.radial_terms=2"] if form == "kalibr" else []
     sides = (str(folder / "left*.png"), str(folder / "right*.png"))
-    return run_calibration(
+    return run_calibrate(
         *sides,
         parse_board(board),
         load_config(None, QUICK + terms),
@@ -257,7 +257,7 @@ def test_a_video_gives_one_view_for_each_place_where_the_board_stands_still(
         right = str(write_video(tmp_path / "right.mkv", [right for _, right in frames]))
     else:
         left, right = write_video(tmp_path / "both.mkv", [np.hstack(both) for both in frames]), None
-    run = run_calibration(str(left), right, BOARD, load_config(None, QUICK), out=tmp_path / "out")
+    run = run_calibrate(str(left), right, BOARD, load_config(None, QUICK), out=tmp_path / "out")
     # In one of the nine places the right camera does not see the board.
     assert 9 <= run.summary["views"] <= 11
     assert run.summary["views_used"] == 8
@@ -269,11 +269,11 @@ def test_a_video_gives_one_view_for_each_place_where_the_board_stands_still(
 def test_one_video_and_one_folder_are_refused(tmp_path: Path) -> None:
     video = write_video(tmp_path / "left.mkv", [np.zeros((32, 32), np.uint8)] * 3)
     with pytest.raises(SourceError, match="two videos, or one video with both views"):
-        run_calibration(
+        run_calibrate(
             str(video), str(tmp_path), BOARD, load_config(None, QUICK), out=tmp_path / "out"
         )
     with pytest.raises(SourceError, match="two videos, or one video with both views"):
-        run_calibration(str(tmp_path), None, BOARD, load_config(None, QUICK), out=tmp_path / "out")
+        run_calibrate(str(tmp_path), None, BOARD, load_config(None, QUICK), out=tmp_path / "out")
 
 
 @pytest.mark.real
@@ -282,7 +282,7 @@ def test_the_published_chessboard_pairs_calibrate_as_they_should(
 ) -> None:
     folder = recon_data / "calibration" / "opencv_chessboard"
     sides = (str(folder / "left*.jpg"), str(folder / "right*.jpg"))
-    summary = run_calibration(*sides, BOARD, load_config(None, QUICK), out=tmp_path / "out").summary
+    summary = run_calibrate(*sides, BOARD, load_config(None, QUICK), out=tmp_path / "out").summary
     assert summary["stereo_rms_px"] <= 0.45
     assert summary["baseline_squares"] == pytest.approx(3.34, abs=0.02)
     assert summary["epipolar_px"] <= 0.3
@@ -302,7 +302,7 @@ def test_the_published_views_captured_five_times_have_the_same_forecast(
     summaries = []
     for name, source in (("once", folder), ("five", tmp_path)):
         sides = (str(source / "left*.jpg"), str(source / "right*.jpg"))
-        run = run_calibration(*sides, BOARD, load_config(None, QUICK), out=tmp_path / name)
+        run = run_calibrate(*sides, BOARD, load_config(None, QUICK), out=tmp_path / name)
         summaries.append(run.summary)
     once, five = summaries
     assert five["rotation_spread_deg"] == pytest.approx(once["rotation_spread_deg"], rel=1e-6)

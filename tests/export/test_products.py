@@ -23,8 +23,7 @@ from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.ground.floor import add_floors, find_floors
 from recon.map.ground.grid import drop_undecided, flatten
 from recon.map.ground.surface import estimate_ground_surface
-from recon.run.directory import RunDirectory
-from recon.run.stopwatch import Stopwatch
+from recon.run.run import Run
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 from tests.scenery.octomaps import write_octomap
@@ -39,13 +38,13 @@ def mapped() -> MappedSequence:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Iterator[RunDirectory]:
-    with RunDirectory(tmp_path / "run") as directory:
-        yield directory
+def folder(tmp_path: Path) -> Iterator[Run]:
+    with Run("map", tmp_path / "run") as run:
+        yield run
 
 
-def test_the_cloud_of_tiles_is_the_cloud(mapped: MappedSequence, folder: RunDirectory) -> None:
-    written = write_products(mapped, folder, Stopwatch())
+def test_the_cloud_of_tiles_is_the_cloud(mapped: MappedSequence, folder: Run) -> None:
+    written = write_products(mapped, folder)
     whole = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
     back = read_ply(folder.path("map/cloud.ply"))
     assert written.points == len(back) == len(written.cloud) > 1000
@@ -54,19 +53,15 @@ def test_the_cloud_of_tiles_is_the_cloud(mapped: MappedSequence, folder: RunDire
         np.testing.assert_array_equal(getattr(back, name), getattr(whole, name))
 
 
-def test_the_octomap_of_tiles_is_that_of_the_whole(
-    mapped: MappedSequence, folder: RunDirectory
-) -> None:
-    written = write_products(mapped, folder, Stopwatch())
+def test_the_octomap_of_tiles_is_that_of_the_whole(mapped: MappedSequence, folder: Run) -> None:
+    written = write_products(mapped, folder)
     assert written.voxels == len(mapped.voxels) > 1000
     whole = write_octomap(folder.path("whole"), drop_undecided(mapped.voxels, mapped.config.grid))
     for theirs, end in zip(whole, ("bt", "ot"), strict=True):
         assert folder.path(f"map/octomap.{end}").read_bytes() == theirs.read_bytes()
 
 
-def test_the_grid_of_tiles_is_that_of_the_whole(
-    mapped: MappedSequence, folder: RunDirectory
-) -> None:
+def test_the_grid_of_tiles_is_that_of_the_whole(mapped: MappedSequence, folder: Run) -> None:
     config = mapped.config
     cloud = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
@@ -74,7 +69,7 @@ def test_the_grid_of_tiles_is_that_of_the_whole(
     ground = estimate_ground_surface(floor, path_m, config.ground)
     whole = flatten(mapped.voxels, ground, config.grid)
     narrow = load_config(None, [*SETTINGS, "grid.vehicle_width_m=0"])
-    written = write_products(replace(mapped, config=narrow), folder, Stopwatch()).grid
+    written = write_products(replace(mapped, config=narrow), folder).grid
     # Beyond the voxels, there is a margin of at least 5 m around the path.
     low = np.minimum(whole.origin_m, np.floor((path_m.min(axis=0)[:2] - 5) / 0.2) * 0.2)
     np.testing.assert_allclose(written.origin_m, low, atol=1e-9)
@@ -93,12 +88,10 @@ def test_the_grid_of_tiles_is_that_of_the_whole(
         assert (ours & theirs).sum() >= 0.995 * (ours | theirs).sum() > 100
 
 
-def test_the_vehicle_frees_its_own_track_alone(
-    mapped: MappedSequence, folder: RunDirectory
-) -> None:
+def test_the_vehicle_frees_its_own_track_alone(mapped: MappedSequence, folder: Run) -> None:
     narrow = load_config(None, [*SETTINGS, "grid.vehicle_width_m=0"])
-    seen = write_products(replace(mapped, config=narrow), folder, Stopwatch()).grid
-    grid = write_products(mapped, folder, Stopwatch()).grid
+    seen = write_products(replace(mapped, config=narrow), folder).grid
+    grid = write_products(mapped, folder).grid
     np.testing.assert_array_equal(read_nav2(folder.path("map/grid.yaml")).cells, grid.cells)
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)[:, :2]
     columns, rows = np.floor((path_m - grid.origin_m) / 0.2).astype(int).T
@@ -114,13 +107,13 @@ def test_the_vehicle_frees_its_own_track_alone(
 
 
 def test_a_map_too_large_for_an_octomap_has_all_else(
-    mapped: MappedSequence, folder: RunDirectory, monkeypatch: pytest.MonkeyPatch
+    mapped: MappedSequence, folder: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = write_products(mapped, folder, Stopwatch())
+    whole = write_products(mapped, folder)
     monkeypatch.setattr("recon.io.occupancy.octomap.KEY_LIMIT", 20)
     folder.path("map/octomap.bt").unlink()
     folder.path("map/octomap.ot").unlink()
-    written = write_products(mapped, folder, Stopwatch())
+    written = write_products(mapped, folder)
     assert written.voxels == whole.voxels
     [warning] = written.warnings
     assert "no OctoMap" in warning
@@ -128,10 +121,10 @@ def test_a_map_too_large_for_an_octomap_has_all_else(
     assert not [name for name in folder.files() if "octomap" in name]
 
 
-def test_an_empty_height_band_is_reported(mapped: MappedSequence, folder: RunDirectory) -> None:
+def test_an_empty_height_band_is_reported(mapped: MappedSequence, folder: Run) -> None:
     config = load_config(None, [*SETTINGS, "grid.min_height_m=2", "grid.max_height_m=1"])
     with pytest.raises(MappingError, match="height band"):
-        write_products(replace(mapped, config=config), folder, Stopwatch())
+        write_products(replace(mapped, config=config), folder)
 
 
 def test_a_grid_that_a_far_pose_makes_too_large_is_refused(

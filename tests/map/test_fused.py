@@ -9,15 +9,15 @@ from recon.core.errors import MappingError
 from recon.core.geometry.projection import depth_sigma
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.map.fusion import part
-from recon.map.fusion.builder import FusionSettings, MapBuilder, fusion_range_m
+from recon.map.fusion.builder import CloudBuilder, FusionSettings, fusion_range_m
 
 
 def _cloud(xyz: np.ndarray, **fields: np.ndarray) -> PointCloud:
     return PointCloud(np.asarray(xyz, np.float32), frame="world", **fields)
 
 
-def _build(*clouds: PointCloud, **settings: float | None) -> MapBuilder:
-    builder = MapBuilder(FusionSettings(**settings))
+def _build(*clouds: PointCloud, **settings: float | None) -> CloudBuilder:
+    builder = CloudBuilder(FusionSettings(**settings))
     for cloud in clouds:
         builder.integrate(cloud)
     return builder

@@ -10,7 +10,7 @@ import pytest
 
 from recon.core.geometry.se3 import apply
 from recon.core.values import FREE, OCCUPIED, PointCloud
-from recon.map.fusion.builder import FusionSettings, MapBuilder
+from recon.map.fusion.builder import CloudBuilder, FusionSettings
 from recon.map.ground.axes import AxesSettings, estimate_ground, map_axes
 from recon.map.ground.grid import GridSettings, flatten
 from recon.map.ground.surface import GroundSettings, estimate_ground_surface
@@ -52,7 +52,7 @@ def test_the_driven_road_is_free_and_has_obstacles_beside_it(recon_data: Path) -
     poses = _poses(drive)[FRAMES]
     clouds = [_cloud(drive, index) for index in FRAMES]
     T_map_world = map_axes(estimate_ground(clouds[0]), AxesSettings())
-    fused = MapBuilder(FusionSettings(min_count=2))
+    fused = CloudBuilder(FusionSettings(min_count=2))
     occupancy = OccupancyBuilder(OccupancySettings(), T_map_world)
     for cloud, T in zip(clouds, poses, strict=True):
         world = PointCloud(apply(T, cloud.xyz), sigma_m=cloud.sigma_m, frame="world")

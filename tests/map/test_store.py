@@ -160,7 +160,7 @@ def test_a_reader_sees_whole_commits_while_another_program_writes(tmp_path: Path
             writer.commit()
             assert _same(reader.get("rays", 0), _record(1))
             assert reader.keys("rays") == [0]
-            reader.refresh()
+        with Store.open(path, read_only=True) as reader:
             assert _same(reader.get("rays", 0), _record(2))
             assert reader.keys("rays") == [0, 1]
 

@@ -10,7 +10,7 @@ import pytest
 from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.values import PointCloud
 from recon.map import submaps as submaps_file
-from recon.map.fusion.builder import FusionSettings, MapBuilder
+from recon.map.fusion.builder import CloudBuilder, FusionSettings
 from recon.map.fusion.part import join_fused
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.occupancy.builder import OccupancyBuilder, OccupancySettings
@@ -71,7 +71,7 @@ def _submaps(builder: SubmapBuilder, frames: list[Frame]) -> list[Submap]:
 
 def test_submaps_put_together_are_the_map_of_the_whole_drive() -> None:
     submaps = _submaps(_builder(length_m=5.0), _frames())
-    fused, occupancy = MapBuilder(FUSION), OccupancyBuilder(OCCUPANCY, T_MAP_WORLD)
+    fused, occupancy = CloudBuilder(FUSION), OccupancyBuilder(OCCUPANCY, T_MAP_WORLD)
     for there, here, T in _frames():
         fused.integrate(there)
         occupancy.integrate(here, T)

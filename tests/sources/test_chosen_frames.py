@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.commands.config import load_config, source_overrides
+from recon.cli.drive import SourceOptions
+from recon.commands.config import load_config
 from recon.core.errors import ReconError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import RectifiedCamera, StereoPair, Trajectory
@@ -147,6 +148,6 @@ def test_one_pair_has_no_second_frame(tmp_path: Path) -> None:
 
 
 def test_the_options_are_settings_so_that_a_run_can_be_resumed_and_repeated() -> None:
-    overrides = source_overrides(None, None, None, None, (2, 9, 3))
+    overrides = SourceOptions(end=9, stride=3).overrides(2)
     config: Any = load_config(None, overrides).source
     assert (config.start, config.end, config.stride) == (2, 9, 3)

@@ -104,14 +104,14 @@ def export_mesh(
         settings: Settings of the mesh; ``target_faces`` is the total over all pieces.
         directory: The folder of the run.
         cloud: A PLY file in it, for the MeshLab project.
-        threads: Pieces reconstructed at a time, each in its own process; None = one per core, at
-            most four, since each needs memory. Does not change results.
+        threads: Pieces reconstructed at a time, each in its own process, but at most four, since
+            each needs memory; None = one per core. Does not change results.
 
     Raises:
         MeshingError: No piece has a surface.
         OutputError: A file cannot be written.
     """
-    at_once = threads or min(available_cores(), _MOST_AT_ONCE)
+    at_once = min(threads or available_cores(), _MOST_AT_ONCE)
     found = _Mesher(tiles, settings, directory, at_once, _count(tiles, settings)).run()
     if not found.pieces:
         raise MeshingError(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import FormatError, MappingError
 from recon.core.kernels.voxels import pack_keys
-from recon.core.values import OccupancyVoxels
+from recon.core.values import OccupancyVoxels, join_voxels
 from recon.core.values.arrays import Int32
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath, reader, reading
@@ -176,11 +176,7 @@ def read_octomap(path: StrPath) -> OccupancyVoxels:
         FormatError: The file is missing, damaged or not an ``.ot`` file.
     """
     pieces = list(octomap_pieces(Path(path)))
-    return OccupancyVoxels(
-        np.concatenate([piece.keys for piece in pieces]),
-        np.concatenate([piece.log_odds for piece in pieces]),
-        pieces[0].resolution_m,
-    )
+    return join_voxels(pieces, pieces[0].resolution_m)
 
 
 def octomap_pieces(path: Path, nodes_each: int = 1 << 19) -> Iterator[OccupancyVoxels]:

@@ -89,7 +89,7 @@ def join_branches(children: dict[int, Branch]) -> Branch:
     nodes = 1 + sum(child.nodes for child in children.values())
     mask = sum(1 << place for place in children)
     full = np.float32(value).tobytes() + bytes([mask])
-    if (len(children) == 8 and kinds <= {FREE}) or (len(children) == 8 and kinds <= {OCCUPIED}):
+    if len(children) == 8 and kinds in ({FREE}, {OCCUPIED}):
         return Branch(full, b"", value, kinds.pop(), nodes, 1)
     bits = sum(child.kind << (2 * place) for place, child in children.items())
     pruned = 1 + sum(child.pruned_nodes for child in children.values())

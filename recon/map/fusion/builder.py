@@ -75,7 +75,7 @@ def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
     return math.sqrt(settings.max_depth_error_m * fb / _NOMINAL_ERROR_PX)
 
 
-class MapBuilder:
+class CloudBuilder:
     """Fuses clouds frame by frame.
 
     A point weighs ``confidence / sigma²``. Time per frame grows with its points alone (on

@@ -1,4 +1,4 @@
-"""A whole drive, located in a map frame by frame."""
+"""A whole drive, or a single pair, located in a map."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import MappingError, RegistrationError
-from recon.core.values import StereoPair, Trajectory
+from recon.core.values import Rig, StereoPair, Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.localizer import Localizer, Located, State
@@ -185,6 +185,16 @@ def open_localizer(
                 hint="x and y in metres and the heading in degrees, in map axes",
             )
     return Localizer(known, Surroundings(map_, config.odometry.max_range_m), among=among)
+
+
+def localize_pair(
+    map_: Map, pair: StereoPair, calibration: Rig, config: DriveSettings | None
+) -> Located:
+    """Find where a single pair was taken; see `Map.localize`."""
+    reconstructor = FrameReconstructor(calibration, config or DriveSettings())
+    # Several views of the map must show the place, since no second frame confirms it.
+    localizer = Localizer(known_places(map_), frames=1)
+    return localizer.add(OdometryFrame(*reconstructor.match(pair)))
 
 
 def localize_sequence(

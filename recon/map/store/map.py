@@ -202,9 +202,9 @@ class Map:
             ReconError: The map has no keyframes or is damaged, or images and calibration do not
                 fit together.
         """
-        from recon.map.localize.single import locate_pair  # noqa: PLC0415 - it needs a `Map`
+        from recon.map.localize.sequence import localize_pair  # noqa: PLC0415 - it is above
 
-        return locate_pair(self, pair, calibration, config)
+        return localize_pair(self, pair, calibration or self.first.camera, config)
 
     def begin(self, info: SessionInfo) -> Session:
         """Add a drive.

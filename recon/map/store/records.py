@@ -248,17 +248,6 @@ class Store:
             self._database.execute("COMMIT")
             self._database.execute("BEGIN IMMEDIATE")
 
-    def refresh(self) -> None:
-        """See what others have committed since a store was opened to read.
-
-        Raises:
-            FormatError: The file is damaged.
-        """
-        with self._lock, self._reading():
-            self.cache.clear()
-            self._database.execute("ROLLBACK")
-            begin_to_read(self._database)
-
     def close(self) -> None:
         """Close the file; what was not committed is lost."""
         with self._lock, suppress(sqlite3.Error):

@@ -1,4 +1,4 @@
-"""A drive located in a map, as files: its path, and the state of each frame."""
+"""Paths as files: that of a mapped drive, and that of one located in a map with its states."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import Final
 import numpy as np
 
 from recon.core.geometry.se3 import invert, quaternion_from_rotation
+from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
-from recon.io.trajectory import write_tum
+from recon.io.trajectory import write_kitti_poses, write_tum
+from recon.map.drive.sequence import MappedSequence
 from recon.map.ground.axes import base_axes
 from recon.map.localize.sequence import LocalizedDrive, LocalizedFrame
 from recon.run.directory import RunDirectory
@@ -25,6 +27,29 @@ HEADER: Final = (
     *("frame", "time_s", "state", "views", "inliers", "seconds"),
     *(*_POSE, *_SIGMAS, *_COVARIANCE),
 )
+
+
+def export_paths(
+    mapped: MappedSequence, camera_height_m: float | None, directory: RunDirectory
+) -> None:
+    """Write ``trajectory_*.txt``, and ``loops.json`` if loops were closed.
+
+    Args:
+        mapped: The mapped drive.
+        camera_height_m: Height of the camera above the ground; None = unknown.
+        directory: The folder of the run.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    path, T_map_world = mapped.trajectory, mapped.T_map_world
+    write_kitti_poses(directory.path("trajectory_kitti.txt"), path)
+    write_tum(directory.path("trajectory_tum.txt"), path)
+    based = _of_base(path, T_map_world, camera_height_m)
+    write_tum(directory.path("trajectory_map_base_tum.txt"), based)
+    if mapped.loops is not None and mapped.loops.closure.closed:
+        write_tum(directory.path("trajectory_odometry_tum.txt"), mapped.loops.odometry)
+        directory.write_json("loops.json", mapped.loops.edges())
 
 
 def export_localized(
@@ -42,11 +67,16 @@ def export_localized(
     """
     path, T_map_world = drive.trajectory, drive.T_map_world
     write_tum(directory.path("trajectory_tum.txt"), path)
-    T_map_base = T_map_world @ path.T_world_camera @ invert(base_axes(T_map_world, camera_height_m))
-    based = replace(path, T_world_camera=T_map_base)
+    based = _of_base(path, T_map_world, camera_height_m)
     write_tum(directory.path("trajectory_map_base_tum.txt"), based)
     lines = [",".join(HEADER), *map(_line, drive.frames)]
     write_text(directory.path("states.csv"), "\n".join(lines) + "\n")
+
+
+def _of_base(path: Trajectory, T_map_world: Float64, camera_height_m: float | None) -> Trajectory:
+    """Return the path of the base of the vehicle, in map axes, from that of its camera."""
+    T_camera_base = invert(base_axes(T_map_world, camera_height_m))
+    return replace(path, T_world_camera=T_map_world @ path.T_world_camera @ T_camera_base)
 
 
 def _line(frame: LocalizedFrame) -> str:
