@@ -22,8 +22,6 @@ from recon.stereo.rectify.rectifier import Rectifier
 from tests.scenery.boards import board_rig, place_boards, render_views
 from tests.sources.drives import write_video
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 BOARD = parse_board("chess:9x6:25mm")
 QUICK = ["calibration.bootstrap=60"]
 

@@ -15,8 +15,6 @@ from recon.core.values import RectifiedCamera
 from recon.io.images.image import write_image
 from recon.sources.pair_input import KnownCamera, PairInput, read_pair_input
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 
 @pytest.fixture
 def images(tmp_path: Path) -> tuple[Path, Path]:

@@ -13,8 +13,6 @@ from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 from tests.scenery.kitti import write_kitti
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 

@@ -23,8 +23,6 @@ from recon.run.batch.work import BatchOptions
 from recon.sources.pair_input import PairInput
 from tests.hostile.refusals import assert_refused, run
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 
 @pytest.fixture(scope="module")
 def pair_run(tmp_path_factory: pytest.TempPathFactory) -> Path:

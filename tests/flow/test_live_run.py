@@ -21,8 +21,6 @@ from recon.sources.live import LiveSource
 from tests.scenery.film import Film
 from tests.scenery.patience import be_patient
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 
 @pytest.fixture(scope="module")
 def config() -> ReconConfig:

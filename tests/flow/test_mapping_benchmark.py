@@ -16,8 +16,6 @@ from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "mapping.py"
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Sequence
-from itertools import islice
 from pathlib import Path
 from unittest.mock import patch
 
@@ -19,13 +17,11 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.commands.merge import run_map_into, run_merge, run_remove
 from recon.commands.occupancy import run_occupancy
-from recon.core.values import StereoPair
 from recon.io.trajectory import read_trajectory
 from recon.map.store.map import Map
+from recon.sources.part import SourcePart
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
-
-pytestmark = pytest.mark.usefixtures("blank_figures")
 
 RIG = {"width_px": 320, "height_px": 120, "focal_px": 180.0, "smooth_edges": False}
 """Large enough that places are recognised."""
@@ -33,31 +29,12 @@ FIRST, FRAMES = 5, 14
 OPTIONS = MapOptions(mesh=False, audit=False)
 
 
-class Part:
-    """Some frames of a street drive, as a source that knows no truth."""
-
-    description = "a part of a street"
-    truth = None
-    files: Sequence[Path] = ()
-
-    def __init__(self, first: int, seed: int = 2, frames: int = FRAMES) -> None:
-        self._frames = frames
-        self._street = SyntheticSource(StreetScene(frames=first + FRAMES, seed=seed, **RIG))
-        self._first = first
-        self.name = f"street {seed} from {first}"
-        self.calibration = self._street.calibration
-
-    def __len__(self) -> int:
-        return self._frames
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
-
-    def frames(self, start: int = 0) -> Iterator[StereoPair]:
-        return islice(self._street.frames(self._first + start), self._frames - start)
+def part(first: int, seed: int = 2, frames: int = FRAMES) -> SourcePart:
+    street = SyntheticSource(StreetScene(frames=first + FRAMES, seed=seed, **RIG))
+    return SourcePart(street, first, first + frames)
 
 
-def _map(source: Part, out: Path) -> Path:
+def _map(source: SourcePart, out: Path) -> Path:
     run_map(source, load_config(), MapOptions(out=out, mesh=False, audit=False))
     return out
 
@@ -66,9 +43,9 @@ def _map(source: Part, out: Path) -> Path:
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Runs of two drives that overlap; a third one is elsewhere. They must not be changed."""
     folder = tmp_path_factory.mktemp("runs")
-    _map(Part(0), folder / "first")
-    _map(Part(FIRST), folder / "second")
-    _map(Part(0, seed=9, frames=5), folder / "elsewhere")
+    _map(part(0), folder / "first")
+    _map(part(FIRST), folder / "second")
+    _map(part(0, seed=9, frames=5), folder / "elsewhere")
     return folder
 
 
@@ -99,7 +76,7 @@ def test_drives_that_share_places_are_linked_and_others_stay_apart(merged: Path)
     assert found["links"]["pairs"].keys() == {"0-1"}
     assert found["links"]["count"] >= 3
     assert found["frames"] == 2 * FRAMES  # those of the drives that are linked
-    assert any("session 2 (street 9 from 0)" in warning for warning in found["warnings"])
+    assert any("session 2 (synthetic street 9 0 to 4)" in warning for warning in found["warnings"])
 
 
 def test_the_second_drive_is_placed_where_it_was(merged: Path) -> None:
@@ -131,7 +108,7 @@ def test_the_map_of_several_drives_is_open_to_python(merged: Path, runs: Path) -
 
 def test_a_drive_is_added_to_a_run_and_taken_out_again(run: Path, runs: Path) -> None:
     (run / "notes.txt").write_text("mine")
-    added = run_map_into(run, Part(FIRST), None, OPTIONS)
+    added = run_map_into(run, part(FIRST), None, OPTIONS)
     assert [drive["linked"] for drive in added["sessions"]] == [True, True]
     assert summary_of(run)["sessions"] == added["sessions"]
     run_remove(run, 1, None, OPTIONS)
@@ -144,7 +121,7 @@ def test_a_drive_is_added_to_a_run_and_taken_out_again(run: Path, runs: Path) ->
 
 @pytest.mark.parametrize("at", ["recon.run.directory.exchange", "recon.commands.joined.place_map"])
 def test_what_fails_before_the_end_leaves_the_run_as_it_was(run: Path, at: str) -> None:
-    before, short = content(run), Part(FIRST, frames=4)
+    before, short = content(run), part(FIRST, frames=4)
     with patch(at, side_effect=KeyboardInterrupt), pytest.raises(KeyboardInterrupt):
         run_map_into(run, short, None, OPTIONS)
     assert {n: c for n, c in content(run).items() if not n.startswith(".partial")} == before

@@ -10,8 +10,6 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.values import OccupancyMetrics
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
-
 STREETS = {
     "curve": ["street.seed=1"],
     "another": ["street.seed=3", "street.turn_deg_per_100m=-35"],

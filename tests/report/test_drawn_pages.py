@@ -8,9 +8,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 
-from recon.core.values import (
-    Reason,
-)
+from recon.core.values import Reason
 from recon.report.colour import REASON_COLOURS
 from recon.report.pair_page import write_disparity_images
 from recon.run.directory import RunDirectory
