@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import hypothesis
 import pytest
+import typer.testing
 
 # The same examples on every machine and in every run: a failure is one of the change at hand.
 # A deadline would fail examples that compile, and any of them on a busy machine.
@@ -27,6 +29,14 @@ def recon_data() -> Path:
     if not path.is_dir():
         pytest.skip(f"real data: RECON_DATA={folder} is no folder")
     return path
+
+
+@pytest.fixture(scope="session", autouse=True)
+def commands_built_once() -> Iterator[None]:
+    """Let Typer build the tree of commands once, not at each call, where it is most of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typer.testing, "_get_command", cache(typer.testing._get_command))
+        yield
 
 
 @pytest.fixture(scope="module")
