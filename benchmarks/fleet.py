@@ -5,9 +5,9 @@ one worker of two threads.
 
 ``scheduler`` runs jobs that only sleep on workers that are threads of one other process: the
 scheduler and all its messages are real. What a job costs the scheduler is its processor time
-divided by the number of jobs; the time of the whole run is that of the crowded process of the
-workers, and says nothing. Smaller numbers (``--workers``, ``--jobs``) give the cost per job nearly
-as well; the output says what was run.
+divided by the number of jobs, after one job with which it has loaded what it needs; the time of the
+whole run is that of the crowded process of the workers, and says nothing. One row is printed for
+each number of workers, the last with the last number of jobs.
 
 ``long`` renders a drive of many small frames around a large block and maps it in one piece and on
 workers (``recon map --scheduler``): time, accuracy, peak memory of each process, and what went from
@@ -16,7 +16,7 @@ the workers to others. Files are not counted: results stay in them.
 Examples:
     python benchmarks/fleet.py pairs --jobs 12
     python benchmarks/fleet.py long --frames 2000 --workers 2
-    python benchmarks/fleet.py scheduler --workers 1000 --jobs 100000
+    python benchmarks/fleet.py scheduler --workers 10 100 1000 --jobs 2000 10000 100000 --seconds 4
 """
 
 from __future__ import annotations
@@ -74,8 +74,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("what", choices=["pairs", "scheduler", "long"])
-    parser.add_argument("--jobs", type=int, default=12)
-    parser.add_argument("--workers", type=int, default=2, help="workers, or simulated ones")
+    parser.add_argument("--jobs", type=int, nargs="+", default=[12])
+    parser.add_argument("--workers", type=int, nargs="+", default=[2], help="or simulated ones")
+    parser.add_argument("--rounds", type=int, default=1, help="of pairs, one after the other")
     parser.add_argument("--frames", type=int, default=2000, help="of the long drive")
     parser.add_argument("--width", type=int, default=256, help="of its frames, in pixels")
     parser.add_argument("--drive", type=Path, help="folder of a long drive that is there already")
@@ -86,13 +87,22 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def pairs(options: argparse.Namespace) -> dict[str, Any]:
     """Throughput of a batch of pairs, for each number of workers and threads."""
+    rounds = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         words = write_pair(folder)
-        rows = [measure(folder, words, options.jobs, *shape) for shape in SHAPES]
+        for n in range(options.rounds):
+            out = folder / str(n)
+            rows = [measure(out, words, options.jobs[0], *shape) for shape in SHAPES]
+            rounds.append({"rows": rows, "ratio to one worker": ratios(rows)})
+            print(json.dumps(rounds[-1]), file=sys.stderr)
+    return {"cores": available_cores(), "rounds": rounds}
+
+
+def ratios(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Throughput of each row, as a multiple of the first."""
     one = rows[0]["jobs_per_hour"]
-    ratios = {f"{r['workers']}x{r['threads']}": round(r["jobs_per_hour"] / one, 2) for r in rows}
-    return {"cores": available_cores(), "rows": rows, "ratio to one worker": ratios}
+    return {f"{r['workers']}x{r['threads']}": round(r["jobs_per_hour"] / one, 2) for r in rows}
 
 
 def write_pair(folder: Path) -> list[str]:
@@ -146,7 +156,9 @@ def long(options: argparse.Namespace) -> dict[str, Any]:
         line = [sys.executable, "-m", "recon", "map", str(drive), "--no-mesh", "--json", "--quiet"]
         line += ["--threads", str(options.threads)]
         alone = run_of(line, folder / "alone", [])
-        with LocalCluster(options.workers, threads_per_worker=1, dashboard_address=None) as local:
+        with LocalCluster(
+            options.workers[0], threads_per_worker=1, dashboard_address=None
+        ) as local:
             where = ["--scheduler", local.scheduler_address]
             spread = run_of(line, folder / "spread", where)
             with Client(local) as client:
@@ -202,32 +214,45 @@ def given(dask_worker: Any) -> int:
 
 
 def scheduler(options: argparse.Namespace) -> dict[str, Any]:
-    """Processor time of the scheduler for each of many jobs that sleep."""
-    with crowd(options.workers) as (address, process), Client(address) as client:
-        client.wait_for_workers(options.workers)
-        jobs = [
-            Job(f"j{n}", "sleep", "", (str(options.seconds),), True, "")
-            for n in range(options.jobs)
-        ]
+    """Processor time of the scheduler for each of many jobs that sleep, for several sizes."""
+    rows = []
+    for n, workers in enumerate(options.workers):
+        jobs = options.jobs[min(n, len(options.jobs) - 1)]
+        rows.append(simulated(workers, jobs, options.seconds))
+        print(json.dumps(rows[-1]), file=sys.stderr)
+    return {"cores": available_cores(), "rows": rows}
+
+
+def simulated(workers: int, count: int, seconds: float) -> dict[str, Any]:
+    """Run jobs that sleep on simulated workers; what each costs, and where that ends."""
+    jobs = [Job(f"j{n}", "sleep", "", (str(seconds),), True, "") for n in range(count)]
+    with crowd(workers) as (address, process), Client(address) as client:
+        cluster, per_job = Cluster(client, sleep), 0.0
+        while len(cluster.workers) < workers:
+            time.sleep(1)
+        list(cluster.run([Job("first", "sleep", "", ("0",), True, "")], Path()))
         idle = idle_share(process)
-        before, begun = process_s(process), time.perf_counter()
-        own = time.process_time()
-        done = sum(1 for _ in Cluster(client, sleep).run(jobs, Path()))
-        took = time.perf_counter() - begun
-        spent = process_s(process) - before
-        own = time.process_time() - own
+        before, begun, own = process_s(process), time.perf_counter(), time.process_time()
+        for done, _ in enumerate(cluster.run(jobs, Path()), start=1):
+            per_job = (process_s(process) - before) / done
+            if done % 5000 == 0:
+                told = {"jobs": done, "scheduler_ms_per_job": round(1e3 * per_job, 3)}
+                print(json.dumps(told), file=sys.stderr, flush=True)
+        took, own = time.perf_counter() - begun, time.process_time() - own
         memory = process.memory_info().rss / 1e6
-    per_job = spent / done
+    most = (1 - idle) / per_job
     return {
-        "workers": options.workers,
-        "jobs": done,
+        "workers": workers,
+        "jobs": count,
+        "seconds_of_a_job": seconds,
         "seconds": round(took, 1),
         "scheduler_ms_per_job": round(1e3 * per_job, 3),
-        "client_ms_per_job": round(1e3 * own / done, 3),
+        "client_ms_per_job": round(1e3 * own / count, 3),
         "scheduler_share_when_idle": round(idle, 3),
         "scheduler_mb": round(memory),
-        "jobs_per_second_at_most": round((1 - idle) / per_job),
-        "workers_busy_with_jobs_of_60_s": round(60 * (1 - idle) / per_job),
+        "jobs_per_second_at_most": round(most),
+        "seconds_of_a_job_at_least": round(workers / most, 2),
+        "workers_busy_with_jobs_of_60_s": round(60 * most),
     }
 
 

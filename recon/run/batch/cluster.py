@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -20,6 +22,9 @@ EXTRA: Final = "cluster"
 _REACH_S: Final = 20.0
 _WORKERS_S: Final = 120.0
 _LOOK_S: Final = 30.0
+_KEY: Final = "recon-job"
+"""Dask keeps a list of the kinds of tasks, told by their keys, and looks through it at every step:
+jobs are all of one kind."""
 
 
 Work = Callable[[Job, str, bool, float], Outcome]
@@ -57,11 +62,14 @@ class Cluster:
     Args:
         client: Dask's client of it.
         work: What a worker does for a job; None = what the job says.
-        final: Whether no other workers will come when all are gone.
+        restart: Starts workers again that have died; None = others do that.
     """
 
-    def __init__(self, client: Any, work: Work | None = None, *, final: bool = False) -> None:
-        self._client, self._work, self._final = client, work or _work, final
+    def __init__(
+        self, client: Any, work: Work | None = None, restart: Callable[[], None] | None = None
+    ) -> None:
+        self._client, self._work, self._restart = client, work or _work, restart
+        self._alive_s = time.monotonic()
 
     @property
     def dashboard(self) -> str:
@@ -69,15 +77,15 @@ class Cluster:
         return str(self._client.dashboard_link)
 
     @property
-    def workers(self) -> dict[str, Any]:
-        """The workers by address, with their threads and what they declare to have."""
+    def workers(self) -> dict[str, int]:
+        """How many jobs each worker runs at once, by its address."""
         with _reaching():
-            return dict(self._client.scheduler_info(n_workers=-1)["workers"])
+            return dict(self._client.nthreads())
 
     @property
     def at_once(self) -> int:
         """How many jobs run at once, as far as workers are known now."""
-        return sum(worker["nthreads"] for worker in self.workers.values())
+        return sum(self.workers.values())
 
     def run(
         self, jobs: Sequence[Job], folder: Path, tell: Tell = lambda event: None
@@ -85,7 +93,8 @@ class Cluster:
         """Run jobs, and yield how each ended.
 
         A job that broke (its worker died, it was killed or late) is tried again, and yielded when
-        it succeeded or its retries are used up.
+        it succeeded or its retries are used up. Dask is given about two jobs for each that can run,
+        and more whenever half of them have ended: what it does not know it need not keep in order.
 
         Args:
             jobs: The jobs.
@@ -98,25 +107,26 @@ class Cluster:
         every_s = max(1.0, len(self.workers) / 50)
         self._client.subscribe_topic(topic_of(folder), lambda event: tell(event[1]))
         ended, tries = SimpleQueue[Any](), dict[str, _Running]()
-
-        def submit(one: Try) -> None:
-            future = self._submit(one, folder, every_s)
-            tries[future.key] = _Running(one, future)
-            future.add_done_callback(ended.put)
-
-        for job in jobs:
-            submit(Try(job))
-        while tries:
+        waiting, room, late_s = deque(map(Try, jobs)), 0, 0.0
+        while waiting or tries:
+            if time.monotonic() > late_s:
+                room, late_s = 2 * self._look() + 1, time.monotonic() + _LOOK_S
+            if waiting and len(tries) <= room // 2:
+                most = min(len(waiting), room - len(tries))
+                some = [waiting.popleft() for _ in range(most)]
+                for running in self._submit(some, folder, every_s):
+                    tries[running.future.key] = running
+                    running.future.add_done_callback(ended.put)
             for key, outcome in self._outcomes(ended, tries):
                 done = tries.pop(key).one
                 if outcome.state == "broken" and done.number < done.job.retries:
-                    submit(self._again(done, outcome))
+                    waiting.appendleft(self._again(done, outcome))
                 else:
                     yield done, outcome
             for orphan in self._orphans(tries):
                 tries.pop(orphan.future.key)
                 orphan.future.cancel()
-                submit(replace(orphan.one, only=frozenset()))
+                waiting.appendleft(replace(orphan.one, only=frozenset()))
 
     def each(self, function: Callable[[Any], None], items: Sequence[Any]) -> None:
         """Run a function with each item on some worker, and wait until all is done.
@@ -168,30 +178,49 @@ class Cluster:
         """Return the next future that has ended; None = none did for a while."""
         with suppress(Empty):
             return ended.get(timeout=_LOOK_S)
-        if self._final and not self.workers:
-            raise ClusterError("all workers of this machine have died")
         return None
 
-    def _submit(self, one: Try, folder: Path, every_s: float) -> Any:
-        workers = self.workers if one.job.needs else {}
-        declared = [worker["resources"] for worker in workers.values()]
-        needs = {
-            name: amount
-            for name, amount in one.job.needs.items()
-            if declared and all(name in have for have in declared)
-        }
-        return self._client.submit(
-            self._work,
-            one.job,
-            str(folder),
-            one.anew,
-            every_s,
-            # Others on this scheduler may have jobs of the same name.
-            key=f"{one.job.name}-{one.number}-{uuid4().hex[:12]}",
-            pure=False,
-            resources=needs or None,
-            workers=list(one.only) or None,
-        )
+    def _look(self) -> int:
+        """Return how many jobs run at once; workers of this machine that died are started again.
+
+        Raises:
+            ClusterError: All have died, and none comes back.
+        """
+        count, now_s = self.at_once, time.monotonic()
+        self._alive_s = now_s if count else self._alive_s
+        if self._restart is not None:
+            if now_s > self._alive_s + _WORKERS_S:
+                raise ClusterError("all workers of this machine have died")
+            self._restart()
+        return count
+
+    def _submit(self, tries: Sequence[Try], folder: Path, every_s: float) -> Iterator[_Running]:
+        """Give tries to Dask: all that may run at the same places in one message."""
+        declared = self._declared() if any(one.job.needs for one in tries) else frozenset()
+        alike: dict[Any, list[Try]] = {}
+        for one in tries:
+            needs = {name: least for name, least in one.job.needs.items() if name in declared}
+            alike.setdefault((tuple(needs.items()), one.only), []).append(one)
+        for (needs_of_all, only), some in alike.items():
+            futures = self._client.map(
+                self._work,
+                [one.job for one in some],
+                [str(folder)] * len(some),
+                [one.anew for one in some],
+                [every_s] * len(some),
+                key=_KEY,
+                pure=False,
+                resources=dict(needs_of_all) or None,
+                workers=list(only) or None,
+            )
+            yield from map(_Running, some, futures)
+
+    def _declared(self) -> frozenset[str]:
+        """Return the resources that all workers declare."""
+        with _reaching():
+            workers = self._client.scheduler_info(n_workers=-1)["workers"]
+        names = [frozenset(worker["resources"]) for worker in workers.values()]
+        return frozenset.intersection(*names) if names else frozenset()
 
 
 @contextmanager
@@ -204,6 +233,14 @@ def local_cluster(workers: int) -> Iterator[Cluster]:
     """
     distributed = require("distributed", extra=EXTRA)
     _be_quiet()
+    require("dask", extra=EXTRA).config.set(
+        {
+            # A worker is not given a second job to wait behind its first.
+            "distributed.scheduler.worker-saturation": 1.0,
+            # Dask gives up one that it starts again and that is not there by then.
+            "distributed.deploy.lost-worker-timeout": _WORKERS_S / 2,
+        }
+    )
     try:
         local = distributed.LocalCluster(
             n_workers=workers,
@@ -217,7 +254,7 @@ def local_cluster(workers: int) -> Iterator[Cluster]:
     except RuntimeError as error:
         raise ClusterError("the workers of this machine do not start", got=error) from error
     with local, distributed.Client(local) as client:
-        yield Cluster(client, final=True)
+        yield Cluster(client, restart=lambda: local.scale(workers))
 
 
 @contextmanager

@@ -127,8 +127,13 @@ def _run(
 
 def _environment() -> dict[str, str]:
     """Return the environment, in which the folder of the job cannot hide this program."""
-    paths = (str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH"))
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    paths = (str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH"))
+    # The second is known to Python from 3.11 on: the working folder is not searched.
+    return {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
+        "PYTHONSAFEPATH": "1",
+    }
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:

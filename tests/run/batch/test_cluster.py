@@ -81,6 +81,37 @@ def test_a_job_that_finds_a_disk_full_is_tried_on_another_worker(
         assert first != second != third
 
 
+def test_dask_has_jobs_of_one_kind_and_about_two_for_each_that_can_run(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given: list[int] = []
+    submit = Cluster._submit
+    monkeypatch.setattr(
+        Cluster, "_submit", lambda *args: given.append(len(args[1])) or submit(*args)
+    )
+    quick = Cluster(cluster._client, lambda *job: Outcome("succeeded"))
+    ended = run(quick, [job(f"j{n}") for n in range(40)], tmp_path)
+    assert {outcome.state for _, outcome in ended.values()} == {"succeeded"}
+    assert given[0] == 2 * quick.at_once + 1
+    assert (sum(given), max(given)) == (40, given[0])
+    kinds = cluster._client.run_on_scheduler(lambda dask_scheduler: [*dask_scheduler.task_prefixes])
+    assert [kind for kind in kinds if "j1" in kind] == []
+
+
+def test_workers_of_this_machine_that_died_are_started_again(
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[str] = []
+    local = Cluster(cluster._client, restart=lambda: begun.append("again"))
+    assert local._look() == 2
+    monkeypatch.setattr(Cluster, "workers", {})
+    assert local._look() == 0
+    assert begun == ["again"] * 2
+    monkeypatch.setattr("recon.run.batch.cluster._WORKERS_S", -1.0)
+    with pytest.raises(ClusterError, match="all workers of this machine have died"):
+        local._look()
+
+
 def test_a_try_whose_workers_have_all_died_is_not_waited_for(cluster: Cluster) -> None:
     alive, gone = next(iter(cluster.workers)), "tcp://192.0.2.1:9"
     tries = {
@@ -139,7 +170,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPat
 
 def test_a_scheduler_that_goes_while_it_is_asked_for_its_workers_is_one_line() -> None:
     class Gone:
-        def scheduler_info(self, n_workers: int) -> None:
+        def nthreads(self) -> None:
             raise OSError("Timed out trying to connect to tcp://127.0.0.1:9 after 20 s")
 
     with pytest.raises(ClusterError, match="the scheduler is gone"):

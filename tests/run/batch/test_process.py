@@ -13,7 +13,9 @@ from typing import Any
 
 import pytest
 
+import recon
 from recon.io.lock import take_lock
+from recon.run.batch import process
 from recon.run.batch.job import Job, is_done
 from recon.run.batch.process import run_job
 from recon.run.directory import lock_file
@@ -53,6 +55,23 @@ def test_a_killed_job_is_broken_and_goes_on_where_it_was(tmp_path: Path) -> None
     again = run_job(job("a", "killed once"), tmp_path)
     assert (again.state, again.resumed) == ("succeeded", True)
     assert tries(tmp_path, "a") == ["begun", "resumed"]
+
+
+def test_a_job_runs_the_program_of_its_worker(tmp_path: Path) -> None:
+    found = subprocess.run(
+        [sys.executable, "-c", "import recon; print(recon.__file__)"],
+        cwd=tmp_path, env=process._environment(), capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert Path(found.stdout.strip()).samefile(recon.__file__)
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python before 3.11 looks there first")
+def test_what_is_in_the_folder_of_a_job_does_not_hide_the_program(tmp_path: Path) -> None:
+    (tmp_path / "recon").mkdir()
+    for hidden in ("recon/__init__.py", "json.py"):
+        (tmp_path / hidden).write_text("raise SystemExit('error: something else')")
+    command = Job("a", "pair", "", ("pair", "left.png", "right.png"), True, str(tmp_path))
+    assert run_job(command, tmp_path).error.startswith("left.png: file does not exist")
 
 
 @usefixtures
