@@ -117,7 +117,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "drive", type=Path, nargs="?", help="rectified drive with true poses; a rendered street"
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
-    parser.add_argument("--odometry", default="fused", help="fused, visual or kiss")
+    parser.add_argument("--odometry", default="visual", help="visual or kiss")
     parser.add_argument("--only", nargs="+", help="names of alterations")
     parser.add_argument("--set", action="append", default=[], help="a setting of recon map")
     parser.add_argument("--write", type=Path, help="only write the altered drives there (KITTI)")

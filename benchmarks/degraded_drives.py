@@ -1,8 +1,7 @@
-"""What kiss-icp is worth where features fail: `fused` against `visual` on the same frames.
+"""What is left of the path where features fail: by each odometry, on the same frames.
 
 Some frames of a drive are black, blurred, overexposed or covered, its steps are long, its surfaces
-nearly bare, or the rig turns on the spot. ``loss`` is by how much the drift exceeds that of the
-drive as it is.
+nearly bare, or the rig turns on the spot.
 
 Example: python benchmarks/degraded_drives.py DRIVE
 """
@@ -25,7 +24,7 @@ from recon.commands.config import load_config
 from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
-from recon.odometry import OdometryFrame, make_odometry
+from recon.odometry import ODOMETRIES, OdometryFrame, make_odometry
 from recon.run.machine import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
@@ -33,7 +32,6 @@ from recon.stereo.frame import FrameReconstructor
 from recon.street.settings import StreetScene
 from recon.street.street import StreetWorld, build_street
 
-NAMES: Final = ("visual", "fused")
 SCENE: Final = {"seed": 3, "frames": 72, "width_px": 400, "height_px": 136, "focal_px": 225.0}
 TURN_DEG: Final = 10.0
 """How much the rig that turns on the spot turns from frame to frame; one whole turn."""
@@ -149,8 +147,8 @@ class Kept:
 def run(altered: Altered) -> dict[str, dict[str, Any]]:
     """Errors of each odometry on the same frames."""
     reconstructor = FrameReconstructor(altered.calibration, load_config(None, []), threads=1)
-    odometries = {name: make_odometry(name) for name in NAMES}
-    results: dict[str, list[Any]] = {name: [] for name in NAMES}
+    odometries = {name: make_odometry(name) for name in ODOMETRIES}
+    results: dict[str, list[Any]] = {name: [] for name in ODOMETRIES}
     with serial_algebra():
         for pair in altered.frames():
             frame = OdometryFrame(*reconstructor.match(pair))
@@ -163,7 +161,6 @@ def run(altered: Altered) -> dict[str, dict[str, Any]]:
         found[name] = {
             **errors_of(path, altered),
             "untrusted": sum(not record.ok for record in health),
-            "corrected": sum(record.accepted for record in health),
         }
     return found
 
@@ -198,7 +195,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def line(name: str, found: dict[str, dict[str, Any]]) -> str:
     cells = (
         f"{odometry}: {row['t_rel_percent']:.3f} %, ATE {row['ate_m']:.2f} m, "
-        f"{row['untrusted']} untrusted, {row['corrected']} corrected"
+        f"{row['untrusted']} untrusted"
         for odometry, row in found.items()
     )
     return f"{name:18s}" + "   ".join(cells)

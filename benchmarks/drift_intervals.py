@@ -196,7 +196,7 @@ def judge(
 ) -> dict[str, Any]:
     """How far the path of a drive is off, beside how far it says it may be."""
     reconstructor = FrameReconstructor(camera, load_config(None, []), threads=1)
-    odometry = make_odometry("fused")
+    odometry = make_odometry("visual")
     poses, health = [], []
     with serial_algebra():
         for pair in pairs:

@@ -19,11 +19,11 @@ def map_(
     out: opt.Out = None,
     start: Start = None,
     odometry: Annotated[
-        Literal["fused", "visual", "kiss"] | None,
+        Literal["visual", "kiss"] | None,
         typer.Option(
-            help="fused: visual odometry, refined by kiss-icp where that helps; visual or kiss: "
-            "one of the two alone.",
-            show_default="fused",
+            help="visual: features followed from frame to frame; kiss: kiss-icp on the points that "
+            "stereo measures well, to compare with.",
+            show_default="visual",
         ),
     ] = None,
     poses: Annotated[

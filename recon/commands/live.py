@@ -60,7 +60,7 @@ def run_live(
     if not 0.0 < rate < float("inf"):
         raise SettingsError("a rate is positive", where="--rate", got=f"{rate:g}")
     config, options = config or load_config(), options or MapOptions(command="live")
-    config = _pose_first(config)
+    _check_pose_first(config)
     _warm_up(LiveSource(_Beginning(source)), config, map_path)
     live = isinstance(source, CameraSource) and source.live
     played = LiveSource(source, None if live else rate, stopped)
@@ -112,11 +112,11 @@ def _warm_up(source: LiveSource, config: ReconConfig, map_path: Path | None) -> 
             localize_sequence(source, Workspace(map_), config)
 
 
-def _pose_first(config: ReconConfig) -> ReconConfig:
-    """Return the configuration with the odometry that needs no exact disparity.
+def _check_pose_first(config: ReconConfig) -> None:
+    """Refuse an odometry that needs exact disparities.
 
     Raises:
-        SettingsError: Another one is asked for.
+        SettingsError: It is asked for.
     """
     if config.odometry.method == "kiss":
         raise SettingsError(
@@ -125,5 +125,3 @@ def _pose_first(config: ReconConfig) -> ReconConfig:
             got="kiss",
             expected="visual",
         )
-    odometry = config.odometry.model_copy(update={"method": "visual"})
-    return config.model_copy(update={"odometry": odometry})

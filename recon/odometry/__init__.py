@@ -1,8 +1,9 @@
-"""From frames to poses: visual odometry, corrected by kiss-icp where that helps.
+"""From frames to poses: visual odometry, or kiss-icp to compare with.
 
 - `protocol.py`: what every odometry takes and gives; `registry.py`: the odometries by name;
 - `visual.py`: features tracked (`tracking.py`) through a short window of frames (`window.py`);
-- `fused.py`: its poses corrected by `kiss_icp.py`, as far as `gate.py` lets them;
+- `kiss.py`: clouds registered over time by `kiss_icp.py`, which also registers in a finished map
+  (`recon.map.localize`);
 - `checked.py`: poses that cannot be trusted are marked; `expected.py`: how far a path may be off;
 - `prior.py`: what wheels or an inertial unit say.
 """

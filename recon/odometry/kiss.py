@@ -39,7 +39,6 @@ class KissOdometry:
         self._icp = KissIcp(
             KissIcpOptions(
                 max_range_m=max_range_m,
-                source_range_m=max_range_m,
                 voxel_m=_VOXEL_M,
                 initial_threshold_m=_INITIAL_THRESHOLD_M,
                 min_motion_m=_MIN_MOTION_M,
@@ -55,7 +54,7 @@ class KissOdometry:
             health = OdometryHealth(ok=not self._poses, icp_points=len(points), notes=(note,))
             return self._keep(self._extrapolated(), health)
         alignment = self._icp.register(points.xyz)
-        health = OdometryHealth(icp_points=len(alignment.source), accepted=True)
+        health = OdometryHealth(icp_points=len(alignment.source))
         return self._keep(alignment.T_world_camera, health)
 
     def state(self) -> dict[str, Any]:

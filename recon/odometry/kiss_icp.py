@@ -30,7 +30,6 @@ class KissIcpOptions:
 
     Attributes:
         max_range_m: Points farther from the sensor are dropped, and the map is clipped there.
-        source_range_m: Points farther away are added to the map, but not used for alignment.
         voxel_m: Voxel size of the map.
         points_per_voxel: Maximum number of points per voxel of the map.
         iterations: Maximum number of ICP iterations.
@@ -41,7 +40,6 @@ class KissIcpOptions:
     """
 
     max_range_m: float
-    source_range_m: float
     voxel_m: float
     points_per_voxel: int = 20
     iterations: int = 500
@@ -78,8 +76,7 @@ class KissIcp:
 
     def __init__(self, options: KissIcpOptions) -> None:
         self._options = options
-        with _our_errors():
-            self._icp = _RangedKissIcp(_config(options), options)
+        self._icp = _new(options)
 
     def register(self, xyz_camera: NDArray[np.floating]) -> IcpAlignment:
         """Register a frame with kiss-icp's own motion model, threshold and map update.
@@ -101,7 +98,7 @@ class KissIcp:
         T_world_guess: NDArray[np.floating],
         threshold_m: float,
     ) -> IcpAlignment:
-        """Align a frame to the map without changing it; the caller may reject the result.
+        """Align a frame to the map without changing it: to one that was set.
 
         Args:
             xyz_camera: (N, 3), metres, finite; not empty.
@@ -112,25 +109,20 @@ class KissIcp:
             RegistrationError: There are no points, or kiss-icp fails.
         """
         points = _points(xyz_camera)
-        guess = _pose(T_world_guess)
+        guess, icp = _pose(T_world_guess), self._icp
         with _our_errors():
-            source, _ = self._icp.voxelize(self._icp.clip(points))
-            pose = self._icp.align(source, guess, threshold_m)
+            near = icp.preprocessor.preprocess(points, np.zeros(0), np.eye(4))
+            source, _ = icp.voxelize(near)
+            if not len(source) or icp.local_map.empty():
+                return IcpAlignment(guess, np.array(source))
+            pose = icp.registration.align_points_to_map(
+                points=source,
+                voxel_map=icp.local_map,
+                initial_guess=guess,
+                max_correspondance_distance=3 * threshold_m,
+                kernel=threshold_m,
+            )
         return IcpAlignment(_pose(pose), np.array(source))
-
-    def update(
-        self, xyz_camera: NDArray[np.floating], T_world_camera: NDArray[np.floating]
-    ) -> None:
-        """Add a frame to the map at its final pose.
-
-        Raises:
-            RegistrationError: There are no points, or kiss-icp fails.
-        """
-        points = _points(xyz_camera)
-        pose = _pose(T_world_camera)
-        with _our_errors():
-            _, frame = self._icp.voxelize(self._icp.clip(points))
-            self._icp.correct(frame, pose)
 
     def set_map(self, xyz_world: NDArray[np.floating]) -> None:
         """Replace the map by points (M, 3), of which there may be none.
@@ -142,13 +134,6 @@ class KissIcp:
             self._icp.local_map.clear()
             if len(xyz_world):
                 self._icp.local_map.add_points(_points(xyz_world))
-
-    def map_points(self) -> Float64:
-        """Return float64 (M, 3), the points of the local map, world axes, in ascending order."""
-        with _our_errors():
-            points = np.array(self._icp.local_map.point_cloud(), dtype=np.float64).reshape(-1, 3)
-        # The order of kiss-icp's hash map depends on its history; sorted order does not.
-        return points[np.lexsort(points.T[::-1])]
 
     def state(self) -> dict[str, Any]:
         """Return everything that later results depend on, as arrays and plain values."""
@@ -169,8 +154,8 @@ class KissIcp:
         poses = [state[name] for name in ("last_pose", "last_delta")]
         for pose in poses:
             _pose(pose)
+        self._icp = _new(self._options)
         with _our_errors():
-            self._icp = _RangedKissIcp(_config(self._options), self._options)
             if len(state["points"]):
                 self._icp.local_map.add_points(_points(state["points"]))
         self._icp.last_pose, self._icp.last_delta = poses
@@ -214,46 +199,12 @@ class _AdaptiveThreshold:
         self._sum_m2, self._count = float(sum_m2), int(count)
 
 
-class _RangedKissIcp(KissICP):  # type: ignore[misc]
-    """kiss-icp with a shorter range for alignment than for the map, and with separate steps."""
-
-    def __init__(self, config: KISSConfig, options: KissIcpOptions) -> None:
-        super().__init__(config)
-        self.last_pose: Float64 = np.eye(4)
-        self.adaptive_threshold = _AdaptiveThreshold(options)
-        self._source_range_m = options.source_range_m
-
-    def voxelize(self, iframe: Float64) -> tuple[Float64, Float64]:
-        """Return source and map points; those near the map's edge would bias the alignment."""
-        source, frame = super().voxelize(iframe)
-        near = np.linalg.norm(source, axis=1) <= self._source_range_m
-        return source[near], frame
-
-    def clip(self, points: Float64) -> Float64:
-        """Return points within range."""
-        clipped: Float64 = self.preprocessor.preprocess(points, np.zeros(0), np.eye(4))
-        return clipped
-
-    def align(self, source: Float64, guess: Float64, threshold_m: float) -> Float64:
-        """Return the pose of a source in the map; the guess if there is nothing to align."""
-        # The guess enters where kiss-icp's motion model does: as last pose times last delta.
-        self.last_delta = orthonormalise(np.linalg.inv(self.last_pose) @ guess)
-        if not len(source) or self.local_map.empty():
-            return guess
-        pose: Float64 = self.registration.align_points_to_map(
-            points=source,
-            voxel_map=self.local_map,
-            initial_guess=orthonormalise(self.last_pose @ self.last_delta),
-            max_correspondance_distance=3 * threshold_m,
-            kernel=threshold_m,
-        )
-        return pose
-
-    def correct(self, frame: Float64, pose: Float64) -> None:
-        """Accept a pose and add its frame to the map."""
-        self.last_delta = orthonormalise(np.linalg.inv(self.last_pose) @ pose)
-        self.last_pose = pose
-        self.local_map.update(frame, pose)
+def _new(options: KissIcpOptions) -> KissICP:
+    """Return kiss-icp with an empty map, and a threshold of which the state can be saved."""
+    with _our_errors():
+        icp = KissICP(_config(options))
+    icp.adaptive_threshold = _AdaptiveThreshold(options)
+    return icp
 
 
 def _config(options: KissIcpOptions) -> KISSConfig:

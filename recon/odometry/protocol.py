@@ -44,11 +44,6 @@ class OdometryHealth:
             each weighted by how much it tells. What all disparities are off, in shares of it, the
             motion is too long or too short.
         icp_points: Points given to ICP.
-        overlap: Share of ICP source points with a neighbour in the map.
-        residual_m: Median distance of those to the map.
-        correction_m: Translation by which ICP would move the prior.
-        correction_deg: Rotation by which ICP would move the prior.
-        accepted: True where (a part of) the ICP correction was applied.
         notes: Why something was refused or went wrong, for the log.
         warnings: Problems of the frame that the user should know, even if it has a pose.
     """
@@ -61,11 +56,6 @@ class OdometryHealth:
     sigma_deg: float = float("nan")
     scale_px: float = float("nan")
     icp_points: int = 0
-    overlap: float = float("nan")
-    residual_m: float = float("nan")
-    correction_m: float = float("nan")
-    correction_deg: float = float("nan")
-    accepted: bool = False
     notes: tuple[str, ...] = field(default=())
     warnings: tuple[str, ...] = field(default=())
 

@@ -8,7 +8,6 @@ from typing import Final
 from recon.core.errors import SettingsError
 from recon.core.values import Trajectory
 from recon.odometry.checked import CheckedOdometry
-from recon.odometry.fused import FusedOdometry
 from recon.odometry.kiss import KissOdometry
 from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import Odometry
@@ -18,7 +17,6 @@ from recon.odometry.visual import VisualOdometry
 ODOMETRIES: Final[dict[str, Callable[[OdometrySettings, MotionPrior | None], Odometry]]] = {
     "visual": lambda settings, prior: VisualOdometry(prior),
     "kiss": lambda settings, prior: KissOdometry(settings.max_range_m),
-    "fused": FusedOdometry,
 }
 
 
@@ -41,7 +39,7 @@ def make_odometry(
         raise SettingsError("unknown odometry", got=repr(name), expected=f"one of: {choices}")
     if name == "kiss" and prior is not None:
         raise SettingsError(
-            "kiss takes no prior", expected="visual or fused", hint="drop --prior or --odometry"
+            "kiss takes no prior", expected="visual", hint="drop --prior or --odometry"
         )
     settings = settings or OdometrySettings()
     motion_prior = None if prior is None else MotionPrior(prior, settings.prior)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from recon.core.settings import Settings
 
@@ -38,21 +38,26 @@ class PriorSettings(Settings):
     )
 
 
-OdometryName = Literal["visual", "kiss", "fused"]
+OdometryName = Literal["visual", "kiss"]
+
+
+def _name_today(name: object) -> object:
+    """Return what an odometry is called today: in runs of older versions it may be "fused"."""
+    return "visual" if name == "fused" else name
 
 
 class OdometrySettings(Settings):
     """Where the camera is in each frame."""
 
-    method: OdometryName = Field(
-        "fused",
-        description="visual = features, fastest; kiss = kiss-icp alone, on the points that stereo "
-        "measures well; fused = features, corrected by ICP where it is more certain.",
+    method: Annotated[OdometryName, BeforeValidator(_name_today)] = Field(
+        "visual",
+        description="visual = features followed from frame to frame; kiss = kiss-icp, which "
+        "registers the points that stereo measures well over time, to compare with.",
     )
     max_range_m: float = Field(
         30.0,
         gt=0.0,
-        description="Points farther than this are not used by ICP. Raise it with a wide baseline "
-        "in open country.",
+        description="Points farther than this are not registered by kiss-icp (`kiss`, and "
+        "`recon localize`). Raise it with a wide baseline in open country.",
     )
     prior: PriorSettings = PriorSettings()

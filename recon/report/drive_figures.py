@@ -248,15 +248,15 @@ def health_figure(health: Sequence[OdometryHealth]) -> bytes:
     """Draw the odometry health of each frame; frames with an untrusted pose are shaded red."""
     rows = (
         ("inlier tracks", [float(record.inliers) for record in health]),
-        ("overlap with\nthe map (share)", [record.overlap for record in health]),
-        ("ICP correction (m)", [record.correction_m for record in health]),
+        ("reprojection\nerror (px)", [record.reprojection_px for record in health]),
+        ("standard deviation\nof the motion (m)", [record.sigma_m for record in health]),
     )
     figure = Figure((WIDE_IN, 5.6))
     all_axes = figure.subplots(len(rows), 1, sharex=True)
     for axes, (label, values) in zip(all_axes, rows, strict=True):
         known = np.isfinite(values)
         if known.any():
-            # Values measured only every few frames have no neighbours to connect by a line.
+            # A value between frames without one has no neighbour to connect by a line.
             axes.plot(values, linewidth=1.3, marker="" if known.all() else ".")
             axes.set_ylim(bottom=0)
         else:

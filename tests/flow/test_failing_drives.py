@@ -251,7 +251,7 @@ def test_a_road_with_texture_is_believed_where_it_is_seen(tmp_path: Path) -> Non
 
 
 def test_a_road_with_texture_needs_no_warning() -> None:
-    assert all(result.health.ok for result in register(Road(grain=25.0, step_m=0.8), 5, "fused"))
+    assert all(result.health.ok for result in register(Road(grain=25.0, step_m=0.8), 5, "visual"))
 
 
 ROAD = Road(grain=25.0, step_m=0.8)

@@ -252,7 +252,7 @@ def test_an_altered_start_is_refused(change: str, interrupted: Path) -> None:
 
 
 MAPPER: Final = ("mapper",)
-FUSED: Final = ("mapper", "odometry", "odometry")
+VISUAL: Final = ("mapper", "odometry", "odometry", "last")
 
 
 def state(change: Callable[[dict[str, Any]], None]) -> Alter:
@@ -278,13 +278,9 @@ CHECKPOINTS: Final[dict[str, Alter]] = {
     "map pose a word": record("axes", spoil("T_map_world", value="eye")),
     "odometry null": state(spoil(*MAPPER, "odometry", value=None)),
     "odometry of bytes": state(spoil(*MAPPER, "odometry", value=np.zeros(9, np.uint8))),
-    "odometry pose NaN": state(spoil(*FUSED, "T_world_camera", value=NAN_POSE)),
-    "odometry covariance 3x3": state(spoil(*FUSED, "icp_covariance", value=np.eye(3))),
-    "odometry counts of words": state(spoil(*FUSED, "counts", value=["a", "b", "c"])),
-    "ICP threshold negative": state(spoil(*FUSED, "icp", "threshold", value=[-1.0, 0])),
-    "ICP points NaN": state(spoil(*FUSED, "icp", "points", value=np.full((5, 3), np.nan))),
-    "ICP points flat": state(spoil(*FUSED, "icp", "points", value=np.zeros(5))),
-    "ICP pose NaN": state(spoil(*FUSED, "icp", "last_pose", value=NAN_POSE)),
+    "odometry pose NaN": state(spoil(*VISUAL, "motion", "T_world_camera", value=NAN_POSE)),
+    "odometry time a word": state(spoil(*VISUAL, "seen_s", value="late")),
+    "odometry points flat": state(spoil(*VISUAL, "window", "xyz_world", value=np.zeros(5))),
     "frames of words": record("frames", spoil("times_s", value="many")),
     "frames missing": record("frames", None),
     "a submap missing in between": record("submap_entry", None),

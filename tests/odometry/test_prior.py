@@ -35,10 +35,8 @@ def steps(count: int, step: np.ndarray = STEP) -> np.ndarray:
     return np.stack([np.linalg.matrix_power(step, n) for n in range(count)])
 
 
-def register(
-    frames: list[OdometryFrame], prior: Trajectory | None, method: str = "fused"
-) -> list[OdometryResult]:
-    odometry = make_odometry(method, OdometrySettings(), prior)
+def register(frames: list[OdometryFrame], prior: Trajectory | None) -> list[OdometryResult]:
+    odometry = make_odometry("visual", OdometrySettings(), prior)
     return [odometry.register(frame) for frame in frames]
 
 
@@ -96,8 +94,7 @@ def test_naive_kiss_takes_no_prior() -> None:
         make_odometry("kiss", OdometrySettings(), path(steps(3)))
 
 
-@pytest.mark.parametrize("method", ["visual", "fused"])
-def test_frames_without_sight_are_carried_by_the_prior(method: str, see: See, blind: See) -> None:
+def test_frames_without_sight_are_carried_by_the_prior(see: See, blind: See) -> None:
     """The camera turns sharply while it is blind: the last motion going on would be far off."""
     turn = make_transform(exp_so3(np.array([0.0, 0.08, 0.0])), np.array([0.0, 0.0, 0.3]))
     truth = list(steps(4))
@@ -105,8 +102,8 @@ def test_frames_without_sight_are_carried_by_the_prior(method: str, see: See, bl
         truth.append(truth[-1] @ turn)
     frames = [see(T, n) for n, T in enumerate(truth[:4])]
     frames += [blind(index=n) for n in range(4, len(truth))]
-    alone = register(frames, None, method)
-    carried = register(frames, path(np.stack(truth)), method)
+    alone = register(frames, None)
+    carried = register(frames, path(np.stack(truth)))
     assert not alone[-1].health.ok
     assert off_m(alone[-1], truth[-1]) > 0.5
     assert all(result.health.ok for result in carried)
@@ -130,7 +127,7 @@ def test_features_that_stand_still_do_not_outvote_the_wheels(see: See) -> None:
     """An image that stays the same while the wheels turn, as behind a lorry or a dirty lens."""
     still = [see(np.eye(4), 0)] * 3
     frames = [replace(f, pair=replace(f.pair, timestamp_s=0.1 * n)) for n, f in enumerate(still)]
-    results = register(frames, path(steps(3)), "visual")
+    results = register(frames, path(steps(3)))
     assert off_m(results[-1], np.linalg.matrix_power(STEP, 2)) < 1e-6
     assert "features contradict the prior" in results[-1].health.notes[0]
     # Who is right is open, and the image is against the wheels.

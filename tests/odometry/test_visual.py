@@ -154,6 +154,16 @@ def test_sight_that_comes_back_finds_the_last_seen_frame(
     assert np.linalg.norm(off[:3, 3]) < 0.1
 
 
+def test_a_drive_that_begins_blind_begins_where_it_sees(
+    blind: See, street: tuple[OdometryFrame, ...]
+) -> None:
+    odometry = VisualOdometry()
+    results = [odometry.register(frame) for frame in (blind(), blind(), *street[:4])]
+    np.testing.assert_allclose(results[2].T_world_camera, np.eye(4), atol=1e-12)
+    assert [result.health.ok for result in results[:2]] == [True, False]
+    assert results[-1].health.ok
+
+
 def test_health_says_how_sure_the_motion_is(street: tuple[OdometryFrame, ...]) -> None:
     odometry = VisualOdometry()
     results = [odometry.register(frame) for frame in street]

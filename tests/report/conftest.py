@@ -72,7 +72,7 @@ def T_map_world() -> Float64:
 @pytest.fixture
 def health() -> list[OdometryHealth]:
     """One record per frame of `trajectory`; frame 5 has no measurement."""
-    good = OdometryHealth(tracks=200, inliers=150, overlap=0.8, correction_m=0.01)
+    good = OdometryHealth(tracks=200, inliers=150, reprojection_px=0.2, sigma_m=0.01)
     bad = OdometryHealth(ok=False, notes=("too few <tracks>",))
     return [bad if frame == 5 else good for frame in range(11)]
 

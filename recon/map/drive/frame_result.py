@@ -55,7 +55,6 @@ class FrameResult:
             "position_m": [_finite(x) for x in self.T_world_camera[:3, 3].tolist()],
             "measured": self.health.ok,
             "inliers": self.health.inliers,
-            "overlap": _finite(self.health.overlap),
             "notes": list(self.health.notes),
         }
 

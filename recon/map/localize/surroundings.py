@@ -12,13 +12,13 @@ from recon.core.geometry.se3 import adjoint, apply, as_step, as_transform, inver
 from recon.core.values.arrays import Float64
 from recon.io.files import reading
 from recon.map.localize.belief import Belief
+from recon.map.localize.gate import Correction, icp_covariance, is_worthwhile
+from recon.map.localize.surfaces import Fit, Surfaces, describe_surfaces, fit_surfaces
 from recon.map.store.map import Map
 from recon.map.store.session import Session
-from recon.odometry.gate import Correction, icp_covariance, judge
 from recon.odometry.kiss_icp import IcpAlignment, KissIcp, KissIcpOptions
 from recon.odometry.points import select_points
 from recon.odometry.protocol import OdometryFrame
-from recon.odometry.surfaces import Fit, Surfaces, describe_surfaces, fit_surfaces
 
 _VOXEL_M: Final = 0.3
 """Edge of a voxel of the map of ICP."""
@@ -80,8 +80,8 @@ class Surroundings:
     def __init__(self, map_: Map, max_range_m: float) -> None:
         self._range_m = max_range_m
         self._parts = [part for session in map_.linked for part in _parts(map_, session)]
-        options = KissIcpOptions(max_range_m, max_range_m, _VOXEL_M, iterations=50)
-        self._icp = KissIcp(replace(options, convergence=1e-3))
+        options = KissIcpOptions(max_range_m, _VOXEL_M, iterations=50, convergence=1e-3)
+        self._icp = KissIcp(options)
         self._loaded_at = np.full(3, np.inf)
         self._surfaces = describe_surfaces(np.zeros((0, 3)), _SURFACE_M)
         self._offset = np.zeros(6)
@@ -98,13 +98,13 @@ class Surroundings:
         points = select_points(frame, self._range_m)
         if len(points) < _MIN_POINTS:
             return None
-        correction = self._measure(belief, points.xyz.astype(np.float64))
-        verdict = judge(correction, self._offset, belief.covariance)
+        measured = self._measure(belief, points.xyz.astype(np.float64))
+        correction = replace(measured, step=measured.step - self._offset)
         if learn:
-            self._learn(correction.step)
-        if not verdict.accepted:
+            self._learn(measured.step)
+        if not is_worthwhile(correction, belief.covariance):
             return None
-        T = belief.T_world_camera @ as_transform(correction.step - self._offset)
+        T = belief.T_world_camera @ as_transform(correction.step)
         return belief.corrected_to(T, icp_covariance(correction.after))
 
     def align(self, xyz: Float64, T_world_guess: Float64) -> IcpAlignment:

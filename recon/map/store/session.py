@@ -302,7 +302,8 @@ def _frames_of(content: dict[str, Any]) -> Iterator[tuple[Float64, float, Odomet
     _check_rotations(path)
     times_s = path.timestamps_s.tolist()
     for number, (T, time_s) in enumerate(zip(path.T_world_camera, times_s, strict=True)):
-        values = {name: columns[name][number] for name in columns}
+        # Older versions measured more.
+        values = {name: columns[name][number] for name in columns if name in _HEALTH}
         values.update({name: tuple(values[name]) for name in ("notes", "warnings")})
         yield T, time_s, OdometryHealth(**values)
 

@@ -22,15 +22,15 @@ class Terminal(io.StringIO):
         return True
 
 
-def frame(index: int, *, ok: bool = True, overlap: float = 0.8) -> FrameResult:
-    health = OdometryHealth(ok=ok, inliers=120, overlap=overlap, notes=("a [bold] note",))
-    return FrameResult(index, 3, 0.25, 0.7, 900, np.eye(4), health)
+def frame(index: int, *, ok: bool = True, valid_share: float = 0.7) -> FrameResult:
+    health = OdometryHealth(ok=ok, inliers=120, notes=("a [bold] note",))
+    return FrameResult(index, 3, 0.25, valid_share, 900, np.eye(4), health)
 
 
 def run(viewer: Progress) -> None:
     viewer.on_start("drive [1]", 3)
     for index in range(3):
-        viewer.on_step(frame(index, ok=index != 1, overlap=float("nan")))
+        viewer.on_step(frame(index, ok=index != 1))
     viewer.on_finish()
     viewer.on_stage("mesh")
 
@@ -53,11 +53,11 @@ def test_every_event_is_one_json_line() -> None:
 
 def test_json_lines_tell_the_frame_and_have_null_for_nan() -> None:
     stream = io.StringIO()
-    JsonLines(stream).on_step(frame(1, ok=False, overlap=float("nan")))
+    JsonLines(stream).on_step(frame(1, ok=False, valid_share=float("nan")))
     (told,) = lines(stream)
     assert told["index"] == 1
     assert told["measured"] is False
-    assert told["overlap"] is None
+    assert told["valid_share"] is None
     assert told["position_m"] == [0.0, 0.0, 0.0]
     assert told["notes"] == ["a [bold] note"]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.core.geometry.se3 import apply, as_transform
-from recon.odometry.surfaces import NOISE_M, describe_surfaces, fit_surfaces
+from recon.map.localize.surfaces import NOISE_M, describe_surfaces, fit_surfaces
 
 
 def wall(points: int = 3000, noise_m: float = 0.0) -> np.ndarray:
