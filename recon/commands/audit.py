@@ -8,7 +8,7 @@ from pathlib import Path
 from recon.commands.config import ReconConfig
 from recon.report.audit_page import write_audit_page
 from recon.rig.audit.audit import Audit, audit_source, correct_calibration
-from recon.run import Run
+from recon.run.run import Run
 from recon.sources.protocol import StereoSource
 from recon.stereo.match.registry import make_matcher
 

@@ -11,7 +11,6 @@ from recon.commands.config import load_config
 from recon.core.errors import ClusterError, OutputError
 from recon.io.files import naming
 from recon.report.batch_page import write_batch_page
-from recon.run import Run
 from recon.run.batch.cluster import connect
 from recon.run.batch.figures import JobResult, compare, result_of
 from recon.run.batch.job import Job, Outcome, is_done
@@ -19,6 +18,7 @@ from recon.run.batch.job_file import Entry
 from recon.run.batch.plan import PLAN, Limits, Program, plan_jobs, read_plan, write_plan
 from recon.run.batch.work import BatchOptions, work_off
 from recon.run.directory import default_folder
+from recon.run.run import Run
 
 COMMANDS: Final = (
     "map", "localize", "merge", "pair", "disparity", "export", "mesh", "occupancy", "rectify",
@@ -120,8 +120,9 @@ def _hint(folder: Path) -> Iterator[None]:
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(hint) from interrupt
     except ClusterError as error:
-        told = error.hint if not (folder / PLAN).is_file() else hint
-        raise ClusterError(error.what, where=error.where, got=error.got, hint=told) from error
+        if not (folder / PLAN).is_file():
+            raise
+        raise error.but(hint=hint) from error
 
 
 def _check_settings(entries: Sequence[Entry]) -> None:

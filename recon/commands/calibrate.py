@@ -20,8 +20,8 @@ from recon.rig.calibrate.result import (
 )
 from recon.rig.calibrate.stereo import calibrate_stereo
 from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
-from recon.run import Run
 from recon.run.machine import serial_algebra
+from recon.run.run import Run
 from recon.sources.image_pairs import ImagePairs, pair_images
 
 

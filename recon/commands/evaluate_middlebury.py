@@ -24,8 +24,8 @@ from recon.evaluation.middlebury.summary import (
 from recon.io.files import StrPath
 from recon.io.images.pfm import write_pfm
 from recon.report.middlebury_page import draw_result, write_middlebury_page
-from recon.run import Run
 from recon.run.progress import SILENT, Progress
+from recon.run.run import Run
 from recon.stereo.match.protocol import Matcher
 
 

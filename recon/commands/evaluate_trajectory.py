@@ -12,7 +12,7 @@ from recon.evaluation.association import TOLERANCE_S, associate
 from recon.evaluation.trajectory import TrajectoryRules, TrajectoryRun, compare_paths
 from recon.io.trajectory import holds_times, read_trajectory, write_tum
 from recon.report.trajectory_page import write_trajectory_page
-from recon.run import Run
+from recon.run.run import Run
 from recon.run.summary import plain
 from recon.sources.times import read_times
 

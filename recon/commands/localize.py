@@ -14,8 +14,8 @@ from recon.map.localize.localize_run import LocalizeRun
 from recon.map.localize.sequence import StartPose, localize_sequence
 from recon.map.store.map import MAP_FILE, Map
 from recon.report.localize_page import write_localize_page
-from recon.run import Run
 from recon.run.finished import GRID, camera_height_of, refuse_as_target
+from recon.run.run import Run
 from recon.sources.live import LiveSource
 from recon.sources.protocol import StereoSource
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.identity import identity_of
 from recon.commands.map_options import MapOptions
@@ -15,13 +17,13 @@ from recon.export.trajectories import export_paths
 from recon.map.drive.empty import check_map
 from recon.map.drive.map_run import MapRun
 from recon.map.drive.sequence import MappedSequence
-from recon.map.store.finished import keep_map
+from recon.map.store.kept import keep_map
 from recon.map.store.map import MAP_FILE
 from recon.odometry.health import health_warnings
 from recon.report.map_page import write_map_page
 from recon.rig.audit.audit import quick_warnings
-from recon.run import Run
 from recon.run.finished import UNTRUSTED
+from recon.run.run import Run
 from recon.run.summary import plain
 from recon.sources.live import LiveSource
 from recon.sources.protocol import IncompleteSource, StereoSource
@@ -92,11 +94,10 @@ def run_map(
         with run.report(result.summary):
             write_map_page(result, run)
         config.memory.check("report")
-        untrusted = [n for n, health in enumerate(mapped.health) if not health.ok]
         record = {
             "source_description": source.description,
             "T_map_world": mapped.T_map_world.tolist(),
-            UNTRUSTED: untrusted,
+            UNTRUSTED: np.flatnonzero(~mapped.trusted).tolist(),
             **pieces_of(run, map_),
         }
         run.finish(result.summary, source=source.name, inputs=source.files, record=record)

@@ -15,7 +15,7 @@ from recon.map.drive.empty import check_map
 from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
 from recon.map.sessions.copying import copy_sessions
-from recon.map.store.finished import keep_map
+from recon.map.store.kept import keep_map
 from recon.map.store.map import MAP_FILE, Map
 from recon.run.finished import open_run, refuse_as_target
 from recon.run.run import Run

@@ -14,7 +14,7 @@ from recon.evaluation.paper.result import (
 )
 from recon.evaluation.paper.scenes import default_scenes_folder, read_experiments
 from recon.report.paper_page import write_paper_page
-from recon.run import Run
+from recon.run.run import Run
 
 
 def run_paper(

@@ -15,8 +15,8 @@ from recon.rig.rectification import (
     plan_by_features,
     read_pairs,
 )
-from recon.run import Run
 from recon.run.machine import serial_algebra
+from recon.run.run import Run
 from recon.sources.image_pairs import ImagePairs, pair_images
 from recon.sources.one_pair import read_pair
 

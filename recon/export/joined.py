@@ -81,8 +81,8 @@ def joined_warnings(joined: JoinedMap) -> list[str]:
     apart = [session for session in joined.map.sessions if session not in linked]
     names = ", ".join(f"{session.number} ({session.info.source})" for session in apart)
     what = "shares no verified place" if len(apart) == 1 else "share no verified place"
-    told = f"session {names} {what} with session {linked[0].number}: kept in the map, but not in "
-    return [*([told + "cloud, grid, OctoMap and mesh"] if apart else ()), *joined.made.warnings]
+    text = f"session {names} {what} with session {linked[0].number}: kept in the map, but not in "
+    return [*([text + "cloud, grid, OctoMap and mesh"] if apart else ()), *joined.made.warnings]
 
 
 def export_sessions(joined: JoinedMap, directory: RunDirectory) -> None:

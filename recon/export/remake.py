@@ -90,8 +90,8 @@ def remake_map(
         figures["points"] = sum(len(tile.cloud) for tile in found.tiles)
     if "octomap" in products:
         with run.stage("octomap"):
-            figures["voxels"], told = export_octomap(found.tiles, run.path("map/octomap"))
-        warnings += told
+            figures["voxels"], missing = export_octomap(found.tiles, run.path("map/octomap"))
+        warnings += missing
     if "grid" in products:
         with run.stage("grid"):
             figures |= _grid(source, found, run, warnings)

@@ -1,14 +1,22 @@
-"""What the health of all poses says about a drive, in words."""
+"""What the health of all poses says about a drive: which are trusted, and why others are not."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Final
 
+import numpy as np
+
+from recon.core.values.arrays import Bool
 from recon.odometry.protocol import OdometryHealth
 
 _MANY: Final = 0.1
 """Share of frames without a trusted pose above which the whole drive is in question."""
+
+
+def trusted_poses(health: Sequence[OdometryHealth]) -> Bool:
+    """Return bool (N,), which poses are to be trusted."""
+    return np.array([record.ok for record in health], np.bool_)
 
 
 def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:

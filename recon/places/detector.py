@@ -95,7 +95,7 @@ class LoopDetector:
         T_world_camera: Float64,
         *,
         path_m: float,
-        measured: bool = True,
+        trusted: bool = True,
     ) -> tuple[Loop, ...]:
         """Add the next frame; return its verified loops, which ``loops`` keeps as well.
 
@@ -105,10 +105,10 @@ class LoopDetector:
             disparity: Of its left view.
             T_world_camera: float64 (4, 4), by odometry.
             path_m: Path up to it, by `path_lengths`.
-            measured: False where the pose is extrapolated; such a frame is no keyframe, nor is one
+            trusted: False where the pose is extrapolated; such a frame is no keyframe, nor is one
                 that was not matched.
         """
-        if not measured or not disparity.valid.any() or not self._is_due(T_world_camera):
+        if not trusted or not disparity.valid.any() or not self._is_due(T_world_camera):
             return ()
         keyframe = make_keyframe(frame, pair, disparity)
         return self.look(StoredKeyframe(keyframe, T_world_camera, path_m), pair.camera)

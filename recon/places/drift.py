@@ -53,20 +53,20 @@ class Drift:
         return np.diag([self.position_m**2] * 3 + [self.angle_rad**2] * 3)
 
 
-def path_lengths(T_world_camera: Float64, measured: Bool) -> Float64:
+def path_lengths(T_world_camera: Float64, trusted: Bool) -> Float64:
     """Return length of the path up to each frame, in which extrapolated metres count several times.
 
     Args:
         T_world_camera: float64 (N, 4, 4).
-        measured: bool (N,), False where a pose is extrapolated.
+        trusted: bool (N,), False where a pose is not, as it is extrapolated.
 
     Returns:
         float64 (N,), metres.
     """
     step_m = np.linalg.norm(np.diff(T_world_camera[:, :3, 3], axis=0), axis=1)
-    lost = ~measured[1:]
+    lost = ~trusted[1:]
     step_m = np.where(lost, _LOST_FACTOR * step_m + _LOST_M, step_m)
-    return np.concatenate([np.zeros(min(1, len(measured))), np.cumsum(step_m)])
+    return np.concatenate([np.zeros(min(1, len(trusted))), np.cumsum(step_m)])
 
 
 def drift_over(path_m: float, model: DriftModel) -> Drift:

@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from recon.core.geometry.projection import depth_from_disparity, disparity_from_depth
-from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
+from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import UInt8
 from recon.report.colour import (
     CONFIDENCE_SCALE,
@@ -127,7 +127,7 @@ def reasons_figure(disparity: Disparity) -> bytes:
     figure = _image(colour_reasons(disparity.reason))
     handles = [
         colour_key(f"{REASON_LABELS[reason]} {100 * share:.1f} %", REASON_COLOURS[reason])
-        for reason, share in reason_shares(disparity.reason).items()
+        for reason, share in disparity.reason_shares.items()
     ]
     columns = 4 if is_wide(disparity.reason.shape) else 3
     middle = 0.5 * _BELOW_IN / figure.get_size_inches()[1]
@@ -164,14 +164,6 @@ def depth_marks(
         if low_m <= depth <= high_m and free:
             marks[depth] = there
     return sorted(marks)
-
-
-def reason_shares(reason: UInt8) -> dict[Reason, float]:
-    """Return the share of the pixels, in [0, 1], for each reason that occurs; the largest first."""
-    counts = np.bincount(reason.ravel(), minlength=len(Reason))
-    total = max(int(counts.sum()), 1)
-    order = sorted(Reason, key=lambda code: -int(counts[code]))
-    return {code: float(counts[code]) / total for code in order if counts[code]}
 
 
 def _image(image: UInt8) -> Figure:

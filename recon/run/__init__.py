@@ -5,7 +5,3 @@
 - `progress.py`: who is shown how far it is; `lookahead.py`: work that overlaps in threads;
 - `batch/`: many commands as jobs, on this machine or on a cluster.
 """
-
-from recon.run.run import Run
-
-__all__ = ["Run"]

@@ -57,12 +57,12 @@ class PairRun:
 def disparity_figures(disparity: Disparity) -> dict[str, Any]:
     """Return size, share of pixels for each reason, and median of a disparity, ready for JSON."""
     found = disparity.values[disparity.valid]
-    shares = np.bincount(disparity.reason.ravel(), minlength=len(Reason)) / disparity.reason.size
+    shares = disparity.reason_shares
     return {
         "width_px": disparity.values.shape[1],
         "height_px": disparity.values.shape[0],
         "valid_percent": 100.0 * float(disparity.valid.mean()),
-        "reasons_percent": {r.name.lower(): 100.0 * float(shares[r]) for r in Reason},
+        "reasons_percent": {r.name.lower(): 100.0 * shares.get(r, 0.0) for r in Reason},
         "disparity_median_px": float(np.median(found)) if len(found) else None,
     }
 

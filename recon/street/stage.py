@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.raycasting import RayScene
+from recon.core.open3d_raycasting import RayScene
 from recon.core.values.arrays import Bool, Float64, Int32
 from recon.street.kernels.surface import SurfaceHits, SurfaceTable, describe_hits
 from recon.street.materials import albedo, sky_colour

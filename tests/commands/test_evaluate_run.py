@@ -70,7 +70,7 @@ def test_a_cloud_of_no_run_is_taken_as_it_is(run: Path) -> None:
 @pytest.mark.parametrize("record", ["{}", "no json", '{"T_map_world": [[1]]}'])
 def test_a_broken_record_is_refused(run: Path, record: str) -> None:
     (run / "run.json").write_text(record)
-    with pytest.raises(FormatError, match=r"run\.json.*T_map_world|T_map_world.*"):
+    with pytest.raises(FormatError, match=r"run\.json|T_map_world"):
         run_evaluate_map(run, run.parent / "in_map.ply", frame="camera")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.core.errors import ShapeError
-from recon.core.raycasting import RayScene
+from recon.core.open3d_raycasting import RayScene
 
 
 def _square(z: float, half: float = 1.0) -> np.ndarray:

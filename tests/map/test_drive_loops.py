@@ -26,9 +26,9 @@ from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.store.keyframes import Keyframes
 from recon.map.store.records import Store
 from recon.map.store.submaps import SubmapEntry
+from recon.places.closure import close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
 from recon.places.drift import DriftModel
-from recon.places.graph import close_loops
 from recon.stereo.frame import ReconstructedFrame
 from tests.run.pools import observed_pool
 
@@ -81,7 +81,7 @@ def _watch(
         if number == committed:
             watch.wait()
             store.commit()
-        watch.add(frame, T, measured=True)
+        watch.add(frame, T, trusted=True)
     watch.wait()
     return watch
 
@@ -151,7 +151,7 @@ def test_an_interrupted_drive_gives_the_same_loops(frames, closed, tmp_path, che
     resumed = LoopWatch(keyframes)
     resumed.restore(path.T_world_camera[:checkpoint], ALL_MEASURED[:checkpoint])
     for frame, T in zip(frames[checkpoint:], path.T_world_camera[checkpoint:], strict=True):
-        resumed.add(frame, T, measured=True)
+        resumed.add(frame, T, trusted=True)
 
     loops = resumed.close(path)
     assert _pairs(loops) == _pairs(closed)
@@ -182,7 +182,7 @@ def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):
     monkeypatch.setattr(drive_loops, "ThreadPoolExecutor", pool)
     watch = LoopWatch(Keyframes(Store.temporary()))
     for frame in frames[:4]:
-        watch.add(frame, np.eye(4), measured=True)
+        watch.add(frame, np.eye(4), trusted=True)
     while not looked:
         time.sleep(0.001)
     watch.stop()

@@ -104,13 +104,13 @@ class Filmed:
 
     def detect(self, frames, path: Trajectory, drift: DriftModel | None = None, lost=()):
         """A detector that has seen some frames, their poses being those of ``path``."""
-        measured = ~np.isin(np.arange(len(path)), list(lost))
-        path_m = path_lengths(path.T_world_camera, measured)
+        trusted = ~np.isin(np.arange(len(path)), list(lost))
+        path_m = path_lengths(path.T_world_camera, trusted)
         detector = LoopDetector(drift or DriftModel(), KeyframeMemory())
         for k in frames:
             pair, disparity = self.frame(k)
             pose = path.T_world_camera[k]
-            detector.add(k, pair, disparity, pose, path_m=path_m[k], measured=bool(measured[k]))
+            detector.add(k, pair, disparity, pose, path_m=path_m[k], trusted=bool(trusted[k]))
         return detector, path_m
 
 

@@ -10,8 +10,8 @@ import pytest
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
 from recon.places.agree import agreeing_loops
+from recon.places.closure import close_loops
 from recon.places.drift import DriftModel
-from recon.places.graph import close_loops
 from recon.places.verify import Loop
 from tests.places.conftest import drifted
 

@@ -14,7 +14,6 @@ from recon.report.pair_figures import (
     disparity_figure,
     error_figure,
     pair_figure,
-    reason_shares,
     reasons_figure,
 )
 
@@ -62,7 +61,7 @@ def test_a_figure_shows_its_picture(pair: RectifiedPair, disparity: Disparity) -
 
 
 def test_shares_of_reasons_add_up_and_the_largest_comes_first(disparity: Disparity) -> None:
-    shares = reason_shares(disparity.reason)
+    shares = disparity.reason_shares
     assert shares == {Reason.VALID: 0.75, Reason.BORDER: 0.25}
     assert list(shares) == [Reason.VALID, Reason.BORDER]
 

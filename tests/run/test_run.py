@@ -9,8 +9,8 @@ from typing import Any
 import yaml
 
 from recon.core.settings import Settings
-from recon.run import Run
 from recon.run.progress import Silent
+from recon.run.run import Run
 
 
 class _Size(Settings):

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from recon.core.errors import OutputError
-from recon.run import Run
 from recon.run.directory import RunDirectory
+from recon.run.run import Run
 
 
 def write_run(folder: Path, *names: str) -> None:

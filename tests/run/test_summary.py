@@ -11,7 +11,7 @@ from typing import Any
 
 from recon.odometry import OdometryHealth
 from recon.odometry.health import health_warnings
-from recon.run import Run
+from recon.run.run import Run
 from recon.run.summary import plain
 
 

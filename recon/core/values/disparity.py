@@ -106,6 +106,13 @@ class Disparity:
         """bool (H, W), where there is a disparity."""
         return np.isfinite(self.values)
 
+    @property
+    def reason_shares(self) -> dict[Reason, float]:
+        """Share of the pixels, in [0, 1], for each reason that occurs; the largest first."""
+        counts = np.bincount(self.reason.ravel(), minlength=len(Reason)).tolist()
+        order = sorted(Reason, key=lambda reason: -counts[reason])
+        return {reason: counts[reason] / self.reason.size for reason in order if counts[reason]}
+
     def reject(self, mask: Bool, reason: Reason) -> Disparity:
         """Return a copy without the pixels of ``mask``; those that had a value get ``reason``."""
         drop = mask & self.valid

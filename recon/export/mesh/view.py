@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.raycasting import RayScene
+from recon.core.open3d_raycasting import RayScene
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.arrays import Bool, Float32
 from recon.export.mesh.poisson import (

@@ -83,7 +83,7 @@ class Drive:
 
     def _add(self, frame: ReconstructedFrame, found: OdometryResult, *, total: int) -> FrameResult:
         result = self.mapper.add(frame, found, total=total)
-        self._loops.add(frame, result.T_world_camera, measured=result.health.ok)
+        self._loops.add(frame, result.T_world_camera, trusted=result.health.ok)
         if result.index <= total // 2 and (self.sample is None or len(frame.cloud)):
             self.sample = frame
         if self._due():

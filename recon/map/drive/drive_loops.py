@@ -14,9 +14,9 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.store.keyframes import Keyframes
 from recon.map.store.submaps import SubmapEntry
+from recon.places.closure import Closure, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.places.drift import DriftModel, path_lengths
-from recon.places.graph import Closure, close_loops
 from recon.run.stopwatch import Stopwatch
 from recon.stereo.frame import ReconstructedFrame
 
@@ -139,13 +139,13 @@ class LoopWatch:
         self._path_m: list[float] = []
         self._last: Float64 = np.eye(4)
 
-    def add(self, frame: ReconstructedFrame, T_world_camera: Float64, *, measured: bool) -> None:
+    def add(self, frame: ReconstructedFrame, T_world_camera: Float64, *, trusted: bool) -> None:
         """Add the next frame; earlier ones may still be in progress.
 
         Raises:
             OutputError: A keyframe cannot be written.
         """
-        path_m, number = self._advance(T_world_camera, measured=measured), len(self._path_m) - 1
+        path_m, number = self._advance(T_world_camera, trusted=trusted), len(self._path_m) - 1
 
         def look() -> None:
             with self._stage("loops"):
@@ -155,7 +155,7 @@ class LoopWatch:
                     frame.disparity,
                     T_world_camera,
                     path_m=path_m,
-                    measured=measured,
+                    trusted=trusted,
                 )
 
         self._wait(_BEHIND)
@@ -173,14 +173,14 @@ class LoopWatch:
         """End the thread; pending frames are dropped."""
         self._pool.shutdown(cancel_futures=True)
 
-    def restore(self, T_world_camera: Iterable[Float64], measured: Iterable[bool]) -> None:
+    def restore(self, T_world_camera: Iterable[Float64], trusted: Iterable[bool]) -> None:
         """Resume after frames with these poses, whose keyframes are kept.
 
         Raises:
             FormatError: A keyframe is damaged.
         """
-        for T, good in zip(T_world_camera, measured, strict=True):
-            self._advance(T, measured=good)
+        for T, good in zip(T_world_camera, trusted, strict=True):
+            self._advance(T, trusted=good)
         for stored in self._keyframes:
             self._detector.restore(stored)
 
@@ -206,10 +206,10 @@ class LoopWatch:
         while len(self._waiting) > left:
             self._waiting.popleft().result()
 
-    def _advance(self, T_world_camera: Float64, *, measured: bool) -> float:
+    def _advance(self, T_world_camera: Float64, *, trusted: bool) -> float:
         """Return path length up to the next frame, as the detector measures it."""
         before = self._last if self._path_m else T_world_camera
-        step = path_lengths(np.stack([before, T_world_camera]), np.array([True, measured]))
+        step = path_lengths(np.stack([before, T_world_camera]), np.array([True, trusted]))
         self._path_m.append((self._path_m[-1] if self._path_m else 0.0) + float(step[1]))
         self._last = T_world_camera
         return self._path_m[-1]

@@ -76,7 +76,7 @@ class MapRun:
             "path_length_m": mapped.trajectory.path_length_m,
             "expected_drift_percent": None if drift is None else drift.percent,
             "expected_drift_rig_percent": None if drift is None else drift.rig_percent,
-            "frames_not_trusted": sum(not record.ok for record in mapped.health),
+            "frames_not_trusted": int((~mapped.trusted).sum()),
             "focal_px": mapped.camera.focal_px,
             "field_of_view_deg": mapped.camera.field_of_view_deg,
             "T_map_world": mapped.T_map_world.tolist(),

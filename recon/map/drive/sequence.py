@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from recon.core.errors import RegistrationError
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import (
@@ -23,6 +21,7 @@ from recon.core.values import (
 from recon.core.values.arrays import Bool, Float64
 from recon.map.drive.drive import Drive
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
+from recon.map.drive.drive_odometry import UsedPrior, axes_of, odometry_of
 from recon.map.drive.mapper import Mapper
 from recon.map.drive.workspace import Workspace
 from recon.map.settings import DriveSettings
@@ -30,43 +29,14 @@ from recon.map.store.submaps import Submaps
 from recon.map.tiles import Tiles
 from recon.odometry import (
     ExpectedDrift,
-    KnownPoses,
-    MotionPrior,
-    Odometry,
-    OdometryFrame,
     OdometryHealth,
-    PriorSettings,
     expected_drift,
-    find_axes,
-    first_moving,
-    make_odometry,
 )
+from recon.odometry.health import trusted_poses
 from recon.run.machine import serial_algebra
 from recon.run.progress import SILENT, Progress
-from recon.sources.protocol import IncompleteSource, StampedSource, StereoSource
+from recon.sources.protocol import StereoSource
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
-
-
-@dataclass(frozen=True)
-class UsedPrior:
-    """How an external trajectory was used.
-
-    Attributes:
-        axes: The axes of its poses.
-        known_from: ``images``, ``settings``, or ``assumed``.
-        sigmas: Median distance from the visual motion in each set of axes, standard deviations.
-    """
-
-    axes: str
-    known_from: str
-    sigmas: Mapping[str, float] = field(default_factory=dict)
-
-    def warnings(self) -> list[str]:
-        """Return what the user should know about it."""
-        if self.known_from != "assumed":
-            return []
-        what = "too little motion was seen to tell the axes of the prior"
-        return [f"{what}; taken as those of the camera (odometry.prior.axes)"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +71,7 @@ class MappedSequence:
     prior: UsedPrior | None = None
 
     def __repr__(self) -> str:
-        trusted = sum(record.ok for record in self.health)
+        trusted = int(self.trusted.sum())
         return f"MappedSequence({self.trajectory}, {trusted} of them trusted, {self.seconds:.4g} s)"
 
     @property
@@ -112,7 +82,7 @@ class MappedSequence:
     @property
     def trusted(self) -> Bool:
         """bool (N,), which poses are to be trusted."""
-        return np.array([record.ok for record in self.health])
+        return trusted_poses(self.health)
 
     @cached_property
     def tiles(self) -> Tiles:
@@ -194,8 +164,8 @@ def map_sequence(
     )
     used = None
     if prior is not None and known_poses is None:
-        used = _axes_of(prior, source, reconstructor, config.odometry.prior)
-    odometry = _odometry(config, source, known_poses, prior, used)
+        used = axes_of(prior, source, reconstructor, config.odometry.prior)
+    odometry = odometry_of(config, source, known_poses, prior, used)
     looking = config.loops.enabled and known_poses is None
     session = work.session(source, config)
     watch = LoopWatch(session.keyframes, work.stopwatch, search=looking)
@@ -240,51 +210,3 @@ def _sample_again(
     """Reconstruct the frame in the middle, which was mapped before this process started."""
     index = min(len(source) // 2, mapped - 1)
     return reconstructor.reconstruct(next(source.frames(index)))
-
-
-def _axes_of(
-    prior: Trajectory,
-    source: StereoSource,
-    reconstructor: FrameReconstructor,
-    settings: PriorSettings,
-) -> UsedPrior:
-    """Return the axes of a prior: those set, else those that explain the first motions."""
-    start = 0
-    if isinstance(source, StampedSource):
-        MotionPrior(prior, settings).check_covers(source.stamps_s)
-        start = first_moving(prior, source.stamps_s, settings)
-    if settings.axes != "auto":
-        return UsedPrior(settings.axes, "settings")
-    frames = (OdometryFrame(*reconstructor.match(pair)) for pair in source.frames(start))
-    found = find_axes(prior, frames, settings)
-    if found is None:
-        return UsedPrior("camera", "assumed")
-    return UsedPrior(found.axes, "images", found.sigmas)
-
-
-def _odometry(
-    config: DriveSettings,
-    source: StereoSource,
-    known_poses: Trajectory | None,
-    prior: Trajectory | None,
-    used: UsedPrior | None,
-) -> Odometry:
-    if known_poses is None:
-        settings = config.odometry
-        if used is not None:
-            axes = settings.prior.model_copy(update={"axes": used.axes})
-            settings = settings.model_copy(update={"prior": axes})
-        return make_odometry(settings.method, settings, prior)
-    count = len(known_poses)
-    lines = list(range(len(source))) if count >= len(source) else None
-    if isinstance(source, IncompleteSource):
-        lines = source.lines(count)
-    if lines is None:
-        raise RegistrationError(
-            "fewer known poses than frames",
-            got=f"{count} poses",
-            expected=f"{len(source)}",
-            hint="the pose file must list every frame of the source",
-        )
-    poses, times_s = known_poses.T_world_camera[lines], known_poses.timestamps_s[lines]
-    return KnownPoses(Trajectory(poses, times_s))

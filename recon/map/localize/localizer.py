@@ -17,8 +17,8 @@ from recon.map.localize.surroundings import Surroundings
 from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualEstimate, VisualOdometry
+from recon.places.closure import loop_bias
 from recon.places.drift import path_lengths
-from recon.places.graph import loop_bias
 from recon.places.keyframe import Keyframe, make_keyframe
 from recon.places.known import KnownPlaces
 from recon.places.verify import Loop
@@ -30,7 +30,7 @@ _SURFACES_EVERY: Final = 3
 """Frames between two corrections by surfaces, where features confirm the pose."""
 
 _MAX_SIGMA_M: Final = 0.15
-"""Poses less certain than this are not told: an error of 0.5 m is then beyond three sigmas."""
+"""Poses less certain than this are not given out: an error of 0.5 m is then beyond three sigmas."""
 
 _MAX_SIGMA_DEG: Final = 1.0
 """The same of the rotation."""
@@ -97,7 +97,7 @@ class Localizer:
     """Finds the frames of a drive in a map, which it does not change.
 
     Visual odometry predicts each pose; features of the nearest views of the map, and its surfaces,
-    correct it, by their covariances. A pose is told only while it is certain.
+    correct it, by their covariances. A pose is given out only while it is certain.
 
     Args:
         known: The places of the map.
@@ -136,7 +136,7 @@ class Localizer:
         self._advance(visual)
         self._frames += 1
         if self._belief is not None and self._belief.sigma_m <= _SURE_SIGMA_M and hurried():
-            return self._told(_Confirmed(self._belief, refused="no time to look at the map"))
+            return self._result(_Confirmed(self._belief, refused="no time to look at the map"))
         focal_px = self._known.focal_px
         keyframe = make_keyframe(self._frames - 1, frame.pair, frame.disparity, focal_px=focal_px)
         if self._belief is None:
@@ -144,7 +144,7 @@ class Localizer:
         if self._belief is None:
             return Located(State.SEARCHING, note="no place is recognised for certain")
         confirmed = self._confirm(self._belief, keyframe, frame)
-        return self._told(confirmed)
+        return self._result(confirmed)
 
     def _advance(self, visual: VisualEstimate) -> None:
         """Move on by the motion since the last frame."""
@@ -201,8 +201,8 @@ class Localizer:
             return None
         return self._surroundings.correct(belief, frame, learn=seen)
 
-    def _told(self, confirmed: _Confirmed) -> Located:
-        """Return what is told of a belief; one that is not certain is given up."""
+    def _result(self, confirmed: _Confirmed) -> Located:
+        """Return the result of a frame; a belief that is not certain is given up."""
         belief = confirmed.belief
         if belief.sigma_m > _MAX_SIGMA_M or belief.sigma_deg > _MAX_SIGMA_DEG:
             self._belief = None

@@ -15,7 +15,7 @@ from recon.map.sessions.linking import DRIFT, find_links, path_up_to
 from recon.map.store.links import Link
 from recon.map.store.map import Map
 from recon.map.store.session import Session
-from recon.places.graph import Drive, Tie, join_drives
+from recon.places.closure import DrivePath, Tie, join_drives
 from recon.places.verify import Loop
 
 _ALONE: Final = "T_alone_camera"
@@ -140,10 +140,10 @@ def _places(numbers: list[int], link: Link) -> tuple[int, int]:
     return one, other
 
 
-def _drive(session: Session, T_world_session: Float64) -> Drive:
+def _drive(session: Session, T_world_session: Float64) -> DrivePath:
     """Return a drive where it is about, for the pose graph."""
     poses = T_world_session @ session.odometry.T_world_camera
-    return Drive(replace(session.odometry, T_world_camera=poses), path_up_to(session))
+    return DrivePath(replace(session.odometry, T_world_camera=poses), path_up_to(session))
 
 
 def _place(map_: Map, session: Session, path: Trajectory) -> None:

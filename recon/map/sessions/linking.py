@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from recon.core.values.arrays import Float64
 from recon.map.sessions.shared import link_by_frame, shared_frames
 from recon.map.store.links import Link
 from recon.map.store.map import Map
 from recon.map.store.session import Session
 from recon.map.store.views import MapViews
+from recon.odometry.health import trusted_poses
 from recon.places.agree import agreeing_loops
 from recon.places.drift import DriftModel, path_lengths
 from recon.places.known import KnownPlaces, KnownView
@@ -49,8 +48,7 @@ def find_links(map_: Map, new: Collection[int]) -> list[Link]:
 
 def path_up_to(session: Session) -> Float64:
     """Return float64 (N,), path of a drive up to each frame; lost frames count several times."""
-    trusted = np.array([health.ok for health in session.health])
-    return path_lengths(session.odometry.T_world_camera, trusted)
+    return path_lengths(session.odometry.T_world_camera, trusted_poses(session.health))
 
 
 def _between(map_: Map, group: Sequence[int], new: Session) -> list[Link]:

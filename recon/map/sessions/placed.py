@@ -11,13 +11,14 @@ from recon.core.geometry.se3 import apply
 from recon.core.values.arrays import Bool, Float64
 from recon.map.sessions.shared import seen_before
 from recon.map.settings import DriveSettings
-from recon.map.store.finished import CastSubmaps, check_rays
 from recon.map.store.map import Map
+from recon.map.store.recast import CastSubmaps, check_rays
 from recon.map.store.records import Store
 from recon.map.store.session import Session
 from recon.map.store.submaps import Submaps
 from recon.map.submaps import Submap
 from recon.map.tiles import Tiles
+from recon.odometry.health import trusted_poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +125,7 @@ def with_path(map_: Map, tiles: Tiles) -> PlacedMap:
     """Return the tiles of a map with the paths of its linked drives."""
     sessions = map_.linked
     paths = [apply(s.T_map_world, s.trajectory.positions_m) for s in sessions]
-    good = [np.array([health.ok for health in session.health]) for session in sessions]
+    good = [trusted_poses(session.health) for session in sessions]
     return PlacedMap(tiles, _with_gaps(paths, np.nan), _with_gaps(good, False))
 
 

@@ -18,7 +18,7 @@ from recon.map.store.keyframes import Keyframes
 from recon.map.store.records import Store
 from recon.map.store.submaps import Submaps
 from recon.odometry import OdometryHealth
-from recon.places.graph import Closure
+from recon.places.closure import Closure
 
 FRAMES: Final = "frames"
 RAYS: Final = "rays"

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.errors import CalibrationError, MatchingError
-from recon.core.values import Disparity, Reason, StereoPair
+from recon.core.values import Disparity, StereoPair
 from recon.rig.audit.audit import audit_source
 from recon.rig.audit.findings import Finding
 from recon.rig.audit.settings import AuditedSettings
@@ -75,7 +75,6 @@ def check_found(
 
 def _reasons(disparity: Disparity) -> str:
     """Return the two most common reasons for having no disparity."""
-    count = np.bincount(disparity.reason.ravel(), minlength=len(Reason))
-    percent = 100 * count / disparity.reason.size
-    most = sorted((r for r in Reason if r and percent[r] >= 1), key=lambda r: -percent[r])[:2]
-    return ", ".join(f"{percent[r]:.0f} % {r.name.lower().replace('_', ' ')}" for r in most)
+    shares = {r: 100 * share for r, share in disparity.reason_shares.items() if r and share >= 0.01}
+    most = list(shares.items())[:2]
+    return ", ".join(f"{share:.0f} % {r.name.lower().replace('_', ' ')}" for r, share in most)

@@ -20,9 +20,9 @@ from typing import IO, Any, Final
 
 from recon.core.errors import OutputError
 from recon.io.lock import is_locked
-from recon.run import Run
 from recon.run.batch.job import Job, Outcome, State, is_done
 from recon.run.directory import lock_file
+from recon.run.run import Run
 
 Tell = Callable[[dict[str, Any]], None]
 """Told now and then how far a job is."""

@@ -1,4 +1,4 @@
-"""Pose graph optimisation: corrects a path so that its loops close."""
+"""Paths corrected so that their loops close, by pose graph optimisation."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from recon.core.geometry.se3 import adjoint, as_step, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.places.drift import Drift, DriftModel, drift_over
-from recon.places.pose_graph import PoseEdge, optimise_poses
+from recon.places.open3d_pose_graph import PoseEdge, optimise_poses
 from recon.places.verify import Loop
 
 _EASING: Final = 10.0  # factor by which the tolerance of loops falls from round to round
@@ -68,8 +68,8 @@ class Closure:
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
-    """A drive in the graph.
+class DrivePath:
+    """The path of a drive in the graph.
 
     Attributes:
         trajectory: By odometry; about where it lies beside the other drives.
@@ -118,7 +118,7 @@ def close_loops(
         drift: How far odometry may drift.
     """
     ties = [Tie((0, 0), loop) for loop in loops]
-    joined = join_drives([Drive(trajectory, path_m)], ties, drift) if ties else None
+    joined = join_drives([DrivePath(trajectory, path_m)], ties, drift) if ties else None
     if joined is None:  # a map by odometry alone is better than none
         return Closure(trajectory, (), tuple(loops))
     sides = [
@@ -129,7 +129,7 @@ def close_loops(
 
 
 def join_drives(
-    drives: Sequence[Drive], ties: Sequence[Tie], drift: DriftModel
+    drives: Sequence[DrivePath], ties: Sequence[Tie], drift: DriftModel
 ) -> JoinedDrives | None:
     """Correct the paths of drives so that their ties hold; None = the ties are not believed.
 
@@ -193,7 +193,7 @@ def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
     return float(step @ edge.information @ step)
 
 
-def _spaced(drives: Sequence[Drive]) -> list[NDArray[np.intp]]:
+def _spaced(drives: Sequence[DrivePath]) -> list[NDArray[np.intp]]:
     """Return the frames of each drive that are nodes."""
     lengths_m = np.array([drive.path_m[-1] for drive in drives])
     most = _MAX_NODES * lengths_m / max(float(lengths_m.sum()), 1e-9)
@@ -220,7 +220,7 @@ def _solve(start: Float64, steps: list[PoseEdge], ties: list[PoseEdge]) -> tuple
 
 
 def _odometry_edges(
-    drive: Drive, nodes: NDArray[np.intp], begin: int, model: DriftModel
+    drive: DrivePath, nodes: NDArray[np.intp], begin: int, model: DriftModel
 ) -> list[PoseEdge]:
     """Return the edges along a drive, whose nodes are numbered from ``begin``."""
     poses, path_m = drive.trajectory.T_world_camera, drive.path_m
@@ -235,7 +235,7 @@ def _odometry_edges(
 
 def _tie_edge(
     tie: Tie,
-    drives: Sequence[Drive],
+    drives: Sequence[DrivePath],
     nodes: Sequence[NDArray[np.intp]],
     begins: Sequence[int],
     model: DriftModel,
@@ -255,7 +255,7 @@ def _tie_edge(
     return PoseEdge(*ends, T, _inverse(covariance), doubtful=True)
 
 
-def _to_node(drive: Drive, nodes: NDArray[np.intp], frame: int) -> tuple[int, Float64, float]:
+def _to_node(drive: DrivePath, nodes: NDArray[np.intp], frame: int) -> tuple[int, Float64, float]:
     """Return the node nearest to a frame, ``T_node_frame``, and the path between them."""
     poses, path_m = drive.trajectory.T_world_camera, drive.path_m
     node = int(np.argmin(np.abs(path_m[nodes] - path_m[frame])))
@@ -275,7 +275,7 @@ def _turned(information: Float64, T_frame_node: Float64) -> Float64:
     return turned
 
 
-def _bent(drive: Drive, nodes: NDArray[np.intp], T_world_node: Float64) -> Trajectory:
+def _bent(drive: DrivePath, nodes: NDArray[np.intp], T_world_node: Float64) -> Trajectory:
     """Return every pose moved with the nodes before and after it, interpolated by distance."""
     old, path_m = drive.trajectory.T_world_camera, drive.path_m
     before = np.searchsorted(nodes, np.arange(len(old)), side="right") - 1

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.errors import FormatError, SettingsError
 from recon.core.kernels import voxels
-from recon.core.values.arrays import Bool, Float32, Float64, Int32
+from recon.core.values.arrays import Bool, Float32, Int32
 from recon.map.kernels import clamped
-from recon.map.occupancy.builder import OccupancyBuilder
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.map.store.keyframes import KEYFRAME
 from recon.map.store.map import Map
-from recon.map.store.records import Store
 from recon.map.store.session import AXES, LOOPS, RAYS, Session
-from recon.map.store.submaps import Submaps
 from recon.map.submaps import Submap
-from recon.run.lookahead import side_by_side
 
 _PLACED: Final = slice(0, 4)
 _PLACE_BITS: Final = 12
@@ -61,108 +55,6 @@ def keep_map(mapped: Map, path: Path, settings: DriveSettings) -> None:
         for kind in (AXES, LOOPS, KEYFRAME, RAYS):
             mapped.store.copy(kind, kept.store)
         kept.commit()
-
-
-@dataclass(frozen=True, eq=False)
-class CastSubmaps:
-    """The submaps of a finished drive, each with occupancy made from its rays when it is read.
-
-    Attributes:
-        session: The drive.
-        settings: How to make it.
-        T_map_world: float64 (4, 4), from world to the axes of the occupancy; None = its own.
-        T_world_camera: float64 (N, 4, 4), from where rays are cast; None = the path by odometry.
-        without: Frames whose rays are not cast.
-    """
-
-    session: Session
-    settings: DriveSettings
-    T_map_world: Float64 | None = None
-    T_world_camera: Float64 | None = None
-    without: Collection[int] = ()
-
-    def __post_init__(self) -> None:
-        if self.session.submaps.frames != len(self.session):
-            raise FormatError("the map lacks submaps", where=self.session.where)
-
-    def __len__(self) -> int:
-        return len(self.session.submaps)
-
-    def __getitem__(self, number: int) -> Submap:
-        """Return a submap.
-
-        Raises:
-            FormatError: The map is damaged.
-            MappingError: A ray would spoil the map.
-        """
-        session, kept = self.session, self.session.submaps.get(number)
-        T_map_world = session.T_map_world if self.T_map_world is None else self.T_map_world
-        poses = self.T_world_camera
-        poses = session.odometry.T_world_camera if poses is None else poses
-        builder = OccupancyBuilder(self.settings.occupancy, T_map_world)
-        for frame in range(kept.first_frame, kept.first_frame + kept.frames):
-            if frame not in self.without:
-                builder.integrate(session.rays(frame)[0].cloud(), poses[frame])
-        return replace(kept, occupancy=builder.take())
-
-
-def with_occupancy(session: Session, settings: DriveSettings, *, threads: int = 1) -> Submaps:
-    """Return the submaps of a finished drive in a temporary store, with occupancy from its rays.
-
-    Args:
-        session: The drive.
-        settings: How to make it.
-        threads: Submaps made at a time. Changes no result.
-
-    Raises:
-        FormatError: The map is damaged.
-        MappingError: A ray would spoil the map.
-    """
-    made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
-    cast = CastSubmaps(session, settings)
-    read, numbers = cast.__getitem__, range(len(cast))
-    for submap in (
-        map(read, numbers) if threads == 1 else side_by_side(read, numbers, threads=threads)
-    ):
-        made.add(submap)
-    return made
-
-
-def check_rays(session: Session, settings: DriveSettings) -> None:
-    """Refuse a cell size or range that the kept rays of a session do not support.
-
-    Raises:
-        FormatError: It kept no rays, or is damaged.
-        SettingsError: The settings need finer or longer rays than it kept.
-    """
-    if not session.ray_frames:
-        raise FormatError(
-            "the run kept no rays to build occupancy from",
-            where=session.where,
-            hint="map the drive again with --set occupancy.keep_rays=true",
-        )
-    if session.ray_frames != len(session):
-        raise FormatError(
-            "the run has different numbers of ray frames and poses",
-            where=session.where,
-            got=f"{session.ray_frames} and {len(session)}",
-        )
-    grain, wanted = session.rays(0)[1], settings.occupancy
-    # The 0.05 % tolerance is for rounded input, such as 0.3333 for a third.
-    if wanted.resolution_m < grain.cell_m * 0.9995:
-        raise SettingsError(
-            "the rays kept by the run are too coarse for these voxels",
-            got=f"{wanted.resolution_m:g} m",
-            expected=f"at least {grain.cell_m:g} m",
-            hint="map the drive again with --set occupancy.rays_per_voxel= or resolution_m=",
-        )
-    if wanted.max_range_m > grain.max_range_m * (1 + 1e-9):
-        raise SettingsError(
-            "the rays kept by the run do not reach that far",
-            got=f"{wanted.max_range_m:g} m",
-            expected=f"at most {grain.max_range_m:g} m",
-            hint="map the drive again with --set occupancy.max_range_m=",
-        )
 
 
 def _compact(submap: Submap, least: int, where: _Places) -> Submap:

@@ -10,9 +10,8 @@ import pytest
 from recon.core.errors import RegistrationError
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
-from recon.places import graph
+from recon.places.closure import close_loops
 from recon.places.drift import Drift, DriftModel, drift_over, is_possible, path_lengths
-from recon.places.graph import close_loops
 from recon.places.verify import Loop
 from tests.places.conftest import drifted
 
@@ -54,8 +53,8 @@ def _loop(truth: Trajectory, first: int, last: int) -> Loop:
 
 
 def _close(odometry: Trajectory, loops: list[Loop]):
-    measured = np.ones(len(odometry), np.bool_)
-    path_m = path_lengths(odometry.T_world_camera, measured)
+    trusted = np.ones(len(odometry), np.bool_)
+    path_m = path_lengths(odometry.T_world_camera, trusted)
     return close_loops(odometry, path_m, loops, DRIFT)
 
 
@@ -117,7 +116,7 @@ def test_a_graph_without_a_solution_closes_nothing(odometry, loops, monkeypatch)
     def fails(*_: object) -> None:
         raise RegistrationError("the pose graph has no solution")
 
-    monkeypatch.setattr("recon.places.graph.optimise_poses", fails)
+    monkeypatch.setattr("recon.places.closure.optimise_poses", fails)
     closure = _close(odometry, loops)
     assert closure.trajectory is odometry
     assert closure.refused == tuple(loops)
@@ -148,7 +147,7 @@ def test_the_first_pose_stays(odometry, loops):
 
 
 def test_a_long_drive_is_closed_with_few_nodes(odometry, truth, loops, monkeypatch):
-    monkeypatch.setattr(graph, "_MAX_NODES", 12)
+    monkeypatch.setattr("recon.places.closure._MAX_NODES", 12)
 
     closure = _close(odometry, loops)
     assert _end_error_m(closure.trajectory, truth) < 0.005 * truth.path_length_m

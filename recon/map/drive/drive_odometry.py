@@ -1,0 +1,105 @@
+"""The odometry of a drive: one of ours, perhaps guided by other sensors, or known poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from recon.core.errors import RegistrationError
+from recon.core.values import Trajectory
+from recon.map.settings import DriveSettings
+from recon.odometry import (
+    KnownPoses,
+    MotionPrior,
+    Odometry,
+    OdometryFrame,
+    PriorSettings,
+    find_axes,
+    first_moving,
+    make_odometry,
+)
+from recon.sources.protocol import IncompleteSource, StampedSource, StereoSource
+from recon.stereo.frame import FrameReconstructor
+
+
+@dataclass(frozen=True)
+class UsedPrior:
+    """How an external trajectory was used.
+
+    Attributes:
+        axes: The axes of its poses.
+        known_from: ``images``, ``settings``, or ``assumed``.
+        sigmas: Median distance from the visual motion in each set of axes, standard deviations.
+    """
+
+    axes: str
+    known_from: str
+    sigmas: Mapping[str, float] = field(default_factory=dict)
+
+    def warnings(self) -> list[str]:
+        """Return what the user should know about it."""
+        if self.known_from != "assumed":
+            return []
+        what = "too little motion was seen to tell the axes of the prior"
+        return [f"{what}; taken as those of the camera (odometry.prior.axes)"]
+
+
+def axes_of(
+    prior: Trajectory,
+    source: StereoSource,
+    reconstructor: FrameReconstructor,
+    settings: PriorSettings,
+) -> UsedPrior:
+    """Return the axes of a prior: those set, else those that explain the first motions."""
+    start = 0
+    if isinstance(source, StampedSource):
+        MotionPrior(prior, settings).check_covers(source.stamps_s)
+        start = first_moving(prior, source.stamps_s, settings)
+    if settings.axes != "auto":
+        return UsedPrior(settings.axes, "settings")
+    frames = (OdometryFrame(*reconstructor.match(pair)) for pair in source.frames(start))
+    found = find_axes(prior, frames, settings)
+    if found is None:
+        return UsedPrior("camera", "assumed")
+    return UsedPrior(found.axes, "images", found.sigmas)
+
+
+def odometry_of(
+    config: DriveSettings,
+    source: StereoSource,
+    known_poses: Trajectory | None,
+    prior: Trajectory | None,
+    used: UsedPrior | None,
+) -> Odometry:
+    """Make the odometry of a drive.
+
+    Args:
+        config: The configuration.
+        source: The drive.
+        known_poses: Poses to use instead of an odometry, one per frame of the source.
+        prior: Motion of the camera by other sensors.
+        used: The axes of the prior, once they are known.
+
+    Raises:
+        RegistrationError: There are fewer known poses than frames.
+        SettingsError: The odometry takes no prior.
+    """
+    if known_poses is None:
+        settings = config.odometry
+        if used is not None:
+            axes = settings.prior.model_copy(update={"axes": used.axes})
+            settings = settings.model_copy(update={"prior": axes})
+        return make_odometry(settings.method, settings, prior)
+    count = len(known_poses)
+    lines = list(range(len(source))) if count >= len(source) else None
+    if isinstance(source, IncompleteSource):
+        lines = source.lines(count)
+    if lines is None:
+        raise RegistrationError(
+            "fewer known poses than frames",
+            got=f"{count} poses",
+            expected=f"{len(source)}",
+            hint="the pose file must list every frame of the source",
+        )
+    poses, times_s = known_poses.T_world_camera[lines], known_poses.timestamps_s[lines]
+    return KnownPoses(Trajectory(poses, times_s))
