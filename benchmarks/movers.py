@@ -19,11 +19,10 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
-from recon.map.joined import join_clouds
 
 from recon.commands.config import ReconConfig, load_config
 from recon.core.geometry import se3
-from recon.core.values import PointCloud, StereoPair
+from recon.core.values import PointCloud, StereoPair, join_clouds
 from recon.core.values.arrays import Bool, Float64
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.fusion.builder import fusion_range_m
