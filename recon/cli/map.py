@@ -102,7 +102,8 @@ def map_(
             if into is None:
                 settings = load_config(shared.config, changes)
             else:
-                settings = run_settings(into, shared.config, changes, without=["source"])
+                of_the_source = () if remove is not None else ("source",)
+                settings = run_settings(into, shared.config, changes, of_the_source)
         if into is not None and remove is not None:
             options = MapOptions(threads=shared.threads, mesh=mesh, progress=shared.viewer())
             summary = run_remove(into, remove, settings, options)

@@ -9,6 +9,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from recon.cli import app
@@ -119,6 +120,17 @@ def test_a_drive_is_added_to_a_run_and_taken_out_again(run: Path, runs: Path) ->
     assert [p.name for p in run.parent.iterdir()] == [run.name]
 
 
+def test_a_drive_is_taken_out_of_a_map_that_began_with_chosen_frames(
+    merged: Path, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(merged, tmp_path / "run"))
+    chosen = load_config(run / "config.yaml", ["source.end=14"]).model_dump(mode="json")
+    (run / "config.yaml").write_text(yaml.safe_dump(chosen))
+    done = CliRunner().invoke(app, ["map", "--into", str(run), "--remove", "2", "--no-mesh"])
+    assert done.exit_code == 0, done.output
+    assert [drive["number"] for drive in summary_of(run)["sessions"]] == [0, 1]
+
+
 @pytest.mark.parametrize("at", ["recon.run.directory.exchange", "recon.commands.joined.place_map"])
 def test_what_fails_before_the_end_leaves_the_run_as_it_was(run: Path, at: str) -> None:
     before, short = content(run), part(FIRST, frames=4)
@@ -189,6 +201,7 @@ def test_what_cannot_be_merged_is_one_line(
         (["map", "--remove", "0"], "--into"),
         (["map", "--into", "RUN", "--remove", "5"], "no such session"),
         (["map", "--into", "RUN", "--remove", "0"], "only this session"),
+        (["map", "--into", "RUN", "--remove", "0", "--end", "3"], "no effect here"),
         (["map", "x", "--into", "nowhere"], "does not contain a finished run"),
     ],
 )

@@ -62,6 +62,9 @@ class Map:
             OutputError: It is to be changed, and another program uses it or it cannot be written.
         """
         file = path / MAP_FILE if path.is_dir() else path
+        if path.is_dir() and not file.is_file():
+            expected = f"a {MAP_FILE}, as recon map, live and merge keep it"
+            raise FormatError("folder has no map", where=path, expected=expected)
         store = Store.open(file, read_only=read_only, cache_bytes=cache_bytes)
         try:
             return cls(store)

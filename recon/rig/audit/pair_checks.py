@@ -34,7 +34,11 @@ def find_pair_faults(
         given: The pair.
         config: The configuration; its ``audit`` and ``rectification`` sections are used.
         metric: Whether depth is wanted, so that the calibration matters.
+
+    Raises:
+        MatchingError: Both images are the same one.
     """
+    _check_two(given.pair)
     if not config.audit.quick:
         return ()
     codes = _BY_IMAGES | _BY_CALIBRATION if metric else _BY_IMAGES
@@ -63,14 +67,19 @@ def check_found(
     )
     if share > 0:
         return (f"only {found}; {advice}",)
-    if np.array_equal(pair.left, pair.right):
-        advice = "left and right are the same image"
     raise MatchingError(
         "no pixel has a match in the other image",
         where=pair.name or None,
         got=_reasons(disparity),
         hint=next((fault.text for fault in faults if fault.fatal), advice),
     )
+
+
+def _check_two(pair: StereoPair) -> None:
+    """Refuse one image given twice; rectified by two cameras it looks like a swapped pair."""
+    if np.array_equal(pair.left, pair.right) and np.ptp(pair.left):
+        hint = "name the image of each camera"
+        raise MatchingError("left and right are the same image", where=pair.name or None, hint=hint)
 
 
 def _reasons(disparity: Disparity) -> str:

@@ -13,7 +13,8 @@ from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.commands.mesh import run_mesh
 from recon.commands.pair import run_disparity, run_pair
 from recon.core.errors import FormatError, MappingError, MatchingError, SettingsError
-from recon.core.values import RectifiedCamera, StereoPair
+from recon.core.geometry.se3 import make_transform
+from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
 from recon.export.mesh import check_coverage
 from recon.run.progress import Silent
 from recon.sources.pair_input import PairInput
@@ -79,8 +80,16 @@ def test_a_pair_without_a_point_is_refused_with_its_depths(
 
 
 def test_the_same_image_twice_is_refused_as_such(pair: StereoPair, tmp_path: Path) -> None:
-    with pytest.raises(MatchingError, match="left and right are the same image"):
-        run(replace(pair, right=pair.left), tmp_path / "out")
+    matrix = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    left = CameraIntrinsics(matrix, np.zeros(0), 320, 240)
+    # Rectified, the image of such a right camera lies farther right: as if they were swapped.
+    right = replace(left, matrix=matrix - [[0, 0, 40], [0, 0, 0], [0, 0, 0]])
+    beside = make_transform(np.eye(3), np.array([-0.1, 0.0, 0.0]))
+    for rig in (CAMERA, StereoCalibration(left, right, beside)):
+        given = PairInput(replace(pair, right=pair.left), rig)
+        with pytest.raises(MatchingError, match=r"^left\.png: left and right are the same image"):
+            run_disparity(given, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_images_of_two_things_are_said_to_be_hardly_a_pair(
