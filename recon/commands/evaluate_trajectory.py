@@ -50,6 +50,7 @@ def run_evaluate_trajectory(
     comparison = compare_paths(ours, true, rules)
     summary = {
         **plain(comparison.metrics),
+        "T_truth_estimate": comparison.motion.T_to_from.tolist(),
         "rotation_deg": float(np.degrees(np.sqrt((comparison.rotation_errors_rad**2).mean()))),
         "roll": "fixed" if comparison.roll_axis is None else "not observable on a straight path",
         "associated": "by time" if by_time else "in order",

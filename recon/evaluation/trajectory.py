@@ -78,6 +78,7 @@ class TrajectoryComparison:
         segment_percent: float64 (N,), translation error of each segment, per cent of its length.
         segment_deg_per_100m: float64 (N,), rotation error of each segment.
         metrics: The summary.
+        motion: What aligned the estimate.
     """
 
     estimate: Trajectory
@@ -86,6 +87,7 @@ class TrajectoryComparison:
     segment_percent: Float64
     segment_deg_per_100m: Float64
     metrics: TrajectoryMetrics
+    motion: Similarity
 
     @property
     def position_errors_m(self) -> Float64:
@@ -194,7 +196,7 @@ def compare_paths(
         ate_max_m=float(np.max(away_m)),
         by_length=_by_length(segments, percent, deg_per_100m),
     )
-    return TrajectoryComparison(estimate, truth, segments, percent, deg_per_100m, metrics)
+    return TrajectoryComparison(estimate, truth, segments, percent, deg_per_100m, metrics, motion)
 
 
 def align(estimate: Trajectory, truth: Trajectory, alignment: str) -> Similarity:

@@ -13,7 +13,7 @@ from recon.core.errors import EvaluationError, FormatError, SourceError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
 from recon.evaluation.trajectory import TrajectoryRules
-from recon.io.trajectory import write_kitti_poses, write_tum
+from recon.io.trajectory import read_trajectory, write_kitti_poses, write_tum
 from recon.report.drive_figures import widest_axes
 
 RULES = TrajectoryRules()
@@ -54,6 +54,23 @@ def test_kitti_and_tum_are_compared_in_order(folder: Path) -> None:
     found = run_evaluate_trajectory(*files, RULES)
     assert (found["associated"], found["frames"]) == ("in order", 120)
     assert found["ate_m"] < 1e-6
+
+
+def test_the_alignment_is_given_as_a_transform_with_the_offset_of_survey_coordinates(
+    folder: Path,
+) -> None:
+    turn = exp_so3(np.array([0.3, -0.2, 1.1]))
+    T_survey_world = make_transform(turn, np.array([567_890.123, 5_432_109.876, 210.5]))
+    path = read_trajectory(folder / "truth_tum.txt")
+    poses = path.T_world_camera.copy()
+    poses[:, :3, 3] *= 2
+    write_tum(folder / "survey.txt", Trajectory(T_survey_world @ poses, path.timestamps_s))
+    rules = TrajectoryRules(alignment="sim3")
+    files = (folder / "half.txt", folder / "survey.txt")
+    found = run_evaluate_trajectory(*files, rules)
+    assert found["scale"] == pytest.approx(2, abs=1e-9)
+    # Doubles of 5e6 m are 1e-9 m apart; means and products of a few of them stay below 1e-6 m.
+    np.testing.assert_allclose(found["T_truth_estimate"], T_survey_world, rtol=0, atol=1e-6)
 
 
 def test_without_times_the_numbers_of_poses_must_agree(folder: Path) -> None:

@@ -136,6 +136,12 @@ def path_of_truth(path: Path) -> None:
     write_tum(path, replace(truth.trajectory, timestamps_s=path_s))
 
 
+def survey(path: Path) -> None:
+    """Positions of the recording above, which drives straight ahead at 10 Hz, to the north-east."""
+    lines = (f"{n / 10} {5e5 + 0.24 * n} {5e6 + 0.32 * n} 100 0 0 0 1\n" for n in range(12))
+    path.write_text("".join(lines))
+
+
 def disparity(path: Path) -> None:
     """As large as the images."""
     write_pfm(path, np.full((96, 256), 5.0, np.float32))
@@ -264,6 +270,7 @@ STAND_INS = (
     StandIn("drive.bag", bag),
     StandIn("camchain.yaml", camchain),
     StandIn("groundtruth.txt", path_of_truth),
+    StandIn("gnss.txt", survey),
     StandIn("lidar.ply", lidar),
     StandIn("scan.ply", lidar),
     StandIn("~/MiddEval3/trainingQ", scenes),

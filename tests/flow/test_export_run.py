@@ -82,7 +82,7 @@ def test_only_what_is_asked_for_is_made(small_demo: Path, tmp_path: Path) -> Non
     higher = run_settings(small_demo, None, ["grid.min_height_m=2.2", "grid.max_height_m=6"])
     run_export(small_demo, higher, products=["grid"], out=tmp_path / "out")
     files = sorted(p.name for p in (tmp_path / "out").rglob("*") if p.is_file())
-    assert files == ["config.yaml", "grid.pgm", "grid.yaml", "run.json", "summary.json"]
+    assert files == ["config.yaml", "grid.pgm", "grid.wld", "grid.yaml", "run.json", "summary.json"]
     low, high = (read_nav2(f / "map/grid.yaml") for f in (small_demo, tmp_path / "out"))
     assert ((low.cells == OCCUPIED) & (high.cells != OCCUPIED)).sum() > 10
 

@@ -33,6 +33,16 @@ def test_the_first_row_of_the_image_has_the_largest_y(tmp_path: Path) -> None:
     assert list(pixels) == [205, 254, 254, 254, 254, 254, 254, 254, 254, 254, 254, 0]
 
 
+def test_a_world_file_places_the_image_in_a_gis(tmp_path: Path) -> None:
+    write_nav2(tmp_path / "grid", GRID)
+    x_step, y_turn, x_turn, y_step, x_m, y_m = map(
+        float, (tmp_path / "grid.wld").read_text().split()
+    )
+    # Of the centre of the upper left pixel, which is the first column of the last row.
+    assert (x_m, y_m) == pytest.approx((-3.4 + 0.1, 1.25 + 2.5 * 0.2))
+    assert (x_step, y_turn, x_turn, y_step) == (0.2, 0, 0, -0.2)
+
+
 def test_the_yaml_file_says_what_nav2_asks(tmp_path: Path) -> None:
     _, description = write_nav2(tmp_path / "grid", GRID)
     assert yaml.safe_load(description.read_text()) == {

@@ -32,14 +32,14 @@ _PGM_HEADER: Final = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d+)\s+(\d+)\s+(\d+)\s
 
 
 def write_nav2(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
-    """Write ``path.pgm`` and ``path.yaml``, each atomically, the image first.
+    """Write ``path.pgm``, ``path.wld`` for a GIS, and ``path.yaml``, each atomically.
 
     Args:
         path: Both names without their suffixes, such as ``map/grid``.
         grid: The grid.
 
     Returns:
-        The two paths written: image, YAML.
+        Two of the paths: image, YAML.
 
     Raises:
         OutputError: A file cannot be written.
@@ -51,6 +51,7 @@ def write_nav2(path: StrPath, grid: OccupancyGrid) -> tuple[Path, Path]:
         file.write(f"P5\n{columns} {rows}\n255\n".encode())
         for last in range(rows, 0, -_STRIP_ROWS):
             file.write(_grey(grid.cells[max(0, last - _STRIP_ROWS) : last][::-1]).tobytes())
+    write_text(stem.with_name(f"{stem.name}.wld"), _world_file(grid))
     write_text(description, yaml.safe_dump(_describe(grid, image.name), sort_keys=False))
     return image, description
 
@@ -95,6 +96,16 @@ def _describe(grid: OccupancyGrid, image: str) -> dict[str, Any]:
         "occupied_thresh": _OCCUPIED_THRESH,
         "free_thresh": _FREE_THRESH,
     }
+
+
+def _world_file(grid: OccupancyGrid) -> str:
+    """Return size and turn of a pixel, and x and y of the centre of the first one, line by line.
+
+    Ref: https://gdal.org/en/stable/drivers/raster/wld.html
+    """
+    side_m, (x_m, y_m) = grid.resolution_m, grid.origin_m
+    centre = (x_m + side_m / 2, y_m + (len(grid.cells) - 0.5) * side_m)
+    return "".join(f"{number:.12g}\n" for number in (side_m, 0, 0, -side_m, *centre))
 
 
 def _fields(path: Path) -> dict[str, Any]:
