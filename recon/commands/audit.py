@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from recon.commands.config import ReconConfig
+from recon.io.files import StrPath
 from recon.report.audit_page import write_audit_page
 from recon.rig.audit.audit import Audit, audit_source, correct_calibration
 from recon.run.run import Run
@@ -18,8 +19,8 @@ def run_audit(
     config: ReconConfig,
     *,
     quick: bool = False,
-    mend: Path | None = None,
-    out: Path | None = None,
+    mend: StrPath | None = None,
+    out: StrPath | None = None,
 ) -> Audit:
     """Check a recording before a long run: what `recon audit` does.
 
@@ -40,7 +41,7 @@ def run_audit(
     """
     audit = audit_source(source, config, quick=quick)
     if mend is not None:
-        audit = replace(audit, corrected=correct_calibration(source, config, audit, mend))
+        audit = replace(audit, corrected=correct_calibration(source, config, audit, Path(mend)))
     if out is not None:
         matcher = make_matcher(config.matching.matcher, config.matching, None)
         with Run("audit", out, config) as run:

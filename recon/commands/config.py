@@ -10,7 +10,7 @@ from recon.core.errors import FormatError, SettingsError
 from recon.core.settings import Settings, merge
 from recon.evaluation.paper.settings import PaperConfig
 from recon.export.mesh import MeshSettings
-from recon.io.files import SMALL_FILE_BYTES, read_text
+from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text
 from recon.io.yaml_file import parse_yaml
 from recon.map.settings import DriveSettings
 from recon.rig.audit.settings import AuditedSettings
@@ -102,7 +102,7 @@ PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
 
 
 def load_config(
-    path: Path | None = None,
+    path: StrPath | None = None,
     overrides: Sequence[str] = (),
     defaults: Mapping[str, Any] | None = None,
 ) -> ReconConfig:
@@ -116,7 +116,7 @@ def load_config(
     Raises:
         SettingsError: The file cannot be read, a key is unknown, or a value is out of range.
     """
-    given = merge(defaults or {}, {} if path is None else _read_yaml(path))
+    given = merge(defaults or {}, {} if path is None else _read_yaml(Path(path)))
     values = given
     for text in overrides:
         values = merge(values, _parse_override(text))

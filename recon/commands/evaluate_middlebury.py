@@ -36,7 +36,7 @@ def run_middlebury(
     matchers: Sequence[str | Matcher] | None = None,
     results: Sequence[StrPath] = (),
     truth: StrPath | None = None,
-    out: Path | None = None,
+    out: StrPath | None = None,
     threads: int | None = None,
     parallel: int = 1,
     auto_range: bool = False,

@@ -11,6 +11,7 @@ from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.commands.occupancy import REMADE
 from recon.core.errors import SettingsError
 from recon.export.remake import Wanted, copy_file, from_rays, mesh_cloud, remake_map
+from recon.io.files import StrPath
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.sessions.spread import place_map_on
 from recon.run.batch.cluster import connect
@@ -29,12 +30,12 @@ _OF_A_PAIR: Final = ("cloud", "mesh")
 
 
 def run_export(
-    source: Path,
+    source: StrPath,
     config: ReconConfig | None = None,
     *,
     products: Sequence[str] = (),
     formats: Sequence[str] = ("ply",),
-    out: Path | None = None,
+    out: StrPath | None = None,
     threads: int | None = None,
     workers: BatchOptions | None = None,
 ) -> dict[str, Any]:
@@ -42,7 +43,7 @@ def run_export(
 
     Args:
         source: Folder of a run of map, demo or pair.
-        config: Its settings with changes, such as ``load_config(source / "config.yaml",
+        config: Its settings with changes, such as ``load_config(f"{source}/config.yaml",
             ["grid.max_height_m=3"])``; None = its own.
         products: Which of `PRODUCTS`; empty = all that such a run can give.
         formats: Formats of the mesh, such as ``("ply", "glb")``.
@@ -57,6 +58,7 @@ def run_export(
         ReconError: There is no such product, the run is damaged or lacks what a product is made
             from, a setting has no effect, or the folder cannot be written; nothing is left behind.
     """
+    source = Path(source)
     check_mesh_formats(formats)
     pair = is_pair_run(source)
     wanted = _known(products, _OF_A_PAIR if pair else PRODUCTS)

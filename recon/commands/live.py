@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
-from pathlib import Path
 from typing import Any, Final
 
 from recon.commands.config import ReconConfig, load_config
@@ -14,6 +13,7 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import MappingError, SettingsError
 from recon.core.values import StereoPair
+from recon.io.files import StrPath
 from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.sequence import StartPose, localize_sequence
@@ -32,7 +32,7 @@ def run_live(
     options: MapOptions | None = None,
     *,
     rate: float = 1.0,
-    map_path: Path | None = None,
+    map_path: StrPath | None = None,
     start: StartPose | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:
@@ -102,7 +102,7 @@ class _Beginning:
         return iter(self._pairs[start:])
 
 
-def _warm_up(source: LiveSource, config: ReconConfig, map_path: Path | None) -> None:
+def _warm_up(source: LiveSource, config: ReconConfig, map_path: StrPath | None) -> None:
     """Do once with the first pairs what comes, and forget it."""
     if map_path is None:
         with Map.temporary() as map_:

@@ -8,6 +8,7 @@ from recon.commands.config import ReconConfig, load_config
 from recon.commands.map_options import MapOptions
 from recon.core.values import OccupancyGrid
 from recon.export.trajectories import export_localized
+from recon.io.files import StrPath
 from recon.io.occupancy.nav2 import read_nav2
 from recon.map.drive.workspace import Workspace
 from recon.map.localize.localize_run import LocalizeRun
@@ -22,7 +23,7 @@ from recon.sources.protocol import StereoSource
 
 def run_localize(
     source: StereoSource,
-    map_path: Path,
+    map_path: StrPath,
     config: ReconConfig | None = None,
     options: MapOptions | None = None,
     *,
@@ -42,6 +43,7 @@ def run_localize(
             is left behind.
     """
     config, options = config or load_config(), options or MapOptions(command="localize")
+    map_path = Path(map_path)
     refuse_as_target(map_path, options.out)
     with (
         Map.open(map_path, cache_bytes=config.memory.cache_bytes) as map_,

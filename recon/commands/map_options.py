@@ -12,6 +12,7 @@ from typing_extensions import Self
 from recon.commands.config import ReconConfig
 from recon.core.errors import SettingsError
 from recon.core.values import Trajectory
+from recon.io.files import StrPath
 from recon.io.trajectory import read_trajectory
 from recon.run.batch.work import BatchOptions
 from recon.run.progress import SILENT, Progress
@@ -42,7 +43,7 @@ class MapOptions:
     """
 
     command: str = "map"
-    out: Path | None = None
+    out: StrPath | None = None
     threads: int | None = None
     known_poses: Trajectory | None = None
     prior: Trajectory | None = None

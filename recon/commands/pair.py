@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.values import Disparity, DisparityMetrics
 from recon.evaluation.disparity import evaluate_disparity
 from recon.export.pair import mesh_frame, write_cloud_files, write_disparity_files
+from recon.io.files import StrPath
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.drive.empty import check_cloud
 from recon.report.pair_page import write_disparity_images, write_pair_page
@@ -26,7 +26,7 @@ def run_pair(
     given: PairInput,
     config: ReconConfig | None = None,
     *,
-    out: Path | None = None,
+    out: StrPath | None = None,
     formats: Sequence[str] = (),
     threads: int | None = None,
     progress: Progress = SILENT,
@@ -98,7 +98,7 @@ def run_disparity(
     given: PairInput,
     config: ReconConfig | None = None,
     *,
-    out: Path | None = None,
+    out: StrPath | None = None,
     threads: int | None = None,
     progress: Progress = SILENT,
 ) -> PairRun:

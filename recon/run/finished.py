@@ -14,7 +14,7 @@ from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64, freeze
-from recon.io.files import read_text, reader, reading
+from recon.io.files import StrPath, read_text, reader, reading
 from recon.run.directory import RECORD
 from recon.run.run import SUMMARY
 
@@ -112,13 +112,13 @@ def camera_height_of(folder: Path) -> float | None:
     raise FormatError("the summary of the run has no valid camera_height_m", where=folder / SUMMARY)
 
 
-def refuse_as_target(run: Path, out: Path | None) -> None:
+def refuse_as_target(run: Path, out: StrPath | None) -> None:
     """Refuse to write derived results into the folder of the run, which would replace it.
 
     Raises:
         SettingsError: ``out`` is the folder of the run.
     """
-    if out is not None and out.resolve() == run.resolve():
+    if out is not None and Path(out).resolve() == run.resolve():
         raise SettingsError("the results would replace the run", where=out, hint="another --out")
 
 

@@ -12,6 +12,7 @@ from typing import Any, Final
 from typing_extensions import Self
 
 from recon.core.settings import Settings
+from recon.io.files import StrPath
 from recon.io.yaml_file import write_yaml
 from recon.run.directory import RECORD, RunDirectory, default_folder
 from recon.run.fingerprint import fingerprint
@@ -51,7 +52,7 @@ class Run(RunDirectory):
     def __init__(
         self,
         command: str,
-        out: Path | None = None,
+        out: StrPath | None = None,
         config: Settings | None = None,
         *,
         threads: int | None = None,
@@ -59,10 +60,11 @@ class Run(RunDirectory):
         resume: bool = False,
     ) -> None:
         standard = default_folder(command)
+        folder = standard if out is None else Path(out)
         # A run in a default folder keeps its link when it is resumed.
-        stamped = out is not None and out.parent.resolve() == standard.parent.resolve()
+        stamped = out is not None and folder.parent.resolve() == standard.parent.resolve()
         super().__init__(
-            standard if out is None else out,
+            folder,
             latest=out is None or (resume and stamped),
             resume=resume,
         )

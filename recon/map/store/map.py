@@ -12,7 +12,7 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import invert
 from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair
 from recon.core.values.arrays import Float64
-from recon.io.files import reading
+from recon.io.files import StrPath, reading
 from recon.map.store.links import LINKS, Link
 from recon.map.store.records import CACHE_BYTES, Store
 from recon.map.store.session import SESSION, Session, SessionInfo
@@ -45,22 +45,23 @@ class Map:
         self.sessions = [Session(store, number) for number in numbers]
 
     @classmethod
-    def create(cls, path: Path, *, cache_bytes: int = CACHE_BYTES) -> Self:
+    def create(cls, path: StrPath, *, cache_bytes: int = CACHE_BYTES) -> Self:
         """Begin an empty map; a file at ``path`` is replaced.
 
         Raises:
             OutputError: The file cannot be written.
         """
-        return cls(Store.create(path, cache_bytes=cache_bytes))
+        return cls(Store.create(Path(path), cache_bytes=cache_bytes))
 
     @classmethod
-    def open(cls, path: Path, *, read_only: bool = True, cache_bytes: int = CACHE_BYTES) -> Self:
+    def open(cls, path: StrPath, *, read_only: bool = True, cache_bytes: int = CACHE_BYTES) -> Self:
         """Open a map as it was committed last, or the map in the folder of a finished run.
 
         Raises:
             FormatError: The file is missing, no map, of a newer format, or damaged.
             OutputError: It is to be changed, and another program uses it or it cannot be written.
         """
+        path = Path(path)
         file = path / MAP_FILE if path.is_dir() else path
         if path.is_dir() and not file.is_file():
             expected = f"a {MAP_FILE}, as recon map, live and merge keep it"
