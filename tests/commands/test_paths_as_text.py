@@ -8,7 +8,7 @@ import pytest
 
 import recon
 from recon.core.errors import FormatError
-from recon.run import Run
+from recon.run.run import Run
 
 
 def test_a_map_is_made_and_opened_by_its_name(tmp_path: Path) -> None:
