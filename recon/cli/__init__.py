@@ -1,6 +1,6 @@
 """The command line: parse, build the configuration, call one story of `commands/`, print one table.
 
-One file per command; `options.py` has what several of them take, `session.py` what an error looks
+One file per command; `options.py` has what several of them take, `errors.py` what an error looks
 like, and `show/` the tables and the progress.
 
 Nothing heavy is imported before a command runs, so ``recon --help`` answers at once.
@@ -22,6 +22,7 @@ from recon.cli.calibrate import calibrate
 from recon.cli.capture import capture
 from recon.cli.demo import demo
 from recon.cli.doctor import doctor
+from recon.cli.errors import BUG, report_bug
 from recon.cli.export import export
 from recon.cli.live import live
 from recon.cli.localize import localize
@@ -33,7 +34,6 @@ from recon.cli.pair import disparity, pair
 from recon.cli.paper import paper
 from recon.cli.piece import piece
 from recon.cli.rectify import rectify
-from recon.cli.session import BUG, report_bug
 from recon.cli.settings import settings
 
 app = typer.Typer(
@@ -94,6 +94,6 @@ def main() -> None:
     """Run the program."""
     try:
         app()
-    except Exception as error:  # noqa: BLE001 - outside of a session, as while printing a table
+    except Exception as error:  # noqa: BLE001 - outside of `one_line_errors`, as while printing a table
         report_bug(error)
         sys.exit(BUG)

@@ -9,7 +9,7 @@ import typer
 
 from recon.cli import options as opt
 from recon.cli.drive import SourceOptions, Start
-from recon.cli.session import session
+from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_figures, print_json
 
 
@@ -45,7 +45,7 @@ def audit(
       recon audit rides/today --mend mended.yaml
       recon audit rides/today --out audited
     """
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.cli.show.announce import announce
         from recon.commands.audit import run_audit
         from recon.commands.config import load_config

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
+from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_batch, print_json
 
 _HELP = "Job file (TOML, YAML), or a command and the sources to run it on."
@@ -72,7 +72,7 @@ def batch(
     """
     if (resume is None) == (not what):
         raise typer.BadParameter("give JOBS, or COMMAND and SOURCES, or --resume FOLDER")
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.cli.program import known_program
         from recon.cli.show.jobs import choose_job_viewer
         from recon.commands.batch import resume_batch, run_batch

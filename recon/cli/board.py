@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
+from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_figures, print_json
 
 
@@ -52,7 +52,7 @@ def board(
     wanted = pattern or same
     if wanted is None or (pattern and same):
         raise typer.BadParameter("name one board, such as chess:9x6:25mm")
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.core.values.board import parse_board
         from recon.rig.board_sheet import write_board
 

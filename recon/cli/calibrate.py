@@ -75,7 +75,7 @@ def calibrate(
       recon calibrate left/ right/ --board charuco:8x6:30mm:22mm:5x5_100
       recon calibrate both.mp4 --board chess:9x6:25mm
     """
-    with shared.session():
+    with shared.one_line_errors():
         from recon.commands.calibrate import run_calibrate
         from recon.commands.config import load_config
         from recon.core.values.board import parse_board

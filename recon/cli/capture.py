@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
+from recon.cli.errors import one_line_errors
 from recon.cli.interrupt import until_interrupted
-from recon.cli.session import session
 from recon.cli.show.tables import print_figures, print_json
 
 
@@ -46,7 +46,7 @@ def capture(
       recon capture 0 2 --out rides/today --calib stereo.yaml --size 1280x720
       recon capture /dev/video4 --out rides/today --set capture.suffix=jpg
     """
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.cli.overrides import capture_overrides
         from recon.commands.capture import run_capture
         from recon.commands.config import load_config

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
+from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_datasets, print_json
 
 app = typer.Typer(
@@ -41,7 +41,7 @@ def list_(
       recon datasets list
       recon datasets list kitti-raw
     """
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.commands.datasets import run_list
 
         found = run_list(name, folder)
@@ -74,7 +74,7 @@ def fetch(
       recon datasets fetch kitti-raw/2011_09_26_drive_0013 tum-vi/room1
       recon datasets fetch euroc/vicon_room1 --address http://mirror.example/data
     """
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.cli.show.progress import choose_viewer
         from recon.commands.datasets import run_fetch
 
@@ -95,7 +95,7 @@ def verify(
     Examples:
       recon datasets verify middlebury-eval3/Q
     """
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.commands.datasets import run_verify
 
         found = run_verify(names, folder)

@@ -30,7 +30,7 @@ def demo(
       recon demo
       recon demo --frames 60 --seed 3 --out outputs/street
     """
-    with shared.session():
+    with shared.one_line_errors():
         from recon.commands.config import load_config
         from recon.commands.demo import run_demo
 

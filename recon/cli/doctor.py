@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
+from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_json
 
 
@@ -32,7 +32,7 @@ def doctor(
     if compile_:
         _compile(json=json, quiet=quiet)
         return
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from dataclasses import asdict
 
         from recon.commands.doctor import examine
@@ -50,7 +50,7 @@ def doctor(
 
 
 def _compile(*, json: bool, quiet: bool) -> None:
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.commands.doctor import compile_kernels
 
         done = compile_kernels()

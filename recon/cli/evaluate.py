@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 import typer
 
 from recon.cli import options as opt
+from recon.cli.errors import one_line_errors
 from recon.cli.evaluate_middlebury import middlebury
-from recon.cli.session import session
 from recon.cli.show.tables import print_evaluation, print_figures, print_json
 
 app = typer.Typer(no_args_is_help=True, help="Compare results with ground truth.")
@@ -47,7 +47,7 @@ def disparity(
       recon evaluate disparity disparity.pfm disp0GT.pfm
       recon evaluate disparity disparity.pfm disp0GT.pfm --mask mask0nocc.png
     """
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.commands.evaluate_disparity import run_evaluate_disparity
 
         figures = run_evaluate_disparity(estimate, truth, mask, scale=scale, confidence=confidence)
@@ -112,7 +112,7 @@ def trajectory(
       recon evaluate trajectory trajectory_kitti.txt poses.txt --out outputs/path
       recon evaluate trajectory trajectory_tum.txt groundtruth.txt --align sim3
     """
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.commands.evaluate_trajectory import run_evaluate_trajectory
         from recon.evaluation.trajectory import TrajectoryRules
 
@@ -149,7 +149,7 @@ def occupancy(
     Examples:
       recon evaluate occupancy outputs/demo/latest --picture compared.png
     """
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.commands.evaluate_occupancy import run_evaluate_occupancy
         from recon.run.summary import plain
 
@@ -206,7 +206,7 @@ def map_(
       recon evaluate map outputs/map/latest lidar_map.ply --threshold 0.1,0.2,0.5
       recon evaluate map outputs/map/latest lidar_map.ply --align-to poses.txt
     """
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.commands.evaluate_map import run_evaluate_map
 
         figures = run_evaluate_map(

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
+from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_json
 
 _NONE = "none"
@@ -78,7 +78,7 @@ def middlebury(
     """
     if json and latex:
         raise typer.BadParameter("--json and --latex exclude each other")
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.cli.show.progress import choose_viewer
         from recon.commands.config import load_config
         from recon.commands.evaluate_middlebury import run_middlebury

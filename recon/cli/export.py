@@ -45,7 +45,7 @@ def export(
       recon export outputs/map/latest --to mesh --set mesh.depth=9
       recon export outputs/city --to grid,octomap --workers 4
     """
-    with shared.session():
+    with shared.one_line_errors():
         from recon.commands.config import run_settings
         from recon.commands.export import run_export
 

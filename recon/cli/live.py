@@ -59,7 +59,7 @@ def live(
       recon live rides/today --rate 2
       recon live rides/today --map outputs/map/latest
     """
-    with shared.session(), ExitStack() as stack:
+    with shared.one_line_errors(), ExitStack() as stack:
         from recon.commands.live import run_live
         from recon.commands.map_options import MapOptions, MapRequest
         from recon.rig.cameras import is_camera, open_camera_source

@@ -37,7 +37,7 @@ def localize(
       recon localize rides/today --map outputs/map/latest
       recon localize rides/today --map outputs/map/latest --start 12.5,-3,90
     """
-    with shared.session():
+    with shared.one_line_errors():
         from recon.commands.localize import run_localize
         from recon.commands.map_options import MapRequest
 

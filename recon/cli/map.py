@@ -82,7 +82,7 @@ def map_(
     _check_folders(source, out, resume, into, remove)
     if into is not None and (workers or scheduler) is not None:
         raise typer.BadParameter("--into maps the drive in one piece: no --workers, no --scheduler")
-    with shared.session():
+    with shared.one_line_errors():
         from recon.cli.show.announce import warn
         from recon.commands.config import load_config, run_settings
         from recon.commands.map import run_map

@@ -31,7 +31,7 @@ def merge(
       recon merge outputs/monday outputs/friday --out outputs/week
       recon merge outputs/week outputs/sunday --no-mesh
     """
-    with shared.session():
+    with shared.one_line_errors():
         from recon.commands.config import run_settings
         from recon.commands.map_options import MapOptions
         from recon.commands.merge import run_merge

@@ -34,7 +34,7 @@ def mesh(
       recon mesh cloud.ply --format obj --format glb
       recon mesh outputs/map/latest --set mesh.target_faces=500000
     """
-    with shared.session():
+    with shared.one_line_errors():
         from recon.commands.config import PAIR_DEFAULTS, load_config
         from recon.commands.mesh import run_mesh
         from recon.run.finished import is_pair_run

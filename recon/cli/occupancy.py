@@ -40,7 +40,7 @@ def occupancy(
       recon occupancy outputs/map/latest --resolution 0.1
       recon occupancy outputs/map/latest --min-height 0.5 --max-height 3.2
     """
-    with shared.session():
+    with shared.one_line_errors():
         from recon.commands.config import run_settings
         from recon.commands.occupancy import run_occupancy
 

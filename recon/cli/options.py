@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from recon.cli.session import session
+from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_json, print_run
 from recon.core.errors import SettingsError
 
@@ -135,9 +135,9 @@ class Shared:
         """The settings of ``--set``."""
         return self.set_ or ()
 
-    def session(self) -> AbstractContextManager[None]:
-        """Open the session that the command works in."""
-        return session(quiet=self.quiet)
+    def one_line_errors(self) -> AbstractContextManager[None]:
+        """Return what the body of the command runs in; see `recon.cli.errors`."""
+        return one_line_errors(quiet=self.quiet)
 
     def viewer(self) -> Progress:
         """Choose what shows the progress."""

@@ -87,7 +87,7 @@ def pair(
       recon pair im0.png im1.png --calib calib.txt --format glb
       recon pair left.png right.png --focal 721.5 --baseline 0.54
     """
-    with shared.session():
+    with shared.one_line_errors():
         from recon.cli.overrides import pair_config
         from recon.commands.pair import run_pair
         from recon.sources.pair_input import KnownCamera, read_pair_input, with_truth
@@ -134,7 +134,7 @@ def disparity(
       recon disparity left.png right.png --ndisp 128
       recon disparity raw_left.png raw_right.png --calib rig.yaml --matcher sgm
     """
-    with shared.session():
+    with shared.one_line_errors():
         from recon.cli.overrides import pair_config
         from recon.commands.pair import run_disparity
         from recon.sources.pair_input import read_pair_input

@@ -36,7 +36,7 @@ def paper(
       recon paper MiddEval3/trainingQ
       recon paper MiddEval3/trainingQ --as-printed --out outputs/paper-as-printed
     """
-    with shared.session():
+    with shared.one_line_errors():
         from recon.commands.config import PAIR_DEFAULTS, load_config
         from recon.commands.paper import headline, run_paper
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
+from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_json, print_run
 
 
@@ -33,7 +33,7 @@ def piece(
     folder = resume or out
     if folder is None:
         raise typer.BadParameter("give --out FOLDER or --resume FOLDER")
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from recon.cli.show.progress import choose_viewer
         from recon.commands.piece import run_piece
 

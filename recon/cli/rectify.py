@@ -39,7 +39,7 @@ def rectify(
       recon rectify left/ right/ --calib rig.yaml --out rectified
       recon rectify left.png right.png
     """
-    with shared.session():
+    with shared.one_line_errors():
         from recon.commands.config import load_config
         from recon.commands.rectify import run_rectify
 

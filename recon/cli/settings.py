@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.session import session
+from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_json
 
 
@@ -33,7 +33,7 @@ def settings(
       recon settings matching.sgm
       recon settings voxel
     """
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         from dataclasses import asdict
 
         from recon.commands.settings import list_settings

@@ -2,6 +2,6 @@
 
 `map.py` is `recon map`, and so on; each reads like the paragraph that explains it. What several of
 them share: `config.py` (settings of all stages), `map_options.py` (what is mapped with what),
-`resume.py` and `identity.py` (interrupted runs), `joined.py` (several drives in one map). `api.py`
-is for Python alone.
+`resume.py` and `identity.py` (interrupted runs), `map_pieces.py` and `piece.py` (a drive mapped by
+workers), `joined.py` (several drives in one map). `api.py` is for Python alone.
 """

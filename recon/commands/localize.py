@@ -16,7 +16,6 @@ from recon.map.localize.sequence import StartPose, localize_sequence
 from recon.map.store.map import MAP_FILE, Map
 from recon.report.localize_page import write_localize_page
 from recon.run.finished import GRID, camera_height_of, refuse_as_target
-from recon.run.run import Run
 from recon.sources.live import LiveSource
 from recon.sources.protocol import StereoSource
 
@@ -47,13 +46,7 @@ def run_localize(
     refuse_as_target(map_path, options.out)
     with (
         Map.open(map_path, cache_bytes=config.memory.cache_bytes) as map_,
-        Run(
-            options.command,
-            options.out,
-            config,
-            threads=options.threads,
-            progress=options.progress,
-        ) as run,
+        options.run(config) as run,
     ):
         workspace = Workspace(map_, run.watch, run.threads)
         drive = localize_sequence(source, workspace, config, start=start, progress=options.progress)

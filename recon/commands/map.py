@@ -9,16 +9,17 @@ import numpy as np
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.identity import identity_of
 from recon.commands.map_options import MapOptions
-from recon.commands.map_pieces import map_drive, pieces_of
+from recon.commands.map_pieces import begun_in_pieces, map_in_pieces, pieces_of
 from recon.commands.resume import begin_or_resume, with_resume_hint
 from recon.evaluation.drive import compare_with_truth
 from recon.export.products import Products, write_products
 from recon.export.trajectories import export_paths
 from recon.map.drive.empty import check_map
 from recon.map.drive.map_run import MapRun
-from recon.map.drive.sequence import MappedSequence
+from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.map.drive.workspace import Workspace
 from recon.map.store.kept import keep_map
-from recon.map.store.map import MAP_FILE
+from recon.map.store.map import MAP_FILE, Map
 from recon.odometry.health import health_warnings
 from recon.report.map_page import write_map_page
 from recon.rig.audit.audit import quick_warnings
@@ -55,18 +56,12 @@ def run_map(
     options.tell(findings)
     identity = identity_of(source, config, options.known_poses, options.prior)
     with (
-        Run(
-            options.command,
-            options.out,
-            config,
-            threads=options.threads,
-            progress=options.progress,
-            resume=options.resume,
-        ) as run,
+        options.run(config) as run,
         with_resume_hint(run, source),
         begin_or_resume(run, source, config, identity, options.arguments) as map_,
     ):
-        mapped = map_drive(source, config, options, run, map_)
+        apart = options.workers is not None or begun_in_pieces(run)
+        mapped = (map_in_pieces if apart else map_whole)(source, config, options, run, map_)
         with run.stage("cloud"):
             check_map(mapped, source.name)
         made = write_products(mapped, run, config.mesh if options.mesh else None)
@@ -102,6 +97,24 @@ def run_map(
         }
         run.finish(result.summary, source=source.name, inputs=source.files, record=record)
     return result
+
+
+def map_whole(
+    source: StereoSource, config: ReconConfig, options: MapOptions, run: Run, map_: Map
+) -> MappedSequence:
+    """Map a drive in one piece, in this process, into the map of a run.
+
+    Raises:
+        ReconError: As for `run_map`.
+    """
+    return map_sequence(
+        source,
+        config,
+        known_poses=options.known_poses,
+        prior=options.prior,
+        progress=options.progress,
+        workspace=Workspace(map_, run.watch, run.threads),
+    )
 
 
 def _warnings(source: StereoSource, mapped: MappedSequence) -> list[str]:

@@ -16,6 +16,7 @@ from recon.io.files import StrPath
 from recon.io.trajectory import read_trajectory
 from recon.run.batch.work import BatchOptions
 from recon.run.progress import SILENT, Progress
+from recon.run.run import Run
 from recon.sources.prior import read_prior
 from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source
@@ -55,6 +56,17 @@ class MapOptions:
     resume: bool = False
     arguments: Mapping[str, Any] = field(default_factory=dict)
     workers: BatchOptions | None = None
+
+    def run(self, config: ReconConfig) -> Run:
+        """Return the run, which begins when it is entered."""
+        return Run(
+            self.command,
+            self.out,
+            config,
+            threads=self.threads,
+            progress=self.progress,
+            resume=self.resume,
+        )
 
 
 @dataclass(frozen=True)

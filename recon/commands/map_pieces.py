@@ -15,7 +15,7 @@ from recon.commands.map_options import MapOptions
 from recon.commands.piece import PiecePlan, piece_job, read_plan, write_plan
 from recon.core.errors import ClusterError, RegistrationError, SettingsError
 from recon.map.drive.pieces import Piece, cut_drive, join_pieces, joined_drive
-from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.map.drive.sequence import MappedSequence
 from recon.map.drive.workspace import Workspace
 from recon.map.store.map import Map
 from recon.run.batch.cluster import Cluster, connect
@@ -28,10 +28,15 @@ from recon.sources.protocol import StereoSource
 _PLAN: Final = "pieces.json"
 
 
-def map_drive(
+def begun_in_pieces(run: Run) -> bool:
+    """Return whether a run that is resumed was begun in pieces."""
+    return run.state(_PLAN).is_file()
+
+
+def map_in_pieces(
     source: StereoSource, config: ReconConfig, options: MapOptions, run: Run, map_: Map
 ) -> MappedSequence:
-    """Map a drive in this process, or in pieces on workers and then joined.
+    """Map a drive in pieces on workers, and join them.
 
     Args:
         source: The drive.
@@ -44,18 +49,7 @@ def map_drive(
         ReconError: As for `run_map`.
     """
     work, plan = Workspace(map_, run.watch, run.threads), run.state(_PLAN)
-    spread = options.workers or (
-        BatchOptions(progress=options.progress) if plan.is_file() else None
-    )
-    if spread is None:
-        return map_sequence(
-            source,
-            config,
-            known_poses=options.known_poses,
-            prior=options.prior,
-            progress=options.progress,
-            workspace=work,
-        )
+    spread = options.workers or BatchOptions(progress=options.progress)
     if len(map_.session()) and not plan.is_file():
         raise SettingsError("the run was begun in one piece", hint="resume it without --workers")
     _refuse_what_does_not_combine(config, options)
@@ -74,7 +68,7 @@ def map_drive(
 
 def pieces_of(run: Run, map_: Map) -> dict[str, Any]:
     """Return what the record of a run has of its pieces; nothing if there were none."""
-    state = map_.session().state() if run.state(_PLAN).is_file() else None
+    state = map_.session().state() if begun_in_pieces(run) else None
     return {} if state is None else {"pieces": state["pieces"]}
 
 

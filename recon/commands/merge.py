@@ -9,11 +9,10 @@ from typing import Any
 
 from recon.commands.config import ReconConfig, run_settings
 from recon.commands.joined import REMADE, copied, joined_settings, make_joined
+from recon.commands.map import map_whole
 from recon.commands.map_options import MapOptions
 from recon.core.errors import SettingsError
 from recon.map.drive.empty import check_map
-from recon.map.drive.sequence import map_sequence
-from recon.map.drive.workspace import Workspace
 from recon.map.sessions.copying import copy_sessions
 from recon.map.store.kept import keep_map
 from recon.map.store.map import MAP_FILE, Map
@@ -122,14 +121,7 @@ def _mapped(
 ) -> list[int]:
     """Map a drive, and copy it into a map; its number."""
     with Map.create(run.state("drive.recon")) as drive:
-        mapped = map_sequence(
-            source,
-            settings,
-            known_poses=options.known_poses,
-            prior=options.prior,
-            progress=options.progress,
-            workspace=Workspace(drive, run.watch, run.threads),
-        )
+        mapped = map_whole(source, settings, options, run, drive)
         check_map(mapped, source.name)
         kept = run.state("kept.recon")
         keep_map(drive, kept, settings)

@@ -75,14 +75,14 @@ def remake_map(
         ReconError: The run is damaged, lacks what a product is made from, or a file cannot be
             written.
     """
-    products, mesh = wanted.products, wanted.mesh
+    products = wanted.products
     anew = from_rays(products)
     with run.stage("map" if anew else "read"):
-        found = (
-            map_from_rays(source, config, wanted.place)
-            if anew
-            else map_as_written(source, config, voxels="mesh" in products and mesh.free_space)
-        )
+        if anew:
+            found = map_from_rays(source, config, wanted.place)
+        else:
+            voxels = "mesh" in products and wanted.mesh.free_space
+            found = map_as_written(source, config, voxels=voxels)
     figures: dict[str, Any] = {"run": str(source.folder), "cloud": str(source.folder / CLOUD)}
     warnings = list(found.warnings)
     if "cloud" in products:
@@ -96,7 +96,7 @@ def remake_map(
         with run.stage("grid"):
             figures |= _grid(source, found, run, warnings)
     if "mesh" in products:
-        figures |= _mesh(source, found, mesh, run, wanted.formats, warnings)
+        figures |= _mesh(source, found, wanted, run, warnings)
     record: dict[str, Any] = {}
     if anew or "cloud" in products:
         T_map_world = source.T_map_world.tolist()
@@ -165,20 +165,15 @@ def _grid(source: FinishedRun, found: FinishedMap, run: Run, warnings: list[str]
 
 
 def _mesh(
-    source: FinishedRun,
-    found: FinishedMap,
-    settings: MeshSettings,
-    run: Run,
-    formats: Sequence[str],
-    warnings: list[str],
+    source: FinishedRun, found: FinishedMap, wanted: Wanted, run: Run, warnings: list[str]
 ) -> dict[str, Any]:
     """Write the mesh of a map; its figures."""
     layer = run.path(_LAYER)
     copy_file(source.folder / CLOUD, layer)
     with run.stage("mesh"):
-        written = export_mesh(found.tiles, settings, run, layer, run.threads)
+        written = export_mesh(found.tiles, wanted.mesh, run, layer, run.threads)
     with run.stage("write"):
-        _in_other_formats(run, formats, "map")
+        _in_other_formats(run, wanted.formats, "map")
     warnings += written.warnings
     return {
         "points": written.points,

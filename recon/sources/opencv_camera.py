@@ -11,6 +11,7 @@ import numpy as np
 
 from recon.core.errors import SourceError
 from recon.core.values.arrays import UInt8
+from recon.io.images.image import silent_opencv
 
 # V4L2's exposure modes: 1 = manual, 3 = automatic.
 _MANUAL: Final = 1
@@ -67,13 +68,8 @@ class OpenCvCamera:
         number = int(device) if device.isdecimal() else None
         if Path(device).is_fifo() or Path(device).is_socket():  # opening one would wait for ever
             raise SourceError("not a camera and not a regular file", where=device)
-        log = cv2.utils.logging
-        before = log.getLogLevel()
-        log.setLogLevel(log.LOG_LEVEL_SILENT)  # a failure is raised as an error below
-        try:
+        with silent_opencv():
             self._capture = cv2.VideoCapture(device if number is None else number)
-        finally:
-            log.setLogLevel(before)
         if not self._capture.isOpened():
             found = ", ".join(sorted(str(path) for path in Path("/dev").glob("video*")))
             raise SourceError(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import typer
 
-from recon.cli.session import session
+from recon.cli.errors import one_line_errors
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetSettings
 from tests.hostile.refusals import Ended, assert_refused, run, run_apart
@@ -227,13 +227,13 @@ def test_a_prior_that_give_no_answer(
 def test_ctrl_c_while_a_native_library_starts_is_an_interruption(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    with pytest.raises(typer.Exit) as ended, session():
+    with pytest.raises(typer.Exit) as ended, one_line_errors():
         raise ImportError("initialization failed") from KeyboardInterrupt()
     assert ended.value.exit_code == 130
     assert capsys.readouterr().err == "interrupted\n"
 
 
 def test_a_library_that_is_missing_is_no_interruption() -> None:
-    with pytest.raises(typer.Exit) as ended, session():
+    with pytest.raises(typer.Exit) as ended, one_line_errors():
         raise ImportError("nothing of that name")
     assert ended.value.exit_code == 3

@@ -6,7 +6,7 @@ import io
 
 import pytest
 
-from recon.cli.session import session
+from recon.cli.errors import one_line_errors
 from recon.core.kernels.cache import announce
 
 
@@ -20,7 +20,7 @@ def shown(
 ) -> list[str]:
     """What standard error gets while a command meets two kernels that are not compiled."""
     monkeypatch.setattr("sys.stderr", stream)
-    with session(quiet=quiet):
+    with one_line_errors(quiet=quiet):
         announce("first")
         announce("second")
     return stream.getvalue().splitlines()

@@ -25,7 +25,7 @@ BUG = 3
 
 
 @contextmanager
-def session(*, quiet: bool = False) -> Iterator[None]:
+def one_line_errors(*, quiet: bool = False) -> Iterator[None]:
     """Run a command's body; a `ReconError` becomes one line on standard error and exit code 1.
 
     Any other exception is a bug: one line with the file that has its traceback, and exit code 3.
