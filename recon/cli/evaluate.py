@@ -68,10 +68,10 @@ def trajectory(
     estimate: Annotated[Path, typer.Argument(help="Estimated trajectory, in KITTI or TUM format.")],
     truth: Annotated[Path, typer.Argument(help="Ground truth, in either format.")],
     align: Annotated[
-        Literal["none", "origin", "se3", "sim3"],
+        Literal["none", "origin", "se3", "sim3", "upright"],
         typer.Option(
             help="Alignment of the estimate: none, at the first pose (origin), rigid (se3), or "
-            "rigid with scale (sim3)."
+            "rigid with scale (sim3), or rigid where z is up in both (upright)."
         ),
     ] = "se3",
     lengths: Annotated[

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from recon.core.errors import EvaluationError
-from recon.core.geometry.alignment import Similarity, fit_points
+from recon.core.geometry.alignment import Similarity, fit_points, fit_upright
 from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.settings import Settings
 from recon.core.values import LengthErrors, Trajectory, TrajectoryMetrics
@@ -48,10 +48,10 @@ class Segments:
 class TrajectoryRules(Settings):
     """Alignment and segments of a trajectory comparison."""
 
-    alignment: Literal["none", "origin", "se3", "sim3"] = Field(
+    alignment: Literal["none", "origin", "se3", "sim3", "upright"] = Field(
         default="se3",
         description="Alignment of the estimate: none, at the first pose (origin), rigid (se3), or "
-        "rigid with scale (sim3).",
+        "rigid with scale (sim3), or rigid where z is up in both (upright).",
     )
     lengths_m: tuple[Annotated[float, Field(gt=0)], ...] | None = Field(
         default=None,
@@ -101,7 +101,7 @@ class TrajectoryComparison:
 
         None if the positions fix every rotation, or if they are not what was aligned.
         """
-        if self.metrics.alignment in ("none", "origin"):
+        if self.metrics.alignment not in ("se3", "sim3"):
             return None
         return open_roll_axis(self.estimate, self.truth)
 
@@ -205,6 +205,8 @@ def align(estimate: Trajectory, truth: Trajectory, alignment: str) -> Similarity
         return Similarity(np.eye(4))
     if alignment == "origin":
         return Similarity(truth.T_world_camera[0] @ invert(estimate.T_world_camera[0]))
+    if alignment == "upright":
+        return fit_upright(estimate.positions_m, truth.positions_m)
     scaled = alignment == "sim3"
     return fit_points(estimate.positions_m, truth.positions_m, scaled=scaled)
 

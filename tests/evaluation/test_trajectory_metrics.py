@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.core.errors import EvaluationError
-from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.geometry.alignment import fit_points, fit_upright
+from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
 from recon.core.values import Trajectory
 from recon.evaluation.trajectory import (
     KITTI_LENGTHS_M,
@@ -45,6 +46,24 @@ def test_a_perfect_estimate_has_no_error() -> None:
     assert metrics.ate_m < 1e-6
     assert metrics.rpe_m < 1e-9
     assert metrics.frames == 300
+
+
+def test_upright_keeps_a_map_upright_where_gnss_leaves_its_roll_open() -> None:
+    along = np.arange(60)[:, None] * np.array([0.8, 0.6, 0.02])
+    noise = np.random.default_rng(4).normal(0, 0.3, along.shape)
+    found, loose = (fit(along, along + noise + 5e6).T_to_from for fit in (fit_upright, fit_points))
+    # The pitch by 0.3 m of noise in 60 points over 60 m: 0.3 / 17 / sqrt(60), 0.13 degrees.
+    assert np.degrees(np.arccos(found[2, 2])) < 0.5
+    assert np.degrees(np.arccos(loose[2, 2])) > 20
+
+
+def test_upright_finds_the_tilt_of_a_path_with_turns() -> None:
+    path = trajectory(bend(200, 0.03)).positions_m[:, [2, 0, 1]]  # a circle in the plane z = 0
+    T_survey_map = make_transform(exp_so3(np.array([0.02, -0.03, 1.2])), np.array([4e5, 5e6, 90.0]))
+    found = fit_upright(path, apply(T_survey_map, path)).T_to_from
+    off_rad = angle_rad(found @ invert(T_survey_map))
+    # Three metres upwards count 9 m² beside half of the squared radius of 33 m: of 0.036 rad.
+    assert off_rad < 0.036 * 9 / (33**2 / 2)
 
 
 @given(scale=st.floats(0.5, 1.5))

@@ -12,6 +12,8 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64, freeze
 
 _AXIS_M: Final = 20.0  # typical distance of a map from its cameras
+_UP_M: Final = np.array([0.0, 0.0, 3.0])
+"""Short beside a path, whose tilt is to count, and longer than a straight one is wide."""
 _IN_ONE_PLACE: Final = 1e-12
 
 
@@ -60,6 +62,19 @@ def fit_points(from_m: Float64, to_m: Float64, *, scaled: bool = False) -> Simil
     possible = scaled and variance > _IN_ONE_PLACE
     scale = float(strength @ signs) / variance if possible else 1.0
     return Similarity(make_transform(rotation, to_mean - scale * rotation @ from_mean), scale)
+
+
+def fit_upright(from_m: Float64, to_m: Float64) -> Similarity:
+    """Return the least-squares rigid transform between points in two frames whose z is up.
+
+    Each point counts with the one three metres above it. The points of a straight street alone,
+    such as positions by GNSS, would leave the roll about it to noise, and a map on its side.
+
+    Args:
+        from_m: float64 (N, 3), N ≥ 1.
+        to_m: float64 (N, 3), the corresponding points.
+    """
+    return fit_points(np.vstack([from_m, from_m + _UP_M]), np.vstack([to_m, to_m + _UP_M]))
 
 
 def fit_paths(from_path: Trajectory, to_path: Trajectory) -> Similarity:

@@ -36,7 +36,8 @@ class TrajectoryMetrics:
         frames: Number of poses compared.
         segment_lengths_m: Lengths of the segments used for the relative errors.
         segments: Number of segments.
-        alignment: How the estimate was aligned: ``none``, ``origin``, ``se3`` or ``sim3``.
+        alignment: How the estimate was aligned: ``none``, ``origin``, ``se3``, ``sim3``,
+            ``upright``.
         scale: Scale factor applied to the estimate in the alignment.
         ate_median_m: Median distance of positions after alignment.
         ate_max_m: Largest distance of positions after alignment.
