@@ -19,10 +19,10 @@ def map_(
     out: opt.Out = None,
     start: Start = None,
     odometry: Annotated[
-        Literal["visual", "kiss"] | None,
+        Literal["visual", "kiss", "fused"] | None,
         typer.Option(
             help="visual: features followed from frame to frame; kiss: kiss-icp on the points that "
-            "stereo measures well, to compare with.",
+            "stereo measures well, to compare with; fused: earlier name of visual.",
             show_default="visual",
         ),
     ] = None,
