@@ -107,7 +107,7 @@ class RunDirectory:
                 lock_file(self.folder),
                 "another run is writing to this folder",
                 where=self.folder,
-                hint="wait for it, or choose another --out",
+                hint="wait for it, or choose another folder",
             )
             self._clear()
         except OSError as error:
@@ -239,5 +239,5 @@ def _unwritable(folder: Path, error: OSError) -> OutputError:
         "output folder cannot be written",
         where=folder,
         got=error.strerror or str(error),
-        hint="choose another --out or fix its permissions",
+        hint="choose another folder or fix its permissions",
     )

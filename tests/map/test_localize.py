@@ -12,7 +12,7 @@ from recon.core.geometry import se3
 from recon.map.drive.sequence import map_sequence
 from recon.map.drive.workspace import Workspace
 from recon.map.localize import localizer as localizer_file
-from recon.map.localize.localizer import State
+from recon.map.localize.localizer import Located, State
 from recon.map.localize.sequence import (
     LocalizedDrive,
     StartPose,
@@ -74,6 +74,15 @@ def test_frames_between_those_of_the_map_are_found_to_centimetres(odd, truth):
     assert error_m.max() < 0.2
     assert np.median(error_deg) < 0.15
     assert odd.figures()["first_fix_frame"] <= 1
+
+
+def test_where_a_frame_was_found_is_shown_in_one_line() -> None:
+    found = Located(State.TRACKING, se3.make_transform(np.eye(3), np.array([1, 2, 3.456])))
+    found = replace(found, covariance=np.eye(6) / 300, views=2, inliers=80)
+    assert repr(found) == "Located(tracking, at 1.00 2.00 3.46 m, sigma 0.1 m, 80 inliers)"
+    assert repr(Located(State.SEARCHING, note="too few features")) == (
+        "Located(searching, too few features)"
+    )
 
 
 def test_errors_are_as_large_as_the_covariance_says(odd, truth):

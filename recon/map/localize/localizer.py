@@ -82,6 +82,20 @@ class Located:
     surfaces: bool = False
     note: str = ""
 
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the position, of its three axes together; NaN where unknown."""
+        if self.covariance is None:
+            return float("nan")
+        return float(np.sqrt(np.trace(self.covariance[:3, :3])))
+
+    def __repr__(self) -> str:
+        parts = [self.state.value, *([self.note] if self.note else [])]
+        if self.T_world_camera is not None:
+            at = " ".join(f"{metres:.2f}" for metres in self.T_world_camera[:3, 3])
+            parts += [f"at {at} m, sigma {self.sigma_m:.2g} m, {self.inliers} inliers"]
+        return f"Located({', '.join(parts)})"
+
 
 @dataclass(frozen=True, eq=False)
 class _Confirmed:

@@ -133,7 +133,7 @@ class LocalizedDrive:
         """Return the figures for ``summary.json``."""
         states = [frame.located.state for frame in self.frames]
         seconds = np.array([frame.seconds for frame in self.frames])
-        sigmas_m = [_sigma_m(frame.located) for frame in self.tracked]
+        sigmas_m = [frame.located.sigma_m for frame in self.tracked]
         return {
             "frames": len(states),
             **{f"frames_{state.value}": states.count(state) for state in State},
@@ -256,12 +256,6 @@ def _located(
     begun = time.perf_counter()
     located = localizer.add(frame, hurried=lambda: live is not None and live.waits)
     return LocalizedFrame(index, frame.pair.timestamp_s, time.perf_counter() - begun, located)
-
-
-def _sigma_m(located: Located) -> float:
-    """Return standard deviation of a position: the root of the sum of those along three axes."""
-    covariance = np.zeros((6, 6)) if located.covariance is None else located.covariance
-    return float(np.sqrt(np.trace(covariance[:3, :3])))
 
 
 def _turned_back(yaw_deg: float) -> Float64:

@@ -183,6 +183,8 @@ def writing(path: Path | None) -> Iterator[None]:
         text = str(error)
         if "locked" in text:
             what, hint = "another program uses the map", "wait for it, or write to another one"
+        elif "readonly" in text:
+            what, hint = "the map was opened to be read", "open it with read_only=False"
         elif "full" in text:
             what, hint = "the disk is full", "make room on it"
         else:
