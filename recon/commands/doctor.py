@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 import time
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Final
 
@@ -40,6 +39,7 @@ from recon.run.installation import (
     check_system_libraries,
 )
 from recon.sources.pair_input import PairInput
+from recon.stereo.frame import FrameReconstructor
 from recon.stereo.match.registry import MATCHERS
 
 _MATCHERS: Final = tuple(name for name in MATCHERS if name != "onnx")  # it needs a network
@@ -114,9 +114,11 @@ def compile_kernels() -> WarmUp:
         _move_submaps(map_sequence(source, config))
         colour = next(iter(source))
         grey = StereoPair(*(image[:, :, 1].copy() for image in (colour.left, colour.right)))
-        for number, (matcher, pair) in enumerate(product(_MATCHERS, (colour, grey))):
-            config = load_config(None, [f"matching.matcher={matcher}"], PAIR_DEFAULTS)
-            run_pair(PairInput(pair, source.calibration), config, out=folder / str(number))
+        for kind, pair in {"colour": colour, "grey": grey}.items():
+            run_pair(PairInput(pair, source.calibration), out=folder / kind)
+            for matcher in _MATCHERS:
+                config = load_config(None, [f"matching.matcher={matcher}"], PAIR_DEFAULTS)
+                FrameReconstructor(source.calibration, config).reconstruct(pair)
     return WarmUp(len(compiled), time.perf_counter() - begun)
 
 
