@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -58,11 +59,15 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[TriangleMesh, list[T
     """The mesh of the street, and its tiles."""
     folder = tmp_path_factory.mktemp("street")
     with pytest.MonkeyPatch.context() as patch:
-        # In the proportion of the pieces of 8 m, which are small.
-        patch.setattr("recon.export.mesh.pieces._OVERLAP_M", 1.5)
-        whole, tiles, warnings = written(filled(), folder / "out")
+        overlap_less(patch)
+        whole, tiles, warnings = written(filled(), folder / "out", threads=1)
     assert warnings == ()
     return whole, tiles
+
+
+def overlap_less(patch: pytest.MonkeyPatch) -> None:
+    """Let tiles overlap in the proportion of the pieces of 8 m, which are small."""
+    patch.setattr("recon.export.mesh.pieces._OVERLAP_M", 1.5)
 
 
 def filled() -> Tiles:
@@ -116,8 +121,14 @@ def test_no_gap_is_left_where_tiles_meet(made: tuple[TriangleMesh, list[Triangle
         assert np.percentile(distance_m, 95) < 1e-4
 
 
-def test_tiles_made_at_once_are_those_made_one_by_one(store: Tiles, tmp_path: Path) -> None:
-    alone, together = (written(store, tmp_path / str(n), threads=n)[0] for n in (1, 3))
+def test_tiles_made_at_once_are_those_made_one_by_one(
+    made: tuple[TriangleMesh, list[TriangleMesh]],
+    store: Tiles,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    overlap_less(monkeypatch)
+    alone, together = made[0], written(store, tmp_path / "out", threads=3)[0]
     np.testing.assert_array_equal(together.vertices, alone.vertices)
     np.testing.assert_array_equal(together.faces, alone.faces)
 
@@ -166,8 +177,11 @@ def test_a_store_without_a_surface_is_an_error(tmp_path: Path) -> None:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
+    return mapped_street(tmp_path / "run")
+
+
+def mapped_street(folder: Path) -> Path:
     """The folder of a run with a map of the street, and its OctoMap."""
-    folder = tmp_path / "run"
     write_ply(folder / "map" / "cloud.ply", street())
     keys = np.unique(np.floor(street().xyz / 0.2).astype(np.int32), axis=0)
     voxels = OccupancyVoxels(keys, np.full(len(keys), 2, np.float32), 0.2)
@@ -183,8 +197,17 @@ def mesh_of(run: Path, *settings: str) -> dict[str, Any]:
     return run_mesh(run, config, out=run.parent / "mesh", formats=("ply", "glb"))
 
 
-def test_the_map_of_a_run_is_meshed_with_its_free_space(run: Path) -> None:
-    summary = mesh_of(run)
+@pytest.fixture(scope="module")
+def meshed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    """A run, beside it what `recon mesh` made of it, and its summary; not to be changed."""
+    run = mapped_street(tmp_path_factory.mktemp("meshed") / "run")
+    return run, mesh_of(run)
+
+
+def test_the_map_of_a_run_is_meshed_with_its_free_space(
+    meshed: tuple[Path, dict[str, Any]],
+) -> None:
+    run, summary = meshed
     assert summary["tiles"] == 2
     assert summary["warnings"] == []
     folder = run.parent / "mesh" / "mesh"
@@ -210,15 +233,18 @@ def test_a_run_without_octomap_is_meshed_with_a_warning(run: Path) -> None:
     assert "free space is not known" in mesh_of(run)["warnings"][0]
 
 
-def test_the_cloud_of_a_run_is_taken_as_it_is(run: Path) -> None:
-    assert mesh_of(run)["points"] == len(street())
+def test_the_cloud_of_a_run_is_taken_as_it_is(meshed: tuple[Path, dict[str, Any]]) -> None:
+    run, summary = meshed
+    assert summary["points"] == len(street())
     copied = run.parent / "mesh" / "mesh" / "cloud.ply"
     assert copied.read_bytes() == (run / "map" / "cloud.ply").read_bytes()
 
 
-def test_a_damaged_map_leaves_the_earlier_mesh(run: Path) -> None:
-    mesh_of(run)
-    out = run.parent / "mesh"
+def test_a_damaged_map_leaves_the_earlier_mesh(
+    meshed: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
+    shutil.copytree(meshed[0].parent, tmp_path, dirs_exist_ok=True)
+    run, out = tmp_path / "run", tmp_path / "mesh"
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     whole = (run / "map" / "octomap.ot").read_bytes()
     (run / "map" / "octomap.ot").write_bytes(whole[:-5])

@@ -23,6 +23,7 @@ from recon.stereo.pair_run import PairRun
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
 CAMERA = RectifiedCamera(300.0, 160.0, 120.0, 160.0, 0.1, 320, 240)
+SETTINGS = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
 
 
 @pytest.fixture(scope="module")
@@ -37,23 +38,35 @@ def pair() -> StereoPair:
 def run(
     pair: StereoPair, out: Path, camera: RectifiedCamera = CAMERA, command: str = "disparity"
 ) -> PairRun:
-    settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
     run_command = run_pair if command == "pair" else run_disparity
-    return run_command(PairInput(pair, camera), settings, out=out)
+    return run_command(PairInput(pair, camera), SETTINGS, out=out)
+
+
+class Notes(Silent):
+    """The stages of a run, as they begin."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+
+    def on_stage(self, name: str) -> None:
+        self.told.append(name)
+
+
+@pytest.fixture(scope="module")
+def good_run(
+    pair: StereoPair, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[PairRun, Path, list[str]]:
+    """A run of the pair with a mesh, its folder, and the stages that it told of."""
+    notes, out = Notes(), tmp_path_factory.mktemp("pair") / "run"
+    given = PairInput(pair, CAMERA)
+    made = run_pair(given, SETTINGS, out=out, formats=("glb",), progress=notes)
+    return made, out, notes.told
 
 
 def test_stages_that_take_long_are_reported_when_they_begin(
-    pair: StereoPair, tmp_path: Path
+    good_run: tuple[PairRun, Path, list[str]],
 ) -> None:
-    told: list[str] = []
-
-    class Notes(Silent):
-        def on_stage(self, name: str) -> None:
-            told.append(name)
-
-    settings = load_config(None, ["mesh.max_depth=5"])
-    run_pair(PairInput(pair, CAMERA), settings, out=tmp_path / "out", progress=Notes())
-    assert told == ["match", "mesh", "report"]
+    assert good_run[2] == ["match", "mesh", "report"]
 
 
 def test_a_good_pair_is_not_warned_of(pair: StereoPair, tmp_path: Path) -> None:
@@ -119,9 +132,9 @@ def test_a_calibration_that_gives_a_cloud_of_wrong_size_is_warned_of(
 
 
 def test_the_summary_says_how_much_of_the_cloud_the_mesh_covers(
-    pair: StereoPair, tmp_path: Path
+    good_run: tuple[PairRun, Path, list[str]],
 ) -> None:
-    result = run(pair, tmp_path / "out", command="pair")
+    result, _, _ = good_run
     # One plane: all but a rim of two pixels.
     assert 0.95 < result.summary["mesh_coverage"] <= 1
     assert not [text for text in result.warnings if "mesh" in text]
@@ -134,16 +147,14 @@ def test_a_mesh_that_leaves_out_much_of_the_cloud_is_warned_of() -> None:
 
 
 def test_the_run_of_a_pair_is_meshed_again_as_the_pair_was(
-    pair: StereoPair, tmp_path: Path
+    good_run: tuple[PairRun, Path, list[str]], tmp_path: Path
 ) -> None:
-    settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
-    given = PairInput(pair, CAMERA)
-    first = run_pair(given, settings, out=tmp_path / "run", formats=("glb",))
-    assert (tmp_path / "run" / "mesh" / "mesh.glb").is_file()
-    again = run_mesh(tmp_path / "run", settings, out=tmp_path / "again", formats=("glb", "obj"))
+    first, folder, _ = good_run
+    assert (folder / "mesh" / "mesh.glb").is_file()
+    again = run_mesh(folder, SETTINGS, out=tmp_path / "again", formats=("glb", "obj"))
     assert again["mesh_coverage"] == pytest.approx(first.summary["mesh_coverage"], abs=1e-3)
     for name in ("mesh.ply", "mesh.glb"):
-        files = [tmp_path / run / "mesh" / name for run in ("run", "again")]
+        files = [run / "mesh" / name for run in (folder, tmp_path / "again")]
         assert files[0].read_bytes() == files[1].read_bytes()
     project = (tmp_path / "again" / "mesh" / "mesh.mlp").read_text()
     assert "0 -1 0 0" in project  # camera axes, turned upright
