@@ -12,7 +12,7 @@ import typer
 
 from recon.cli.errors import one_line_errors
 from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from tests.hostile.refusals import Ended, assert_refused, run, run_apart
 from tests.scenery.kitti import write_kitti
 
@@ -20,8 +20,8 @@ from tests.scenery.kitti import write_kitti
 @pytest.fixture(scope="module")
 def good_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("drive")
-    settings = StreetSettings(frames=3, width_px=128, height_px=64, focal_px=72.0)
-    write_kitti(SyntheticSource(settings), folder)
+    size = {"width_px": 128, "height_px": 64, "focal_px": 72.0}
+    write_kitti(SyntheticSource(StreetScene(frames=3, smooth_edges=False, **size)), folder)
     return folder
 
 

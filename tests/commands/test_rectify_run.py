@@ -15,10 +15,10 @@ from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.image import read_image, write_image
 from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from tests.scenery.boards import board_rig
 
-SMALL = StreetSettings(frames=2, width_px=480, height_px=240, focal_px=280.0)
+SMALL = StreetScene(frames=2, width_px=480, height_px=240, focal_px=280.0, smooth_edges=False)
 WARP = np.array([[1.0, 0.04, -12], [-0.05, 1.02, 9], [4e-5, -3e-5, 1]])
 
 

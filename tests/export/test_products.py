@@ -25,10 +25,10 @@ from recon.map.ground.grid import drop_undecided, flatten
 from recon.map.ground.surface import estimate_ground_surface
 from recon.run.run import Run
 from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from tests.scenery.octomaps import write_octomap
 
-STREET = StreetSettings(frames=20, width_px=192, height_px=72, focal_px=110.0)
+STREET = StreetScene(frames=20, width_px=192, height_px=72, focal_px=110.0, smooth_edges=False)
 SETTINGS = ["submaps.length_m=4", "submaps.tile_m=6.4", "fusion.min_count=1"]
 
 

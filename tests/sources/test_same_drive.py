@@ -44,7 +44,7 @@ LAYOUTS: dict[str, tuple[str, drives.Writer]] = {
 
 @pytest.fixture(scope="module")
 def drive() -> tuple[list[StereoPair], RectifiedCamera]:
-    return drives.rendered(FRAMES, width_px=320, height_px=128, focal_px=180.0)
+    return drives.rendered(FRAMES, width_px=320, height_px=128, focal_px=180.0, smooth_edges=False)
 
 
 @pytest.fixture(scope="module")

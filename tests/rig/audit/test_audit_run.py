@@ -23,15 +23,18 @@ CONFIG = load_config()
 FRAMES = 10
 
 
+def rendered(seed: int, frames: int) -> faults.Spoiled:
+    size = {"width_px": 400, "height_px": 136, "focal_px": 225.0}
+    scene = StreetScene(seed=seed, frames=frames, threads=1, smooth_edges=False, **size)
+    source = SyntheticSource(scene)
+    pairs: list[StereoPair] = list(source)
+    return faults.Spoiled(source.calibration, len(pairs), pairs.__getitem__)
+
+
 @pytest.fixture(scope="module")
 def street() -> faults.Spoiled:
     """A rendered drive without a fault, kept in memory."""
-    size = StreetScene(
-        seed=5, frames=FRAMES, width_px=400, height_px=136, focal_px=225.0, threads=1
-    )
-    source = SyntheticSource(size)
-    pairs: list[StereoPair] = list(source)
-    return faults.Spoiled(source.calibration, FRAMES, pairs.__getitem__)
+    return rendered(5, FRAMES)
 
 
 def codes(source: StereoSource, *, quick: bool = False) -> set[str]:
@@ -129,10 +132,7 @@ def test_a_frozen_camera_is_found(street: faults.Spoiled) -> None:
 @pytest.fixture(scope="module")
 def longer_street() -> faults.Spoiled:
     """A drive long enough for its motion to show the rig."""
-    size = StreetScene(seed=3, frames=48, width_px=400, height_px=136, focal_px=225.0, threads=1)
-    source = SyntheticSource(size)
-    pairs: list[StereoPair] = list(source)
-    return faults.Spoiled(source.calibration, len(pairs), pairs.__getitem__)
+    return rendered(3, 48)
 
 
 @pytest.mark.slow
