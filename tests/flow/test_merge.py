@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import cache
 from pathlib import Path
 from unittest.mock import patch
 
@@ -21,21 +22,25 @@ from recon.commands.occupancy import run_occupancy
 from recon.io.trajectory import read_trajectory
 from recon.map.store.map import Map
 from recon.sources.part import SourcePart
-from recon.sources.synthetic import SyntheticSource
+from recon.sources.protocol import StereoSource
 from recon.street.settings import StreetScene
+from tests.scenery.film import RIG, Film, film
 
-RIG = {"width_px": 320, "height_px": 120, "focal_px": 180.0, "smooth_edges": False}
-"""Large enough that places are recognised."""
 FIRST, FRAMES = 5, 14
 OPTIONS = MapOptions(mesh=False, audit=False)
 
 
-def part(first: int, seed: int = 2, frames: int = FRAMES) -> SourcePart:
-    street = SyntheticSource(StreetScene(frames=first + FRAMES, seed=seed, **RIG))
-    return SourcePart(street, first, first + frames)
+@cache
+def street(seed: int, frames: int) -> Film:
+    return film(StreetScene(frames=frames, seed=seed, **RIG))
 
 
-def _map(source: SourcePart, out: Path) -> Path:
+def part(first: int, frames: int = FRAMES) -> SourcePart:
+    # A street of its own length, whose far end looks otherwise: no two drives share every pixel.
+    return SourcePart(street(2, first + FRAMES), first, first + frames)
+
+
+def _map(source: StereoSource, out: Path) -> Path:
     run_map(source, load_config(), MapOptions(out=out, mesh=False, audit=False))
     return out
 
@@ -46,7 +51,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs")
     _map(part(0), folder / "first")
     _map(part(FIRST), folder / "second")
-    _map(part(0, seed=9, frames=5), folder / "elsewhere")
+    _map(street(9, 5), folder / "elsewhere")
     return folder
 
 
@@ -77,11 +82,11 @@ def test_drives_that_share_places_are_linked_and_others_stay_apart(merged: Path)
     assert found["links"]["pairs"].keys() == {"0-1"}
     assert found["links"]["count"] >= 3
     assert found["frames"] == 2 * FRAMES  # those of the drives that are linked
-    assert any("session 2 (synthetic street 9 0 to 4)" in warning for warning in found["warnings"])
+    assert any("session 2 (film)" in warning for warning in found["warnings"])
 
 
 def test_the_second_drive_is_placed_where_it_was(merged: Path) -> None:
-    true = SyntheticSource(StreetScene(frames=FIRST + FRAMES, seed=2, **RIG)).trajectory
+    true = street(2, FIRST + FRAMES).trajectory
     path = read_trajectory(merged / "sessions/1/trajectory_tum.txt")
     off_m = np.linalg.norm(path.positions_m - true.positions_m[FIRST:], axis=1)
     assert off_m.max() < 0.3
