@@ -14,9 +14,11 @@ from recon.map.drive.workspace import Workspace, session_info
 from recon.map.store.map import Map
 from recon.sources.part import SourcePart
 from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 
-STREET = StreetSettings(frames=26, width_px=256, height_px=96, focal_px=150.0, seed=5)
+STREET = StreetScene(
+    frames=26, width_px=256, height_px=96, focal_px=150.0, seed=5, smooth_edges=False
+)
 PIECES = [Piece(0, 10), Piece(5, 18, 5), Piece(12, 26, 6)]
 
 

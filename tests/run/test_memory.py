@@ -28,7 +28,8 @@ from tests.scenery.kitti import write_kitti
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
-STREET = StreetScene(frames=12, width_px=256, height_px=96, focal_px=150.0, speed_m_per_frame=0.5)
+SIZE = {"width_px": 256, "height_px": 96, "focal_px": 150.0}
+STREET = StreetScene(frames=12, speed_m_per_frame=0.5, smooth_edges=False, **SIZE)
 
 
 @pytest.mark.parametrize(
