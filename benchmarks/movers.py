@@ -45,20 +45,24 @@ THIN = (Material.METAL,)
 class Traffic(SyntheticSource):
     """A street with cars and people that move."""
 
+    def __init__(self, settings: StreetScene, pace: float) -> None:
+        super().__init__(settings)
+        self._pace = pace
+
     def movers(self, index: int) -> list[TriangleSoup]:
         """Return what moves, where it is in a frame; street axes."""
         rng = np.random.default_rng([self.settings.seed, 5])
         step = self.settings.speed_m_per_frame
         oncoming, leading, crossing = (props.car(rng) for _ in range(3))
         person = cylinder((0.25, 0.2), 1.75, Paint(Material.BARK, (0.5, 0.35, 0.3), 3), 12)
-        at = step * index
+        at, way = step * index, self._pace * index
         return [
-            move(oncoming, placed(60.0 - 1.2 * index, 1.6, np.pi)),
-            move(leading, placed(10.0 + 1.3 * step * index, -1.5, 0.0)),
-            move(crossing, placed(34.0, -8.0 + 0.7 * index, np.pi / 2)),
-            move(person, placed(14.0 + 0.15 * index, -3.4, 0.0)),
-            move(person, placed(22.0 - 0.12 * index, 3.2, 0.0)),
-            move(person, placed(at + 8.0, 2.6 - 0.05 * index, 0.0)),
+            move(oncoming, placed(60.0 - 1.2 * way, 1.6, np.pi)),
+            move(leading, placed(10.0 + 1.3 * step * way, -1.5, 0.0)),
+            move(crossing, placed(34.0, -8.0 + 0.7 * way, np.pi / 2)),
+            move(person, placed(14.0 + 0.15 * way, -3.4, 0.0)),
+            move(person, placed(22.0 - 0.12 * way, 3.2, 0.0)),
+            move(person, placed(at + 8.0, 2.6 - 0.05 * way, 0.0)),
         ]
 
     def frames(self, start: int = 0) -> Any:
@@ -80,7 +84,7 @@ def placed(x_m: float, y_m: float, turn_rad: float) -> Float64:
 def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(arguments)
     config = load_config()
-    source = Traffic(scene_of(options))
+    source = Traffic(scene_of(options), options.pace)
     began = time.perf_counter()
     mapped = map_sequence(source, config, known_poses=source.trajectory)
     before, after = (cloud_of(mapped, config, remove=on) for on in (False, True))
@@ -100,6 +104,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--json", action="store_true", help="JSON, which is printed anyway")
     parser.add_argument("--seed", type=int, default=4, help="another seed is another street")
+    parser.add_argument("--pace", type=float, default=1.0, help="speed of what moves; 1 = as it is")
     parser.add_argument("--frames", type=int, default=40, help="length of the drive")
     parser.add_argument("--width", type=int, default=480, help="width of the pictures")
     return parser.parse_args(arguments)

@@ -115,10 +115,10 @@ class Cutter:
         small = self.edge_m < 2 * _LEAST_TILE_M or self.edge_cells == BLOCK_EDGE
         self.limit_bytes = None if small else config.memory.tile_bytes
         margin_m = max(_FILTER_MARGIN_M, 2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
-        # A voxel more, since a point may lie anywhere in its voxel.
-        self._filter_margin_m = margin_m + config.fusion.voxel_m
-        # A cell of a grid depends on the cells joined to it, on their blob, and on adjacent cells;
-        # whether a point moved, on the voxels that touch its own.
+        # A voxel more, since a point may lie anywhere in its voxel; and whether a point moved
+        # depends on the points in the voxels that touch its own.
+        self._filter_margin_m = margin_m + config.fusion.voxel_m + 2 * resolution_m
+        # A cell of a grid depends on the cells joined to it, on their blob, and on adjacent cells.
         beyond = config.grid.min_blob_cells + JOINED_CELLS + 2
         beyond = max(beyond, math.ceil(self._filter_margin_m / resolution_m) + 1)
         self.grid_margin_m = math.ceil(beyond / BLOCK_EDGE) * BLOCK_EDGE * resolution_m

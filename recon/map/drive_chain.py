@@ -17,11 +17,11 @@ from recon.core.values import OccupancyVoxels, join_voxels
 from recon.core.values.grid import log_odds
 from recon.map.cut import OCCUPANCY
 from recon.map.kernels.raycast import BLOCK_BITS
-from recon.map.occupancy.moving import passed_cells
+from recon.map.occupancy.moving import CellEvidence, cell_evidence
 from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.store.tile_parts import TileKey, TileParts
 
-_PASSED: Final = "passed"
+_EVIDENCE: Final = "evidence"
 _OLD: Final = log_odds(0.85)
 """Log-odds that count at most for a later drive: five rays of it free what was surely occupied."""
 
@@ -45,14 +45,16 @@ class DriveChain:
         return int(self.drive_of[numbered[0]]) if len(self.drive_of) else 0
 
     def joined(self, key: TileKey, *, note: bool) -> OccupancyPart:
-        """Join what all drives observed in a tile; ``note`` what each saw through, for `passed`."""
+        """Join what all drives observed in a tile; ``note`` what each saw, for `evidence`."""
         drives = self._drives(key)
         return _outdone(self._noted(key, drives) if note else (part for _, part in drives))
 
-    def passed(self, key: TileKey, drive: int) -> NDArray[np.int64]:
-        """Return int64 (N,), the `passed_cells` of a drive that were noted in a tile."""
-        found = [tree["keys"] for n, tree in self._parts.read(_PASSED, key) if n == drive]
-        return found[0] if found else np.zeros(0, np.int64)
+    def evidence(self, key: TileKey, drive: int) -> CellEvidence:
+        """Return the `cell_evidence` of a drive that was noted in a tile."""
+        for number, tree in self._parts.read(_EVIDENCE, key):
+            if number == drive:
+                return tree["cells"], tree["log_odds"]
+        return np.zeros(0, np.int64), np.zeros(0, np.float32)
 
     def changed(
         self, key: TileKey, seen: OccupancyVoxels, after: Mapping[int, OccupancyPart]
@@ -74,9 +76,10 @@ class DriveChain:
     def _noted(
         self, key: TileKey, drives: Iterable[tuple[int, OccupancyPart]]
     ) -> Iterator[OccupancyPart]:
-        """Return the parts of drives, with a note of what each saw through."""
+        """Return the parts of drives, with a note of what each saw."""
         for drive, part in drives:
-            self._parts.put(_PASSED, key, {"keys": passed_cells(part)}, drive)
+            cells, seen = cell_evidence(part)
+            self._parts.put(_EVIDENCE, key, {"cells": cells, "log_odds": seen}, drive)
             yield part
 
     def _drives(

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.geometry.axes import transform_cloud
+from recon.core.geometry.se3 import apply
 from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
 from recon.core.values.arrays import Bool, Float32, Float64
 from recon.map.cut import FUSED, OCCUPANCY, Cut, Cutter
@@ -287,11 +288,13 @@ class Tiles:
 
     def _exported(self, parts: Iterable[FusedPart]) -> PointCloud:
         """Return the points of voxels that enough frames saw, frame ``world``."""
-        fusion = self.config.fusion
-        # A drive with fewer frames than the minimum count must still give a map.
-        least = min(fusion.min_count, len(self.submap_of_frame))
         fused = replace(join_fused(parts), known=self._known)
-        return fused.cloud(fusion.voxel_m, least)
+        return fused.cloud(self.config.fusion.voxel_m, self._least_frames)
+
+    @property
+    def _least_frames(self) -> int:
+        """Return how many frames must see a point; a drive of fewer must still give a map."""
+        return min(self.config.fusion.min_count, len(self.submap_of_frame))
 
     def _placed(self, key: TileKey, cloud: PointCloud) -> PointCloud:
         """Return the points in a tile, frame ``map``, of a cloud in frame ``world``."""
@@ -303,9 +306,10 @@ class Tiles:
         fusion = self.config.fusion
         if not fusion.remove_moving:
             return np.zeros(len(fused), np.bool_)
-        voxels = self.wide_voxels(key)
-        passed = self._chain.passed(key, drive)
-        return find_moved(fused, fusion.voxel_m, self._T_map_world, voxels, passed)
+        points = apply(self._T_map_world, fused.points(fusion.voxel_m))
+        counted = fused.enough(self._least_frames)
+        voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
+        return find_moved(points, fused.frame_sigma_m, counted, voxels, evidence)
 
 
 def _cloud_tree(cloud: PointCloud) -> dict[str, Any]:

@@ -104,7 +104,7 @@ class FusedPart:
             Frame ``world``. ``sigma_m`` treats frames as independent, and the points of one
             frame in one voxel as one measurement. Voxels whose normals cancel are left out.
         """
-        rows = np.flatnonzero(self.frames >= self._needed(least))
+        rows = np.flatnonzero(self.enough(least))
         part = self.select(rows[self._has_direction(rows)])
         weight = part.sums[:, :1]
         values = part.sums[:, 4:] / weight
@@ -125,12 +125,20 @@ class FusedPart:
         """Return float64 (N, 3), the mean point of each voxel, world axes."""
         return np.asarray((self.cells + 0.5) * voxel_m + self.sums[:, _OFFSET] / self.sums[:, :1])
 
-    def _needed(self, least: int) -> Int32:
-        """Return int32 (N,), frames that must have seen each voxel."""
+    @property
+    def frame_sigma_m(self) -> Float32:
+        """float32 (N,), standard deviation of a point in one frame; 0 where it is not known."""
         if "sigma_m" not in self.known:
-            return np.full(len(self), least, np.int32)
+            return np.zeros(len(self), np.float32)
+        variance = self.frames / np.maximum(self.information, np.float32(1e-9))
+        return np.asarray(np.sqrt(variance), np.float32)
+
+    def enough(self, least: int) -> Bool:
+        """Return bool (N,), which voxels enough frames saw; see `cloud`."""
+        if "sigma_m" not in self.known:
+            return np.asarray(self.frames >= least)
         precise = self.information >= np.float32(PRECISE_SIGMA_M**-2)
-        return np.where(precise, max(1, least - 1), least).astype(np.int32)
+        return np.asarray(self.frames >= np.where(precise, max(1, least - 1), least))
 
     def _has_direction(self, rows: NDArray[np.intp]) -> Bool:
         """Return which voxels have normals that do not cancel; all, where normals are not known."""
