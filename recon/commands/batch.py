@@ -48,10 +48,10 @@ def run_batch(
         The summary: ``jobs`` with the figures of each, ``succeeded``, ``failed`` and more.
 
     Raises:
-        SettingsError: A job is none.
+        SettingsError: A job is none, or the scheduler cannot be reached.
         OutputError: The folder is not empty or cannot be written.
         MissingDependencyError: Dask is not installed.
-        ClusterError: The scheduler cannot be reached or is gone.
+        ClusterError: The scheduler or all workers are gone.
     """
     jobs = plan_jobs(entries, program, options.share_cores(limits), place)
     _check_settings(entries)
@@ -70,7 +70,8 @@ def resume_batch(folder: Path, options: BatchOptions) -> dict[str, Any]:
     Raises:
         FormatError: The folder is not one of a batch.
         OutputError: The folder cannot be written, or another batch is writing to it.
-        ClusterError: The scheduler cannot be reached or is gone.
+        SettingsError: The scheduler cannot be reached.
+        ClusterError: The scheduler or all workers are gone.
     """
     folder = folder.resolve()
     return _run(read_plan(folder), folder, options)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Mapping
 from contextlib import suppress
@@ -28,6 +29,8 @@ STARTED: Final = "map.recon"
 _PARTIAL: Final = ".partial"
 _STATE: Final = ".state"
 _LOCK: Final = ".lock"
+_SCHEME: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
+"""What an address begins with, such as ``s3:``; of ``s3://`` a path keeps one slash."""
 #: Errors that the input did not cause: the run can be resumed later.
 _PASSING: Final = (
     ClusterError, OutputError, MemoryLimitError, OSError, MemoryError, KeyboardInterrupt,
@@ -99,6 +102,7 @@ class RunDirectory:
         write_text(self.path(name), text + "\n")
 
     def __enter__(self) -> Self:
+        _refuse_address(self.folder)
         if not self.resumes:
             _refuse_foreign(self.folder)
         self._made = [p for p in (self.folder, *self.folder.parents) if not p.exists()]
@@ -201,6 +205,15 @@ class RunDirectory:
         for folder in self._made:
             with suppress(OSError):  # not empty: files of others, which stay
                 folder.rmdir()
+
+
+def _refuse_address(folder: Path) -> None:
+    if any(_SCHEME.fullmatch(p.name) and not p.is_dir() for p in (folder, *folder.parents)):
+        raise OutputError(
+            "results go into a folder, not to an address",
+            where=folder,
+            hint="give a folder of a shared file system, or copy the finished one there",
+        )
 
 
 def _refuse_foreign(folder: Path) -> None:

@@ -146,6 +146,14 @@ def test_what_does_not_combine_is_refused_and_nothing_is_left(
     assert not out.exists()
 
 
+def test_a_scheduler_that_cannot_be_reached_leaves_nothing(tmp_path: Path) -> None:
+    source = SyntheticSource(StreetSettings(frames=3, width_px=128, height_px=48, focal_px=80.0))
+    write_kitti(source, tmp_path / "drive")
+    words = ("map", tmp_path / "drive", "--out", tmp_path / "out", "--scheduler", "nonsense")
+    assert_refused(run(*words), "nonsense: the scheduler cannot be reached")
+    assert not (tmp_path / "out").exists()
+
+
 def test_options_that_say_nothing_together_are_wrong_usage(tmp_path: Path) -> None:
     scheduler = ["--scheduler", "tcp://127.0.0.1:9"]
     for words in (["--workers", "2", *scheduler], ["--into", "run", *scheduler]):

@@ -54,6 +54,20 @@ def test_a_failed_run_leaves_an_earlier_run_as_it_was(tmp_path: Path) -> None:
     assert files_in(tmp_path / "run") == {"map/cloud.ply", "run.json"}
 
 
+@pytest.mark.parametrize("resume", [False, True])
+def test_an_address_is_not_taken_for_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, resume: bool
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    address = Path("s3://bucket/week")
+    for out in (address, address.resolve()):
+        with pytest.raises(OutputError, match="folder, not to an address"):
+            RunDirectory(out, resume=resume).__enter__()
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "s3:").mkdir()  # who has made it means it
+    write_run(address, "summary.json")
+
+
 def test_a_second_run_replaces_the_first_and_keeps_what_is_not_a_runs(tmp_path: Path) -> None:
     write_run(tmp_path / "run", "mesh/mesh.ply")
     (tmp_path / "run" / "notes.txt").write_text("mine")

@@ -13,7 +13,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Final
 from uuid import uuid4
 
-from recon.core.errors import ClusterError, ReconError
+from recon.core.errors import ClusterError, ReconError, SettingsError
 from recon.core.optional import require
 from recon.run.batch.job import Job, Outcome
 from recon.run.batch.process import Tell, run_job
@@ -266,7 +266,7 @@ def join_cluster(address: str) -> Iterator[Cluster]:
 
     Raises:
         MissingDependencyError: Dask is not installed.
-        ClusterError: The scheduler cannot be reached, or has no workers.
+        SettingsError: The scheduler cannot be reached, or has no workers: nothing was begun.
     """
     distributed = require("distributed", extra=EXTRA)
     _be_quiet()
@@ -274,14 +274,14 @@ def join_cluster(address: str) -> Iterator[Cluster]:
         where = {"scheduler_file" if Path(address).is_file() else "address": address}
         client = distributed.Client(**where, timeout=_REACH_S)
     except (OSError, TimeoutError, ValueError) as error:
-        raise ClusterError(
+        raise SettingsError(
             "the scheduler cannot be reached", where=address, got=error, expected="tcp://host:8786"
         ) from error
     with client:
         try:
             client.wait_for_workers(1, timeout=_WORKERS_S)
         except TimeoutError as error:
-            raise ClusterError(
+            raise SettingsError(
                 "the scheduler has no workers",
                 where=address,
                 hint="start some: dask worker ADDRESS",

@@ -9,7 +9,12 @@ from typing import Any
 
 import pytest
 
-from recon.core.errors import ClusterError, FormatError, MissingDependencyError
+from recon.core.errors import (
+    ClusterError,
+    FormatError,
+    MissingDependencyError,
+    SettingsError,
+)
 from recon.run.batch.cluster import Cluster, Try, _Running, join_cluster, local_cluster
 from recon.run.batch.job import Job, Outcome
 from tests.run.batch.jobs import job, stand_in, tries
@@ -164,7 +169,7 @@ def test_a_function_is_called_with_each_item_and_its_error_is_raised(
 
 def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("recon.run.batch.cluster._REACH_S", 0.5)
-    with pytest.raises(ClusterError, match="scheduler cannot be reached"):
+    with pytest.raises(SettingsError, match="scheduler cannot be reached"):
         join_cluster("tcp://127.0.0.1:9").__enter__()
 
 
