@@ -100,7 +100,6 @@ SOURCES_HELP = (
     "KITTI (odometry or raw), EuRoC or TUM sequence, folder with left and right images, video, "
     "ROS bag, MCAP file, or Middlebury scene."
 )
-SourceArgument = Annotated[Path | None, typer.Argument(help=SOURCES_HELP)]
 
 
 def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:

@@ -10,7 +10,14 @@ from typing import Any, Final
 from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.commands.occupancy import REMADE
 from recon.core.errors import SettingsError
-from recon.export.remake import Wanted, copy_file, from_rays, mesh_cloud, remake_map
+from recon.export.remake import (
+    PRODUCTS,
+    Wanted,
+    copy_file,
+    from_rays,
+    mesh_cloud,
+    remake_map,
+)
 from recon.io.files import StrPath
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.sessions.spread import place_map_on
@@ -25,7 +32,6 @@ from recon.run.finished import (
 )
 from recon.run.run import Run
 
-PRODUCTS: Final = ("cloud", "grid", "octomap", "mesh")
 _OF_A_PAIR: Final = ("cloud", "mesh")
 
 

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
-from typing import Any
+from typing import Any, Final
 
 from recon.core.values import FREE, OCCUPIED, OccupancyGrid, RectifiedCamera
 from recon.core.values.cloud import Frame
@@ -37,7 +37,9 @@ from recon.map.settings import DriveSettings
 from recon.run.finished import CLOUD, MAPPED_BY, UNTRUSTED, FinishedRun
 from recon.run.run import Run
 
-_LAYER = "mesh/cloud.ply"
+PRODUCTS: Final = ("cloud", "grid", "octomap", "mesh")
+"""What `remake_map` can make."""
+_LAYER: Final = "mesh/cloud.ply"
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Wanted:
     """What is made of a map.
 
     Attributes:
-        products: Any of ``cloud``, ``grid``, ``octomap``, ``mesh``.
+        products: Any of `PRODUCTS`.
         mesh: Settings of the mesh.
         formats: Formats of the mesh.
         place: Cuts the map into tiles where its rays are needed.

@@ -58,8 +58,7 @@ class DriveLoops:
         """
         if not self.closure.closed:
             return None
-        middles = (entry.first_frame + entry.frames // 2 for entry in entries)
-        return np.stack([self.closure.correction(self.odometry, frame) for frame in middles])
+        return np.stack([self.closure.correction(self.odometry, one.middle) for one in entries])
 
     def figures(self) -> dict[str, Any]:
         """Return the figures for ``summary.json``."""

@@ -64,7 +64,7 @@ class MapRun:
         mapped = self.mapped
         frames, seconds = len(mapped.trajectory), mapped.seconds
         drift = mapped.expected_drift
-        measured = {
+        errors = {
             "trajectory": self.metrics,
             "map": self.map_metrics,
             "occupancy": self.occupancy_metrics,
@@ -84,5 +84,5 @@ class MapRun:
             "T_base_camera": base_axes(mapped.T_map_world, self.camera_height_m).tolist(),
             "warnings": list(self.warnings),
             **({} if mapped.loops is None else {"loops": mapped.loops.figures()}),
-            **{name: plain(errors) for name, errors in measured.items() if errors is not None},
+            **{name: plain(known) for name, known in errors.items() if known is not None},
         }

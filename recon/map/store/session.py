@@ -177,8 +177,8 @@ class Session:
             closure, odometry = Closure(self.trajectory, (), ()), self.odometry
             if self.loops.get("T_world_camera") is None:
                 return None
-            middles = (entry.first_frame + entry.frames // 2 for entry in self.submaps.entries)
-            return np.stack([closure.correction(odometry, frame) for frame in middles])
+            entries = self.submaps.entries
+            return np.stack([closure.correction(odometry, one.middle) for one in entries])
 
     @property
     def ray_frames(self) -> int:

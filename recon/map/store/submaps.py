@@ -33,6 +33,11 @@ class SubmapEntry:
     voxels: int
     cells: int
 
+    @property
+    def middle(self) -> int:
+        """Index of the frame in its middle, whose correction the submap gets."""
+        return self.first_frame + self.frames // 2
+
 
 class Submaps:
     """Closed submaps of one drive, in order.
