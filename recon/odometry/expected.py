@@ -21,10 +21,6 @@ RIG_YAW_DEG: Final = 0.02
 RIG_BASELINE: Final = 0.002
 """That of the baseline, as a share of it."""
 
-_ASSUMED_PX: Final = 0.35
-"""Median reprojection error of features that are as uncertain as the odometry assumes: 0.3 px along
-either axis."""
-
 _SEGMENT_M: Final = 100.0
 """Length over which the drift is stated, or the path if it is shorter: errors of the heading make
 it grow with the length."""
@@ -77,21 +73,17 @@ def expected_drift(
         camera: The rectified camera.
     """
     steps_m = np.linalg.norm(np.diff(path.positions_m, axis=0), axis=1)
-    figures = np.array(
-        [(h.scale_px, h.sigma_m, h.sigma_deg, h.reprojection_px) for h in health[1:]]
-    )
+    figures = np.array([(h.scale_px, h.sigma_m, h.sigma_deg) for h in health[1:]])
     known = np.isfinite(figures).all(axis=1) if len(figures) else np.zeros(0, np.bool_)
     known &= np.array([h.ok for h in health[1:]], dtype=np.bool_)
     length_m = float(steps_m[known].sum())
     if not length_m > 0.0:
         return None
-    scale_px, sigma_m, sigma_deg, reprojection_px = figures[known].T
-    # Standard deviations are stated for assumed errors of the features; this is what they are.
-    real = reprojection_px / _ASSUMED_PX
+    scale_px, sigma_m, sigma_deg = figures[known].T
     share = _scale_share(scale_px, camera)
     rig = float(np.hypot(steps_m[known] @ share / length_m, RIG_BASELINE))
     step_m = length_m / float(known.sum())
-    random = _random_share(step_m, length_m, real * sigma_m, real * np.deg2rad(sigma_deg))
+    random = _random_share(step_m, length_m, sigma_m, np.deg2rad(sigma_deg))
     rests_on_px = length_m / float(steps_m[known] @ (1.0 / scale_px))
     return ExpectedDrift(
         percent=100.0 * float(np.hypot(rig, random)),

@@ -38,7 +38,8 @@ class OdometryHealth:
         tracks: Features followed from the last frame.
         inliers: Features that agree with the visual motion.
         reprojection_px: Their median reprojection error.
-        sigma_m: Standard deviation of the visual translation, given the frames before.
+        sigma_m: Standard deviation of the visual translation, given the frames before: from how
+            well features fit, and how far their disparities may be off.
         sigma_deg: That of the rotation.
         scale_px: Disparity on which the length of the motion rests: the mean over the features,
             each weighted by how much it tells. What all disparities are off, in shares of it, the

@@ -23,8 +23,8 @@ _ITERATIONS: Final = 6
 _MIN_GAIN: Final = 1e-3
 """Relative decrease of the cost below which a step is the last."""
 
-_SIGMA_UV_PX: Final = 0.3
-"""Standard deviation of a tracked column or row."""
+SIGMA_UV_PX: Final = 0.3
+"""Standard deviation of a tracked column or row, as it is assumed."""
 
 SIGMA_D_PX: Final = 1.5
 """Standard deviation of a disparity; larger than that of a single match, because its error stays
@@ -125,7 +125,7 @@ def weighted(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Flo
     Returns:
         float64 (W, N, 3), 0 where nothing is seen; float64 (W, N), Cauchy weights, likewise.
     """
-    sigmas = np.array([_SIGMA_UV_PX, _SIGMA_UV_PX, SIGMA_D_PX])
+    sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
     residual = np.nan_to_num(reprojection(window, camera) / sigmas)
     square = np.square(residual).sum(axis=2)
     return residual, window.seen / (1.0 + square / CAUCHY_SIGMAS**2)
@@ -134,7 +134,7 @@ def weighted(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Flo
 def misfits(window: TrackWindow, camera: RectifiedCamera) -> Bool:
     """Return bool (N,), points whose newest observation is an outlier."""
     residual = np.nan_to_num(reprojection(window, camera)[-1])
-    sigmas = [_SIGMA_UV_PX, _SIGMA_UV_PX, SIGMA_D_PX]
+    sigmas = [SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX]
     square = np.square(residual / np.array(sigmas)).sum(axis=1)
     return np.asarray(square > _MAX_SIGMAS**2)
 
@@ -171,8 +171,15 @@ def adjust(window: TrackWindow, camera: RectifiedCamera) -> TrackWindow:
     return TrackWindow(part.T_world_camera, window.uvd, xyz_world)
 
 
-def pose_information(window: TrackWindow, camera: RectifiedCamera) -> Float64:
+def pose_information(
+    window: TrackWindow, camera: RectifiedCamera, sigma_uv_px: float = SIGMA_UV_PX
+) -> Float64:
     """Return information of the newest frame's observations on its pose, given the frames before.
+
+    Args:
+        window: The frames.
+        camera: The rectified camera.
+        sigma_uv_px: Standard deviation of a tracked column or row.
 
     Returns:
         float64 (6, 6), information of a step (translation in metres, rotation vector in radians)
@@ -180,7 +187,8 @@ def pose_information(window: TrackWindow, camera: RectifiedCamera) -> Float64:
     """
     usable = window.seen[-1] & (window.seen.sum(axis=0) >= 2)
     part = TrackWindow(window.T_world_camera, window.uvd[:, usable], window.xyz_world[usable])
-    normal = _linearise(part, _model(camera)._replace(cauchy=_DOUBTED_SIGMAS))
+    model = _model(camera)._replace(cauchy=_DOUBTED_SIGMAS, sigma_uv=sigma_uv_px)
+    normal = _linearise(part, model)
     inverse = np.linalg.inv(normal.H_point + bundle.RIDGE * np.eye(3))
     cross = normal.H_cross[-1]
     folded = (cross @ inverse) @ cross.transpose(0, 2, 1)
@@ -216,7 +224,7 @@ def _model(camera: RectifiedCamera) -> bundle.BundleModel:
         cy=camera.cy_px,
         fb=camera.focal_px * camera.baseline_m,
         doffs=camera.doffs_px,
-        sigma_uv=_SIGMA_UV_PX,
+        sigma_uv=SIGMA_UV_PX,
         sigma_d=SIGMA_D_PX,
         cauchy=CAUCHY_SIGMAS,
     )

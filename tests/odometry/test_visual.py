@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
-from recon.core.values import RectifiedPair
-from recon.odometry.protocol import OdometryFrame
+from recon.core.values import Disparity, RectifiedPair
+from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.visual import VisualOdometry
 from recon.stereo.match.half_size import HalfSizeMatcher
 from recon.stereo.match.registry import MatchingSettings
@@ -170,6 +170,40 @@ def test_health_says_how_sure_the_motion_is(street: tuple[OdometryFrame, ...]) -
     for result in results[1:]:
         assert 0.0 < result.health.sigma_m < 0.05
         assert 0.0 < result.health.sigma_deg < 0.5
+
+
+def test_the_stated_error_of_a_motion_is_about_its_error(
+    street: tuple[OdometryFrame, ...], street_poses: np.ndarray
+) -> None:
+    odometry = VisualOdometry()
+    results = [odometry.register(frame) for frame in street]
+    path = np.stack([result.T_world_camera for result in results])
+    steps, truth = (invert(T[:-1]) @ T[1:] for T in (path, street_poses))
+    off_m = np.linalg.norm((steps - truth)[:, :3, 3], axis=1)
+    stated_m = np.array([result.health.sigma_m for result in results[1:]])
+    ratio = np.sqrt(np.square(off_m / stated_m).mean())
+    # 1.06; eleven steps, of which neighbours share their features.
+    assert 0.5 < ratio < 2.0
+
+
+@pytest.mark.parametrize("error_px", [-0.3, 0.3])
+def test_what_all_disparities_are_off_is_in_the_length_as_health_says(
+    error_px: float, street: tuple[OdometryFrame, ...]
+) -> None:
+    right, wrong = VisualOdometry(), VisualOdometry()
+    results = [right.register(frame) for frame in street]
+    off = [wrong.register(_off(frame, error_px)) for frame in street]
+    scale_px = np.mean([result.health.scale_px for result in results[1:]])
+    assert _way_m(off) / _way_m(results) - 1.0 == pytest.approx(-error_px / scale_px, rel=0.1)
+
+
+def _way_m(results: list[OdometryResult]) -> float:
+    places = np.stack([result.T_world_camera[:3, 3] for result in results])
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+
+def _off(frame: OdometryFrame, error_px: float) -> OdometryFrame:
+    return replace(frame, disparity=Disparity.from_values(frame.disparity.values + error_px))
 
 
 def _exposed(frame: OdometryFrame, gain: float) -> OdometryFrame:

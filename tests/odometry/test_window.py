@@ -89,7 +89,7 @@ def test_information_predicts_the_scatter(camera: RectifiedCamera) -> None:
     right = truth(camera, frames=2)
     rng = np.random.default_rng(13)
     sigmas = np.array(
-        [bundle_window._SIGMA_UV_PX, bundle_window._SIGMA_UV_PX, bundle_window.SIGMA_D_PX]
+        [bundle_window.SIGMA_UV_PX, bundle_window.SIGMA_UV_PX, bundle_window.SIGMA_D_PX]
     )
     offs = []
     for _ in range(60):
