@@ -174,7 +174,7 @@ def test_a_second_writer_is_refused(tmp_path: Path) -> None:
 def test_who_only_reads_cannot_write(tmp_path: Path) -> None:
     Store.create(tmp_path / "map.recon").close()
     store = Store.open(tmp_path / "map.recon", read_only=True)
-    with pytest.raises(OutputError, match=r"opened to be read .*; open it with read_only=False"):
+    with pytest.raises(OutputError, match=r"can only be read .* open it with read_only=False"):
         store.put("rays", 0, {})
     store.close()
 

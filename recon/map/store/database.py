@@ -184,7 +184,8 @@ def writing(path: Path | None) -> Iterator[None]:
         if "locked" in text:
             what, hint = "another program uses the map", "wait for it, or write to another one"
         elif "readonly" in text:
-            what, hint = "the map was opened to be read", "open it with read_only=False"
+            what = "the map can only be read"
+            hint = "make the file writable, and open it with read_only=False"
         elif "full" in text:
             what, hint = "the disk is full", "make room on it"
         else:
