@@ -10,8 +10,10 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import stat
+import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
@@ -40,7 +42,8 @@ def cache_parent() -> Path:
     """The folder that holds the cache: ``NUMBA_CACHE_DIR``, else beside the sources, else in home.
 
     Beside the sources it is where Python keeps its own compiled files; where that cannot be
-    written, as in a system-wide installation, it is the user's cache folder.
+    written, as in a system-wide installation, it is the user's cache folder. A user without one,
+    as in a container that runs under any number, gets a folder for temporary files.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
@@ -49,7 +52,27 @@ def cache_parent() -> Path:
     beside = here / "__pycache__"
     if os.access(beside if beside.is_dir() else here, os.W_OK):
         return beside
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "recon"
+    # Unlike those of Path, these functions take no home and one of somebody else for what they are.
+    users = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # noqa: PTH111
+    return users / "recon" if users.is_absolute() and _may_make(users) else _temporary()
+
+
+def _may_make(folder: Path) -> bool:
+    """Return whether a folder can be written, or made where its nearest parent is."""
+    nearest = next(path for path in (folder, *folder.parents) if os.path.exists(path))  # noqa: PTH110
+    return os.access(nearest, os.W_OK)
+
+
+def _temporary() -> Path:
+    """Return a folder that is this user's alone: machine code of others must not run."""
+    user = os.getuid()  # elsewhere than on POSIX there is always a home
+    folder = Path(tempfile.gettempdir()) / f"recon-{user}"
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    state = folder.lstat()
+    if stat.S_ISDIR(state.st_mode) and state.st_uid == user and not state.st_mode & 0o022:
+        return folder
+    return Path(tempfile.mkdtemp(prefix="recon-"))
 
 
 def cache_folder(parent: Path, package: Path = _PACKAGE) -> Path:

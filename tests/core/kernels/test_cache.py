@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numba
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import recon
-from recon.core.kernels import cache, voxels
+from recon.core.kernels import voxels
 from recon.core.kernels.cache import cache_folder, cache_parent, when_compiling
 from recon.core.kernels.compiled import kernel
 
@@ -67,13 +68,35 @@ def test_the_cache_is_where_numba_is_reported_to_keep_it(
     assert cache_parent() == tmp_path
 
 
-def test_the_cache_is_the_users_where_the_installation_cannot_be_written(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+@pytest.fixture
+def foreign(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """The folder of a user who may write nothing but what lies in it."""
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(cache.os, "access", lambda *_: False)
-    assert cache_parent() == tmp_path / "recon"
+    monkeypatch.setattr(os, "access", lambda path, _: tmp_path in (path, *path.parents))
+    return tmp_path
+
+
+def test_the_cache_is_the_users_where_the_installation_cannot_be_written(
+    monkeypatch: pytest.MonkeyPatch, foreign: Path
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(foreign / "caches"))
+    assert cache_parent() == foreign / "caches" / "recon"
+
+
+@pytest.mark.parametrize("home", ["/", "~"])
+def test_a_user_without_a_home_gets_a_temporary_folder_that_nobody_else_can_write(
+    monkeypatch: pytest.MonkeyPatch, foreign: Path, home: str
+) -> None:
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setenv("HOME", home)
+    monkeypatch.setattr(tempfile, "tempdir", str(foreign))
+    kept = cache_parent()
+    assert kept.parent == foreign
+    assert kept.stat().st_mode & 0o077 == 0
+    assert cache_parent() == kept  # the next process finds it again
+    kept.chmod(0o777)
+    assert cache_parent() not in (kept, Path())
+    assert cache_parent().stat().st_mode & 0o077 == 0
 
 
 @compiled
