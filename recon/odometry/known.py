@@ -43,7 +43,7 @@ class KnownPoses:
         if not self._begun:
             self._T_first_world = invert(self._poses[index])
             self._begun = True
-        return OdometryResult(self._T_first_world @ self._poses[index], OdometryHealth())
+        return OdometryResult(self._T_first_world @ self._poses[index], OdometryHealth(known=True))
 
     def state(self) -> dict[str, Any]:
         """Return everything that later poses depend on."""

@@ -35,6 +35,7 @@ class OdometryHealth:
     Attributes:
         ok: False where the pose is not to be trusted: it is extrapolated, or the image
             contradicts it.
+        known: True where the pose was given, not measured: nothing later bends it.
         tracks: Features followed from the last frame.
         inliers: Features that agree with the visual motion.
         reprojection_px: Their median reprojection error.
@@ -50,6 +51,7 @@ class OdometryHealth:
     """
 
     ok: bool = True
+    known: bool = False
     tracks: int = 0
     inliers: int = 0
     reprojection_px: float = float("nan")

@@ -73,7 +73,8 @@ class DrivePath:
 
     Attributes:
         trajectory: By odometry; about where it lies beside the other drives.
-        path_m: float64 (N,), path up to each frame, by `path_lengths`.
+        path_m: float64 (N,), path up to each frame, by `path_lengths`; 0 everywhere where poses are
+            known, which moves the drive as one rigid thing.
     """
 
     trajectory: Trajectory
@@ -203,6 +204,8 @@ def _spaced(drives: Sequence[DrivePath]) -> list[NDArray[np.intp]]:
 def _nodes(path_m: Float64, most: int = _MAX_NODES) -> NDArray[np.intp]:
     """Return frames at even distances along the path, including the first and the last."""
     length = float(path_m[-1])
+    if length == 0.0:
+        return np.zeros(1, np.intp)
     count = max(2, min(most, math.ceil(length / _NODE_M) + 1))
     marks = np.searchsorted(path_m, np.linspace(0.0, length, count))
     return np.unique(np.concatenate([[0], marks, [len(path_m) - 1]]))

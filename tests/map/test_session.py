@@ -9,6 +9,7 @@ import pytest
 
 from recon.core.errors import FormatError, ShapeError
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera
+from recon.map.sessions.linking import path_up_to
 from recon.map.store.map import Map
 from recon.map.store.session import Session, SessionInfo
 from recon.odometry import OdometryHealth
@@ -60,6 +61,21 @@ def test_frames_come_back_bit_by_bit(tmp_path: Path) -> None:
             with Map.open(path) as read:
                 _assert_same(read.session(), session)
                 assert read.session().info == session.info
+
+
+@pytest.mark.parametrize(("measured", "length_m"), [((), 0.0), ((2,), 3.0)])
+def test_only_a_path_that_is_known_throughout_does_not_drift(
+    tmp_path: Path, measured: tuple[int, ...], length_m: float
+) -> None:
+    with Map.create(tmp_path / "map.recon") as made:
+        session = made.begin(SessionInfo())
+        for number in range(4):
+            pose = np.eye(4)
+            pose[2, 3] = number
+            session.add_frame(pose, float(number), OdometryHealth(known=number not in measured))
+        made.commit()
+        with Map.open(tmp_path / "map.recon") as read:
+            assert path_up_to(read.session())[-1] == length_m
 
 
 def test_a_commit_writes_the_frames_since_the_last_one_alone(tmp_path: Path) -> None:

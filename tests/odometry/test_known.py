@@ -25,6 +25,7 @@ def test_poses_begin_at_the_identity(blind: See, street_poses: np.ndarray) -> No
         expected = invert(street_poses[3]) @ street_poses[3 + index]
         np.testing.assert_allclose(result.T_world_camera, expected, atol=1e-12)
         assert result.health.ok
+        assert result.health.known
 
 
 def test_poses_are_picked_by_the_number_of_the_frame(blind: See, street_poses: np.ndarray) -> None:

@@ -10,7 +10,7 @@ import pytest
 from recon.core.errors import RegistrationError
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
-from recon.places.closure import close_loops
+from recon.places.closure import DrivePath, Tie, close_loops, join_drives
 from recon.places.drift import Drift, DriftModel, drift_over, is_possible, path_lengths
 from recon.places.verify import Loop
 from tests.places.conftest import drifted
@@ -52,10 +52,12 @@ def _loop(truth: Trajectory, first: int, last: int) -> Loop:
     return Loop(first, last, se3.invert(poses[first]) @ poses[last], INFORMATION, 100, 1.0)
 
 
+def _path_m(path: Trajectory) -> np.ndarray:
+    return path_lengths(path.T_world_camera, np.ones(len(path), np.bool_))
+
+
 def _close(odometry: Trajectory, loops: list[Loop]):
-    trusted = np.ones(len(odometry), np.bool_)
-    path_m = path_lengths(odometry.T_world_camera, trusted)
-    return close_loops(odometry, path_m, loops, DRIFT)
+    return close_loops(odometry, _path_m(odometry), loops, DRIFT)
 
 
 def _end_error_m(path: Trajectory, truth: Trajectory) -> float:
@@ -168,3 +170,35 @@ def test_drift_grows_with_the_path_and_bounds_what_is_possible():
     assert far.position_m > near.position_m
     assert is_possible(off, far, Drift(0.0, 1e-3))
     assert not is_possible(off, near, Drift(0.0, 1e-3))
+
+
+@pytest.mark.parametrize("known", [(True, False), (True, True)])
+def test_a_drive_with_known_poses_keeps_its_shape(truth, odometry, known):
+    """Links are off by centimetres, which would bend what odometry measured."""
+    noise = np.random.default_rng(0)
+    away = se3.make_transform(np.eye(3), np.array([0.1, 0.0, 0.1]))
+    paths = [
+        truth if sure else replace(odometry, T_world_camera=away @ odometry.T_world_camera)
+        for sure in known
+    ]
+    drives = [
+        DrivePath(path, np.zeros(len(path)) if sure else _path_m(path))
+        for path, sure in zip(paths, known, strict=True)
+    ]
+    off = noise.normal(0.0, [0.02] * 3 + [0.001] * 3, (12, 6))
+    ties = [
+        Tie((0, 1), Loop(20 * k, 20 * k, se3.as_transform(step), INFORMATION, 100, 1.0))
+        for k, step in enumerate(off[: len(truth) // 20])
+    ]
+
+    joined = join_drives(drives, ties, DRIFT)
+
+    assert joined is not None
+    assert joined.kept.all()
+    for path, sure, found in zip(paths, known, joined.trajectories, strict=True):
+        moved = found.T_world_camera[0] @ se3.invert(path.T_world_camera[0])
+        off_m = np.linalg.norm(moved @ path.T_world_camera - found.T_world_camera, axis=(1, 2))
+        assert (off_m.max() < 1e-9) == sure
+    apart_m = joined.trajectories[1].positions_m - truth.positions_m
+    # Behind the last link only odometry says where the drive goes.
+    assert np.linalg.norm(apart_m, axis=1)[: ties[-1].loop.last].max() < 0.1

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from recon.core.values.arrays import Float64
 from recon.map.sessions.shared import link_by_frame, shared_frames
 from recon.map.store.links import Link
@@ -47,7 +49,12 @@ def find_links(map_: Map, new: Collection[int]) -> list[Link]:
 
 
 def path_up_to(session: Session) -> Float64:
-    """Return float64 (N,), path of a drive up to each frame; lost frames count several times."""
+    """Return float64 (N,), path of a drive up to each frame; lost frames count several times.
+
+    Of known poses it is 0 everywhere: odometry, whose drift grows with the path, had no part in it.
+    """
+    if all(record.known for record in session.health):
+        return np.zeros(len(session))
     return path_lengths(session.odometry.T_world_camera, trusted_poses(session.health))
 
 
