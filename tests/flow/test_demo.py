@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 FRAMES = 12
+# Three quarters of the size that users see: it shows the same in half the time.
+SIZE = ("street.width_px=480", "street.height_px=180", "street.focal_px=270")
 PRODUCTS = {
     "trajectory_kitti.txt",
     "trajectory_tum.txt",
@@ -34,6 +36,7 @@ PRODUCTS = {
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     out = tmp_path_factory.mktemp("demo") / "run"
     command = [sys.executable, "-m", "recon", "demo", "--frames", str(FRAMES), "--out", str(out)]
+    command += [word for setting in SIZE for word in ("--set", setting)]
     done = subprocess.run([*command, "--json"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return out, json.loads(done.stdout)

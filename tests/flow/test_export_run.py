@@ -94,7 +94,7 @@ def test_a_cloud_needs_no_rays(small_demo: Path, tmp_path: Path) -> None:
         target.write_bytes((small_demo / name).read_bytes())
     summary = run_export(tmp_path / "run", products=["cloud"], out=tmp_path / "out")
     assert summary["points"] > 1000
-    with pytest.raises(FormatError, match=r"map\.recon: file does not exist"):
+    with pytest.raises(FormatError, match=r"folder has no map \(expected a map/map\.recon"):
         run_export(tmp_path / "run", products=["grid"], out=tmp_path / "other")
     assert not (tmp_path / "other").exists()
 

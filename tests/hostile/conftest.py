@@ -14,7 +14,7 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.io.images.image import write_image
 from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from tests.hostile.runs import DRIVE, interrupt_run
 from tests.scenery.kitti import write_kitti
 
@@ -39,8 +39,8 @@ def pair(here: Path) -> tuple[Path, Path]:
 def good_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A drive of three frames in KITTI's layout."""
     folder = tmp_path_factory.mktemp("good") / "drive"
-    settings = StreetSettings(frames=3, width_px=128, height_px=64, focal_px=72.0)
-    write_kitti(SyntheticSource(settings), folder)
+    size = {"width_px": 128, "height_px": 64, "focal_px": 72.0}
+    write_kitti(SyntheticSource(StreetScene(frames=3, smooth_edges=False, **size)), folder)
     return folder
 
 

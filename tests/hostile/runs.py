@@ -13,7 +13,7 @@ from recon.commands.map_options import MapRequest
 from recon.map.drive.frame_result import FrameResult
 from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti
 
 DRIVE = {"frames": 6, "width_px": 256, "height_px": 96, "focal_px": 150.0}
@@ -30,7 +30,7 @@ class _Stops(Silent):
 
 def interrupt_run(folder: Path) -> None:
     """Write a drive to ``folder/drive`` and an interrupted run of it to ``folder/run``."""
-    write_kitti(SyntheticSource(StreetSettings(**DRIVE)), folder / "drive")
+    write_kitti(SyntheticSource(StreetScene(smooth_edges=False, **DRIVE)), folder / "drive")
     config = load_config(None, ["checkpoints.every_frames=1", "submaps.length_m=1"])
     source, options = MapRequest(folder / "drive", mesh=False).open(config)
     options = replace(options, audit=False, out=folder / "run", progress=_Stops())

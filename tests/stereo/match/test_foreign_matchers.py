@@ -63,7 +63,7 @@ def test_an_object_is_taken_where_a_name_is() -> None:
 
 def test_a_run_is_made_with_an_object_and_records_its_name(tmp_path: Path) -> None:
     config = recon.load_config().with_matcher(Flat())
-    given = recon.PairInput(recon.StereoPair(image(), image()), CAMERA)
+    given = recon.PairInput(recon.StereoPair(image(0), image(1)), CAMERA)
     out = tmp_path / "run"
     run = recon.run_disparity(given, config, out=out)
     assert np.nanmedian(run.disparity.values) == 5
