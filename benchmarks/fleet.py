@@ -101,7 +101,7 @@ def pairs(options: argparse.Namespace) -> dict[str, Any]:
         folder = Path(name)
         words = write_pair(folder)
         for n in range(options.rounds):
-            out = folder / str(n)
+            (out := folder / str(n)).mkdir()
             rows = [measure(out, words, options.jobs[0], *shape) for shape in SHAPES]
             rounds.append({"rows": rows, "ratio to one worker": ratios(rows)})
             print(json.dumps(rounds[-1]), file=sys.stderr)

@@ -41,7 +41,7 @@ _BELOW_IN = 1.0
 _BAR_BOTTOM_IN = 0.5
 _BAR_IN = 0.16
 _WIDE_ASPECT = 2.0
-_LABEL_ROOM = 0.07  # fraction of the length of a scale
+_LABEL_ROOM = 0.1  # fraction of the length of a scale: "0.45 m" below a narrow image
 _FARTHEST_MARK_M = 1000.0
 # Ticks of a depth scale, the roundest first; the others fill the remaining space.
 _DEPTH_STEPS = ((1.0, 2.0, 5.0), (3.0, 4.0, 6.0, 8.0), (1.5, 2.5, 3.5, 4.5, 7.0, 9.0))
