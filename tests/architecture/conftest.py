@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,3 +25,10 @@ def root() -> Path:
 def pyproject(root: Path) -> dict[str, Any]:
     """Content of pyproject.toml."""
     return tomllib.loads((root / "pyproject.toml").read_text())
+
+
+@pytest.fixture(scope="session")
+def trees(root: Path) -> dict[Path, ast.Module]:
+    """The modules of the library, parsed."""
+    modules = sorted((root / "recon").rglob("*.py"))
+    return {path: ast.parse(path.read_text()) for path in modules}

@@ -36,32 +36,33 @@ def _text_files(root: Path) -> list[Path]:
     return [path for path in files if path.suffix in TEXT and "__pycache__" not in path.parts]
 
 
-def _modules(root: Path) -> list[Path]:
-    return sorted((root / "recon").rglob("*.py"))
-
-
-def _packages(root: Path) -> list[Path]:
-    return [path for path in _modules(root) if path.name == "__init__.py"]
-
-
-def test_every_module_says_what_it_is(root: Path) -> None:
-    silent = [
-        str(path) for path in _modules(root) if not ast.get_docstring(ast.parse(path.read_text()))
+@pytest.fixture(scope="module")
+def functions(trees: dict[Path, ast.Module]) -> list[tuple[Path, ast.FunctionDef]]:
+    """All functions of the library but those of kernels."""
+    return [
+        (path, node)
+        for path, tree in trees.items()
+        if "kernels" not in path.parts
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
     ]
+
+
+def test_every_module_says_what_it_is(trees: dict[Path, ast.Module]) -> None:
+    silent = [str(path) for path, tree in trees.items() if not ast.get_docstring(tree)]
 
     assert silent == []
 
 
-def test_the_docstring_of_a_function_begins_with_its_verb(root: Path) -> None:
+def test_the_docstring_of_a_function_begins_with_its_verb(
+    functions: list[tuple[Path, ast.FunctionDef]], root: Path
+) -> None:
     """Properties are values, and kernels say what they give in the terms of their arrays."""
     verbs = set(VERBS.split())
     others = [
         f"{path.relative_to(root)}:{node.lineno} {node.name}: {docstring.splitlines()[0]}"
-        for path in _modules(root)
-        if "kernels" not in path.parts
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.FunctionDef)
-        and (docstring := ast.get_docstring(node))
+        for path, node in functions
+        if (docstring := ast.get_docstring(node))
         and not any("property" in ast.unparse(mark) for mark in node.decorator_list)
         and docstring.split()[0].strip(".,:;") not in verbs
     ]
@@ -69,8 +70,8 @@ def test_the_docstring_of_a_function_begins_with_its_verb(root: Path) -> None:
     assert others == []
 
 
-def test_no_package_or_module_is_a_drawer_for_everything(root: Path) -> None:
-    names = {path.stem for path in _modules(root)} | {path.parent.name for path in _packages(root)}
+def test_no_package_or_module_is_a_drawer_for_everything(trees: dict[Path, ast.Module]) -> None:
+    names = {name for path in trees for name in (path.stem, path.parent.name)}
 
     assert names & NO_NAMES == set()
 
@@ -85,15 +86,9 @@ def test_files_are_short(root: Path) -> None:
     assert {path: length for path, length in lengths.items() if length > MAX_LINES} == {}
 
 
-def test_functions_are_short(root: Path) -> None:
+def test_functions_are_short(functions: list[tuple[Path, ast.FunctionDef]]) -> None:
     """House style: half of all functions within 8 lines, 90 % within 30 (kernels apart)."""
-    lengths = sorted(
-        _body_lines(node)
-        for path in _modules(root)
-        if "kernels" not in path.parts
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.FunctionDef)
-    )
+    lengths = sorted(_body_lines(node) for _, node in functions)
 
     assert statistics.median(lengths) <= 8
     assert statistics.quantiles(lengths, n=10)[-1] <= 30

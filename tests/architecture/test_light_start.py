@@ -16,37 +16,28 @@ try:
     main()
 except SystemExit:
     pass
-print("LOADED", *sys.modules)
 """
 
 
-def test_help_loads_no_heavy_library() -> None:
-    done = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, text=True, check=True)
+def loaded(probe: str) -> set[str]:
+    """The modules that a process has loaded at its end."""
+    command = [sys.executable, "-c", f"{probe}\nimport sys; print('LOADED', *sys.modules)"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return set(done.stdout.rpartition("LOADED")[2].split())
 
-    _, _, loaded = done.stdout.rpartition("LOADED")
-    assert HEAVY & set(loaded.split()) == set()
+
+def test_help_loads_the_shells_and_neither_libraries_nor_numbers_nor_settings() -> None:
+    """What it takes is measured by `benchmarks/against.py`; this is what makes it little."""
+    found = loaded(PROBE)
+    assert found.isdisjoint(HEAVY | {"numpy", "pydantic", "scipy", "dask"})
+    rooms = {name.split(".")[1] for name in found if name.startswith("recon.")}
+    assert rooms == {"cli", "core"}
 
 
 def test_import_of_the_package_loads_no_heavy_library() -> None:
-    probe = "import recon, sys; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
-
-    assert HEAVY & set(done.stdout.split()) == set()
+    assert loaded("import recon").isdisjoint(HEAVY)
 
 
 def test_the_process_that_meshes_loads_nothing_that_it_does_not_use() -> None:
     """There is one for each tile of a surface."""
-    probe = "import recon.export.pymeshlab, sys; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
-
-    assert HEAVY & set(done.stdout.split()) == set()
-
-
-def test_help_loads_the_shells_and_neither_numbers_nor_settings() -> None:
-    """What it takes is measured by `benchmarks/against.py`; this is what makes it little."""
-    done = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, text=True, check=True)
-
-    _, _, loaded = done.stdout.rpartition("LOADED")
-    assert {"numpy", "pydantic", "scipy", "dask"}.isdisjoint(loaded.split())
-    rooms = {name.split(".")[1] for name in loaded.split() if name.startswith("recon.")}
-    assert rooms == {"cli", "core"}
+    assert loaded("import recon.export.pymeshlab").isdisjoint(HEAVY)

@@ -9,6 +9,8 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 import recon
 
 
@@ -16,41 +18,39 @@ def _normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", re.split(r"[\[<>=!~; ]", name)[0]).lower()
 
 
-def _imported(root: Path) -> set[str]:
+@pytest.fixture(scope="module")
+def imported(trees: dict[Path, ast.Module]) -> dict[str, set[str]]:
+    """Names of the libraries that are imported, with the names that they could be declared by."""
     names = set()
-    for path in (root / "recon").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+    for tree in trees.values():
+        for node in ast.walk(tree):
             if isinstance(node, ast.Import):
                 names |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 names.add(node.module.split(".")[0])
-    return names - set(sys.stdlib_module_names) - {"recon"}
+    providers = packages_distributions()
+    return {
+        name: {_normal(provider) for provider in providers.get(name, [name])}
+        for name in names - set(sys.stdlib_module_names) - {"recon"}
+    }
 
 
 def _declared(pyproject: dict[str, Any]) -> set[str]:
     return {_normal(entry) for entry in pyproject["project"]["dependencies"]}
 
 
-def test_every_imported_library_is_declared(root: Path, pyproject: dict[str, Any]) -> None:
-    providers = packages_distributions()
+def test_every_imported_library_is_declared(
+    imported: dict[str, set[str]], pyproject: dict[str, Any]
+) -> None:
     declared = _declared(pyproject)
 
-    undeclared = {
-        name
-        for name in _imported(root)
-        if not declared & {_normal(provider) for provider in providers.get(name, [name])}
-    }
-
-    assert undeclared == set()
+    assert {name for name, providers in imported.items() if not declared & providers} == set()
 
 
-def test_every_declared_library_is_imported(root: Path, pyproject: dict[str, Any]) -> None:
-    providers = packages_distributions()
-    used = {
-        _normal(provider) for name in _imported(root) for provider in providers.get(name, [name])
-    }
-
-    assert _declared(pyproject) - used == set()
+def test_every_declared_library_is_imported(
+    imported: dict[str, set[str]], pyproject: dict[str, Any]
+) -> None:
+    assert _declared(pyproject) - set().union(*imported.values()) == set()
 
 
 def test_constraints_pin_every_declared_library(root: Path, pyproject: dict[str, Any]) -> None:

@@ -15,11 +15,11 @@ import pytest
 
 from recon.map.store.map import Map
 from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from tests.flow.test_killed_runs import BREAKER, content, kill
 from tests.scenery.kitti import write_kitti
 
-STREET = StreetSettings(frames=40, width_px=192, height_px=72, focal_px=110.0)
+STREET = StreetScene(frames=40, width_px=256, height_px=96, focal_px=150.0, smooth_edges=False)
 KILLS = 6
 PLAYED_S = 16.0
 """Long enough for some commits."""

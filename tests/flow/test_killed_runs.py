@@ -16,10 +16,11 @@ import pytest
 from recon.core.errors import FormatError
 from recon.map.store.map import Map
 from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti
 
-STREET = StreetSettings(frames=24, width_px=192, height_px=72, focal_px=110.0)
+STREET = StreetScene(frames=24, width_px=256, height_px=96, focal_px=150.0, smooth_edges=False)
+"""Large enough that every pose is trusted."""
 SETTINGS = ["checkpoints.every_frames=5", "submaps.length_m=4", "submaps.tile_m=12.8"]
 BREAKER = Path(__file__).with_name("break_at_write.py")
 KILLS = 10

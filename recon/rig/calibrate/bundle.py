@@ -1,9 +1,9 @@
 """Bundle adjustment of the lenses, the pose of the right camera and every pose of the board.
 
-One solver handles one or two cameras, pinhole and fisheye lenses, and partly visible boards. The
-board poses are eliminated view by view (Schur complement), which leaves the few parameters shared
-by all views and each view's information matrix for them. The bootstrap over views reweights these
-matrices.
+One solver handles one or two cameras, pinhole and fisheye lenses, and partly visible boards. All
+corners of a camera are projected at once. The board poses are eliminated view by view (Schur
+complement), which leaves the few parameters shared by all views and each view's information matrix
+for them. The bootstrap over views reweights these matrices.
 
 Ref: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6; Zhang 2000.
 """
@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import apply, exp_so3, make_transform, orthonormalise, step_jacobian
@@ -68,19 +69,32 @@ class RigState:
     Attributes:
         cameras: One or two cameras.
         T_camera_rig: float64 (4, 4) for each; the first is the identity.
-        T_rig_board: float64 (4, 4) for each view.
+        T_rig_board: float64 (V, 4, 4), one for each view.
     """
 
     cameras: tuple[CameraIntrinsics, ...]
     T_camera_rig: tuple[Float64, ...]
-    T_rig_board: tuple[Float64, ...]
+    T_rig_board: Float64
 
-    def residuals(self, view: View, number: int) -> tuple[Float64, ...]:
-        """Return float64 (N, 2) for each camera: observed minus predicted, pixels."""
-        return tuple(
-            seen.pixels - project(camera, apply(T @ self.T_rig_board[number], seen.board_m))
-            for camera, T, seen in zip(self.cameras, self.T_camera_rig, view.seen, strict=True)
-        )
+
+@dataclass(frozen=True, eq=False)
+class _Corners:
+    """All corners that one camera saw, view after view.
+
+    Attributes:
+        board_m: float64 (N, 3), their positions on the board.
+        pixels: float64 (N, 2), their positions in the image.
+        view: intp (N,), the number of the view, ascending.
+    """
+
+    board_m: Float64
+    pixels: Float64
+    view: NDArray[np.intp]
+
+    def in_rig(self, state: RigState) -> Float64:
+        """Return float64 (N, 3), the corners in the axes of the rig."""
+        T = state.T_rig_board[self.view]
+        return np.asarray((T[:, :3, :3] @ self.board_m[:, :, None])[:, :, 0] + T[:, :3, 3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,17 +118,6 @@ class Information:
     weights: Float64
 
 
-@dataclass(frozen=True, eq=False)
-class _Blocks:
-    """Normal equations of one view: shared (A, a), mixed (B), board pose (C, c)."""
-
-    A: Float64
-    B: Float64
-    C: Float64
-    a: Float64
-    c: Float64
-
-
 def solve(
     views: Sequence[View], start: RigState, weights: Float64 | None = None
 ) -> tuple[RigState, Information]:
@@ -129,19 +132,35 @@ def solve(
         CalibrationError: The initial guess has points behind a camera.
     """
     w = np.ones(len(views)) if weights is None else weights
-    if not np.isfinite(_cost(views, start, w)):
+    corners = _gather(views)
+    if not np.isfinite(_cost(corners, start, w)):
         raise CalibrationError("no initial guess puts the board in front of the cameras")
     state = minimise(
         Problem(
-            cost=lambda state: _cost(views, state, w),
-            linearise=lambda state: _linearise(views, state),
-            step=lambda state, blocks, damping: _step(blocks, state, w, damping),
+            cost=lambda state: _cost(corners, state, w),
+            linearise=lambda state: _linearise(corners, state),
+            step=lambda state, normals, damping: _step(normals, state, w, damping),
         ),
         start,
         rounds=_ROUNDS,
         min_gain=_STILL,
     )
-    return state, _information(_linearise(views, state), state, w)
+    matrices, vectors, _ = _without_poses(_linearise(corners, state))
+    return state, Information(matrices, vectors, _prior(state), w)
+
+
+def squared_errors(views: Sequence[View], state: RigState) -> tuple[Float64, Float64]:
+    """Return how well each view fits each camera.
+
+    Returns:
+        The sums of squared distances from the predicted corners, pixels², NaN where one is behind
+        the camera, and the numbers of corners; both float64 (V, cameras).
+    """
+    corners = _gather(views)
+    squares = zip(corners, _squares(corners, state), strict=True)
+    sums = [np.bincount(seen.view, each, len(views)) for seen, each in squares]
+    counts = [np.bincount(seen.view, minlength=len(views)) for seen in corners]
+    return np.stack(sums, axis=1), np.stack(counts, axis=1).astype(np.float64)
 
 
 def shared_size(state: RigState) -> int:
@@ -180,30 +199,43 @@ def _moved_pose(T: Float64, step: Float64) -> Float64:
     return orthonormalise(make_transform(exp_so3(step[:3]), step[3:]) @ T)
 
 
-def _linearise(views: Sequence[View], state: RigState) -> list[_Blocks]:
-    return [_view_blocks(view, state, number) for number, view in enumerate(views)]
+def _gather(views: Sequence[View]) -> list[_Corners]:
+    """Return the corners that each camera saw."""
+    corners = []
+    for sightings in zip(*(view.seen for view in views), strict=True):
+        board_m, pixels = (
+            np.concatenate(each)
+            for each in zip(*((seen.board_m, seen.pixels) for seen in sightings), strict=True)
+        )
+        counts = [len(seen.pixels) for seen in sightings]
+        corners.append(_Corners(board_m, pixels, np.repeat(np.arange(len(views)), counts)))
+    return corners
 
 
-def _view_blocks(view: View, state: RigState, number: int) -> _Blocks:
-    """Return the normal equations of one view."""
+def _linearise(corners: Sequence[_Corners], state: RigState) -> Float64:
+    """Return float64 (V, P + 7, P + 7), the normal equations of each view.
+
+    They are JᵀJ with the columns of J by the shared parameters, the pose of the board, and the
+    error itself.
+    """
     size, at = shared_size(state), 0
-    J_shared, J_own, errors = [], [], []
-    xyz_rig_of = state.T_rig_board[number]
-    for camera, T, seen in zip(state.cameras, state.T_camera_rig, view.seen, strict=True):
-        xyz_rig = apply(xyz_rig_of, seen.board_m)
+    normals = np.zeros((len(state.T_rig_board), size + _POSE + 1, size + _POSE + 1))
+    for camera, T, seen in zip(state.cameras, state.T_camera_rig, corners, strict=True):
+        xyz_rig = seen.in_rig(state)
         xyz = apply(T, xyz_rig)
         pixels, by_point, by_lens = project_with_jacobian(camera, xyz)
-        count = 2 * len(xyz)
-        shared = np.zeros((count, size))
-        shared[:, at : at + _camera_size(camera)] = by_lens.reshape(count, -1)
+        J = np.zeros((len(xyz), 2, size + _POSE + 1))
+        J[:, :, at : at + _camera_size(camera)] = by_lens
         if at:
-            shared[:, -_POSE:] = (by_point @ _by_motion(xyz)).reshape(count, _POSE)
-        J_shared.append(shared)
-        J_own.append((by_point @ T[:3, :3] @ _by_motion(xyz_rig)).reshape(count, _POSE))
-        errors.append((seen.pixels - pixels).ravel())
+            J[:, :, size - _POSE : size] = by_point @ _by_motion(xyz)
+        J[:, :, size:-1] = by_point @ T[:3, :3] @ _by_motion(xyz_rig)
+        J[:, :, -1] = seen.pixels - pixels
         at += _camera_size(camera)
-    S, P, r = np.concatenate(J_shared), np.concatenate(J_own), np.concatenate(errors)
-    return _Blocks(S.T @ S, S.T @ P, P.T @ P, S.T @ r, P.T @ r)
+        ends = np.searchsorted(seen.view, np.arange(1, len(normals)))
+        for number, each in enumerate(np.split(J, ends)):
+            rows = each.reshape(-1, J.shape[2])
+            normals[number] += rows.T @ rows
+    return normals
 
 
 def _by_motion(xyz: Float64) -> Float64:
@@ -227,34 +259,46 @@ def _shared_numbers(state: RigState) -> Float64:
     return np.concatenate([*numbers, np.zeros(_POSE * (len(state.cameras) - 1))])
 
 
-def _cost(views: Sequence[View], state: RigState, weights: Float64) -> float:
+def _squares(corners: Sequence[_Corners], state: RigState) -> list[Float64]:
+    """Return for each camera float64 (N,), squared distances in the image, pixels²."""
+    return [
+        ((seen.pixels - project(camera, apply(T, seen.in_rig(state)))) ** 2).sum(axis=1)
+        for camera, T, seen in zip(state.cameras, state.T_camera_rig, corners, strict=True)
+    ]
+
+
+def _cost(corners: Sequence[_Corners], state: RigState, weights: Float64) -> float:
     """Return the sum of squared errors and of the prior; NaN for a point behind a camera."""
     numbers = _shared_numbers(state)
-    total = float(numbers @ _prior(state) @ numbers)
-    for number, (view, w) in enumerate(zip(views, weights, strict=True)):
-        total += w * sum(float((error**2).sum()) for error in state.residuals(view, number))
-    return total
+    squares = zip(corners, _squares(corners, state), strict=True)
+    total = sum(float(weights[seen.view] @ each) for seen, each in squares)
+    return total + float(numbers @ _prior(state) @ numbers)
 
 
-def _step(
-    blocks: Sequence[_Blocks], state: RigState, weights: Float64, damping: float
-) -> RigState | None:
+def _without_poses(normals: Float64, damping: float = 0.0) -> tuple[Float64, Float64, Float64]:
+    """Remove the pose of the board from the normal equations of each view.
+
+    Returns:
+        Matrices (V, P, P) and vectors (V, P) of the shared parameters, and (V, 6, P + 1), which
+        give the pose's step from theirs: the last column less the others times it.
+    """
+    P = normals.shape[1] - _POSE - 1
+    shared, own = normals[:, :P], normals[:, P:-1]
+    damped = own[:, :, P:-1] * (1.0 + damping * np.eye(_POSE))
+    back = np.linalg.solve(damped, np.delete(own, np.s_[P:-1], axis=2))
+    left = np.delete(shared, np.s_[P:-1], axis=2) - shared[:, :, P:-1] @ back
+    return left[:, :, :-1], left[:, :, -1], np.asarray(back, dtype=np.float64)
+
+
+def _step(normals: Float64, state: RigState, weights: Float64, damping: float) -> RigState | None:
     """Return the state after one damped step; None if a focal length would not be positive."""
     prior = _prior(state)
-    A, a = prior.copy(), -prior @ _shared_numbers(state)
-    own = []
-    for w, block in zip(weights, blocks, strict=True):
-        damped = block.C + damping * np.diag(np.diag(block.C))
-        back = np.linalg.solve(damped, np.column_stack([block.B.T, block.c]))
-        A += w * (block.A - block.B @ back[:, :-1])
-        a += w * (block.a - block.B @ back[:, -1])
-        own.append(back)
+    matrices, vectors, back = _without_poses(normals, damping)
+    A = prior + np.tensordot(weights, matrices, axes=1)
     A[np.diag_indices_from(A)] += damping * np.diag(A) + 1e-15
-    step = solve_scaled(A, a)
-    poses = tuple(
-        _moved_pose(T, back[:, -1] - back[:, :-1] @ step)
-        for T, back in zip(state.T_rig_board, own, strict=True)
-    )
+    step = solve_scaled(A, weights @ vectors - prior @ _shared_numbers(state))
+    own = back[:, :, -1] - back[:, :, :-1] @ step
+    poses = np.stack(list(map(_moved_pose, state.T_rig_board, own)))
     try:
         return replace(moved(state, step), T_rig_board=poses)
     except CalibrationError:
@@ -269,12 +313,3 @@ def solve_scaled(A: Float64, a: Float64) -> Float64:
     scale = 1.0 / np.sqrt(np.maximum(np.diag(A), 1e-300))
     solution, *_ = np.linalg.lstsq(A * np.outer(scale, scale), a * scale, rcond=1e-14)
     return np.asarray(solution * scale)
-
-
-def _information(blocks: Sequence[_Blocks], state: RigState, weights: Float64) -> Information:
-    matrices, vectors = [], []
-    for block in blocks:
-        back = np.linalg.solve(block.C, np.column_stack([block.B.T, block.c]))
-        matrices.append(block.A - block.B @ back[:, :-1])
-        vectors.append(block.a - block.B @ back[:, -1])
-    return Information(np.array(matrices), np.array(vectors), _prior(state), weights)

@@ -14,7 +14,7 @@ from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import exp_so3, invert, log_so3, make_transform
 from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64
-from recon.rig.calibrate.bundle import RigState, Sighting, View, solve
+from recon.rig.calibrate.bundle import RigState, Sighting, View, solve, squared_errors
 from recon.rig.calibrate.settings import CalibrationSettings
 from recon.stereo.rectify.lens import unproject
 
@@ -60,11 +60,8 @@ def solve_robustly(views: Sequence[View], start: RigState) -> RigState:
 
 def view_errors(views: Sequence[View], state: RigState) -> Float64:
     """Return float64 (V,), rms reprojection error of each view, pixels."""
-    errors = []
-    for number, view in enumerate(views):
-        apart = np.concatenate(state.residuals(view, number))
-        errors.append(math.sqrt(float((apart**2).sum(axis=1).mean())))
-    return np.array(errors)
+    sums, counts = squared_errors(views, state)
+    return np.asarray(np.sqrt(sums.sum(axis=1) / counts.sum(axis=1)))
 
 
 def join_cameras(left: RigState, right: RigState) -> RigState:
@@ -100,7 +97,7 @@ def locate_board(camera: CameraIntrinsics, seen: Sighting) -> Float64:
 
 
 def _with_poses(camera: CameraIntrinsics, sightings: Sequence[Sighting]) -> RigState:
-    poses = tuple(locate_board(camera, seen) for seen in sightings)
+    poses = np.stack([locate_board(camera, seen) for seen in sightings])
     return RigState((camera,), (np.eye(4),), poses)
 
 

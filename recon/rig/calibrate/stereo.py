@@ -12,7 +12,14 @@ import numpy as np
 from recon.core.errors import CalibrationError
 from recon.core.values import StereoCalibration
 from recon.core.values.arrays import Bool, Float64
-from recon.rig.calibrate.bundle import Information, RigState, Sighting, View, solve
+from recon.rig.calibrate.bundle import (
+    Information,
+    RigState,
+    Sighting,
+    View,
+    solve,
+    squared_errors,
+)
 from recon.rig.calibrate.initial import (
     Size,
     calibrate_one,
@@ -128,20 +135,19 @@ def _finish(
     information: Information,
     alone_px: tuple[float, float],
 ) -> StereoFit:
-    apart = [state.residuals(view, number) for number, view in enumerate(views)]
-    errors = np.array([[_length_rms(side) for side in both] for both in apart])
-    rms_px = _length_rms(np.concatenate([side for both in apart for side in both]))
+    sums, counts = squared_errors(views, state)
+    rms_px = math.sqrt(float(sums.sum() / counts.sum()))
     if rms_px > _MAX_RMS_PX:
         raise _no_fit(rms_px, alone_px)
+    errors_px = np.sqrt(sums / counts)
     return StereoFit(
-        stereo_of(state), state, information, tuple(views), (), {}, errors, alone_px, rms_px
+        stereo_of(state), state, information, tuple(views), (), {}, errors_px, alone_px, rms_px
     )
 
 
 def _keep(views: list[View], state: RigState, good: Bool) -> tuple[list[View], RigState]:
-    chosen = np.flatnonzero(good)
-    poses = tuple(state.T_rig_board[number] for number in chosen)
-    return [views[number] for number in chosen], replace(state, T_rig_board=poses)
+    kept = [views[number] for number in np.flatnonzero(good)]
+    return kept, replace(state, T_rig_board=state.T_rig_board[good])
 
 
 def _length_rms(apart: Float64) -> float:
