@@ -9,6 +9,7 @@ import numpy as np
 
 from recon.core.values import Trajectory
 from recon.evaluation.association import TOLERANCE_S, associate
+from recon.evaluation.interpolated import interpolation_warnings
 from recon.evaluation.trajectory import TrajectoryRules, TrajectoryRun, compare_paths
 from recon.io.trajectory import holds_times, read_trajectory, write_tum
 from recon.report.trajectory_page import write_trajectory_page
@@ -55,7 +56,10 @@ def run_evaluate_trajectory(
         "roll": "fixed" if comparison.roll_axis is None else "not observable on a straight path",
         "associated": "by time" if by_time else "in order",
         **poses,
-        "warnings": _warnings(len(true), min(poses.values())),
+        "warnings": [
+            *_warnings(len(true), min(poses.values())),
+            *interpolation_warnings(comparison.truth, comparison.segments),
+        ],
     }
     if out is not None:
         with Run("evaluate trajectory", out) as run:
