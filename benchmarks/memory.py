@@ -8,6 +8,7 @@ where the map is negligible.
 Examples:
     python benchmarks/memory.py --json --frames 1000 --frames 4000
     python benchmarks/memory.py --json --frames 600 --frames 2400 --again mesh --again occupancy
+    python benchmarks/memory.py --json --frames 1000 --frames 4000 --again merge --again localize
 """
 
 from __future__ import annotations
@@ -76,8 +77,9 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--again",
         action="append",
         default=[],
-        choices=["mesh", "occupancy"],
-        help="also what this command takes for the run of each drive; repeatable",
+        choices=["mesh", "occupancy", "merge", "localize"],
+        help="also what this command takes for the run of each drive; repeatable. merge: with the "
+        "run of its first frames; localize: those in its map",
     )
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--folder", type=Path, help="where to work; 2 MB for each frame at most")
@@ -124,7 +126,7 @@ def measure(period: Path, frames: int, options: argparse.Namespace) -> dict[str,
     settings = [part for text in options.set for part in ("--set", text)]
     mesh = [] if options.mesh else ["--no-mesh"]
     summary = run_recon("map", drive, out, [*mesh, *settings])
-    again = options.again if frames > LIBRARIES_FRAMES else ()
+    again = options.again if frames > COMPILING_FRAMES else ()
     files_mb = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6
     return {
         "frames": frames,
@@ -141,9 +143,17 @@ def measure(period: Path, frames: int, options: argparse.Namespace) -> dict[str,
 
 def make_again(command: str, run: Path) -> dict[str, Any]:
     """Run a command on a finished run; its cost."""
-    summary = run_recon(command, run, run.with_name(f"{run.name}_{command}"), [])
+    source, more = run, list[str]()
+    if command == "merge":
+        more = [str(run.with_name(f"run_{COMPILING_FRAMES}")), "--no-mesh"]
+    elif command == "localize":
+        source = run.with_name(f"drive_{COMPILING_FRAMES}")
+        # The street repeats: without it, each frame would be looked for in all of the map.
+        more = ["--map", str(run), "--start", "0,0,0"]
+    summary = run_recon(command, source, run.with_name(f"{run.name}_{command}"), more)
     names = {"peak_mb": "peak_memory_mb", "seconds": "seconds", "stages": "stages"}
-    return {name: summary[key] for name, key in names.items()}
+    figures = {name: summary[key] for name, key in names.items()}
+    return figures | {key: summary[key] for key in ("frames_tracking",) if key in summary}
 
 
 def run_recon(command: str, source: Path, out: Path, options: list[str]) -> dict[str, Any]:
