@@ -29,7 +29,7 @@ from recon.street.settings import StreetScene
 from tests.scenery.octomaps import write_octomap
 
 STREET = StreetScene(frames=20, width_px=192, height_px=72, focal_px=110.0, smooth_edges=False)
-SETTINGS = ["submaps.length_m=4", "submaps.tile_m=6.4", "fusion.min_count=1"]
+SETTINGS = ["submaps.length_m=4", "submaps.tile_m=12.8", "fusion.min_count=1"]
 
 
 @pytest.fixture(scope="module")
