@@ -18,6 +18,7 @@ from recon.core.errors import EvaluationError
 from recon.core.geometry import se3
 from recon.core.geometry.projection import project
 from recon.core.kernels.voxels import pack_keys
+from recon.core.keys import find_keys
 from recon.core.values import (
     FREE,
     OCCUPIED,
@@ -111,10 +112,10 @@ def _compare_voxels(
 def _near(keys: Int32, others: Int32, tolerance: int) -> Bool:
     """Return which voxels have one of the others within ``tolerance`` cells on every axis."""
     steps = np.arange(-tolerance, tolerance + 1)
-    known = np.unique(pack_keys(others))
+    known = np.sort(pack_keys(others))
     found = np.zeros(len(keys), dtype=np.bool_)
     for offset in np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3):
-        found |= np.isin(pack_keys(keys + offset), known)
+        found |= find_keys(pack_keys(keys + offset), known)[1]
     return found
 
 

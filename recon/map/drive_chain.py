@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.kernels.voxels import pack_keys, unpack_keys
+from recon.core.keys import are_among, distinct_keys
 from recon.core.values import OccupancyVoxels, join_voxels
 from recon.core.values.grid import log_odds
 from recon.map.cut import OCCUPANCY
@@ -60,15 +61,15 @@ class DriveChain:
         self, key: TileKey, seen: OccupancyVoxels, after: Mapping[int, OccupancyPart]
     ) -> OccupancyVoxels:
         """Make the voxels of a tile again where ``after`` the end of submaps more was observed."""
-        blocks = np.unique(np.concatenate([part.rows.blocks for part in after.values()]))
+        blocks = distinct_keys(np.concatenate([part.rows.blocks for part in after.values()]))
         # Whether a surface crosses a voxel depends on what hit those that touch it.
         changed, needed = _grown(blocks, 1), _grown(blocks, 2)
         joined = _outdone(part for _, part in self._drives(key, after, needed))
         anew = joined.voxels(seen.resolution_m)
         return join_voxels(
             [
-                seen.select(~np.isin(pack_keys(seen.keys >> BLOCK_BITS), changed)),
-                anew.select(np.isin(pack_keys(anew.keys >> BLOCK_BITS), changed)),
+                seen.select(~are_among(pack_keys(seen.keys >> BLOCK_BITS), changed)),
+                anew.select(are_among(pack_keys(anew.keys >> BLOCK_BITS), changed)),
             ],
             seen.resolution_m,
         )
@@ -104,7 +105,7 @@ class DriveChain:
 
 
 def _in_blocks(part: OccupancyPart, blocks: NDArray[np.int64] | None) -> OccupancyPart:
-    return part if blocks is None else part.select(np.isin(part.rows.blocks, blocks))
+    return part if blocks is None else part.select(are_among(part.rows.blocks, blocks))
 
 
 def _outdone(drives: Iterable[OccupancyPart]) -> OccupancyPart:
@@ -116,4 +117,4 @@ def _grown(blocks: NDArray[np.int64], by: int) -> NDArray[np.int64]:
     """Return packed blocks with those up to ``by`` blocks away from one on each axis."""
     steps = np.array(list(product(range(-by, by + 1), repeat=3)))
     around = unpack_keys(blocks)[:, None] + steps
-    return np.unique(pack_keys(around.reshape(-1, 3)))
+    return distinct_keys(pack_keys(around.reshape(-1, 3)))

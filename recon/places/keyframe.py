@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.geometry.projection import depth_from_disparity, unproject
+from recon.core.keys import distinct_keys
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, Float64, UInt8, freeze
 
@@ -150,7 +151,7 @@ def words_of(descriptors: UInt8) -> NDArray[np.uint32]:
     bits = np.unpackbits(descriptors, axis=1)[:, _chosen_bits()]
     values = bits.reshape(len(bits), WORDS, _BITS) @ (1 << np.arange(_BITS, dtype=np.uint32))
     numbered = values + (np.arange(WORDS, dtype=np.uint32) << _BITS)
-    return np.unique(numbered.astype(np.uint32))
+    return distinct_keys(numbered.astype(np.uint32).ravel())
 
 
 @lru_cache

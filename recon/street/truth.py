@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from recon.core.errors import EvaluationError
 from recon.core.geometry import se3
 from recon.core.kernels.voxels import pack_keys, unpack_keys
+from recon.core.keys import distinct_keys
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import FREE, OCCUPIED, OccupancyGrid, OccupancyTruth, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64, Int32
@@ -138,11 +139,11 @@ class _Counter:
 
     def add(self, cells: NDArray[np.int64]) -> None:
         """Count the cells (N, 3) of one frame; duplicates count once."""
-        self._merge(np.unique(pack_keys(cells)), 1)
+        self._merge(distinct_keys(pack_keys(cells)), 1)
 
     def know(self, cells: NDArray[np.int64]) -> None:
         """Include cells (N, 3) without counting a frame."""
-        self._merge(np.unique(pack_keys(cells)), 0)
+        self._merge(distinct_keys(pack_keys(cells)), 0)
 
     def _merge(self, keys: NDArray[np.int64], count: int) -> None:
         self._keys, place = np.unique(np.concatenate([self._keys, keys]), return_inverse=True)

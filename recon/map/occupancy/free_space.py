@@ -6,9 +6,9 @@ from itertools import product
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.core.kernels.voxels import pack_keys
+from recon.core.keys import find_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float32
 
@@ -29,18 +29,10 @@ def looked_through(points: Float32, voxels: OccupancyVoxels) -> Bool:
     """
     cells = np.floor(points / np.float32(voxels.resolution_m)).astype(np.int64)
     keys = pack_keys(voxels.keys)
-    _, through = find_cells(pack_keys(cells), np.sort(keys[voxels.log_odds <= _EVEN]))
+    _, through = find_keys(pack_keys(cells), np.sort(keys[voxels.log_odds <= _EVEN]))
     occupied = np.sort(keys[voxels.log_odds > 0])
     rows = np.flatnonzero(through)
     for step in product((-1, 0, 1), repeat=3):
-        _, near = find_cells(pack_keys(cells[rows] + np.array(step)), occupied)
+        _, near = find_keys(pack_keys(cells[rows] + np.array(step)), occupied)
         through[rows[near]] = False
     return through
-
-
-def find_cells(wanted: NDArray[np.int64], keys: NDArray[np.int64]) -> tuple[NDArray[np.intp], Bool]:
-    """Return where in sorted packed cells the wanted ones are, and which of them are there."""
-    if not len(keys):
-        return np.zeros(len(wanted), np.intp), np.zeros(len(wanted), np.bool_)
-    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return place, np.asarray(keys[place] == wanted)

@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.kernels.voxels import pack_keys, unpack_keys
+from recon.core.keys import are_among, find_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float32, Float64
 from recon.core.values.grid import log_odds
 from recon.map.occupancy.builder import FREE_MARGIN_SIGMAS, MIN_PROBABILITY
-from recon.map.occupancy.free_space import find_cells
 from recon.map.occupancy.part import OccupancyPart
 
 _FREE: Final = np.float32(log_odds(0.35))
@@ -71,7 +71,7 @@ def find_moved(
     moved = _mostly_free(packed, counted, voxels, evidence)
     placed = sigma_m <= _PLACED * voxels.resolution_m
     occupied = pack_keys(voxels.keys[voxels.log_odds > 0])
-    occupied = np.setdiff1d(occupied, packed[moved & placed & counted])
+    occupied = np.sort(occupied[~are_among(occupied, packed[moved & placed & counted])])
     unsure = np.flatnonzero(moved & ~placed)
     reach = FREE_MARGIN_SIGMAS * sigma_m[unsure] / voxels.resolution_m
     moved[unsure] = ~_in_reach(places[unsure], reach, occupied)
@@ -83,10 +83,10 @@ def _mostly_free(
 ) -> Bool:
     """Return bool (N,), whether the voxels around points, in which there are points, are free."""
     keys, home = np.unique(packed, return_inverse=True)
-    place, known = find_cells(keys, evidence[0])
+    place, known = find_keys(keys, evidence[0])
     seen = np.full(len(keys), _MOST)
     seen[known] = evidence[1][place[known]]
-    free_in_the_end = np.isin(keys, pack_keys(voxels.keys[voxels.log_odds <= _FREE]))
+    free_in_the_end = are_among(keys, pack_keys(voxels.keys[voxels.log_odds <= _FREE]))
     seen[free_in_the_end] = np.minimum(seen[free_in_the_end], _FREE)
     tells = np.zeros(len(keys), np.bool_)
     tells[home[counted]] = True
@@ -101,7 +101,7 @@ def _mean_around(wanted: NDArray[np.int64], keys: NDArray[np.int64], values: Flo
     total, number = np.zeros((2, len(wanted)), np.float32)
     cells = unpack_keys(wanted)
     for step in _AROUND:
-        place, known = find_cells(pack_keys(cells + step), keys)
+        place, known = find_keys(pack_keys(cells + step), keys)
         total[known] += values[place[known]]
         number += known
     return np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
@@ -117,5 +117,5 @@ def _in_reach(places: Float64, reach: Float32, keys: NDArray[np.int64]) -> Bool:
     for step in _AROUND:
         gap = np.where(step < 0, inside, np.where(step > 0, 1 - inside, 0))
         close = np.flatnonzero(np.linalg.norm(gap, axis=1) <= reach)
-        near[close] |= find_cells(pack_keys(cells[close] + step), keys)[1]
+        near[close] |= find_keys(pack_keys(cells[close] + step), keys)[1]
     return near

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
+from recon.core.keys import are_among
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Float32, Float64, Int32
 from recon.map.kernels import clamped, raycast
@@ -110,7 +111,7 @@ def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints) -> Float32:
     """Return log-odds (N,) of cells (N, 3), no more than unsure where no surface crosses."""
     hit = np.flatnonzero(log_odds > _UNSURE)
     # What was hit and then looked through is no surface: a car that drove off, an outlier.
-    points = points.select(np.isin(points.keys, voxels.pack_keys(cells[hit])))
+    points = points.select(are_among(points.keys, voxels.pack_keys(cells[hit])))
     log_odds[hit[~points.cross(cells[hit])]] = _UNSURE
     return log_odds
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import apply
 from recon.core.kernels import voxels
+from recon.core.keys import are_among
 from recon.core.values.arrays import Bool, Float32, Float64, Int32
 from recon.map.kernels import facets
 from recon.map.kernels.raycast import BLOCK_BITS
@@ -39,7 +40,7 @@ class SurfacePoints:
     def in_blocks(self, blocks: NDArray[np.int64]) -> SurfacePoints:
         """Return the cells that lie in some packed blocks."""
         home = voxels.pack_keys(voxels.unpack_keys(self.keys) >> BLOCK_BITS)
-        return self.select(np.isin(home, blocks))
+        return self.select(are_among(home, blocks))
 
     def moved(self, T_new_map: Float64) -> SurfacePoints:
         """Return the sums after a rigid motion: those of a cell go to that of its moved mean point.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
+from recon.core.keys import are_among
 from recon.core.values.arrays import Bool, Float32, Int32
 from recon.map.kernels import clamped
 from recon.map.occupancy.part import OccupancyPart
@@ -88,7 +89,7 @@ class _Places:
         for other, (low, high) in enumerate(self._boxes):
             ours_low, ours_high = self._boxes[index]
             if other != index and (low <= ours_high).all() and (ours_low <= high).all():
-                found |= np.isin(keys, self._keys(other))
+                found |= are_among(keys, self._keys(other))
         return found
 
     def _keys(self, index: int) -> NDArray[np.int64]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.kernels.voxels import pack_keys, unpack_keys
+from recon.core.keys import distinct_keys
 from recon.core.values.arrays import Bool
 from recon.map.rectangle import Rectangle
 from recon.map.store.records import Store
@@ -56,7 +57,7 @@ class TileParts:
         """Yield the tiles that have places (N, 2 or 3) in them or their margin, and which ones."""
         home = np.floor(places_m[:, :2] / self.edge_m).astype(np.int64)
         # Packed into one integer, since numpy sorts rows slowly.
-        homes = unpack_keys(np.unique(pack_keys(np.pad(home, ((0, 0), (0, 1))))))
+        homes = unpack_keys(distinct_keys(pack_keys(np.pad(home, ((0, 0), (0, 1))))))
         reach = math.ceil(margin_m / self.edge_m) or 1
         steps = range(-reach, reach + 1)
         found = {(x + i, y + j) for x, y, _ in homes.tolist() for i, j in product(steps, repeat=2)}
