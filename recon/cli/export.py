@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from recon.cli import options as opt
 from recon.cli.drive import open_workers
+from recon.core.errors import SettingsError
+
+if TYPE_CHECKING:
+    from recon.export.survey import Survey
 
 
 @opt.takes_groups
@@ -17,9 +22,9 @@ def export(
     to: Annotated[
         list[str] | None,
         typer.Option(
-            help="What to make: cloud, grid, octomap, mesh; several separated by commas. A pair "
-            "has cloud and mesh.",
-            show_default="all",
+            help="What to make: cloud, grid, octomap, mesh, and on request las or laz, the cloud "
+            "for surveying programs; several separated by commas. A pair has cloud and mesh.",
+            show_default="cloud, grid, octomap, mesh",
         ),
     ] = None,
     out: opt.Out = None,
@@ -27,6 +32,29 @@ def export(
     resolution: Annotated[
         float | None,
         typer.Option(help="Cell size of grid and OctoMap in metres.", show_default="as in the run"),
+    ] = None,
+    georeference: Annotated[
+        Path | None,
+        typer.Option(
+            help="Measured positions, in whose coordinates las and laz are written: rows of time, "
+            "easting, northing and height (s, m), on the clock of the images.",
+            show_default="map coordinates",
+        ),
+    ] = None,
+    antenna: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="Where that antenna or prism is, from the left camera: metres forward, left, up.",
+            show_default="0,0,0",
+        ),
+    ] = None,
+    crs: Annotated[
+        str | None,
+        typer.Option(
+            help="Coordinate system of the positions, such as EPSG:25832.",
+            show_default="not stated",
+        ),
     ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
@@ -43,6 +71,7 @@ def export(
       recon export outputs/map/latest --to grid,mesh --format glb --out robot
       recon export outputs/map/latest --to grid --set grid.max_height_m=3.2
       recon export outputs/map/latest --to mesh --set mesh.depth=9
+      recon export outputs/site --to laz --georeference gnss.txt --crs EPSG:25832
       recon export outputs/city --to grid,octomap --workers 4
     """
     with shared.one_line_errors():
@@ -58,5 +87,27 @@ def export(
             out=out,
             threads=shared.threads,
             workers=open_workers(workers, scheduler, shared),
+            survey=_survey(georeference, antenna, crs),
         )
     shared.show(summary)
+
+
+def _survey(positions: Path | None, antenna: str | None, crs: str | None) -> Survey | None:
+    """Return what the options say of a survey.
+
+    Raises:
+        SettingsError: The offset is not three numbers, or there are no positions.
+    """
+    from recon.export.survey import Survey
+
+    if positions is None:
+        if antenna is None and crs is None:
+            return None
+        given = "--crs" if antenna is None else "--antenna"
+        raise SettingsError(
+            "there are no positions that it describes", where=given, expected="--georeference FILE"
+        )
+    offset = opt.parse_numbers(antenna or "0,0,0", "--antenna")
+    if offset is None or len(offset) != 3 or not all(map(math.isfinite, offset)):
+        raise SettingsError("not three numbers", where="--antenna", got=antenna, expected="X,Y,Z")
+    return Survey(positions, (offset[0], offset[1], offset[2]), crs)

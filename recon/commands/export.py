@@ -11,6 +11,7 @@ from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.commands.occupancy import REMADE
 from recon.core.errors import SettingsError
 from recon.export.remake import (
+    ON_REQUEST,
     PRODUCTS,
     Wanted,
     copy_file,
@@ -18,7 +19,9 @@ from recon.export.remake import (
     mesh_cloud,
     remake_map,
 )
+from recon.export.survey import Survey
 from recon.io.files import StrPath
+from recon.io.models.las import check_crs
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.sessions.spread import place_map_on
 from recon.run.batch.cluster import connect
@@ -44,6 +47,7 @@ def run_export(
     out: StrPath | None = None,
     threads: int | None = None,
     workers: BatchOptions | None = None,
+    survey: Survey | None = None,
 ) -> dict[str, Any]:
     """Make products of a finished run, and write them.
 
@@ -51,11 +55,14 @@ def run_export(
         source: Folder of a run of map, demo or pair.
         config: Its settings with changes, such as ``load_config(f"{source}/config.yaml",
             ["grid.max_height_m=3"])``; None = its own.
-        products: Which of `PRODUCTS`; empty = all that such a run can give.
+        products: Which of `PRODUCTS` and `ON_REQUEST`; empty = those of `PRODUCTS` that such a
+            run can give.
         formats: Formats of the mesh, such as ``("ply", "glb")``.
         out: Result folder; None = a new one below ``outputs/``.
         threads: Threads to use; None = all cores.
         workers: Where the tiles of grid and OctoMap are made; None = here. Changes no product.
+        survey: Measured positions in whose coordinates LAS and LAZ are written; None = in those
+            of the map.
 
     Returns:
         The figures of ``summary.json``.
@@ -67,8 +74,10 @@ def run_export(
     source = Path(source)
     check_mesh_formats(formats)
     pair = is_pair_run(source)
-    wanted = _known(products, _OF_A_PAIR if pair else PRODUCTS)
+    wanted = _known(products, _OF_A_PAIR) if pair else _known(products, PRODUCTS, ON_REQUEST)
     refuse_as_target(source, out)
+    if survey is not None:
+        _check_survey(survey, wanted)
     if workers is not None and not from_rays(wanted):
         raise SettingsError(
             "only grids and OctoMaps are made on workers",
@@ -84,11 +93,13 @@ def run_export(
     check_changes(ran, settings, (*(REMADE if from_rays(wanted) else ()), "mesh"))
     with Run("export", out, settings, threads=threads) as run:
         if workers is None:
-            return remake_map(mapped, settings, Wanted(wanted, settings.mesh, formats), run)
+            what = Wanted(wanted, settings.mesh, formats, survey=survey)
+            return remake_map(mapped, settings, what, run)
         with connect(workers.scheduler, workers.workers_here) as cluster:
             folder = run.state("tiles").resolve()
             place = partial(place_map_on, folder=folder, each=cluster.each, workers=cluster.at_once)
-            return remake_map(mapped, settings, Wanted(wanted, settings.mesh, formats, place), run)
+            what = Wanted(wanted, settings.mesh, formats, place, survey)
+            return remake_map(mapped, settings, what, run)
 
 
 def _export_pair(
@@ -105,20 +116,39 @@ def _export_pair(
     return figures
 
 
-def _known(products: Sequence[str], possible: Sequence[str]) -> Sequence[str]:
-    """Return the requested products, or all.
+def _known(
+    products: Sequence[str], usual: Sequence[str], on_request: Sequence[str] = ()
+) -> Sequence[str]:
+    """Return the requested products, or the usual ones.
 
     Raises:
         SettingsError: One is unknown, or not possible for such a run.
     """
     for product in products:
-        if product not in possible:
-            unknown = product not in PRODUCTS
+        if product not in (*usual, *on_request):
+            unknown = product not in (*PRODUCTS, *ON_REQUEST)
             raise SettingsError(
                 "unknown product" if unknown else "a pair has no such product",
                 where="--to",
                 got=product,
-                expected=", ".join(possible),
+                expected=", ".join((*usual, *on_request)),
                 hint=None if unknown else "recon map makes it of a drive",
             )
-    return list(dict.fromkeys(products)) or possible
+    return list(dict.fromkeys(products)) or usual
+
+
+def _check_survey(survey: Survey, products: Sequence[str]) -> None:
+    """Refuse a coordinate system that there is not, and one for nothing.
+
+    Raises:
+        SettingsError: So it is.
+    """
+    if not set(products) & set(ON_REQUEST):
+        raise SettingsError(
+            "only LAS and LAZ have the coordinates of a survey",
+            where="--to",
+            got=", ".join(products),
+            expected=" or ".join(ON_REQUEST),
+        )
+    if survey.crs is not None:
+        check_crs(survey.crs)

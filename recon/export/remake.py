@@ -8,6 +8,8 @@ from pathlib import Path
 from shutil import copyfile
 from typing import Any, Final
 
+import numpy as np
+
 from recon.core.values import FREE, OCCUPIED, OccupancyGrid, RectifiedCamera
 from recon.core.values.cloud import Frame
 from recon.export.finished import (
@@ -27,18 +29,23 @@ from recon.export.mesh import (
 )
 from recon.export.mesh.pieces import WHOLE, export_mesh
 from recon.export.octomap import export_octomap
+from recon.export.survey import Survey, georeference
 from recon.io.atomic import atomic_path
 from recon.io.files import reading
+from recon.io.models.las import SUFFIXES as LAS
+from recon.io.models.las import write_las
 from recon.io.models.mesh import read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
-from recon.io.models.ply import read_ply, write_ply
+from recon.io.models.ply import read_ply, read_ply_pieces, write_ply
 from recon.map.ground.axes import base_axes
 from recon.map.settings import DriveSettings
 from recon.run.finished import CLOUD, MAPPED_BY, UNTRUSTED, FinishedRun
 from recon.run.run import Run
 
 PRODUCTS: Final = ("cloud", "grid", "octomap", "mesh")
-"""What `remake_map` can make."""
+"""What `remake_map` makes unless told otherwise."""
+ON_REQUEST: Final = LAS
+"""What it makes, too."""
 _LAYER: Final = "mesh/cloud.ply"
 
 
@@ -47,16 +54,18 @@ class Wanted:
     """What is made of a map.
 
     Attributes:
-        products: Any of `PRODUCTS`.
+        products: Any of `PRODUCTS` and `ON_REQUEST`.
         mesh: Settings of the mesh.
         formats: Formats of the mesh.
         place: Cuts the map into tiles where its rays are needed.
+        survey: In whose coordinates LAS and LAZ are written; None = in those of the map.
     """
 
     products: Collection[str]
     mesh: MeshSettings
     formats: Sequence[str] = ("ply",)
     place: Place = place_here
+    survey: Survey | None = None
 
 
 def remake_map(
@@ -90,6 +99,9 @@ def remake_map(
     if "cloud" in products:
         copy_file(source.folder / CLOUD, run.path(CLOUD))
         figures["points"] = sum(len(tile.cloud) for tile in found.tiles)
+    if any(suffix in products for suffix in LAS):
+        with run.stage("las"):
+            figures |= _las(source, wanted, run, warnings)
     if "octomap" in products:
         with run.stage("octomap"):
             figures["voxels"], missing = export_octomap(found.tiles, run.path("map/octomap"))
@@ -164,6 +176,21 @@ def _grid(source: FinishedRun, found: FinishedMap, run: Run, warnings: list[str]
         "camera_height_m": written.camera_height_m,
         "T_base_camera": base_axes(source.T_map_world, written.camera_height_m).tolist(),
     }
+
+
+def _las(source: FinishedRun, wanted: Wanted, run: Run, warnings: list[str]) -> dict[str, Any]:
+    """Write the cloud as LAS or LAZ; its figures."""
+    T_file_map, crs, figures = np.eye(4), None, dict[str, Any]()
+    if wanted.survey is not None:
+        placed = georeference(source, wanted.survey)
+        T_file_map, crs = placed.T_survey_map, wanted.survey.crs
+        figures["georeference"] = placed.figures()
+        warnings += placed.warnings()
+    for suffix in (suffix for suffix in LAS if suffix in wanted.products):
+        pieces = read_ply_pieces(source.folder / CLOUD, sigma=True)
+        path = run.path(f"map/cloud.{suffix}")
+        figures["points"] = write_las(path, pieces, T_file_map, crs)
+    return figures
 
 
 def _mesh(

@@ -18,6 +18,7 @@ from recon.core.values import OCCUPIED, RectifiedCamera, StereoPair
 from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import read_ply
 from recon.io.occupancy.nav2 import read_nav2
+from recon.io.trajectory import read_tum
 from recon.run.batch.cluster import Cluster
 from recon.run.batch.work import BatchOptions
 from recon.sources.pair_input import PairInput
@@ -69,6 +70,43 @@ def test_products_whose_tiles_workers_make_are_the_same_files(
     for name in ("map/grid.pgm", "map/grid.yaml", "map/octomap.bt", "map/octomap.ot"):
         assert (out / name).read_bytes() == (small_demo / name).read_bytes()
     assert not (out / ".partial").exists()
+
+
+def test_the_cloud_comes_as_laz_in_the_coordinates_of_a_survey(
+    small_demo: Path, tmp_path: Path
+) -> None:
+    laspy = pytest.importorskip("laspy")
+    path, origin = read_tum(small_demo / "trajectory_map_base_tum.txt"), np.array([4e5, 5e6, 100])
+    there = np.column_stack([path.timestamps_s, path.positions_m + origin])
+    np.savetxt(tmp_path / "gnss.txt", there, fmt="%.6f")
+    height_m = json.loads((small_demo / "summary.json").read_text())["camera_height_m"]
+    words = ["--georeference", tmp_path / "gnss.txt", f"--antenna=0,0,{-height_m}"]
+    out = tmp_path / "out"
+    done = run("export", small_demo, "--to", "laz", *words, "--crs", "EPSG:25832", "--out", out)
+    assert done.code == 0, done.err
+    found, cloud = laspy.read(out / "map/cloud.laz"), read_ply(small_demo / "map/cloud.ply")
+    expected = cloud.xyz.astype(np.float64) + origin
+    assert np.abs(found.xyz - expected).max() < 0.002
+    assert found.header.parse_crs().to_epsg() == 25832
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["georeference"]["misfit_rms_m"] < 0.001
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--to", "laz", "--crs", "EPSG:25832"], "--crs: there are no positions"),
+        (["--to", "laz", "--georeference", "none.txt", "--antenna", "1,2"], "not three numbers"),
+        (["--to", "grid", "--georeference", "none.txt"], "only LAS and LAZ"),
+        (["--to", "laz", "--georeference", "none.txt", "--crs", "EPSG:4326"], "not metres"),
+        (["--to", "laz", "--georeference", "none.txt"], "none.txt"),
+    ],
+)
+def test_what_says_nothing_of_a_survey_is_refused(
+    words: list[str], expected: str, small_demo: Path, tmp_path: Path
+) -> None:
+    assert_refused(run("export", small_demo, *words, "--out", tmp_path / "out"), expected)
+    assert not (tmp_path / "out").exists()
 
 
 def test_workers_that_would_have_nothing_to_do_are_refused(

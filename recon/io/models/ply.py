@@ -110,8 +110,10 @@ def read_ply(path: StrPath) -> PointCloud:
     return kept
 
 
-def read_ply_pieces(path: StrPath, points_each: int = _PIECE_POINTS) -> Iterator[PointCloud]:
-    """Read positions, normals and colours like `read_ply`, one piece at a time.
+def read_ply_pieces(
+    path: StrPath, points_each: int = _PIECE_POINTS, *, sigma: bool = False
+) -> Iterator[PointCloud]:
+    """Read positions, normals, colours and perhaps sigma like `read_ply`, one piece at a time.
 
     Other fields are left out, as the meaning of ``quality`` depends on all its values.
 
@@ -121,7 +123,10 @@ def read_ply_pieces(path: StrPath, points_each: int = _PIECE_POINTS) -> Iterator
     vertex: Table | None = None
     points, kept = 0, 0
     for header, vertex in read_table_pieces(path, "vertex", points_each):
-        piece = _finite(_shape(_vertices(vertex, path), header))
+        piece = _shape(_vertices(vertex, path), header)
+        if sigma:
+            piece = replace(piece, sigma_m=_scalar(vertex, "sigma", np.float32))
+        piece = _finite(piece)
         points, kept = points + len(vertex), kept + len(piece)
         yield piece
     _vertices(vertex, path)

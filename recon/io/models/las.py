@@ -1,0 +1,107 @@
+"""Point clouds as LAS and LAZ files (extra ``survey``), the formats of surveying programs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from recon.core.errors import SettingsError
+from recon.core.geometry.se3 import apply
+from recon.core.optional import require
+from recon.core.values import PointCloud
+from recon.core.values.arrays import Float64
+from recon.io.atomic import atomic_path
+from recon.io.files import StrPath
+
+SUFFIXES: Final = ("las", "laz")
+_EXTRA: Final = "survey"
+_COLOURED: Final = 7
+"""Point format with colours, of LAS 1.4."""
+_STEP_M: Final = 0.001
+_FULL_COLOUR: Final = 257
+"""Colours have 16 bits: 255 becomes 65535."""
+
+
+def write_las(
+    path: StrPath, clouds: Iterable[PointCloud], T_to_from: Float64, crs: str | None = None
+) -> int:
+    """Write clouds into one LAS 1.4 file, atomically; compressed if it ends in ``.laz``.
+
+    Positions are rounded to millimetres; colours, and the standard deviation of the depth as the
+    extra dimension ``sigma``, are written where the clouds have them.
+
+    Args:
+        path: The file.
+        clouds: Clouds in one frame; one is in memory at a time.
+        T_to_from: float64 (4, 4), from their frame to the coordinates of the file, in doubles.
+        crs: Coordinate system of the file, see `check_crs`; None = not stated.
+
+    Returns:
+        The number of points.
+
+    Raises:
+        MissingDependencyError: laspy is not installed.
+        SettingsError: There is no such coordinate system.
+        OutputError: The file cannot be written.
+
+    Ref:
+        ASPRS, "LAS specification 1.4 - R15", 2019.
+    """
+    laspy = require("laspy", extra=_EXTRA)
+    header = laspy.LasHeader(point_format=_COLOURED, version="1.4")
+    header.generating_software = "recon"
+    header.scales, header.offsets = np.full(3, _STEP_M), np.floor(T_to_from[:3, 3])
+    sigma = laspy.ExtraBytesParams("sigma", np.float32, "depth, 1 sigma, metres")
+    header.add_extra_dims([sigma])
+    if crs is not None:
+        header.add_crs(check_crs(crs))
+    points = 0
+    packed = Path(path).suffix == ".laz"
+    with (
+        atomic_path(path) as temporary,
+        laspy.open(temporary, mode="w", header=header, do_compress=packed) as file,
+    ):
+        for cloud in clouds:
+            file.write_points(_record(laspy, header, cloud, T_to_from))
+            points += len(cloud)
+    return points
+
+
+def check_crs(crs: str) -> Any:
+    """Return the coordinate system of a name such as ``EPSG:25832``.
+
+    Raises:
+        MissingDependencyError: pyproj is not installed.
+        SettingsError: There is none of that name, or its coordinates are not metres to the east,
+            to the north (and up).
+    """
+    pyproj = require("pyproj", extra=_EXTRA)
+    try:
+        found = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError as error:
+        raise SettingsError(
+            "unknown coordinate system", where="--crs", got=crs, expected="such as EPSG:25832"
+        ) from error
+    units = {axis.unit_name for axis in found.axis_info}
+    if not found.is_projected or units != {"metre"}:
+        raise SettingsError(
+            "the coordinates of this system are not metres to the east and north",
+            where="--crs",
+            got=f"{crs} ({found.name}; {', '.join(sorted(units))})",
+            expected="a projected system, such as EPSG:25832",
+        )
+    return found
+
+
+def _record(laspy: Any, header: Any, cloud: PointCloud, T_to_from: Float64) -> Any:
+    """Return the points of a cloud, as laspy writes them."""
+    record = laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header)
+    record.x, record.y, record.z = apply(T_to_from, cloud.xyz.astype(np.float64)).T
+    if cloud.rgb is not None:
+        record.red, record.green, record.blue = cloud.rgb.T.astype(np.uint16) * _FULL_COLOUR
+    if cloud.sigma_m is not None:
+        record["sigma"] = cloud.sigma_m
+    return record
