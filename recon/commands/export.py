@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.commands.occupancy import REMADE
 from recon.core.errors import SettingsError
 from recon.export.remake import (
     ON_REQUEST,
-    PRODUCTS,
     Wanted,
     copy_file,
     from_rays,
+    known_products,
     mesh_cloud,
     remake_map,
 )
@@ -34,8 +34,6 @@ from recon.run.finished import (
     refuse_as_target,
 )
 from recon.run.run import Run
-
-_OF_A_PAIR: Final = ("cloud", "mesh")
 
 
 def run_export(
@@ -74,7 +72,7 @@ def run_export(
     source = Path(source)
     check_mesh_formats(formats)
     pair = is_pair_run(source)
-    wanted = _known(products, _OF_A_PAIR) if pair else _known(products, PRODUCTS, ON_REQUEST)
+    wanted = known_products(products, pair=pair)
     refuse_as_target(source, out)
     if survey is not None:
         _check_survey(survey, wanted)
@@ -114,27 +112,6 @@ def _export_pair(
         figures |= mesh_cloud(cloud, camera, config.mesh, run, formats)
     run.finish(figures, source=str(source), inputs=[cloud])
     return figures
-
-
-def _known(
-    products: Sequence[str], usual: Sequence[str], on_request: Sequence[str] = ()
-) -> Sequence[str]:
-    """Return the requested products, or the usual ones.
-
-    Raises:
-        SettingsError: One is unknown, or not possible for such a run.
-    """
-    for product in products:
-        if product not in (*usual, *on_request):
-            unknown = product not in (*PRODUCTS, *ON_REQUEST)
-            raise SettingsError(
-                "unknown product" if unknown else "a pair has no such product",
-                where="--to",
-                got=product,
-                expected=", ".join((*usual, *on_request)),
-                hint=None if unknown else "recon map makes it of a drive",
-            )
-    return list(dict.fromkeys(products)) or usual
 
 
 def _check_survey(survey: Survey, products: Sequence[str]) -> None:

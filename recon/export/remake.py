@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from recon.core.errors import SettingsError
 from recon.core.values import FREE, OCCUPIED, OccupancyGrid, RectifiedCamera
 from recon.core.values.cloud import Frame
 from recon.export.finished import (
@@ -46,6 +47,7 @@ PRODUCTS: Final = ("cloud", "grid", "octomap", "mesh")
 """What `remake_map` makes unless told otherwise."""
 ON_REQUEST: Final = LAS
 """What it makes, too."""
+_OF_A_PAIR: Final = ("cloud", "mesh")
 _LAYER: Final = "mesh/cloud.ply"
 
 
@@ -123,6 +125,26 @@ def remake_map(
     figures["warnings"] = warnings
     run.finish(figures, source=str(source.folder), inputs=found.files, record=record)
     return figures
+
+
+def known_products(products: Sequence[str], *, pair: bool) -> Sequence[str]:
+    """Return the requested products, or the usual ones.
+
+    Raises:
+        SettingsError: One is unknown, or not possible for a run of `recon pair`.
+    """
+    possible = _OF_A_PAIR if pair else (*PRODUCTS, *ON_REQUEST)
+    for product in products:
+        if product not in possible:
+            unknown = product not in (*PRODUCTS, *ON_REQUEST)
+            raise SettingsError(
+                "unknown product" if unknown else "a pair has no such product",
+                where="--to",
+                got=product,
+                expected=", ".join(possible),
+                hint=None if unknown else "recon map makes it of a drive",
+            )
+    return list(dict.fromkeys(products)) or (_OF_A_PAIR if pair else PRODUCTS)
 
 
 def from_rays(products: Collection[str]) -> bool:
