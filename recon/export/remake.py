@@ -206,7 +206,7 @@ def _las(source: FinishedRun, wanted: Wanted, run: Run, warnings: list[str]) -> 
     if wanted.survey is not None:
         placed = georeference(source, wanted.survey)
         T_file_map, crs = placed.T_survey_map, wanted.survey.crs
-        figures["georeference"] = placed.figures()
+        figures |= placed.figures()
         warnings += placed.warnings()
     for suffix in (suffix for suffix in LAS if suffix in wanted.products):
         pieces = read_ply_pieces(source.folder / CLOUD, sigma=True)

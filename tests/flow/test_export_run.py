@@ -89,7 +89,7 @@ def test_the_cloud_comes_as_laz_in_the_coordinates_of_a_survey(
     assert np.abs(found.xyz - expected).max() < 0.002
     assert found.header.parse_crs().to_epsg() == 25832
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["georeference"]["misfit_rms_m"] < 0.001
+    assert summary["misfit_rms_m"] < 0.001
 
 
 @pytest.mark.parametrize(
