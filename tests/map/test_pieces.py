@@ -13,8 +13,8 @@ from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.drive.workspace import Workspace, session_info
 from recon.map.store.map import Map
 from recon.sources.part import SourcePart
-from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
+from tests.scenery.film import Film, film
 
 STREET = StreetScene(
     frames=26, width_px=256, height_px=96, focal_px=150.0, seed=5, smooth_edges=False
@@ -33,8 +33,12 @@ def test_pieces_have_every_frame_once_behind_their_leads(frames: int, workers: i
     assert len(pieces) == 1 or len(pieces) % workers == 0 or len(pieces) == frames // (2 * LEAD)
 
 
-def test_a_part_of_a_source_has_its_frames() -> None:
-    source = SyntheticSource(STREET)
+@pytest.fixture(scope="module")
+def source() -> Film:
+    return film(STREET)
+
+
+def test_a_part_of_a_source_has_its_frames(source: Film) -> None:
     part = SourcePart(source, 5, 9, 2)
     times = [pair.timestamp_s for pair in source.frames(5)][:4]
     assert [pair.timestamp_s for pair in part] == times
@@ -48,13 +52,13 @@ def config() -> ReconConfig:
 
 
 @pytest.fixture(scope="module")
-def whole(config: ReconConfig) -> MappedSequence:
-    return map_sequence(SyntheticSource(STREET), config, workspace=Workspace(threads=1))
+def whole(source: Film, config: ReconConfig) -> MappedSequence:
+    return map_sequence(source, config, workspace=Workspace(threads=1))
 
 
 @pytest.fixture(scope="module")
-def joined(config: ReconConfig) -> MappedSequence:
-    source, work = SyntheticSource(STREET), Workspace(threads=1)
+def joined(source: Film, config: ReconConfig) -> MappedSequence:
+    work = Workspace(threads=1)
 
     def mapped() -> Iterator[Map]:
         for piece in PIECES:

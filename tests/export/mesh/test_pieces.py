@@ -164,7 +164,8 @@ def test_tiles_with_too_few_points_are_reported_in_one_line(store: Tiles, tmp_pa
     stray = np.array([[60, 60, 0], [61, 60, 0], [90, 90, 0]], dtype=np.float32)
     cloud = street().select(np.arange(3))
     store.put_cloud(PointCloud(stray, rgb=cloud.rgb, normals=cloud.normals, frame="map"))
-    warnings = written(store, tmp_path / "out")[2]
+    coarse = SETTINGS.model_copy(update={"max_depth": 5})
+    warnings = written(store, tmp_path / "out", coarse)[2]
     assert len(warnings) == 1
     assert warnings[0].startswith("no surface in 2 of 4 tiles, 0.0% of the points (too few points")
 
@@ -193,7 +194,8 @@ def mapped_street(folder: Path) -> Path:
 
 
 def mesh_of(run: Path, *settings: str) -> dict[str, Any]:
-    config = load_config(None, ["mesh.tile_m=8", *settings])
+    # What is written is asked, not how fine it is.
+    config = load_config(None, ["mesh.tile_m=8", "mesh.max_depth=5", *settings])
     return run_mesh(run, config, out=run.parent / "mesh", formats=("ply", "glb"))
 
 
