@@ -13,7 +13,11 @@ import pytest
 
 import recon
 
-compiled = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="kernels are not compiled")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(3600),  # two minutes of a core of its own; others may have most of it
+    pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="kernels are not compiled"),
+]
 
 NOT_IN_CACHE = """
 import importlib, pkgutil
@@ -80,14 +84,10 @@ def printed(code: str, environment: dict[str, str], *arguments: str) -> list[str
     return done.stdout.splitlines()
 
 
-@compiled
-@pytest.mark.slow
 def test_every_kernel_is_compiled(environment: dict[str, str]) -> None:
     assert printed(NOT_IN_CACHE, environment) == []
 
 
-@compiled
-@pytest.mark.slow
 def test_pairs_and_drives_from_files_compile_nothing_more(
     environment: dict[str, str], tmp_path: Path
 ) -> None:

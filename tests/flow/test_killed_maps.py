@@ -24,7 +24,7 @@ KILLS = 6
 PLAYED_S = 16.0
 """Long enough for some commits."""
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
 
 @pytest.fixture(scope="module")

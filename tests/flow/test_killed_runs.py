@@ -19,11 +19,14 @@ from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti
 
-STREET = StreetScene(frames=24, width_px=256, height_px=96, focal_px=150.0, smooth_edges=False)
+STREET = StreetScene(frames=16, width_px=256, height_px=96, focal_px=150.0, smooth_edges=False)
 """Large enough that every pose is trusted."""
 SETTINGS = ["checkpoints.every_frames=5", "submaps.length_m=4", "submaps.tile_m=12.8"]
 BREAKER = Path(__file__).with_name("break_at_write.py")
 KILLS = 10
+
+# A dozen runs in a test: what the machine does beside them may take most of it.
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 
 
 class Runs:
@@ -89,7 +92,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
     return Runs(tmp_path_factory.mktemp("runs"))
 
 
-@pytest.mark.slow
 def test_runs_killed_at_ten_random_moments_give_the_same_files(runs: Runs, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     kills = 0
@@ -106,7 +108,6 @@ def test_runs_killed_at_ten_random_moments_give_the_same_files(runs: Runs, tmp_p
     pytest.fail(f"only {kills} runs were killed before they were done")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("what", ["mapping", "exporting", "moving", "done"])
 def test_runs_killed_at_a_write_give_the_same_files(runs: Runs, tmp_path: Path, what: str) -> None:
     last = {
@@ -122,7 +123,6 @@ def test_runs_killed_at_a_write_give_the_same_files(runs: Runs, tmp_path: Path, 
         runs.finish(out)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("what", ["beginning", "mapping", "exporting"])
 def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
     runs: Runs, tmp_path: Path, what: str
@@ -138,7 +138,6 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
     runs.finish(tmp_path / "run")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("command", ["mesh", "occupancy"])
 def test_what_is_made_of_a_run_stays_as_it_was_when_it_cannot_be_made_again(
     runs: Runs, tmp_path: Path, command: str
