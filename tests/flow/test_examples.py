@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -20,7 +20,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 def kitti_drive(tmp_path: Path) -> Path:
     """Six frames of the synthetic street as a KITTI folder."""
     folder = tmp_path / "drive"
-    street = StreetSettings(frames=6, width_px=256, height_px=96, focal_px=150.0)
+    street = StreetScene(frames=6, width_px=256, height_px=96, focal_px=150.0, smooth_edges=False)
     write_kitti(SyntheticSource(street), folder)
     return folder
 

@@ -24,7 +24,12 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What the benchmark prints."""
     drive = tmp_path_factory.mktemp("drive")
     street = StreetScene(
-        frames=4, width_px=256, height_px=96, focal_px=150.0, speed_m_per_frame=0.4
+        frames=4,
+        width_px=256,
+        height_px=96,
+        focal_px=150.0,
+        speed_m_per_frame=0.4,
+        smooth_edges=False,
     )
     write_kitti(SyntheticSource(street), drive)
     options = ["--json", "--rays", "3000", "--rounds", "1", "--drive", str(drive)]

@@ -10,9 +10,9 @@ from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 
-STREET = StreetSettings(frames=4, width_px=320, height_px=120, focal_px=180.0)
+STREET = StreetScene(frames=4, width_px=320, height_px=120, focal_px=180.0, smooth_edges=False)
 
 
 @pytest.fixture(scope="module")

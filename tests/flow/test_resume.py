@@ -21,11 +21,11 @@ from recon.map.store.records import Store
 from recon.run.progress import SILENT, Silent
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
 from tests.scenery.kitti import write_kitti
 
-STREET = StreetSettings(frames=24, width_px=192, height_px=72, focal_px=110.0)
-SETTINGS = ["checkpoints.every_frames=5", "submaps.length_m=4", "submaps.tile_m=12.8"]
+STREET = StreetScene(frames=24, width_px=192, height_px=72, focal_px=110.0, smooth_edges=False)
+SETTINGS = ["checkpoints.every_frames=5", "submaps.length_m=4", "submaps.tile_m=25.6"]
 FILES = [
     "trajectory_kitti.txt",
     "trajectory_tum.txt",
@@ -82,6 +82,21 @@ def unbroken(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
     return _content(folder)
 
 
+@pytest.fixture(scope="module")
+def broken_off(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run that was interrupted at its thirteenth frame; it must not be changed."""
+    folder = tmp_path_factory.mktemp("broken_off")
+    with pytest.raises(KeyboardInterrupt):
+        _run(drive, folder, _Breaks(12, KeyboardInterrupt()))
+    return folder
+
+
+@pytest.fixture
+def begun(broken_off: Path, tmp_path: Path) -> Path:
+    """A copy of that folder."""
+    return Path(shutil.copytree(broken_off, tmp_path / "run"))
+
+
 @pytest.mark.parametrize("frame", [0, 4, 13, 23])
 def test_an_interrupted_run_goes_on_to_the_same_files(
     drive: Path, unbroken: dict[str, bytes], tmp_path: Path, frame: int
@@ -112,12 +127,10 @@ def test_bad_input_leaves_nothing_to_resume(drive: Path, tmp_path: Path) -> None
 
 
 def test_other_settings_another_source_and_other_poses_are_refused(
-    drive: Path, tmp_path: Path
+    drive: Path, begun: Path, tmp_path: Path
 ) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        _run(drive, tmp_path / "run", _Breaks(12, KeyboardInterrupt()))
     source = open_source(drive)
-    options = MapOptions(audit=False, out=tmp_path / "run", mesh=False, resume=True)
+    options = MapOptions(audit=False, out=begun, mesh=False, resume=True)
     with pytest.raises(SettingsError, match=r"other settings.*fusion.voxel_m = 0.2, expected 0.1"):
         run_map(source, _config("fusion.voxel_m=0.2"), options)
     other = shutil.copytree(drive, tmp_path / "other")
@@ -127,14 +140,14 @@ def test_other_settings_another_source_and_other_poses_are_refused(
     assert source.truth is not None
     known = MapOptions(
         audit=False,
-        out=tmp_path / "run",
+        out=begun,
         mesh=False,
         resume=True,
         known_poses=source.truth.trajectory,
     )
     with pytest.raises(SettingsError, match="other poses"):
         run_map(source, _config(), known)
-    assert (tmp_path / "run" / ".partial").is_dir()
+    assert (begun / ".partial").is_dir()
 
 
 def test_without_an_unfinished_run_there_is_nothing_to_resume(drive: Path, tmp_path: Path) -> None:
@@ -175,10 +188,8 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on_when_there_is_room(
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "empty", "another"])
-def test_a_damaged_map_is_one_line_and_stays(drive: Path, tmp_path: Path, damage: str) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        _run(drive, tmp_path, _Breaks(12, KeyboardInterrupt()))
-    path = tmp_path / ".partial" / ".state" / "map.recon"
+def test_a_damaged_map_is_one_line_and_stays(drive: Path, begun: Path, damage: str) -> None:
+    path = begun / ".partial" / ".state" / "map.recon"
     content = bytearray(path.read_bytes())
     for place in range(100, len(content), 3000):
         content[place] ^= 0xFF
@@ -190,17 +201,15 @@ def test_a_damaged_map_is_one_line_and_stays(drive: Path, tmp_path: Path, damage
     else:
         path.write_bytes(damaged[damage])
     with pytest.raises(ReconError, match=r"without --resume") as caught:
-        _run(drive, tmp_path, resume=True)
+        _run(drive, begun, resume=True)
     assert "\n" not in str(caught.value)
-    assert str(tmp_path) in str(caught.value)
+    assert str(begun) in str(caught.value)
     assert path.exists()
 
 
 @pytest.mark.parametrize("kind", ["frames", "state", "submap_entry", "session", "axes"])
-def test_a_missing_or_changed_record_is_one_line(drive: Path, tmp_path: Path, kind: str) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        _run(drive, tmp_path, _Breaks(12, KeyboardInterrupt()))
-    with Store.open(tmp_path / ".partial" / ".state" / "map.recon") as store:
+def test_a_missing_or_changed_record_is_one_line(drive: Path, begun: Path, kind: str) -> None:
+    with Store.open(begun / ".partial" / ".state" / "map.recon") as store:
         first = store.keys(kind)[0]
         if kind in ("state", "axes", "session"):
             store.put(kind, first, {"a": 1})
@@ -208,7 +217,7 @@ def test_a_missing_or_changed_record_is_one_line(drive: Path, tmp_path: Path, ki
             store.delete(kind, first)
         store.commit()
     with pytest.raises(ReconError, match=r"map.recon: .*without --resume") as caught:
-        _run(drive, tmp_path, resume=True)
+        _run(drive, begun, resume=True)
     assert "\n" not in str(caught.value)
 
 
