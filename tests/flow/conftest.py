@@ -16,6 +16,7 @@ from recon.sources import synthetic
 from recon.street.settings import StreetScene
 from tests.scenery.figures import leave_figures_blank
 from tests.scenery.film import RIG, Film, film
+from tests.scenery.made_once import made_once
 
 SMALL_STREET = {"frames": 12, "width_px": 256, "height_px": 96, "focal_px": 150.0}
 
@@ -44,9 +45,11 @@ def street_film() -> Film:
 def small_demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run; it must not be changed."""
     config = load_config(None, [f"street.{key}={value}" for key, value in SMALL_STREET.items()])
-    out = tmp_path_factory.mktemp("demo") / "run"
-    options = MapOptions(audit=False, command="demo", out=out, mesh=False)
-    with pytest.MonkeyPatch.context() as patch:
-        leave_figures_blank(patch)
-        run_map(demo_source(config), config, options)
-    return out
+
+    def make(out: Path) -> None:
+        options = MapOptions(audit=False, command="demo", out=out, mesh=False)
+        with pytest.MonkeyPatch.context() as patch:
+            leave_figures_blank(patch)
+            run_map(demo_source(config), config, options)
+
+    return made_once(tmp_path_factory, "demo", make)

@@ -26,7 +26,7 @@ from recon.sources.protocol import StereoSource
 from recon.street.settings import StreetScene
 from tests.scenery.film import RIG, Film, film
 
-FIRST, FRAMES = 5, 14
+FIRST, FRAMES = 4, 11
 OPTIONS = MapOptions(mesh=False, audit=False)
 
 
@@ -129,7 +129,7 @@ def test_a_drive_is_taken_out_of_a_map_that_began_with_chosen_frames(
     merged: Path, tmp_path: Path
 ) -> None:
     run = Path(shutil.copytree(merged, tmp_path / "run"))
-    chosen = load_config(run / "config.yaml", ["source.end=14"]).model_dump(mode="json")
+    chosen = load_config(run / "config.yaml", [f"source.end={FRAMES}"]).model_dump(mode="json")
     (run / "config.yaml").write_text(yaml.safe_dump(chosen))
     done = CliRunner().invoke(app, ["map", "--into", str(run), "--remove", "2", "--no-mesh"])
     assert done.exit_code == 0, done.output
