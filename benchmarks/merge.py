@@ -1,8 +1,9 @@
 """Several drives in one map: a drive in two halves, a second drive on another day, and look-alikes.
 
 - `halves`: a real drive cut into two that overlap, mapped apart and merged, beside one run of it.
-- `second`: a rendered street driven twice, with another light, other parked cars and 2 m aside: the
-  merged map and each of the two against the surface that the second drive would have found.
+- `second`: a rendered street driven twice, with another light, other parked cars and 2 m aside, or
+  (`--lane opposite`) back on the other side: the merged map and each of the two against the surface
+  that the second drive would have found, and how many of its frames find themselves in the first.
 - `alike`: keyframes of streets that look alike but are elsewhere: links that should not be.
 
 Example: python benchmarks/merge.py --json
@@ -24,6 +25,7 @@ from unittest.mock import patch
 import numpy as np
 
 from recon.commands.config import ReconConfig, load_config
+from recon.commands.localize import run_localize
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions, MapRequest
 from recon.commands.merge import run_merge
@@ -44,11 +46,15 @@ from recon.places.drift import path_lengths
 from recon.places.keyframe import make_keyframe
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
+from recon.street.path import LANE_M
 from recon.street.settings import StreetScene
 from recon.street.street import StreetWorld, build_street
 
 THRESHOLD_M = 0.2
-ASIDE_M = 2.0
+LATERAL_M = {"aside": LANE_M + 2.0, "opposite": -LANE_M}
+"""Of the second drive, to the left of the centre line."""
+TURNED = np.diag([-1.0, 1.0, -1.0, 1.0])
+"""From the camera that looks back to the one that looks ahead."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -58,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if "halves" in options.parts and options.drive is not None:
             result["halves"] = halves(options.drive, options.overlap, Path(folder))
         if "second" in options.parts:
-            result["second"] = second(options.seed, options.frames, options.width, Path(folder))
+            result["second"] = second(options, Path(folder))
     if "alike" in options.parts:
         result["alike"] = alike(options.tries, options.width)
     print(json.dumps(result, indent=2))
@@ -73,6 +79,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=3, help="another seed is another street")
     parser.add_argument("--frames", type=int, default=40, help="frames of each rendered drive")
     parser.add_argument("--width", type=int, default=480, help="width of the rendered pictures")
+    parser.add_argument("--lane", choices=LATERAL_M, default="aside", help="of the second drive")
     parser.add_argument("--tries", type=int, default=200, help="pairs of streets that look alike")
     return parser.parse_args(arguments)
 
@@ -148,16 +155,23 @@ def overlaid(one: OccupancyGrid, other: OccupancyGrid) -> tuple[np.ndarray, np.n
     return found[0], found[1]
 
 
-def second(seed: int, frames: int, width: int, folder: Path) -> dict[str, Any]:
+def second(asked: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """A street on two days, and the map of both."""
     config = load_config(None, [])
-    days = [street_on(day, seed, frames, width) for day in (0, 1)]
+    days = [street_on(lane, asked) for lane in (None, asked.lane)]
     for number, source in enumerate(days):
         options = MapOptions(out=folder / f"day{number}", mesh=False, audit=False)
         run_map(source, config, options)
     options = MapOptions("merge", folder / "days", mesh=False)
     summary = run_merge([folder / "day0", folder / "day1"], None, options)
-    return {"links": summary["links"], **compare_days(days, folder, config)}
+    options = MapOptions("localize", folder / "found")
+    found = run_localize(days[1], folder / "day0", config, options).summary
+    return {
+        "links": summary["links"],
+        "warnings": summary["warnings"],
+        "localized": {name: found[name] for name in ("frames", "frames_tracking", "warnings")},
+        **compare_days(days, folder, config),
+    }
 
 
 def compare_days(
@@ -187,38 +201,40 @@ def compare_days(
     return {"voxel_m": config.fusion.voxel_m, "clouds": rows}
 
 
-def street_on(day: int, seed: int, frames: int, width: int) -> SyntheticSource:
-    """The street on a day: on the second one other cars are parked, and the sun is elsewhere."""
+def street_on(lane: str | None, asked: argparse.Namespace) -> SyntheticSource:
+    """The street on the first day (None), or on the second one in a lane."""
     settings = StreetScene(
-        seed=seed,
-        frames=frames,
-        width_px=width,
-        height_px=width * 3 // 8,
-        focal_px=width * 0.5625,
+        seed=asked.seed,
+        frames=asked.frames,
+        width_px=asked.width,
+        height_px=asked.width * 3 // 8,
+        focal_px=asked.width * 0.5625,
         smooth_edges=False,
     )
     source = SyntheticSource(settings)
-    world = world_on(day, settings)
+    world = build_street(settings) if lane is None else world_on_second_day(lane, settings)
     source.__dict__["world"] = world  # in place of the cached one
     return source
 
 
-def world_on(day: int, settings: StreetScene) -> StreetWorld:
-    """A street world with the cars, the light and the lane of a day."""
+def world_on_second_day(lane: str, settings: StreetScene) -> StreetWorld:
+    """The street with other parked cars and the sun elsewhere, driven in some lane."""
     from recon.street import street  # noqa: PLC0415 - patched here
 
     own = street._parked_cars
 
     def parked(road: Any, side: float, rng: np.random.Generator) -> Any:
-        return own(road, side, rng if day == 0 else np.random.default_rng([settings.seed, 77, 1]))
+        return own(road, side, np.random.default_rng([settings.seed, 77, 1]))
 
     with (
         patch.object(street, "_parked_cars", parked),
-        patch("recon.street.path.LANE_M", -1.55 + ASIDE_M * day),
+        patch("recon.street.path.LANE_M", LATERAL_M[lane]),
     ):
         world = build_street(settings)
-    sun = world.to_sun if day == 0 else world.to_sun * [-1.0, 1.0, 1.0]
-    return replace(world, to_sun=sun)
+    world = replace(world, to_sun=world.to_sun * [-1.0, 1.0, 1.0])
+    if lane == "opposite":
+        world = replace(world, T_street_camera=world.T_street_camera[::-1] @ TURNED)
+    return world
 
 
 def true_street(days: Sequence[SyntheticSource], T_first_second: Float64) -> PointCloud:

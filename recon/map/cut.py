@@ -16,6 +16,7 @@ from recon.core.values.arrays import Float64
 from recon.map.fusion.part import KNOWABLE, FusedPart
 from recon.map.ground.grid import JOINED_CELLS
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
+from recon.map.occupancy.moving import GROWTH_CELLS
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.map.store.tile_parts import TileKey, TileParts
@@ -116,8 +117,9 @@ class Cutter:
         self.limit_bytes = None if small else config.memory.tile_bytes
         margin_m = max(_FILTER_MARGIN_M, 2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
         # A voxel more, since a point may lie anywhere in its voxel; and whether a point moved
-        # depends on the points in the voxels that touch its own.
-        self._filter_margin_m = margin_m + config.fusion.voxel_m + 2 * resolution_m
+        # depends on the points in the voxels that touch those through which it may have grown.
+        beyond = 3 + GROWTH_CELLS
+        self._filter_margin_m = margin_m + config.fusion.voxel_m + beyond * resolution_m
         # A cell of a grid depends on the cells joined to it, on their blob, and on adjacent cells.
         beyond = config.grid.min_blob_cells + JOINED_CELLS + 2
         beyond = max(beyond, math.ceil(self._filter_margin_m / resolution_m) + 1)

@@ -10,9 +10,11 @@ import pytest
 from recon.commands.config import load_config
 from recon.core.geometry.axes import transform_cloud
 from recon.core.geometry.se3 import make_transform
-from recon.core.values import PointCloud, join_clouds
+from recon.core.kernels.voxels import pack_keys
+from recon.core.values import OccupancyVoxels, PointCloud, join_clouds
 from recon.core.values.arrays import Bool
 from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.occupancy.moving import find_moved
 from recon.map.occupancy.rays import thin_rays
 from recon.map.submaps import Submap, SubmapBuilder
 from recon.map.tiles import Tiles
@@ -107,6 +109,28 @@ PARKED: list[Box] = [((3.0, 0.0, 16.0), VAN)]
 def test_what_moved_is_gone(scenes: list[list[Box]]) -> None:
     trail = [box for boxes in scenes for box in boxes]
     assert _left(trail, _drive(scenes)) <= 0.05
+
+
+def test_what_moved_grows_along_an_upright_surface_but_not_over_the_ground() -> None:
+    # A wall over the line y = 0 and the ground beside it: free, unsure, surely occupied along x.
+    wall = np.stack(np.meshgrid(np.arange(14), [0], np.arange(1, 7)), -1).reshape(-1, 3)
+    ground = np.stack(np.meshgrid(np.arange(14), np.arange(-6, 7), [-2]), -1).reshape(-1, 3)
+    cells = np.concatenate([wall, ground]).astype(np.int32)
+    x = cells[:, 0]
+    seen = np.where(x < 5, -2.0, np.where(x < 9, 0.5, 2.0)).astype(np.float32)
+    keys = pack_keys(cells)
+    order = np.argsort(keys)
+    moved = find_moved(
+        (cells + 0.5) * 0.2,
+        np.zeros(len(cells), np.float32),
+        np.ones(len(cells), np.bool_),
+        OccupancyVoxels(cells, seen, 0.2),
+        (keys[order], seen[order]),
+    )
+    upright = np.arange(len(cells)) < len(wall)
+    # What counts is the mean over a cell and those that touch it: 5 is free, 8 stands.
+    assert set(x[moved & upright].tolist()) == set(range(8))
+    assert set(x[moved & ~upright].tolist()) == set(range(6))
 
 
 def test_what_stands_still_stays_even_if_it_is_thin() -> None:

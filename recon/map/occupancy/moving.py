@@ -8,6 +8,12 @@ through, and the surface of a wall lies partly in voxels that rays pass. So evid
 over the voxels around a point in which there are points. What moved has left a whole body where
 space was free; next to what stands, most voxels are surely occupied.
 
+What moved has places that no ray came through before or after, such as its last ones in a drive.
+They hang together with the others, and less is known of them than of what stands, which was seen
+again and again: so where a whole piece of surface was free, what moved grows into voxels that are
+not surely occupied, if half of those beside them at the same height have moved. That is one of two
+along an upright surface; at a straight edge on the ground it is three of eight, and nothing grows.
+
 A point that its frames could not place in a voxel stays if something occupied is in its reach.
 """
 
@@ -33,8 +39,16 @@ _MOST: Final = np.float32(-log_odds(MIN_PROBABILITY))
 """Largest evidence of a voxel either way, so that none outvotes all others."""
 _PLACED: Final = 0.45
 """Standard deviation of a frame, in voxels, up to which a point is in its voxel or beside it."""
+_UNSURE: Final = _MOST / 2
+"""Largest mean evidence around a voxel that may be of what moved beside it."""
+_INSIDE: Final = 8
+"""Voxels that touch one inside a surface."""
+GROWTH_CELLS: Final = 5
+"""Voxels through which what moved grows."""
 _AROUND: Final = np.array(list(product((-1, 0, 1), repeat=3)))
 """Steps to a cell itself and to those that touch it."""
+_BESIDE: Final = _AROUND[(_AROUND[:, 2] == 0) & _AROUND[:, :2].any(axis=1)]
+"""Steps to the cells that touch a cell at its own height."""
 
 CellEvidence = tuple[NDArray[np.int64], Float32]
 """Packed cells int64 (N,), sorted, and what a drive saw in each, log-odds float32 (N,)."""
@@ -71,7 +85,7 @@ def find_moved(
     moved = _mostly_free(packed, counted, voxels, evidence)
     placed = sigma_m <= _PLACED * voxels.resolution_m
     occupied = pack_keys(voxels.keys[voxels.log_odds > 0])
-    occupied = np.sort(occupied[~are_among(occupied, packed[moved & placed & counted])])
+    occupied = np.sort(occupied[~are_among(occupied, packed[moved & placed])])
     unsure = np.flatnonzero(moved & ~placed)
     reach = FREE_MARGIN_SIGMAS * sigma_m[unsure] / voxels.resolution_m
     moved[unsure] = ~_in_reach(places[unsure], reach, occupied)
@@ -90,7 +104,29 @@ def _mostly_free(
     seen[free_in_the_end] = np.minimum(seen[free_in_the_end], _FREE)
     tells = np.zeros(len(keys), np.bool_)
     tells[home[counted]] = True
-    return np.asarray((_mean_around(keys, keys[tells], seen[tells]) <= 0)[home])
+    mean = _mean_around(keys, keys[tells], seen[tells])
+    return _grown(keys, mean <= 0, mean <= _UNSURE)[home]
+
+
+def _grown(keys: NDArray[np.int64], sure: Bool, unsure: Bool) -> Bool:
+    """Return bool (N,), the sure ones of sorted keys, and the unsure ones that join a body."""
+    body = np.zeros(len(keys), np.bool_)
+    body[sure] = _touching(keys[sure], keys[sure], _AROUND) > _INSIDE
+    for _ in range(GROWTH_CELLS if body.any() else 0):
+        rows = np.flatnonzero(unsure & ~body)
+        moved, there = (_touching(keys[rows], among, _BESIDE) for among in (keys[body], keys))
+        body[rows] = (moved > 0) & (2 * moved >= there)
+    return sure | body
+
+
+def _touching(
+    wanted: NDArray[np.int64], keys: NDArray[np.int64], steps: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return int64 (N,), how many of the sorted keys are some steps away from each wanted one."""
+    number, cells = np.zeros(len(wanted), np.int64), unpack_keys(wanted)
+    for step in steps:
+        number += find_keys(pack_keys(cells + step), keys)[1]
+    return number
 
 
 def _mean_around(wanted: NDArray[np.int64], keys: NDArray[np.int64], values: Float32) -> Float32:
