@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 _UNKNOWN = "not known"
@@ -43,7 +43,7 @@ def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
         turn = ", ".join(f"{mended[f'{x}_deg']:+.3f} deg {x}" for x in ("pitch", "yaw", "roll"))
         lines["mended"] = (
             f"{mended['calibration']}: right camera rotated by {turn}, its focal length changed by "
-            f"{mended['focal_percent']:+.2f} %"
+            f"{mended['focal_percent']:+.2f} %" + _straightened(mended["lenses_px"])
         )
     return lines
 
@@ -58,6 +58,13 @@ def _by_motion(found: Mapping[str, Any]) -> str:
         f"{off['lens_px']} px by the lenses; right focal length {off['focal_percent']} %; the "
         "baseline cannot be seen"
     )
+
+
+def _straightened(moved_px: Sequence[float] | None) -> str:
+    if moved_px is None:
+        return ""
+    left, right = moved_px
+    return f", and both lenses straightened, by {left:.2f} and {right:.2f} px (rms)"
 
 
 def _interval(figure: Mapping[str, float]) -> str:

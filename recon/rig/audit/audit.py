@@ -26,11 +26,11 @@ from recon.rig.audit.findings import (
     verdict_of,
 )
 from recon.rig.audit.geometry import Geometry, measure_geometry
+from recon.rig.audit.lens_fit import BentLenses, estimate_lenses
 from recon.rig.audit.measures import Gaps, find_gaps
 from recon.rig.audit.sample import Look, Sample, take_sample
 from recon.rig.audit.settings import AuditedSettings
-from recon.rig.audit.turn import measure_turn, turn_figures
-from recon.rig.audit.turn_fit import RightTurn
+from recon.rig.audit.turn import SeenMotion, measure_turn, turn_figures
 from recon.run.summary import plain
 from recon.sources.protocol import IncompleteSource, StereoSource
 from recon.stereo.match.registry import MatchingSettings, settings_of
@@ -56,8 +56,8 @@ class Audit:
         findings: Problems found, fatal ones first.
         figures: All measures, ready for JSON.
         alignment: Row errors of all pairs together; None if there are too few features.
-        turn: How the right camera is turned by the motion of the drive, rows aligned; None if it
-            was not measured.
+        motion: What the motion of the drive shows of the rig, rows aligned; None if it was not
+            measured.
         looks: What was measured in each pair, and a few of the images.
         corrected: What `correct_calibration` did, if it was asked to.
     """
@@ -66,7 +66,7 @@ class Audit:
     findings: tuple[Finding, ...]
     figures: dict[str, Any]
     alignment: RowAlignment | None
-    turn: RightTurn | None = None
+    motion: SeenMotion | None = None
     looks: tuple[Look, ...] = ()
     corrected: dict[str, Any] | None = None
 
@@ -103,7 +103,8 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     geometry = measure_geometry(sample, camera)
     gaps = find_gaps(source)
     reach_px = _reach_px(camera, config.matching)
-    turn = None if quick else _measure_turn(source, config, geometry.alignment)
+    motion = None if quick else _measure_motion(source, config, geometry.alignment)
+    turn = None if motion is None else motion.turn
     findings = [
         *find_image_faults(sample, config.matching.matcher),
         *find_series_faults(sample, gaps),
@@ -121,7 +122,7 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
         tuple(findings),
         figures,
         geometry.alignment,
-        turn,
+        motion,
         tuple(sample.looks),
     )
 
@@ -143,14 +144,15 @@ def quick_warnings(source: StereoSource, config: AuditedSettings) -> tuple[str, 
 def correct_calibration(
     source: StereoSource, config: AuditedSettings, audit: Audit, path: Path
 ) -> dict[str, Any]:
-    """Write the calibration with the right camera turned so that rows and motion agree with it.
+    """Write the calibration with which rows and motion agree.
 
+    The lenses of rectified images are straightened, if they bend; and the right camera is turned.
     What the drive does not show beyond two standard deviations stays as it is; the baseline always
     does.
 
     Returns:
-        The turn of the right camera in degrees, the change of its focal length in per cent, and
-        the row error before.
+        The turn of the right camera in degrees, the change of its focal length in per cent, what
+        the lenses moved (None: they are as they were), and the row error before.
 
     Raises:
         CalibrationError: There are too few features to measure the row error.
@@ -162,30 +164,51 @@ def correct_calibration(
             where=source.name,
             hint="record scenes with more texture, or recalibrate the cameras",
         )
-    turns = []
-    if audit.turn is None or _rows_off(audit.alignment):
-        turns.append(audit.alignment.turn)
-    if audit.turn is not None:
-        turns.append(audit.turn.telling)
-    rig = source.calibration
-    for turn in turns:
-        rig = _turned(rig, turn, config)
-    pitch, yaw, roll, enlarged = np.sum(turns, axis=0).tolist()
+    lenses = _bent_lenses(source.calibration, audit.motion)
+    if lenses is None:
+        rig, turn = _corrected_turn(source.calibration, audit.alignment, audit, config)
+    else:
+        rig, turn = lenses.calibration, lenses.turn
+    pitch, yaw, roll, enlarged = turn.tolist()
     figures = {
         "pitch_deg": float(np.degrees(pitch)),
         "yaw_deg": float(np.degrees(yaw)),
         "roll_deg": float(np.degrees(roll)),
         "focal_percent": -100.0 * enlarged,
+        "lenses_px": None if lenses is None else list(lenses.moved_px),
         "row_error_before_px": audit.alignment.rms_px,
     }
     write_recon_calibration(path, rig, figures)
     return {**figures, "calibration": str(path)}
 
 
-def _measure_turn(
+def _bent_lenses(rig: Rig, motion: SeenMotion | None) -> BentLenses | None:
+    """Return what the lenses bend; None if they do not, or are in the calibration already.
+
+    The lenses of images that are rectified here are for a board to calibrate.
+    """
+    if motion is None or not isinstance(rig, RectifiedCamera):
+        return None
+    return estimate_lenses(motion.tracks_as_recorded(rig), rig)
+
+
+def _corrected_turn(
+    rig: Rig, alignment: RowAlignment, audit: Audit, config: AuditedSettings
+) -> tuple[Rig, Float64]:
+    """Return a calibration with the right camera turned as rows and motion show, and the turn."""
+    turn = None if audit.motion is None else audit.motion.turn
+    turns = [alignment.turn] if turn is None or _rows_off(alignment) else []
+    if turn is not None:
+        turns.append(turn.telling)
+    for each in turns:
+        rig = _turned(rig, each, config)
+    return rig, np.asarray(np.sum(turns, axis=0))
+
+
+def _measure_motion(
     source: StereoSource, config: AuditedSettings, alignment: RowAlignment | None
-) -> RightTurn | None:
-    """Return how the right camera is turned; rows that are off are aligned first, to match."""
+) -> SeenMotion | None:
+    """Return what the motion shows of the rig; rows that are off are aligned first, to match."""
     if alignment is None:
         return None
     rig = source.calibration

@@ -13,22 +13,26 @@ which would take it for yaw otherwise, but no turn can correct it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, Final
 
 import numpy as np
 
-from recon.core.values import RectifiedCamera, Rig
+from recon.core.geometry.projection import map_pixels
+from recon.core.values import RectifiedCamera, Rig, StereoCalibration
 from recon.core.values.arrays import Float64
 from recon.odometry.patches import find_in_right, surface_slopes
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualOdometry
 from recon.odometry.window import TrackWindow
+from recon.rig.audit.rig_fit import StereoTracks
 from recon.rig.audit.sample import plan_stretches
-from recon.rig.audit.turn_fit import MIN_WINDOWS, RightTurn, StereoTracks, estimate_turn
+from recon.rig.audit.turn_fit import MIN_WINDOWS, RightTurn, estimate_turn
 from recon.run.machine import serial_algebra
 from recon.sources.protocol import StereoSource
 from recon.stereo.frame import FrameReconstructor
+from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
 from recon.stereo.settings import StereoSettings
 
 _MIN_FRAMES: Final = 4
@@ -44,7 +48,34 @@ _READ: Final = 72
 """Frames to read in all, in several runs."""
 
 
-def measure_turn(source: StereoSource, rig: Rig, config: StereoSettings) -> RightTurn | None:
+@dataclass(frozen=True, eq=False)
+class SeenMotion:
+    """What the motion of a drive shows of its rig.
+
+    Attributes:
+        turn: How the right camera is turned; None if there are too few windows.
+        tracks: The windows of tracks.
+        views: How their images were rectified; None if they were rectified before.
+    """
+
+    turn: RightTurn | None
+    tracks: tuple[StereoTracks, ...]
+    views: RectifyingTurns | None
+
+    def tracks_as_recorded(self, camera: RectifiedCamera) -> tuple[StereoTracks, ...]:
+        """Return the windows as they are in the images of a camera that were rectified before."""
+        if self.views is None:
+            return self.tracks
+        rotations = (self.views.R_left, self.views.R_right)
+        recorded = (camera.matrix, camera.right_matrix)
+        left, right = (
+            K @ R.T @ np.linalg.inv(seen)
+            for K, R, seen in zip(recorded, rotations, self.views.matrices, strict=True)
+        )
+        return tuple(_mapped(part, left, right) for part in self.tracks)
+
+
+def measure_turn(source: StereoSource, rig: Rig, config: StereoSettings) -> SeenMotion | None:
     """Measure how the right camera of a drive is turned against a calibration.
 
     Args:
@@ -53,7 +84,7 @@ def measure_turn(source: StereoSource, rig: Rig, config: StereoSettings) -> Righ
         config: How pairs are rectified and matched.
 
     Returns:
-        None if the drive is too short, or too few of its frames can be tracked.
+        None if the drive is too short.
     """
     if len(source) < MIN_WINDOWS * _FRAMES:
         return None
@@ -63,7 +94,9 @@ def measure_turn(source: StereoSource, rig: Rig, config: StereoSettings) -> Righ
         for start, stop in plan_stretches(len(source), _READ, quick=False):
             pairs = islice(source.frames(start), stop - start)
             tracks += stereo_tracks(OdometryFrame(*reconstructor.match(pair)) for pair in pairs)
-        return estimate_turn(tracks, reconstructor.camera)
+        turn = estimate_turn(tracks, reconstructor.camera)
+    views = plan_turns(rig, config.rectification) if isinstance(rig, StereoCalibration) else None
+    return SeenMotion(turn, tuple(tracks), views)
 
 
 def turn_figures(turn: RightTurn, camera: RectifiedCamera) -> dict[str, Any]:
@@ -104,6 +137,15 @@ def stereo_tracks(frames: Iterable[OdometryFrame]) -> Iterator[StereoTracks]:
             if len(window.T_world_camera) >= _MIN_FRAMES:
                 yield StereoTracks(window, _in_right(window, recent))
             recent = []
+
+
+def _mapped(tracks: StereoTracks, H_left: Float64, H_right: Float64) -> StereoTracks:
+    """Return tracks in images to which homographies (3, 3) take them."""
+    uvd, shape = tracks.window.uvd.copy(), tracks.right_uv.shape
+    uvd[..., :2] = map_pixels(H_left, uvd[..., :2].reshape(-1, 2)).reshape(shape)
+    right_uv = map_pixels(H_right, tracks.right_uv.reshape(-1, 2)).reshape(shape)
+    uvd[..., 2] = uvd[..., 0] - right_uv[..., 0]
+    return StereoTracks(replace(tracks.window, uvd=uvd), right_uv)
 
 
 def _in_right(window: TrackWindow, frames: Sequence[OdometryFrame]) -> Float64:

@@ -141,7 +141,7 @@ def test_the_motion_of_a_clean_drive_shows_no_fault(longer_street: faults.Spoile
     assert audit.findings == ()
     found = audit.figures["rig_by_motion"]
     assert abs(found["disparity_px"]["value"]) < 0.05
-    assert np.abs(audit.turn.values[:4]).max() * longer_street.camera.focal_px < 0.1
+    assert np.abs(audit.motion.turn.values[:4]).max() * longer_street.camera.focal_px < 0.1
 
 
 @pytest.mark.slow
@@ -172,7 +172,7 @@ def test_a_turn_that_only_motion_shows_is_mended(
 def test_a_turn_planted_in_a_real_drive_is_found(recon_data: Path) -> None:
     source = open_source(recon_data / "driven" / "kitti_raw_0013")
     yaw = [
-        audit_source(drive, CONFIG).turn.values[1]
+        audit_source(drive, CONFIG).motion.turn.values[1]
         for drive in (source, faults.turned(source, yaw_deg=0.06))
     ]
     assert np.degrees(yaw[1] - yaw[0]) == pytest.approx(-0.06, rel=0.2)

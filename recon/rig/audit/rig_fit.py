@@ -1,0 +1,221 @@
+"""A correction of the rig that makes disparities fit the motion, and rows meet.
+
+Bundle adjustment of a few windows, with the correction as one more unknown that all windows share.
+Poses and points are eliminated, so that each window says something of the correction alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Protocol
+
+import numpy as np
+
+from recon.core.geometry.se3 import apply, invert
+from recon.core.values import RectifiedCamera
+from recon.core.values.arrays import Float64
+from recon.odometry.kernels import bundle
+from recon.odometry.window import (
+    CAUCHY_SIGMAS,
+    SIGMA_D_PX,
+    SIGMA_UV_PX,
+    TrackWindow,
+    adjust,
+    normal_equations,
+    weighted,
+)
+
+_ROUNDS: Final = 6
+"""Times that all windows are adjusted with the places as corrected by then."""
+
+_ROW_SIGMA_PX: Final = 0.3
+"""Standard deviation of the row of a feature in the right image."""
+
+
+@dataclass(frozen=True, eq=False)
+class StereoTracks:
+    """Tracks in the left images of a window, and the same features in the right ones.
+
+    Attributes:
+        window: Poses, points and their places in the left images.
+        right_uv: float64 (W, N, 2), columns and rows in the right images; NaN = not found.
+    """
+
+    window: TrackWindow
+    right_uv: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Where features are after a correction, and how that follows its parameters (P).
+
+    Attributes:
+        left_uv: float64 (W, N, 2), columns and rows in the left images.
+        right_uv: float64 (W, N, 2), in the right ones.
+        by_left: float64 (W, N, 2, P), derivatives of ``left_uv``.
+        by_right: float64 (W, N, 2, P), of ``right_uv``.
+    """
+
+    left_uv: Float64
+    right_uv: Float64
+    by_left: Float64
+    by_right: Float64
+
+    @property
+    def row_error(self) -> Float64:
+        """float64 (W, N), right minus left."""
+        return np.asarray(self.right_uv[..., 1] - self.left_uv[..., 1])
+
+    def seen(self, window: TrackWindow) -> TrackWindow:
+        """Return a window with the features where they are after the correction."""
+        disparity = self.left_uv[..., :1] - self.right_uv[..., :1]
+        return replace(window, uvd=np.concatenate([self.left_uv, disparity], axis=2))
+
+
+class Correction(Protocol):
+    """What may be wrong with a rig, as parameters (P) that are 0 where nothing is."""
+
+    def place(self, tracks: StereoTracks, values: Float64) -> Placed:
+        """Return where the features of a window are after a correction."""
+
+    def prior(self) -> Float64:
+        """Return what is known beforehand: float64 (P,), information that a parameter is 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A fitted correction, and what each window says of it.
+
+    Attributes:
+        values: float64 (P,).
+        H: float64 (K, P, P), normal equations of the K windows at ``values``.
+        g: float64 (K, P).
+    """
+
+    values: Float64
+    H: Float64
+    g: Float64
+
+
+def fit_correction(
+    tracks: Sequence[StereoTracks], camera: RectifiedCamera, correction: Correction
+) -> Fitted:
+    """Fit a correction to windows of tracks."""
+    prior = correction.prior()
+    values, windows = np.zeros(len(prior)), [part.window for part in tracks]
+    for _ in range(_ROUNDS):
+        placed = [correction.place(part, values) for part in tracks]
+        windows = [
+            adjust(each.seen(window), camera) for each, window in zip(placed, windows, strict=True)
+        ]
+        systems = [
+            _system(window, each, camera) for window, each in zip(windows, placed, strict=True)
+        ]
+        H, g = (np.stack(parts) for parts in zip(*systems, strict=True))
+        step = np.linalg.solve(H.sum(axis=0) + np.diag(prior), g.sum(axis=0) - prior * values)
+        values = values + step
+    return Fitted(values, H, g - H @ step)
+
+
+def misfit(
+    tracks: Sequence[StereoTracks], camera: RectifiedCamera, correction: Correction, values: Float64
+) -> float:
+    """Return what is left of row errors and disparities after a correction, as a robust cost."""
+    total = 0.0
+    for part in tracks:
+        placed = correction.place(part, values)
+        residual, _ = weighted(adjust(placed.seen(part.window), camera), camera)
+        rows = np.nan_to_num(placed.row_error) / _ROW_SIGMA_PX
+        for square in (np.square(residual).sum(axis=2), np.square(rows)):
+            total += float(np.log1p(square / CAUCHY_SIGMAS**2).sum())
+    return total
+
+
+def _system(
+    window: TrackWindow, placed: Placed, camera: RectifiedCamera
+) -> tuple[Float64, Float64]:
+    """Return the normal equations (P, P) and (P,) of a further correction, all else eliminated."""
+    normal = normal_equations(window, camera)
+    shared = _of_places(window, placed, camera)
+    rows_H, rows_g = _of_rows(placed)
+    frames, points = window.uvd.shape[:2]
+    size, parameters = 6 * (frames - 1), placed.by_left.shape[-1]
+    # The correction follows the poses, of which the first is fixed, as one more block.
+    S, g = np.zeros((size + parameters,) * 2), np.zeros(size + parameters)
+    for k in range(1, frames):
+        at = slice(6 * (k - 1), 6 * k)
+        S[at, at], g[at] = normal.H_pose[k], normal.g_pose[k]
+        S[at, size:] = shared.H_pose[k]
+        S[size:, at] = shared.H_pose[k].T
+    S[size:, size:], g[size:] = shared.H + rows_H, shared.g + rows_g
+    of_poses = normal.H_cross[1:].transpose(1, 0, 2, 3).reshape(points, size, 3)
+    cross = np.concatenate([of_poses, shared.H_point], axis=1)
+    folded = cross @ np.linalg.inv(normal.H_point + bundle.RIDGE * np.eye(3))
+    S -= np.einsum("nij,nkj->ik", folded, cross)
+    g -= np.einsum("nij,nj->i", folded, normal.g_point)
+    share = np.linalg.solve(S[:size, :size] + bundle.RIDGE * np.eye(size), S[:size, size:]).T
+    return S[size:, size:] - share @ S[:size, size:], g[size:] - share @ g[:size]
+
+
+@dataclass(frozen=True, eq=False)
+class _Shared:
+    """What places say of the correction (P), with the poses and points that share them.
+
+    Attributes:
+        H: float64 (P, P).
+        g: float64 (P,).
+        H_pose: float64 (W, 6, P).
+        H_point: float64 (N, P, 3).
+    """
+
+    H: Float64
+    g: Float64
+    H_pose: Float64
+    H_point: Float64
+
+
+def _of_rows(placed: Placed) -> tuple[Float64, Float64]:
+    """Return normal equations of the row errors (W, N), which neither pose nor depth changes."""
+    residual = np.nan_to_num(placed.row_error) / _ROW_SIGMA_PX
+    weight = np.isfinite(placed.row_error) / (1.0 + (residual / CAUCHY_SIGMAS) ** 2)
+    J = np.nan_to_num(placed.by_right - placed.by_left)[:, :, 1] / _ROW_SIGMA_PX
+    J_weighted = weight[:, :, None] * J
+    H = np.einsum("wni,wnj->ij", J_weighted, J)
+    # A correction moves the observed row: it is to take the error away.
+    return H, -np.einsum("wni,wn->i", J_weighted, residual)
+
+
+def _of_places(window: TrackWindow, placed: Placed, camera: RectifiedCamera) -> _Shared:
+    T_camera_world = invert(window.T_world_camera)
+    residual, weight = weighted(window, camera)
+    xyz = np.stack([apply(T, window.xyz_world) for T in T_camera_world])
+    by_place = _derivative(xyz, camera)
+    by_places = [placed.by_left, (placed.by_left - placed.by_right)[:, :, :1]]
+    sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
+    # A correction moves what is observed, a step what is predicted: hence the sign.
+    J = -np.nan_to_num(np.concatenate(by_places, axis=2)) / sigmas[:, None]
+    # What has no disparity has no residual and no derivative of one.
+    by_place = by_place * np.isfinite(window.uvd)[..., None] / sigmas[:, None]
+    by_pose = np.concatenate([-by_place, np.cross(by_place, xyz[:, :, None])], axis=3)
+    by_point = by_place @ T_camera_world[:, None, :3, :3]
+    J_weighted = weight[:, :, None, None] * J
+    return _Shared(
+        H=np.einsum("wnki,wnkj->ij", J_weighted, J),
+        g=np.einsum("wnki,wnk->i", J_weighted, residual),
+        H_pose=np.einsum("wnkp,wnki->wpi", by_pose, J_weighted),
+        H_point=np.einsum("wnki,wnkc->nic", J_weighted, by_point),
+    )
+
+
+def _derivative(xyz: Float64, camera: RectifiedCamera) -> Float64:
+    """Return how column, row and disparity follow a place in camera axes: (W, N, 3, 3)."""
+    f, fb = camera.focal_px, camera.focal_px * camera.baseline_m
+    z = np.maximum(xyz[..., 2], bundle.MIN_DEPTH_M)
+    x, y, zero = xyz[..., 0] / z, xyz[..., 1] / z, np.zeros_like(z)
+    rows = [
+        np.stack([f / z, zero, -f * x / z], -1),
+        np.stack([zero, f / z, -f * y / z], -1),
+        np.stack([zero, zero, -fb / z**2], -1),
+    ]
+    return np.stack(rows, axis=-2)
