@@ -111,6 +111,7 @@ def _mostly_free(
 def _grown(keys: NDArray[np.int64], sure: Bool, unsure: Bool) -> Bool:
     """Return bool (N,), the sure ones of sorted keys, and the unsure ones that join a body."""
     body = np.zeros(len(keys), np.bool_)
+    # More than that, as it is among them itself.
     body[sure] = _touching(keys[sure], keys[sure], _AROUND) > _INSIDE
     for _ in range(GROWTH_CELLS if body.any() else 0):
         rows = np.flatnonzero(unsure & ~body)
