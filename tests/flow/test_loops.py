@@ -100,8 +100,10 @@ def block() -> _Filmed:
 def closed(block: _Filmed, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MapRun, int]:
     """Folder and run of the drive, and how many pairs were matched."""
     folder = tmp_path_factory.mktemp("closed")
-    match = FrameReconstructor.reconstruct
-    with patch.object(FrameReconstructor, "reconstruct", autospec=True, side_effect=match) as asked:
+    match = FrameReconstructor.reconstruct_rectified
+    with patch.object(
+        FrameReconstructor, "reconstruct_rectified", autospec=True, side_effect=match
+    ) as asked:
         run = _run(block, folder)
     return folder, run, asked.call_count
 
@@ -113,13 +115,13 @@ def test_a_drive_around_a_block_closes_to_a_fifth_of_a_percent(
     assert run.truth is not None
     assert run.truth.trajectory is not None
     truth = run.truth.trajectory
-    limit_m = 0.002 * truth.path_length_m
-
-    before = read_tum(folder / "trajectory_odometry_tum.txt").positions_m[-1]
-    after = read_tum(folder / "trajectory_tum.txt").positions_m[-1]
-    assert np.linalg.norm(after - truth.positions_m[-1]) < limit_m
-    # Odometry alone is not that good, or there would be nothing to show.
-    assert np.linalg.norm(before - truth.positions_m[-1]) > limit_m
+    before_m, after_m = (
+        np.linalg.norm(read_tum(folder / name).positions_m[-1] - truth.positions_m[-1])
+        for name in ("trajectory_odometry_tum.txt", "trajectory_tum.txt")
+    )
+    assert after_m < 0.002 * truth.path_length_m
+    # Odometry alone is as good after one lap, but it goes on to drift: what is left is far less.
+    assert after_m < before_m / 3
 
 
 def test_loops_stand_in_summary_report_and_file(closed: tuple[Path, MapRun, int]) -> None:
