@@ -124,6 +124,20 @@ def test_in_a_hurry_frames_are_tracked_by_odometry_alone(street, street_map, tru
     assert np.linalg.norm(off[:3, 3]) < 0.3
 
 
+def test_frames_that_are_matched_roughly_are_corrected_by_one_view_alone(street, street_map, truth):
+    localizer = open_localizer(street_map, SETTINGS)
+    reconstructor = FrameReconstructor(street.calibration, SETTINGS)
+    pairs = street.taken(slice(1, None, 2))
+    frames = [OdometryFrame(*reconstructor.match_roughly(pair), rough=True) for pair in pairs]
+
+    found = [localizer.add(frame) for frame in frames]
+
+    assert [place.state for place in found[1:]] == [State.TRACKING] * 7
+    assert {(place.views, place.surfaces) for place in found[1:]} == {(1, False)}
+    off = se3.invert(truth[3::2]) @ np.stack([place.T_world_camera for place in found[1:]])
+    assert np.linalg.norm(off[:, :3, 3], axis=1).max() < 0.2
+
+
 def test_a_drive_backwards_from_the_middle_is_found(street, street_map, truth):
     drive = _localized(street.taken(slice(11, None, -2)), street_map)
 

@@ -111,7 +111,8 @@ class Localizer:
     """Finds the frames of a drive in a map, which it does not change.
 
     Visual odometry predicts each pose; features of the nearest views of the map, and its surfaces,
-    correct it, by their covariances. A pose is given out only while it is certain.
+    correct it, by their covariances. A pose is given out only while it is certain. Where frames are
+    matched roughly, since time is short, one view corrects them; surfaces do only if none is found.
 
     Args:
         known: The places of the map.
@@ -205,12 +206,15 @@ class Localizer:
                 continue
             belief = corrected
             loops.append(verdict.loop)
+            if frame.rough:  # one tells most of it, and in a hurry time counts
+                break
         by_surfaces = self._by_surfaces(belief, frame, seen=bool(loops))
         return _Confirmed(by_surfaces or belief, tuple(loops), refused, by_surfaces is not None)
 
     def _by_surfaces(self, belief: Belief, frame: OdometryFrame, *, seen: bool) -> Belief | None:
         """Return the belief corrected by the surfaces of the map; None = not."""
-        due = not seen or self._frames % _SURFACES_EVERY == 0
+        # Aligning takes as long as several frames may, where they are in a hurry.
+        due = not seen or (not frame.rough and self._frames % _SURFACES_EVERY == 0)
         if self._surroundings is None or not due:
             return None
         return self._surroundings.correct(belief, frame, learn=seen)
