@@ -147,6 +147,22 @@ def test_a_parked_car_that_a_later_drive_looked_through_is_gone() -> None:
     assert _left(PARKED, older) >= 0.95
 
 
+def test_what_a_later_drive_looked_through_outweighs_what_stood_beside_it() -> None:
+    cells = np.stack(np.meshgrid(np.arange(14), [0], np.arange(1, 7)), -1).reshape(-1, 3)
+    keys = pack_keys(cells)
+    stood = (np.sort(keys), np.full(len(cells), 2.0, np.float32))
+    in_the_end = np.where(cells[:, 0] < 7, -1.0, 2.0).astype(np.float32)
+    moved = find_moved(
+        (cells + 0.5) * 0.2,
+        np.zeros(len(cells), np.float32),
+        np.ones(len(cells), np.bool_),
+        OccupancyVoxels(cells.astype(np.int32), in_the_end, 0.2),
+        stood,
+    )
+    # Columns 0 to 6 are free in the end; 7, between a free one and one that stands, goes with them.
+    assert set(cells[moved, 0].tolist()) == set(range(8))
+
+
 def test_a_car_that_a_later_drive_finds_parked_stays() -> None:
     older, later = _drive([[]] * FRAMES), _drive([PARKED] * FRAMES, aside=0.5)
     assert _left(PARKED, older, later) >= 0.95

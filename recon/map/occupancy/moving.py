@@ -8,6 +8,8 @@ through, and the surface of a wall lies partly in voxels that rays pass. So evid
 over the voxels around a point in which there are points. What moved has left a whole body where
 space was free; next to what stands, most voxels are surely occupied.
 
+What a later drive looked through is free, however often it was hit before.
+
 What moved has places that no ray came through before or after, such as its last ones in a drive.
 They hang together with the others, and less is known of them than of what stands, which was seen
 again and again: so where a whole piece of surface was free, what moved grows into voxels that are
@@ -101,7 +103,8 @@ def _mostly_free(
     seen = np.full(len(keys), _MOST)
     seen[known] = evidence[1][place[known]]
     free_in_the_end = are_among(keys, pack_keys(voxels.keys[voxels.log_odds <= _FREE]))
-    seen[free_in_the_end] = np.minimum(seen[free_in_the_end], _FREE)
+    # What was there when the drive ended, and is free in the end, a later drive looked through.
+    seen[free_in_the_end & (seen > _FREE)] = -_MOST
     tells = np.zeros(len(keys), np.bool_)
     tells[home[counted]] = True
     mean = _mean_around(keys, keys[tells], seen[tells])
