@@ -103,7 +103,8 @@ def _mostly_free(
     seen = np.full(len(keys), _MOST)
     seen[known] = evidence[1][place[known]]
     free_in_the_end = are_among(keys, pack_keys(voxels.keys[voxels.log_odds <= _FREE]))
-    # What was there when the drive ended, and is free in the end, a later drive looked through.
+    # What was there when the drive ended, and is free in the end, another drive looked through:
+    # a later one; or an earlier one, where this one hit it hardly more often than by chance.
     seen[free_in_the_end & (seen > _FREE)] = -_MOST
     tells = np.zeros(len(keys), np.bool_)
     tells[home[counted]] = True
