@@ -79,8 +79,8 @@ def run_evaluate_map(
     }
     if out is not None:
         result = MapComparison(placed.cloud, truth, tuple(thresholds_m), summary)
-        with Run("evaluate map", out) as directory:
-            with directory.report(summary):
-                write_map_errors(result, directory)
-            directory.finish(summary, source=str(run), inputs=[reference])
+        with Run("evaluate map", out) as written:
+            with written.report(summary):
+                write_map_errors(result, written)
+            written.finish(summary, source=str(run), inputs=[reference])
     return summary

@@ -55,7 +55,7 @@ def resumed(
 
 
 def begin_or_resume(
-    directory: RunDirectory,
+    run: RunDirectory,
     source: StereoSource,
     config: ReconConfig,
     identity: Mapping[str, Any],
@@ -68,9 +68,9 @@ def begin_or_resume(
         FormatError: The map is damaged.
         OutputError: The map cannot be written, or there is no run to resume.
     """
-    path, memory = directory.state(STARTED), config.memory.cache_bytes
-    if directory.resumes:
-        refuse_others(identity, read_started(directory.folder)["identity"], directory.folder)
+    path, memory = run.state(STARTED), config.memory.cache_bytes
+    if run.resumes:
+        refuse_others(identity, read_started(run.folder)["identity"], run.folder)
         with resuming(path):
             return Map.open(path, read_only=False, cache_bytes=memory)
     map_ = Map.create(path, cache_bytes=memory)
@@ -82,7 +82,7 @@ def begin_or_resume(
 
 
 @contextmanager
-def with_resume_hint(directory: RunDirectory, source: StereoSource) -> Iterator[None]:
+def with_resume_hint(run: RunDirectory, source: StereoSource) -> Iterator[None]:
     """Add a hint on how to resume to errors after which the run can be resumed.
 
     Of a live source, whose drive is over then, it says where the map is that was made so far.
@@ -96,8 +96,8 @@ def with_resume_hint(directory: RunDirectory, source: StereoSource) -> Iterator[
     try:
         yield
     except (*passing, KeyboardInterrupt) as error:
-        hint = _way_on(directory.folder, source)
-        hinted = _with_hint(error, hint) if directory.resumable else None
+        hint = _way_on(run.folder, source)
+        hinted = _with_hint(error, hint) if run.resumable else None
         if hinted is None:
             raise
         raise hinted from error

@@ -85,12 +85,12 @@ def joined_warnings(joined: JoinedMap) -> list[str]:
     return [*([text + "cloud, grid, OctoMap and mesh"] if apart else ()), *joined.made.warnings]
 
 
-def export_sessions(joined: JoinedMap, directory: RunDirectory) -> None:
+def export_sessions(joined: JoinedMap, run: RunDirectory) -> None:
     """Write ``sessions/<number>/trajectory_*.txt`` of the linked drives, in the map's world.
 
     Raises:
         OutputError: A file cannot be written.
     """
     for number, path in joined.paths.items():
-        write_kitti_poses(directory.path(f"sessions/{number}/trajectory_kitti.txt"), path)
-        write_tum(directory.path(f"sessions/{number}/trajectory_tum.txt"), path)
+        write_kitti_poses(run.path(f"sessions/{number}/trajectory_kitti.txt"), path)
+        write_tum(run.path(f"sessions/{number}/trajectory_tum.txt"), path)

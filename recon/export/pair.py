@@ -35,13 +35,13 @@ def mesh_frame(
     return mesh, coverage, check_coverage(coverage)
 
 
-def write_disparity_files(disparity: Disparity, directory: RunDirectory) -> float:
+def write_disparity_files(disparity: Disparity, run: RunDirectory) -> float:
     """Write disparity, confidence and reasons below ``disparity/``.
 
     Returns:
         Grey levels per pixel of disparity in ``disparity.png``.
     """
-    path, scale = directory.path, fitting_scale(disparity.values)
+    path, scale = run.path, fitting_scale(disparity.values)
     write_pfm(path("disparity/disparity.pfm"), disparity.values)
     write_disparity_png(path("disparity/disparity.png"), disparity.values, scale=scale)
     write_pfm(path("disparity/confidence.pfm"), disparity.confidence)
@@ -53,20 +53,20 @@ def write_cloud_files(
     frame: ReconstructedFrame,
     mesh: TriangleMesh | None,
     formats: Sequence[str],
-    directory: RunDirectory,
+    run: RunDirectory,
 ) -> None:
     """Write depth, cloud and mesh (PLY and ``formats``), and a project with the left image."""
     depth_m = depth_from_disparity(frame.disparity.values, frame.pair.camera)
-    write_pfm(directory.path("disparity/depth.pfm"), depth_m)
-    write_ply(directory.path("clouds/cloud.ply"), frame.cloud)
+    write_pfm(run.path("disparity/depth.pfm"), depth_m)
+    write_ply(run.path("clouds/cloud.ply"), frame.cloud)
     if mesh is not None:
         for suffix in dict.fromkeys(("ply", *formats)):
-            write_mesh(directory.path(f"mesh/mesh.{suffix}"), mesh, "camera")
-        _write_project(frame.pair, directory)
+            write_mesh(run.path(f"mesh/mesh.{suffix}"), mesh, "camera")
+        _write_project(frame.pair, run)
 
 
-def _write_project(pair: RectifiedPair, directory: RunDirectory) -> None:
-    path = directory.path
+def _write_project(pair: RectifiedPair, run: RunDirectory) -> None:
+    path = run.path
     layers = {"mesh": path("mesh/mesh.ply"), "cloud": path("clouds/cloud.ply")}
     write_image(path("mesh/left.png"), pair.colours)
     write_mlp(path("mesh/mesh.mlp"), layers, "camera", Photo(path("mesh/left.png"), pair.camera))

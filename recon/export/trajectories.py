@@ -29,48 +29,46 @@ HEADER: Final = (
 )
 
 
-def export_paths(
-    mapped: MappedSequence, camera_height_m: float | None, directory: RunDirectory
-) -> None:
+def export_paths(mapped: MappedSequence, camera_height_m: float | None, run: RunDirectory) -> None:
     """Write ``trajectory_*.txt``, and ``loops.json`` if loops were closed.
 
     Args:
         mapped: The mapped drive.
         camera_height_m: Height of the camera above the ground; None = unknown.
-        directory: The folder of the run.
+        run: The run.
 
     Raises:
         OutputError: A file cannot be written.
     """
     path, T_map_world = mapped.trajectory, mapped.T_map_world
-    write_kitti_poses(directory.path("trajectory_kitti.txt"), path)
-    write_tum(directory.path("trajectory_tum.txt"), path)
+    write_kitti_poses(run.path("trajectory_kitti.txt"), path)
+    write_tum(run.path("trajectory_tum.txt"), path)
     based = _of_base(path, T_map_world, camera_height_m)
-    write_tum(directory.path("trajectory_map_base_tum.txt"), based)
+    write_tum(run.path("trajectory_map_base_tum.txt"), based)
     if mapped.loops is not None and mapped.loops.closure.closed:
-        write_tum(directory.path("trajectory_odometry_tum.txt"), mapped.loops.odometry)
-        directory.write_json("loops.json", mapped.loops.edges())
+        write_tum(run.path("trajectory_odometry_tum.txt"), mapped.loops.odometry)
+        run.write_json("loops.json", mapped.loops.edges())
 
 
 def export_localized(
-    drive: LocalizedDrive, camera_height_m: float | None, directory: RunDirectory
+    drive: LocalizedDrive, camera_height_m: float | None, run: RunDirectory
 ) -> None:
     """Write ``trajectory_tum.txt``, ``trajectory_map_base_tum.txt`` and ``states.csv``.
 
     Args:
         drive: The drive in the map.
         camera_height_m: Height of the map's camera above the ground; None = unknown.
-        directory: The folder of the run.
+        run: The run.
 
     Raises:
         OutputError: A file cannot be written.
     """
     path, T_map_world = drive.trajectory, drive.T_map_world
-    write_tum(directory.path("trajectory_tum.txt"), path)
+    write_tum(run.path("trajectory_tum.txt"), path)
     based = _of_base(path, T_map_world, camera_height_m)
-    write_tum(directory.path("trajectory_map_base_tum.txt"), based)
+    write_tum(run.path("trajectory_map_base_tum.txt"), based)
     lines = [",".join(HEADER), *map(_line, drive.frames)]
-    write_text(directory.path("states.csv"), "\n".join(lines) + "\n")
+    write_text(run.path("states.csv"), "\n".join(lines) + "\n")
 
 
 def _of_base(path: Trajectory, T_map_world: Float64, camera_height_m: float | None) -> Trajectory:

@@ -28,7 +28,7 @@ _SHOWN_ROWS_PX: Final = 5.0  # farther apart are wrong matches
 
 
 def write_audit_page(
-    audit: Audit, source: StereoSource, matcher: Matcher, directory: RunDirectory
+    audit: Audit, source: StereoSource, matcher: Matcher, run: RunDirectory
 ) -> None:
     """Write ``report.html`` of an audit; ``matcher`` finds the disparities of its sample pairs.
 
@@ -37,7 +37,7 @@ def write_audit_page(
     """
     write_page(
         "audit",
-        directory,
+        run,
         source=source,
         lines=audit_lines(audit.summary),
         found=audit.figures,

@@ -31,34 +31,34 @@ _ACCURACY: Final = (
 
 
 def write_batch_page(
-    results: Sequence[JobResult], summary: Mapping[str, Any], directory: RunDirectory
+    results: Sequence[JobResult], summary: Mapping[str, Any], run: RunDirectory
 ) -> None:
     """Write the table as CSV and Markdown, and ``report.html`` with the outliers first.
 
     Args:
         results: The jobs, in the order of the batch.
         summary: The content of ``summary.json``.
-        directory: The folder of the batch.
+        run: The run of the batch.
 
     Raises:
         OutputError: A file cannot be written.
     """
     table = batch_table(results)
-    write_text(directory.path("table.csv"), batch_csv(results))
-    write_text(directory.path("table.md"), join([table.markdown()]))
+    write_text(run.path("table.csv"), batch_csv(results))
+    write_text(run.path("table.md"), join([table.markdown()]))
     sweep = sweep_figure(results) if any(one.job.swept for one in results) else b""
     if sweep:
-        write_bytes(directory.path("sweep.png"), sweep)
+        write_bytes(run.path("sweep.png"), sweep)
     failed = [f"{one.job.name}: {one.error}" for one in results if one.state == "failed"]
     write_page(
         "batch",
-        directory,
+        run,
         found=summary,
         head=table.head,
         jobs=[
             {
                 "name": one.job.name,
-                "page": _page(one, directory.folder),
+                "page": _page(one, run.folder),
                 "cells": cells[1:],
                 "why": why,
             }

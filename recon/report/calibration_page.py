@@ -25,27 +25,27 @@ from recon.stereo.rectify.rectifier import Rectifier
 _CELLS: Final = (8, 6)
 
 
-def write_calibration_page(run: CalibrationRun, directory: RunDirectory) -> None:
+def write_calibration_page(result: CalibrationRun, run: RunDirectory) -> None:
     """Write ``report.html`` of a calibration, and its images.
 
     Raises:
         OutputError: A file cannot be written.
     """
-    before, after = epipolar_images(run)
+    before, after = epipolar_images(result)
     figures = {
-        "coverage": coverage_figure(run),
-        "view_errors": errors_figure(run),
+        "coverage": coverage_figure(result),
+        "view_errors": errors_figure(result),
         "epipolar_raw": before,
         "epipolar_rectified": after,
-        "row_errors": rows_figure(run),
-        "depth_error": depth_error_figure(run),
+        "row_errors": rows_figure(result),
+        "depth_error": depth_error_figure(result),
     }
     for name, png in figures.items():
-        write_bytes(directory.path(f"pictures/{name}.png"), png)
-    found = run.summary
+        write_bytes(run.path(f"pictures/{name}.png"), png)
+    found = result.summary
     write_page(
         "calibration",
-        directory,
+        run,
         found=found,
         figures=figures,
         warnings=found["warnings"],
@@ -54,21 +54,23 @@ def write_calibration_page(run: CalibrationRun, directory: RunDirectory) -> None
     )
 
 
-def epipolar_images(run: CalibrationRun) -> tuple[bytes, bytes]:
+def epipolar_images(result: CalibrationRun) -> tuple[bytes, bytes]:
     """Draw the view with median error: raw with epipolar curves, rectified with rows."""
-    view = run.fit.views[int(np.argsort(run.fit.errors_px.sum(axis=1))[len(run.fit.views) // 2])]
+    view = result.fit.views[
+        int(np.argsort(result.fit.errors_px.sum(axis=1))[len(result.fit.views) // 2])
+    ]
     left_px, right_px = shared_pixels(view)
     chosen = spread_points(left_px)
     pixels = (left_px[chosen], right_px[chosen])
-    left, right = run.seen.pairs[view.name]
+    left, right = result.seen.pairs[view.name]
     pair = StereoPair(read_image(left), read_image(right), name=view.name)
-    rig, turns = run.fit.calibration, run.turns
+    rig, turns = result.fit.calibration, result.turns
     curves = epipolar_curves(rig, *pixels)
     raw = epipolar_figure(
         EpipolarImage(pair.left, pixels[0], curves[0], f"Left, as recorded: {view.name}"),
         EpipolarImage(pair.right, pixels[1], curves[1], "Right, as recorded"),
     )
-    rectified = Rectifier(rig, run.config.rectification).rectify(pair)
+    rectified = Rectifier(rig, result.config.rectification).rectify(pair)
     placed = [turns.place(rig, pixels[0]), turns.place(rig, pixels[1], right=True)]
     rows = level_lines(placed[0], turns.camera.width_px)
     level = epipolar_figure(
@@ -79,36 +81,36 @@ def epipolar_images(run: CalibrationRun) -> tuple[bytes, bytes]:
 
 
 @styled
-def coverage_figure(run: CalibrationRun) -> bytes:
+def coverage_figure(result: CalibrationRun) -> bytes:
     """Draw all corners found in both images, over the cells of the coverage measure."""
-    width, height = run.seen.size_px
+    width, height = result.seen.size_px
     figure = Figure((WIDE_IN, WIDE_IN / 2 * height / width + 0.5))
     for side, axes in enumerate(figure.subplots(1, 2)):
         name = ("left", "right")[side]
-        colours = colormaps["turbo"](np.linspace(0.05, 0.95, len(run.fit.views)))
-        for view, colour in zip(run.fit.views, colours, strict=True):
+        colours = colormaps["turbo"](np.linspace(0.05, 0.95, len(result.fit.views)))
+        for view, colour in zip(result.fit.views, colours, strict=True):
             axes.plot(*view.seen[side].pixels.T, ".", color=colour, markersize=3.5, alpha=0.8)
-        share = run.summary[f"coverage_{name}"]
+        share = result.summary[f"coverage_{name}"]
         axes.set_title(f"{name.capitalize()}: {100 * share:.0f} % of the cells")
         _frame(axes, width, height)
     return to_png(figure)
 
 
 @styled
-def errors_figure(run: CalibrationRun) -> bytes:
+def errors_figure(result: CalibrationRun) -> bytes:
     """Draw the RMS error of each view in both images, including dropped views."""
-    names = [*(view.name for view in run.fit.views), *run.fit.dropped]
-    used = len(run.fit.views)
+    names = [*(view.name for view in result.fit.views), *result.fit.dropped]
+    used = len(result.fit.views)
     figure = Figure((WIDE_IN, 3.4))
     axes = figure.subplots()
     place = np.arange(used)
-    axes.bar(place - 0.2, run.fit.errors_px[:, 0], 0.38, label="left")
-    axes.bar(place + 0.2, run.fit.errors_px[:, 1], 0.38, label="right")
-    if run.fit.dropped:
+    axes.bar(place - 0.2, result.fit.errors_px[:, 0], 0.38, label="left")
+    axes.bar(place + 0.2, result.fit.errors_px[:, 1], 0.38, label="right")
+    if result.fit.dropped:
         gone = np.arange(used, len(names))
-        axes.bar(gone, list(run.fit.dropped.values()), 0.6, color=BAD, label="dropped")
+        axes.bar(gone, list(result.fit.dropped.values()), 0.6, color=BAD, label="dropped")
         axes.set_yscale("log")
-    axes.axhline(run.fit.rms_px, color=INK, linewidth=1, linestyle="--")
+    axes.axhline(result.fit.rms_px, color=INK, linewidth=1, linestyle="--")
     axes.set_ylabel("rms error, px")
     axes.set_xticks(np.arange(len(names)), names, rotation=60, ha="right", fontsize=7)
     axes.legend(ncols=3)
@@ -116,21 +118,21 @@ def errors_figure(run: CalibrationRun) -> bytes:
 
 
 @styled
-def rows_figure(run: CalibrationRun) -> bytes:
+def rows_figure(result: CalibrationRun) -> bytes:
     """Draw the row differences of the corners after rectification."""
     figure = Figure((HALF_IN, 3.4))
     axes = figure.subplots()
-    reach = max(float(np.quantile(np.abs(run.rows_px), 0.999)), 0.05)
-    axes.hist(run.rows_px, bins=list(np.linspace(-reach, reach, 61)))
+    reach = max(float(np.quantile(np.abs(result.rows_px), 0.999)), 0.05)
+    axes.hist(result.rows_px, bins=list(np.linspace(-reach, reach, 61)))
     axes.axvline(0, color=INK, linewidth=1)
     axes.set(xlabel="row left − row right, px", ylabel="corners")
     return to_png(figure)
 
 
 @styled
-def depth_error_figure(run: CalibrationRun) -> bytes:
+def depth_error_figure(result: CalibrationRun) -> bytes:
     """Draw the depth error by depth: from matching, and from calibration with its interval."""
-    errors = run.spread.depths
+    errors = result.spread.depths
     known = [each for each in errors if np.isfinite(each.calibration_m)]
     known_m = [each.depth_m for each in known]
     matching = [100 * each.matching_m for each in errors]

@@ -34,31 +34,31 @@ class EpipolarImage:
     title: str
 
 
-def write_epipolar_images(run: RectifyRun, directory: RunDirectory) -> None:
+def write_epipolar_images(result: RectifyRun, run: RunDirectory) -> None:
     """Write ``pictures/epipolar_raw.png`` and ``pictures/epipolar_rectified.png``.
 
     Raises:
         OutputError: A file cannot be written.
     """
-    chosen = spread_points(run.raw_px[0], 12)
-    rows = level_lines(run.rectified_px[0][chosen], run.rectified[0].shape[1])
-    raw = (run.pair.left, run.pair.right)
+    chosen = spread_points(result.raw_px[0], 12)
+    rows = level_lines(result.rectified_px[0][chosen], result.rectified[0].shape[1])
+    raw = (result.pair.left, result.pair.right)
     titles = ("Left, rectified", "Right, rectified: rows of the left")
     before = [
         EpipolarImage(
             raw[n],
-            run.raw_px[n][chosen],
-            [run.raw_lines[n][line] for line in chosen],
+            result.raw_px[n][chosen],
+            [result.raw_lines[n][line] for line in chosen],
             f"{('Left', 'Right')[n]}, as recorded",
         )
         for n in (0, 1)
     ]
     after = [
-        EpipolarImage(run.rectified[n], run.rectified_px[n][chosen], rows, titles[n])
+        EpipolarImage(result.rectified[n], result.rectified_px[n][chosen], rows, titles[n])
         for n in (0, 1)
     ]
-    write_bytes(directory.path("pictures/epipolar_raw.png"), epipolar_figure(*before))
-    write_bytes(directory.path("pictures/epipolar_rectified.png"), epipolar_figure(*after))
+    write_bytes(run.path("pictures/epipolar_raw.png"), epipolar_figure(*before))
+    write_bytes(run.path("pictures/epipolar_rectified.png"), epipolar_figure(*after))
 
 
 def level_lines(pixels: Float64, width_px: int) -> list[Float64]:

@@ -14,7 +14,7 @@ from recon.report.scene import Scene, plot_scene
 from recon.run.directory import RunDirectory
 
 
-def write_joined_page(joined: JoinedMap, summary: dict[str, Any], directory: RunDirectory) -> None:
+def write_joined_page(joined: JoinedMap, summary: dict[str, Any], run: RunDirectory) -> None:
     """Write ``report.html`` of a map of several drives: all paths on one grid.
 
     Raises:
@@ -26,7 +26,7 @@ def write_joined_page(joined: JoinedMap, summary: dict[str, Any], directory: Run
     ways = [(name, np.asarray(apply(T_map_world, p.positions_m))) for name, p in named.items()]
     write_page(
         "joined",
-        directory,
+        run,
         run=summary,
         warnings=summary["warnings"],
         grid=grid_figure(made.grid, from_above),

@@ -20,21 +20,21 @@ from recon.run.directory import RunDirectory
 _SHADES: Final = {State.SEARCHING: FAINT, State.LOST: BAD}
 
 
-def write_localize_page(run: LocalizeRun, directory: RunDirectory) -> None:
+def write_localize_page(result: LocalizeRun, run: RunDirectory) -> None:
     """Write ``report.html`` of a drive in a map.
 
     Raises:
         OutputError: The file cannot be written.
     """
-    figures = {"path": _path(run), "certainty": certainty_figure(run.drive)}
-    write_page("localize", directory, run=run, figures=figures, warnings=run.summary["warnings"])
+    figures = {"path": _path(result), "certainty": certainty_figure(result.drive)}
+    write_page("localize", run, run=result, figures=figures, warnings=result.summary["warnings"])
 
 
-def _path(run: LocalizeRun) -> bytes | None:
+def _path(result: LocalizeRun) -> bytes | None:
     """Return the path on the grid, or alone if the map has none; None where there is neither."""
-    path, T_map_world = run.drive.trajectory, run.drive.T_map_world
-    if run.grid is not None:
-        return grid_figure(run.grid, {"path": seen_from_above(path, T_map_world)})
+    path, T_map_world = result.drive.trajectory, result.drive.T_map_world
+    if result.grid is not None:
+        return grid_figure(result.grid, {"path": seen_from_above(path, T_map_world)})
     return path_figure(path, None, T_map_world) if len(path) else None
 
 

@@ -16,7 +16,7 @@ _SCALE_THRESHOLDS: Final = 2.0
 """The last colour of the scale corresponds to this multiple of the largest threshold."""
 
 
-def write_map_errors(comparison: MapComparison, directory: RunDirectory) -> None:
+def write_map_errors(comparison: MapComparison, run: RunDirectory) -> None:
     """Write ``error.ply`` and ``missed.ply``, both in the axes of the reference.
 
     The first is the map, coloured by the distance of each point to the reference; the second is
@@ -31,4 +31,4 @@ def write_map_errors(comparison: MapComparison, directory: RunDirectory) -> None
         distance_m = nearest_distances(points.xyz, others.xyz)
         rgb = colour_values(distance_m, ERROR_SCALE, (0.0, limit_m))
         coloured = replace(PointCloud(points.xyz, frame=points.frame), rgb=rgb)
-        write_ply(directory.path(f"{name}.ply"), coloured, quality=distance_m)
+        write_ply(run.path(f"{name}.ply"), coloured, quality=distance_m)

@@ -20,54 +20,59 @@ from recon.report.scene import Json, Scene, plot_scene
 from recon.run.directory import RunDirectory
 
 
-def write_map_page(run: MapRun, directory: RunDirectory) -> None:
+def write_map_page(result: MapRun, run: RunDirectory) -> None:
     """Write ``report.html`` of a drive.
 
     Raises:
         OutputError: The file cannot be written.
     """
-    write_page("map", directory, **map_content(run))
+    write_page("map", run, **map_content(result))
 
 
-def map_content(run: MapRun) -> Json:
+def map_content(result: MapRun) -> Json:
     """Return what the page of a drive shows: map and path first, then the data behind them."""
-    sample = run.mapped.sample
+    sample = result.mapped.sample
     return {
-        "run": run,
-        "warnings": run.warnings,
-        "figures": _figures(run),
-        "view": _view(run),
+        "run": result,
+        "warnings": result.warnings,
+        "figures": _figures(result),
+        "view": _view(result),
         "sample": stereo_figures(sample.pair, sample.disparity),
     }
 
 
-def _figures(run: MapRun) -> dict[str, bytes | None]:
-    path, health, T_map_world = run.mapped.trajectory, run.mapped.health, run.mapped.T_map_world
-    truth = None if run.truth is None else run.truth.trajectory
-    drift = run.mapped.expected_drift
+def _figures(result: MapRun) -> dict[str, bytes | None]:
+    path, health, T_map_world = (
+        result.mapped.trajectory,
+        result.mapped.health,
+        result.mapped.T_map_world,
+    )
+    truth = None if result.truth is None else result.truth.trajectory
+    drift = result.mapped.expected_drift
     radius_share = 0.0 if drift is None else drift.radius_share
     return {
-        "grid": grid_figure(run.grid, {"path": seen_from_above(path, T_map_world)}),
+        "grid": grid_figure(result.grid, {"path": seen_from_above(path, T_map_world)}),
         "path": path_figure(path, truth, T_map_world, health, radius_share),
-        "loops": _loops(run),
+        "loops": _loops(result),
         "drift": None if truth is None else drift_figure(path, truth, health),
         "health": health_figure(health) if health else None,
     }
 
 
-def _loops(run: MapRun) -> bytes | None:
-    loops = run.mapped.loops
+def _loops(result: MapRun) -> bytes | None:
+    loops = result.mapped.loops
     if loops is None or not loops.closure.closed:
         return None
     pairs = [(loop.first, loop.last) for loop in loops.closure.closed]
-    return loops_figure(loops.odometry, loops.closure.trajectory, pairs, run.mapped.T_map_world)
+    return loops_figure(loops.odometry, loops.closure.trajectory, pairs, result.mapped.T_map_world)
 
 
-def _view(run: MapRun) -> Json | None:
-    drives = [("path", run.mapped.trajectory)]
-    if run.truth is not None and run.truth.trajectory is not None:
-        drives.append(("true path", run.truth.trajectory))
+def _view(result: MapRun) -> Json | None:
+    drives = [("path", result.mapped.trajectory)]
+    if result.truth is not None and result.truth.trajectory is not None:
+        drives.append(("true path", result.truth.trajectory))
     paths = [
-        (name, np.asarray(apply(run.mapped.T_map_world, path.positions_m))) for name, path in drives
+        (name, np.asarray(apply(result.mapped.T_map_world, path.positions_m)))
+        for name, path in drives
     ]
-    return plot_scene(Scene(np.eye(4), run.cloud, run.mesh, paths))
+    return plot_scene(Scene(np.eye(4), result.cloud, result.mesh, paths))

@@ -29,7 +29,7 @@ _GAP_PX: Final = 6
 _LEAST_SHARE: Final = 0.001
 
 
-def draw_result(result: SceneResult, directory: RunDirectory) -> None:
+def draw_result(result: SceneResult, run: RunDirectory) -> None:
     """Write the disparity and the error of a result as colour images.
 
     In the error, blue is correct, red is wrong by `ERROR_LIMIT_PX` full-size pixels or more, and
@@ -45,11 +45,11 @@ def draw_result(result: SceneResult, directory: RunDirectory) -> None:
         "error": colour_error(result.error_px(), ERROR_LIMIT_PX),
     }
     for name, image in images.items():
-        path = directory.path(f"pictures/{result.matcher}/{result.scene.name}_{name}.png")
+        path = run.path(f"pictures/{result.matcher}/{result.scene.name}_{name}.png")
         write_image(path, image)
 
 
-def write_middlebury_page(summary: Mapping[str, Any], directory: RunDirectory) -> None:
+def write_middlebury_page(summary: Mapping[str, Any], run: RunDirectory) -> None:
     """Write the tables as text, Markdown, LaTeX and CSV, and ``report.html``.
 
     Raises:
@@ -57,18 +57,18 @@ def write_middlebury_page(summary: Mapping[str, Any], directory: RunDirectory) -
     """
     tables = middlebury_tables(summary)
     for suffix, form in (("txt", Table.text), ("md", Table.markdown), ("tex", Table.latex)):
-        write_text(directory.path(f"tables.{suffix}"), join(map(form, tables)))
-    write_text(directory.path("figures.csv"), csv_table(summary))
+        write_text(run.path(f"tables.{suffix}"), join(map(form, tables)))
+    write_text(run.path("figures.csv"), csv_table(summary))
     found = {name: one["weighted"]["confidence"] for name, one in summary["matchers"].items()}
     rated = {name: curves for name, curves in found.items() if curves}
     write_page(
         "middlebury",
-        directory,
+        run,
         found=summary,
         tables=tables,
         reliability=reliability_figure(rated) if rated else None,
         sparsification=sparsification_figure(rated) if rated else None,
-        scenes=[_scene(name, summary, directory) for name in scene_names(summary["matchers"])],
+        scenes=[_scene(name, summary, run) for name in scene_names(summary["matchers"])],
         warnings=summary["warnings"],
     )
 
@@ -122,21 +122,21 @@ def _floats(values: Any) -> Any:
     return np.array(values, dtype=np.float64)
 
 
-def _scene(scene: str, summary: Mapping[str, Any], directory: RunDirectory) -> dict[str, Any]:
+def _scene(scene: str, summary: Mapping[str, Any], run: RunDirectory) -> dict[str, Any]:
     """Return what the page shows of a scene: one row of images per matcher."""
     names = [name for name, found in summary["matchers"].items() if scene in found["scenes"]]
     buffer = io.BytesIO()
-    rows = [_both_images(directory, name, scene) for name in names]
+    rows = [_both_images(run, name, scene) for name in names]
     _joined(rows, down=True).save(buffer, "PNG")
     return {"name": scene, "matchers": names, "png": buffer.getvalue()}
 
 
-def _both_images(directory: RunDirectory, matcher: str, scene: str) -> Image.Image:
+def _both_images(run: RunDirectory, matcher: str, scene: str) -> Image.Image:
     """Return disparity and error side by side."""
     stem = f"pictures/{matcher}/{scene}"
-    found = Image.open(directory.path(f"{stem}_disparity.png"))
+    found = Image.open(run.path(f"{stem}_disparity.png"))
     # The error has the size of the ground truth, which is that of no or every matcher's result.
-    error = Image.open(directory.path(f"{stem}_error.png"))
+    error = Image.open(run.path(f"{stem}_error.png"))
     width = min(_WIDTH_PX, error.width)
     size = (width, max(1, round(error.height * width / error.width)))
     nearest = Image.Resampling.NEAREST

@@ -28,21 +28,21 @@ _WEBP_QUALITY: Final = 80
 _NOT_TABULATED: Final = frozenset({"stages", "warnings", "findings"})
 
 
-def write_page(name: str, directory: RunDirectory, **content: Any) -> None:
+def write_page(name: str, run: RunDirectory, /, **content: Any) -> None:
     """Write ``report.html`` of a run, with its command, ``config.yaml`` and versions.
 
     Args:
         name: The template, such as ``map``.
-        directory: The run.
+        run: The run.
         content: What the template shows, see `render_page`.
 
     Raises:
         OutputError: The file cannot be written.
     """
-    path = directory.path("config.yaml")
+    path = run.path("config.yaml")
     config = path.read_text(encoding="utf-8") if path.is_file() else ""
     origin = {"command": command_line(), "config": config, "versions": versions()}
-    write_text(directory.path("report.html"), render_page(name, **origin, **content))
+    write_text(run.path("report.html"), render_page(name, **origin, **content))
 
 
 def render_page(name: str, **content: Any) -> str:

@@ -14,50 +14,50 @@ from recon.run.directory import RunDirectory
 from recon.stereo.pair_run import PairRun
 
 
-def write_pair_page(run: PairRun, directory: RunDirectory) -> None:
+def write_pair_page(result: PairRun, run: RunDirectory) -> None:
     """Write ``report.html`` of a pair, and its results as colour images.
 
     Raises:
         OutputError: A file cannot be written.
     """
-    write_disparity_images(run, directory)
-    write_page("pair", directory, **pair_content(run))
+    write_disparity_images(result, run)
+    write_page("pair", run, **pair_content(result))
 
 
-def write_disparity_images(run: PairRun, directory: RunDirectory) -> None:
+def write_disparity_images(result: PairRun, run: RunDirectory) -> None:
     """Write disparity, confidence and reasons of a pair as colour images.
 
     Raises:
         OutputError: A file cannot be written.
     """
     images = {
-        "disparity_colour.png": colour_disparity(run.disparity.values),
-        "confidence_colour.png": colour_confidence(run.disparity.confidence),
-        "reason_colour.png": colour_reasons(run.disparity.reason),
+        "disparity_colour.png": colour_disparity(result.disparity.values),
+        "confidence_colour.png": colour_confidence(result.disparity.confidence),
+        "reason_colour.png": colour_reasons(result.disparity.reason),
     }
     for name, image in images.items():
-        write_image(directory.path(f"disparity/{name}"), image)
+        write_image(run.path(f"disparity/{name}"), image)
 
 
-def pair_content(run: PairRun) -> Json:
+def pair_content(result: PairRun) -> Json:
     """Return what the page of a pair shows: disparity, accuracy and 3-D view."""
-    scene = Scene(T_UPRIGHT_CAMERA, run.cloud, run.mesh, eye_m=_beside_camera(run))
+    scene = Scene(T_UPRIGHT_CAMERA, result.cloud, result.mesh, eye_m=_beside_camera(result))
     error: bytes | None = None
-    if run.truth is not None and run.truth.values.shape == run.disparity.values.shape:
-        error = error_figure(np.abs(run.disparity.values - run.truth.values))
+    if result.truth is not None and result.truth.values.shape == result.disparity.values.shape:
+        error = error_figure(np.abs(result.disparity.values - result.truth.values))
     return {
-        "run": run,
-        "warnings": run.warnings,
-        "result": stereo_figures(run.pair, run.disparity),
+        "run": result,
+        "warnings": result.warnings,
+        "result": stereo_figures(result.pair, result.disparity),
         "error": error,
         "limit_px": ERROR_LIMIT_PX,
         "view": plot_scene(scene),
     }
 
 
-def _beside_camera(run: PairRun) -> tuple[float, float, float]:
+def _beside_camera(result: PairRun) -> tuple[float, float, float]:
     """Return a viewpoint behind, left of and above the camera, from which depth is visible."""
-    depth_m = depth_from_disparity(run.disparity.values, run.pair.camera)
+    depth_m = depth_from_disparity(result.disparity.values, result.pair.camera)
     known = depth_m[np.isfinite(depth_m)]
     far = float(np.median(known)) if known.size else 1.0
     return (-0.1 * far, 0.25 * far, 0.25 * far)

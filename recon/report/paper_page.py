@@ -64,27 +64,27 @@ _ELEVATION_DEG: Final = 55.0
 _AZIMUTH_DEG: Final = -72.0
 
 
-def write_paper_page(run: PaperRun, directory: RunDirectory) -> None:
+def write_paper_page(result: PaperRun, run: RunDirectory) -> None:
     """Write ``report.html`` of the seed paper's experiments, and each disparity in colour.
 
     Raises:
         OutputError: A file cannot be written.
     """
-    for result in run.experiments:
-        for one in result.methods:
-            path = directory.path(f"{result.experiment.folder}/{one.method}/disparity_colour.png")
-            write_image(path, colour_disparity(one.disparity.values))
+    for one in result.experiments:
+        for method in one.methods:
+            path = run.path(f"{one.experiment.folder}/{method.method}/disparity_colour.png")
+            write_image(path, colour_disparity(method.disparity.values))
     write_page(
         "paper",
-        directory,
-        run=run,
+        run,
+        run=result,
         titles=TITLES,
-        drawn=[_drawn(result) for result in run.experiments],
+        drawn=[_drawn(one) for one in result.experiments],
         limit_px=ERROR_LIMIT_PX,
         bad_px=BAD_PX,
         # Experiments have their own sections.
-        of_the_run={k: v for k, v in run.summary.items() if k not in {"experiments", "table_1"}},
-        warnings=run.warnings,
+        of_the_run={k: v for k, v in result.summary.items() if k not in {"experiments", "table_1"}},
+        warnings=result.warnings,
     )
 
 

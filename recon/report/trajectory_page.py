@@ -13,19 +13,19 @@ from recon.report.page import write_page
 from recon.run.directory import RunDirectory
 
 
-def write_trajectory_page(run: TrajectoryRun, directory: RunDirectory) -> None:
+def write_trajectory_page(result: TrajectoryRun, run: RunDirectory) -> None:
     """Write ``report.html`` of a comparison, and its figures as PNG files.
 
     Raises:
         OutputError: A file cannot be written.
     """
     figures = {
-        "path": compared_paths_figure(run.comparison),
-        "error_along_path": pose_errors_figure(run.comparison),
-        "translation_by_length": errors_by_length_figure(run.comparison, rotation=False),
-        "rotation_by_length": errors_by_length_figure(run.comparison, rotation=True),
+        "path": compared_paths_figure(result.comparison),
+        "error_along_path": pose_errors_figure(result.comparison),
+        "translation_by_length": errors_by_length_figure(result.comparison, rotation=False),
+        "rotation_by_length": errors_by_length_figure(result.comparison, rotation=True),
     }
     for name, png in figures.items():
-        write_bytes(directory.path(f"{name}.png"), png)
-    warnings = run.summary["warnings"]
-    write_page("trajectory", directory, run=run, figures=figures, warnings=warnings)
+        write_bytes(run.path(f"{name}.png"), png)
+    warnings = result.summary["warnings"]
+    write_page("trajectory", run, run=result, figures=figures, warnings=warnings)

@@ -139,19 +139,19 @@ def _method_summary(result: MethodResult) -> dict[str, Any]:
     }
 
 
-def write_experiments(results: Sequence[ExperimentResult], directory: RunDirectory) -> None:
+def write_experiments(results: Sequence[ExperimentResult], run: RunDirectory) -> None:
     """Write disparity, depth and cloud of each method, and a MeshLab project per experiment."""
     for result in results:
         folder = result.experiment.folder
         layers = {}
         for one in result.methods:
-            _write_method(one, f"{folder}/{one.method}", directory)
-            layers[one.method] = directory.path(f"{folder}/{one.method}/cloud.ply")
-        write_mlp(directory.path(f"{folder}/clouds.mlp"), layers, "camera")
+            _write_method(one, f"{folder}/{one.method}", run)
+            layers[one.method] = run.path(f"{folder}/{one.method}/cloud.ply")
+        write_mlp(run.path(f"{folder}/clouds.mlp"), layers, "camera")
 
 
-def _write_method(result: MethodResult, folder: str, directory: RunDirectory) -> None:
-    write_pfm(directory.path(f"{folder}/disparity.pfm"), result.disparity.values)
-    write_pfm(directory.path(f"{folder}/depth.pfm"), result.depth_m)
-    write_ply(directory.path(f"{folder}/cloud.ply"), result.cloud)
-    write_ply(directory.path(f"{folder}/cloud_ascii.ply"), result.cloud, ascii=True)
+def _write_method(result: MethodResult, folder: str, run: RunDirectory) -> None:
+    write_pfm(run.path(f"{folder}/disparity.pfm"), result.disparity.values)
+    write_pfm(run.path(f"{folder}/depth.pfm"), result.depth_m)
+    write_ply(run.path(f"{folder}/cloud.ply"), result.cloud)
+    write_ply(run.path(f"{folder}/cloud_ascii.ply"), result.cloud, ascii=True)

@@ -84,16 +84,16 @@ class WrittenMesh:
         """Number of vertices."""
         return sum(piece.vertices for piece in self.pieces)
 
-    def to_show(self, directory: RunDirectory) -> TriangleMesh | None:
+    def to_show(self, run: RunDirectory) -> TriangleMesh | None:
         """Return the mesh for images; None if it is too large for memory."""
-        whole = directory.path(WHOLE)
+        whole = run.path(WHOLE)
         return read_mesh(whole) if self.faces <= SAMPLE_FACES else None
 
 
 def export_mesh(
     tiles: Tiles,
     settings: MeshSettings,
-    directory: RunDirectory,
+    run: RunDirectory,
     cloud: Path,
     threads: int | None = None,
 ) -> WrittenMesh:
@@ -102,7 +102,7 @@ def export_mesh(
     Args:
         tiles: The map; without voxels no space is known to be free.
         settings: Settings of the mesh; ``target_faces`` is the total over all pieces.
-        directory: The folder of the run.
+        run: The run.
         cloud: A PLY file in it, for the MeshLab project.
         threads: Pieces reconstructed at a time, each in its own process, but at most four, since
             each needs memory; None = one per core. Does not change results.
@@ -112,18 +112,18 @@ def export_mesh(
         OutputError: A file cannot be written.
     """
     at_once = min(threads or available_cores(), _MOST_AT_ONCE)
-    found = _Mesher(tiles, settings, directory, at_once, _count(tiles, settings)).run()
+    found = _Mesher(tiles, settings, run, at_once, _count(tiles, settings)).written()
     if not found.pieces:
         raise MeshingError(
             "no part of the map gives a surface", got="; ".join(found.warnings) or "no point"
         )
-    whole = directory.path(WHOLE)
+    whole = run.path(WHOLE)
     join_meshes(whole, [(piece.path, piece.vertices, piece.faces) for piece in found.pieces])
     layers = {piece.path.stem: piece.path for piece in found.pieces}
     if len(found.pieces) == 1:
         found.pieces[0].path.unlink()
         layers = {"mesh": whole}
-    write_mlp(directory.path("mesh/mesh.mlp"), {**layers, "cloud": cloud}, "map")
+    write_mlp(run.path("mesh/mesh.mlp"), {**layers, "cloud": cloud}, "map")
     return found
 
 
@@ -145,12 +145,12 @@ class _Mesher:
 
     tiles: Tiles
     settings: MeshSettings
-    directory: RunDirectory
+    run: RunDirectory
     threads: int
     points: Counter[PieceKey]
     borders: dict[tuple[PieceKey, Plane], Float32] = field(default_factory=dict)
 
-    def run(self) -> WrittenMesh:
+    def written(self) -> WrittenMesh:
         pieces: list[MeshPiece] = []
         failed: dict[PieceKey, MeshingError] = {}
         keys = sorted(self.points)
@@ -161,7 +161,7 @@ class _Mesher:
                 continue
             mesh = self._joined(key, surface)
             if len(mesh.faces):
-                path = self.directory.path(f"mesh/tiles/tile_{key[0]}_{key[1]}.ply")
+                path = self.run.path(f"mesh/tiles/tile_{key[0]}_{key[1]}.ply")
                 write_mesh(path, mesh)
                 pieces.append(MeshPiece(path, len(mesh.vertices), len(mesh.faces)))
         return WrittenMesh(self.points.total(), tuple(pieces), self._warnings(failed))
