@@ -23,6 +23,7 @@ _R = TypeVar("_R")
 #: Larger than any calibration or configuration: other files are not read to the end.
 SMALL_FILE_BYTES: Final = 1 << 22
 _LONGEST_REASON: Final = 120
+_NO_DATA: Final = "begin lines that are no data with #"
 _KINDS: Final = (
     (stat.S_ISFIFO, "a named pipe"),
     (stat.S_ISSOCK, "a socket"),
@@ -175,7 +176,8 @@ def _parse_row(words: list[str], columns: tuple[int, ...], where: str) -> list[f
     try:
         row = [float(word) for word in words]
     except ValueError as error:
-        raise FormatError("not a number", where=where, got=" ".join(words)[:60]) from error
+        got = " ".join(words)[:60]
+        raise FormatError("not a number", where=where, got=got, hint=_NO_DATA) from error
     if not np.isfinite(row).all():
         raise FormatError("number is not finite", where=where, got=" ".join(words)[:60])
     return row

@@ -121,3 +121,53 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "gnss.txt").write_text("$GPGGA,123519,4807.038,N\n")
     with pytest.raises(FormatError, match=r"gnss\.txt:1"):
         georeference(write_run(tmp_path), Survey(tmp_path / "gnss.txt"))
+
+
+def test_positions_that_contradict_most_are_left_out_and_named(tmp_path: Path) -> None:
+    rows = positions(FROM_S + np.arange(20))
+    rows[[3, 11], 1:3] += [[30.0, -12.0], [-8.0, 5.0]]
+    rows[17, 1:] = 0.0  # no fix
+    placed = georeference(write_run(tmp_path), Survey(write_positions(tmp_path, rows), ANTENNA))
+    np.testing.assert_allclose(placed.T_survey_map, T_SURVEY_MAP, atol=0.002)
+    assert placed.figures()["positions"] == 17
+    assert placed.figures()["positions_left_out"] == 3
+    (warning,) = placed.warnings()
+    assert "3 of 20 positions contradict the others" in warning
+    assert f"{FROM_S + 3:.3f} s" in warning
+
+
+def test_noise_alone_leaves_no_position_out(tmp_path: Path) -> None:
+    rows = positions(FROM_S + np.arange(0, 19.8, 0.2))
+    rows[:, 1:] += np.random.default_rng(4).normal(0, 1.5, (len(rows), 3))
+    placed = georeference(write_run(tmp_path), Survey(write_positions(tmp_path, rows), ANTENNA))
+    assert placed.figures()["positions_left_out"] == 0
+
+
+def test_positions_in_feet_are_warned_of_as_another_unit(tmp_path: Path) -> None:
+    rows = positions(FROM_S + np.arange(20))
+    rows[:, 1:] /= 0.3048
+    placed = georeference(write_run(tmp_path), Survey(write_positions(tmp_path, rows), ANTENNA))
+    assert "3.28 times as far apart" in placed.warnings()[0]
+
+
+@pytest.mark.parametrize("change", ["swapped", "local", "degrees"])
+def test_positions_outside_the_coordinate_system_are_refused(tmp_path: Path, change: str) -> None:
+    pytest.importorskip("pyproj")
+    rows = positions(FROM_S + np.arange(20))
+    if change == "swapped":
+        rows[:, 1:3] = rows[:, 2:0:-1]
+    elif change == "local":
+        rows[:, 1:3] -= rows[0, 1:3]
+    else:
+        rows[:, 1:3] = [8.5, 49.0]
+    survey = Survey(write_positions(tmp_path, rows), ANTENNA, "EPSG:25832")
+    with pytest.raises(EvaluationError, match="outside the area of their coordinate system"):
+        georeference(write_run(tmp_path), survey)
+
+
+def test_positions_just_across_the_border_of_a_zone_are_taken(tmp_path: Path) -> None:
+    pytest.importorskip("pyproj")
+    rows = positions(FROM_S + np.arange(20))
+    rows[:, 1] -= 300000.0  # 1.6 degrees west of zone 33
+    survey = Survey(write_positions(tmp_path, rows), ANTENNA, "EPSG:25833")
+    assert not georeference(write_run(tmp_path), survey).warnings()

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.core.errors import MissingDependencyError, SettingsError
+from recon.core.errors import EvaluationError, MissingDependencyError, SettingsError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import PointCloud
-from recon.io.models.las import check_crs, write_las
+from recon.io.models.las import check_crs, check_inside, write_las
 
 laspy = pytest.importorskip("laspy")
 
@@ -64,6 +64,14 @@ def test_positions_alone_are_enough(tmp_path: Path) -> None:
     assert found.header.parse_crs() is None
 
 
+def test_each_point_is_the_only_return_of_its_ray(tmp_path: Path) -> None:
+    write_las(tmp_path / "cloud.las", [some_cloud(1)], np.eye(4))
+    found = laspy.read(tmp_path / "cloud.las")
+    assert set(found.return_number) == {1}  # the specification permits no 0
+    assert set(found.number_of_returns) == {1}
+    assert found.header.number_of_points_by_return[0] == 1000
+
+
 def test_no_points_make_an_empty_file(tmp_path: Path) -> None:
     assert write_las(tmp_path / "cloud.laz", [], np.eye(4)) == 0
     assert len(laspy.read(tmp_path / "cloud.laz")) == 0
@@ -87,6 +95,29 @@ def test_other_coordinates_are_refused(tmp_path: Path, name: str, why: str) -> N
 
 def test_a_system_with_heights_is_taken() -> None:
     assert check_crs("EPSG:25832+7837").to_epsg(min_confidence=0) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "east", "north", "inside"),
+    [
+        ("EPSG:25832", 456789.0, 5433210.0, True),
+        ("EPSG:25832", 5433210.0, 456789.0, False),  # swapped
+        ("EPSG:25832", 8.4, 49.0, False),  # degrees
+        ("EPSG:3857", -1.9e7, -1.0e6, True),  # the whole world
+        ("EPSG:32760", 1.0e5, 8.0e6, True),  # beside the line where dates change
+        ("EPSG:3832", 3.0e6, 1.0e6, True),  # an area across that line
+        ("EPSG:3832", -1.6e7, 1.0e6, False),  # Greenwich
+        ("+proj=utm +zone=32 +ellps=GRS80 +units=m", 0.0, 0.0, True),  # no area is stated
+    ],
+)
+def test_positions_lie_in_the_area_of_their_system(
+    name: str, east: float, north: float, inside: bool
+) -> None:
+    if inside:
+        check_inside(name, np.array([east, north, 100.0]), "gnss.txt")
+        return
+    with pytest.raises(EvaluationError, match=r"gnss\.txt: the positions lie outside the area"):
+        check_inside(name, np.array([east, north, 100.0]), "gnss.txt")
 
 
 def test_without_laspy_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

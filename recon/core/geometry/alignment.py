@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from recon.core.geometry.se3 import make_transform
+from recon.core.geometry.se3 import apply, make_transform
 from recon.core.values import Trajectory
-from recon.core.values.arrays import Float64, freeze
+from recon.core.values.arrays import Bool, Float64, freeze
 
 _AXIS_M: Final = 20.0  # typical distance of a map from its cameras
 _UP_M: Final = np.array([0.0, 0.0, 3.0])
 """Short beside a path, whose tilt is to count, and longer than a straight one is wide."""
 _IN_ONE_PLACE: Final = 1e-12
+_ENDS: Final = 24
+"""Points between which lines are tried: of 276 some have two good ends, if half of all are good."""
+_SIGMA_OF_MEDIAN: Final = 1.4826
+_SIGMAS: Final = 4.0
+"""Of ten thousand points with normal errors, none to speak of is farther away than this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +81,45 @@ def fit_upright(from_m: Float64, to_m: Float64) -> Similarity:
         to_m: float64 (N, 3), the corresponding points.
     """
     return fit_points(np.vstack([from_m, from_m + _UP_M]), np.vstack([to_m, to_m + _UP_M]))
+
+
+def find_agreeing(from_m: Float64, to_m: Float64, allowed_m: float) -> Bool:
+    """Return which points fit the transform (`fit_upright`) that suits half of them best.
+
+    Transforms are those of two points far apart.
+
+    Args:
+        from_m: float64 (N, 3), N ≥ 1.
+        to_m: float64 (N, 3), the corresponding points, of which fewer than half may be wrong.
+        allowed_m: Distance that is no contradiction; nor is one of four standard deviations.
+
+    Returns:
+        bool (N,); all True where three points or fewer cannot outvote one another.
+
+    Ref: P. J. Rousseeuw, "Least median of squares regression", JASA 79, 1984.
+    """
+    if len(from_m) <= 3:
+        return np.ones(len(from_m), np.bool_)
+    ends = np.unique(np.linspace(0, len(from_m) - 1, _ENDS).round().astype(int))
+    first, second = ends[np.stack(np.triu_indices(len(ends), 1))]
+    apart_m = np.linalg.norm(from_m[first] - from_m[second], axis=1)
+    far = apart_m >= 0.5 * apart_m.max()
+    tried = [
+        _distances_m(from_m, to_m, np.array(pair))
+        for pair in zip(first[far], second[far], strict=True)
+    ]
+    best_m = min(tried, key=lambda distances_m: float(np.median(distances_m)))
+    for _ in range(2):  # two points alone carry their own errors
+        limit_m = max(allowed_m, _SIGMAS * _SIGMA_OF_MEDIAN * float(np.median(best_m)))
+        agree = best_m <= limit_m
+        best_m = _distances_m(from_m, to_m, agree)
+    return np.asarray(agree)
+
+
+def _distances_m(from_m: Float64, to_m: Float64, chosen: NDArray[Any]) -> Float64:
+    """Return how far each point is from its partner by the transform of the chosen ones."""
+    T_to_from = fit_upright(from_m[chosen], to_m[chosen]).T_to_from
+    return np.asarray(np.linalg.norm(apply(T_to_from, from_m) - to_m, axis=1))
 
 
 def fit_paths(from_path: Trajectory, to_path: Trajectory) -> Similarity:

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.errors import SettingsError
+from recon.core.errors import EvaluationError, SettingsError
 from recon.core.geometry.se3 import apply
 from recon.core.optional import require
 from recon.core.values import PointCloud
@@ -21,6 +21,8 @@ _EXTRA: Final = "survey"
 _COLOURED: Final = 7
 """Point format with colours, of LAS 1.4."""
 _STEP_M: Final = 0.001
+_MARGIN_DEG: Final = 6.0
+"""Systems are used as far outside their area as a zone of UTM is wide."""
 _FULL_COLOUR: Final = 257
 """Colours have 16 bits: 255 becomes 65535."""
 
@@ -96,9 +98,42 @@ def check_crs(crs: str) -> Any:
     return found
 
 
+def check_inside(crs: str, position_m: Float64, where: StrPath) -> None:
+    """Check that a position (east, north, up) lies where its coordinate system is used.
+
+    Raises:
+        EvaluationError: It does not: axes swapped, another system, local coordinates or degrees.
+        MissingDependencyError: pyproj is not installed.
+        SettingsError: There is no such coordinate system, see `check_crs`.
+    """
+    system = check_crs(crs)
+    area = system.area_of_use
+    if area is None:
+        return
+    pyproj = require("pyproj", extra=_EXTRA)
+    to_degrees = pyproj.Transformer.from_crs(system, system.geodetic_crs, always_xy=True)
+    lon, lat = to_degrees.transform(float(position_m[0]), float(position_m[1]))
+    wide = area.east - area.west + (360.0 if area.east < area.west else 0.0)
+    east_of_west = (lon - area.west + _MARGIN_DEG) % 360.0
+    if (
+        east_of_west <= wide + 2 * _MARGIN_DEG
+        and area.south - _MARGIN_DEG <= lat <= area.north + _MARGIN_DEG
+    ):
+        return
+    raise EvaluationError(
+        "the positions lie outside the area of their coordinate system",
+        where=where,
+        got=f"easting {position_m[0]:.0f}, northing {position_m[1]:.0f} in {crs}",
+        expected=f"longitude {area.west:g} to {area.east:g}, latitude {area.south:g} to "
+        f"{area.north:g}",
+        hint="columns are time, easting, northing, height in metres; without --crs any are taken",
+    )
+
+
 def _record(laspy: Any, header: Any, cloud: PointCloud, T_to_from: Float64) -> Any:
     """Return the points of a cloud, as laspy writes them."""
     record = laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header)
+    record.return_number[:] = record.number_of_returns[:] = 1  # 0 is not permitted
     record.x, record.y, record.z = apply(T_to_from, cloud.xyz.astype(np.float64)).T
     if cloud.rgb is not None:
         record.red, record.green, record.blue = cloud.rgb.T.astype(np.uint16) * _FULL_COLOUR

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.core.geometry.alignment import Similarity, fit_paths, fit_points
+from recon.core.geometry.alignment import Similarity, find_agreeing, fit_paths, fit_points
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import Trajectory
 
@@ -73,3 +73,18 @@ def test_a_path_is_moved_with_its_size() -> None:
     np.testing.assert_allclose(
         moved.T_world_camera[1, :3, :3], invert(invert(T))[:3, :3], atol=1e-12
     )
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 17])
+def test_points_that_contradict_more_than_half_are_found(wrong: int) -> None:
+    random = np.random.default_rng(8)
+    along = np.column_stack([np.arange(40.0), np.zeros((40, 2))])  # straight: the hardest case
+    T = make_transform(exp_so3(np.array([0.0, 0.0, 2.0])), np.array([5e5, 5e6, 100.0]))
+    there = along @ T[:3, :3].T + T[:3, 3] + random.normal(0, 0.02, (40, 3))
+    bad = random.permutation(40)[:wrong]
+    there[bad] += random.choice([-1, 1], (wrong, 3)) * random.uniform(2, 50, (wrong, 3))
+    np.testing.assert_array_equal(np.flatnonzero(~find_agreeing(along, there, 0.4)), np.sort(bad))
+
+
+def test_three_points_cannot_outvote_one_another() -> None:
+    assert find_agreeing(points(1, 3), points(2, 3), 0.1).all()
