@@ -25,11 +25,12 @@ from recon.sources.bag_topics import (
     rig_of_messages,
 )
 from recon.sources.calibration import as_rectified, read_rig
+from recon.sources.frame_list import FrameList, check_most
 from recon.sources.one_pair import join_pair
-from recon.sources.pairing import Roll, StampPairs, check_increasing, check_most, pair_stamps
 from recon.sources.protocol import Recording
 from recon.sources.rosbags import CAMERA_INFO, Bag, BagImage
 from recon.sources.settings import SourceSettings
+from recon.sources.stamps import StampPairs, check_increasing, pair_stamps
 
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
 _S: Final = 1e-9
@@ -124,18 +125,18 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
     pairs = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, str(path))
     rig, texts, source = _read_rig(bag, topics, pairs, settings, path)
     also += list_others(bag, topics)
-    roll = Roll([""] * len(stamps[0]), pairs.left, pairs.alone).choose(settings, path)
+    listing = FrameList([""] * len(stamps[0]), pairs.left, pairs.alone).choose(settings, path)
     check_most(len(pairs.left), min(map(len, stamps)), path)
     kind = {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(bag.paths[0].suffix, "ROS 2 bag")
     return BagSource(
         name=path.resolve().name,
-        description=f"{kind}, {topics[0]} and {topics[1]}, paired by stamps{roll}{clock}, "
+        description=f"{kind}, {topics[0]} and {topics[1]}, paired by stamps{listing}{clock}, "
         f"{source}{also}",
         calibration=rig,
         bag=bag,
         topics=topics,
-        pairs=pairs.chosen(roll.chosen),
-        roll=roll,
+        pairs=StampPairs(listing.used(pairs.left), listing.used(pairs.right), pairs.alone),
+        listing=listing,
         left_s=stamps[0],
         recorded_ns=(times[topics[0]][:, 0], times[topics[1]][:, 0]),
         texts=texts,

@@ -12,7 +12,7 @@ from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig
 from recon.io.cameras.camera_info import check_shift, rig_of_camera_infos
 from recon.io.cameras.lens_models import ROS_MODELS, lens_of
 from recon.io.files import reading
-from recon.sources.pairing import find_partners, partner_names
+from recon.sources.image_names import find_partners, partner_names
 from recon.sources.rosbags import CAMERA_INFO, COMPRESSED, IMAGE, POSES, Bag, BagCameraInfo
 from recon.sources.settings import SourceSettings
 

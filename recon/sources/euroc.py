@@ -26,8 +26,8 @@ from recon.core.values.arrays import Float64
 from recon.io.cameras.euroc import NS, read_euroc_camera, read_euroc_truth
 from recon.sources.calibration import as_rectified, find_calibration, read_rig
 from recon.sources.images import ImageSource, image_size, pair_listed
-from recon.sources.pairing import check_increasing
 from recon.sources.settings import SourceSettings
+from recon.sources.stamps import check_increasing
 from recon.sources.times import read_stamped_names, truth_at
 
 _TRUTH: Final = "state_groundtruth_estimate0"
@@ -46,16 +46,16 @@ def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
     views = [root / (settings.left or "cam0"), root / (settings.right or "cam1")]
     lists = [_read_list(view) for view in views]
-    frames, roll = pair_listed(lists, settings, root)
+    frames, listing = pair_listed(lists, settings, root)
     rig, calibration_files = _read_rig(root, settings, views, image_size(frames[0].left, settings))
     truth, note = _read_truth(root, views[0], np.array([frame.timestamp_s for frame in frames]))
     return ImageSource(
         name=folder.resolve().name,
-        description=f"EuRoC drive, {views[0].name} and {views[1].name}, paired by stamps{roll}"
+        description=f"EuRoC drive, {views[0].name} and {views[1].name}, paired by stamps{listing}"
         f"{note}",
         calibration=rig,
         images=frames,
-        roll=roll,
+        listing=listing,
         truth=truth,
         texts=(*calibration_files, *(view / "data.csv" for view in views)),
     )

@@ -24,6 +24,8 @@ from recon.core.values.arrays import Float64
 from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.frames_csv import FRAMES, read_frames
 from recon.sources.calibration import read_rig
+from recon.sources.frame_list import FrameList
+from recon.sources.image_names import find_partners, natural_key, partner_names, split_sides
 from recon.sources.images import (
     ImageFrame,
     ImageSource,
@@ -34,16 +36,8 @@ from recon.sources.images import (
     pair_listed,
     pair_named,
 )
-from recon.sources.pairing import (
-    Roll,
-    check_increasing,
-    find_partners,
-    natural_key,
-    partner_names,
-    split_sides,
-    stamps_of_names,
-)
 from recon.sources.settings import SourceSettings
+from recon.sources.stamps import check_increasing, stamps_of_names
 from recon.sources.times import read_times_of_pairs, read_tum_truth
 
 DEFAULT_RATE_HZ: Final = 10.0
@@ -59,7 +53,7 @@ class _Pairing:
     """Pairs in order; ``stamps_s`` is None if their times are unknown."""
 
     pairs: list[tuple[Path, Path]]
-    roll: Roll
+    listing: FrameList
     stamps_s: Float64 | None
     how: str
     texts: tuple[Path, ...] = ()
@@ -81,13 +75,13 @@ def open_folders(folder: Path, settings: SourceSettings) -> ImageSource:
     truth, note = read_tum_truth(folder, stamps_s)
     return ImageSource(
         name=folder.resolve().name,
-        description=f"plain folders, {found.how}{found.roll}{clock}{note}",
+        description=f"plain folders, {found.how}{found.listing}{clock}{note}",
         calibration=rig,
         images=[
             ImageFrame(left, right, float(stamp))
             for (left, right), stamp in zip(found.pairs, stamps_s, strict=True)
         ],
-        roll=found.roll,
+        listing=found.listing,
         truth=truth,
         texts=(*texts, *found.texts),
     )
@@ -145,9 +139,10 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
     how = "by name"
     if frames is None:
         frames, how = _by_index(left, right, by, folder), "by their order"
-    named, roll = _choose(*pair_named(frames, folder), settings, folder)
+    named, listing = pair_named(frames, folder)
+    listing = listing.choose(settings, folder)
     label = f"{views[0].name} and {views[1].name}" if views[0] != views[1] else "one folder"
-    found = _Pairing(named, roll, None, f"{label}, paired {how}")
+    found = _Pairing(listing.used(named), listing, None, f"{label}, paired {how}")
     return found if listed is None else _with_times(found, listed)
 
 
@@ -159,24 +154,17 @@ def _list_both(left: Path, right: Path) -> tuple[list[Path], list[Path]]:
     return [by_stem[name] for name in sides[0]], [by_stem[name] for name in sides[1]]
 
 
-def _choose(
-    pairs: list[tuple[Path, Path]], roll: Roll, settings: SourceSettings, folder: Path
-) -> tuple[list[tuple[Path, Path]], Roll]:
-    """Return the pairs that the settings choose."""
-    roll = roll.choose(settings, folder)
-    return pairs if roll.chosen is None else [pairs[k] for k in roll.chosen], roll
-
-
 def _pair_as_listed(folder: Path, settings: SourceSettings) -> _Pairing:
     frames = read_frames(folder / FRAMES)
     check_increasing(np.array([frame.left_s for frame in frames]), str(folder / FRAMES))
-    pairs, roll = pair_named(
+    pairs, listing = pair_named(
         [(existing(folder / frame.left), existing(folder / frame.right)) for frame in frames],
         folder,
     )
-    pairs, roll = _choose(pairs, roll, settings, folder)
-    stamps_s = np.array([frames[k].left_s for k in roll.kept])
-    return _Pairing(pairs, roll, stamps_s, f"paired according to {FRAMES}", (folder / FRAMES,))
+    listing = listing.choose(settings, folder)
+    stamps_s = np.array([frames[k].left_s for k in listing.kept])
+    how = f"paired according to {FRAMES}"
+    return _Pairing(listing.used(pairs), listing, stamps_s, how, (folder / FRAMES,))
 
 
 def _stamps(left: list[Path], right: list[Path]) -> tuple[Float64, Float64] | None:
@@ -198,10 +186,10 @@ def _pair_by_stamp(
         list(zip(series.tolist(), paths, strict=True))
         for series, paths in zip(stamps, (left, right), strict=True)
     ]
-    frames, roll = pair_listed(lists, settings, folder)
+    frames, listing = pair_listed(lists, settings, folder)
     pairs = [(frame.left, frame.right) for frame in frames]
     stamps_s = np.array([frame.timestamp_s for frame in frames])
-    return _Pairing(pairs, roll, stamps_s, "paired by stamps")
+    return _Pairing(pairs, listing, stamps_s, "paired by stamps")
 
 
 def _by_name(left: list[Path], right: list[Path]) -> _Frames | None:
@@ -244,7 +232,7 @@ def _by_index(left: list[Path], right: list[Path], by: str, folder: Path) -> _Fr
 
 def _with_times(found: _Pairing, path: Path) -> _Pairing:
     """Return the pairs with the times of a file, which win over those in names."""
-    stamps_s = read_times_of_pairs(path, found.roll)
+    stamps_s = read_times_of_pairs(path, found.listing)
     return replace(found, stamps_s=stamps_s, how=f"{found.how}, times of {_TIMES}", texts=(path,))
 
 
@@ -254,4 +242,4 @@ def _times(found: _Pairing, settings: SourceSettings) -> tuple[Float64, str]:
         return found.stamps_s, ""
     rate_hz = settings.rate_hz or DEFAULT_RATE_HZ
     given = "" if settings.rate_hz else ", no times: assumed"
-    return np.array(found.roll.kept) / rate_hz, f"{given or ','} {rate_hz:g} Hz"
+    return np.array(found.listing.kept) / rate_hz, f"{given or ','} {rate_hz:g} Hz"

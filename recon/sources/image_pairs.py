@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Final
 
 from recon.core.errors import SourceError
+from recon.sources.image_names import natural_key
 from recon.sources.images import IMAGES
-from recon.sources.pairing import natural_key
 
 _NUMBER: Final = re.compile(r"[0-9]+")
 

@@ -18,10 +18,12 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float64, UInt8
 from recon.io.images.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
+from recon.sources.frame_list import FrameList, check_most
+from recon.sources.image_names import natural_key
 from recon.sources.one_pair import join_pair
-from recon.sources.pairing import Roll, check_most, natural_key, pair_stamps
 from recon.sources.protocol import Recording
 from recon.sources.settings import SourceSettings
+from recon.sources.stamps import pair_stamps
 
 IMAGES: Final = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".tif", ".tiff", ".bmp"})
 
@@ -104,7 +106,7 @@ class ImageSource(Recording):
 
 def pair_listed(
     lists: Sequence[Sequence[tuple[float, Path]]], settings: SourceSettings, where: Path
-) -> tuple[list[ImageFrame], Roll]:
+) -> tuple[list[ImageFrame], FrameList]:
     """Pair two lists of images by time; a listed image that is missing has no partner.
 
     Only the frames that the settings choose are returned.
@@ -131,18 +133,18 @@ def pair_listed(
     ]
     frames += [(stamp, None, path) for k, (stamp, path) in enumerate(lists[1]) if k not in taken]
     frames.sort(key=lambda frame: frame[0])
-    chosen, roll = pair_named([frame[1:] for frame in frames])
+    chosen, listing = pair_named([frame[1:] for frame in frames])
     paired = [
         ImageFrame(left, right, frames[k][0])
-        for k, (left, right) in zip(roll.paired, chosen, strict=True)
+        for k, (left, right) in zip(listing.paired, chosen, strict=True)
     ]
-    roll = roll.choose(settings, where)
-    return paired if roll.chosen is None else [paired[k] for k in roll.chosen], roll
+    listing = listing.choose(settings, where)
+    return listing.used(paired), listing
 
 
 def pair_named(
     frames: Sequence[tuple[Path | None, Path | None]], where: Path | None = None
-) -> tuple[list[tuple[Path, Path]], Roll]:
+) -> tuple[list[tuple[Path, Path]], FrameList]:
     """Return the pairs among frames of which an image may be missing.
 
     Args:
@@ -160,7 +162,7 @@ def pair_named(
     if where is not None:
         check_most(len(pairs), len(pairs) + max(alone_left, alone_right), where)
     names = [(left or right or Path()).stem for left, right in frames]
-    return pairs, Roll(names, kept, (alone_left, alone_right))
+    return pairs, FrameList(names, kept, (alone_left, alone_right))
 
 
 def existing(path: Path) -> Path | None:

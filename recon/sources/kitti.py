@@ -26,6 +26,8 @@ from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offs
 from recon.io.files import StrPath
 from recon.io.trajectory import read_kitti_poses
 from recon.sources.calibration import as_rectified, read_rig
+from recon.sources.frame_list import FrameList
+from recon.sources.image_names import natural_key
 from recon.sources.images import (
     ImageFrame,
     ImageSource,
@@ -33,7 +35,6 @@ from recon.sources.images import (
     is_image,
     pair_named,
 )
-from recon.sources.pairing import Roll, natural_key
 from recon.sources.settings import SourceSettings
 from recon.sources.times import read_times_of_pairs
 
@@ -64,23 +65,23 @@ def open_kitti(
     if not path.is_dir():
         raise SourceError("folder does not exist", where=path)
     pair = cameras or choose_cameras(path, "image_{}")
-    images, roll = list_pairs(*(path / f"image_{camera}" for camera in pair))
+    images, listing = list_pairs(*(path / f"image_{camera}" for camera in pair))
     settings = settings or SourceSettings()
-    roll = roll.choose(settings, path)
-    images = images if roll.chosen is None else [images[k] for k in roll.chosen]
-    times, time_files = _read_times(path, roll, settings)
+    listing = listing.choose(settings, path)
+    images = listing.used(images)
+    times, time_files = _read_times(path, listing, settings)
     rig, calibration_files = _read_rig(path, settings, pair, images[0][0])
     texts = (*calibration_files, *time_files, _find_poses(path))
     return ImageSource(
         name=path.resolve().name,
-        description=f"KITTI odometry drive, image_{pair[0]} and image_{pair[1]}{roll}",
+        description=f"KITTI odometry drive, image_{pair[0]} and image_{pair[1]}{listing}",
         calibration=rig,
         images=[
             ImageFrame(left, right, float(time_s))
             for (left, right), time_s in zip(images, times, strict=True)
         ],
-        roll=roll,
-        truth=_read_truth(path, times, roll, pair[0]),
+        listing=listing,
+        truth=_read_truth(path, times, listing, pair[0]),
         texts=tuple(text for text in texts if text is not None),
     )
 
@@ -112,7 +113,7 @@ def choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
     )
 
 
-def list_pairs(left: Path, right: Path) -> tuple[list[tuple[Path, Path]], Roll]:
+def list_pairs(left: Path, right: Path) -> tuple[list[tuple[Path, Path]], FrameList]:
     """Return the left and right image of each frame, paired by equal names.
 
     Raises:
@@ -136,11 +137,11 @@ def _names(folder: Path) -> set[str]:
 
 
 def _read_times(
-    folder: Path, roll: Roll, settings: SourceSettings
+    folder: Path, listing: FrameList, settings: SourceSettings
 ) -> tuple[Float64, tuple[Path, ...]]:
     """Return times of the frames in seconds, and their file; no file if a rate is given."""
     if settings.rate_hz is not None:
-        return np.array(roll.kept) / settings.rate_hz, ()
+        return np.array(listing.kept) / settings.rate_hz, ()
     path = folder / "times.txt"
     if not path.exists():
         raise SourceError(
@@ -149,7 +150,7 @@ def _read_times(
             hint="write the time of each frame in seconds, one per line, or give the frames per "
             "second with --set source.rate_hz=",
         )
-    return read_times_of_pairs(path, roll), (path,)
+    return read_times_of_pairs(path, listing), (path,)
 
 
 def _read_rig(
@@ -166,18 +167,20 @@ def _read_rig(
     return as_rectified(read_kitti_rig(path, *size, cameras)), (path,)
 
 
-def _read_truth(folder: Path, times: Float64, roll: Roll, camera: int) -> SequenceTruth | None:
+def _read_truth(
+    folder: Path, times: Float64, listing: FrameList, camera: int
+) -> SequenceTruth | None:
     path = _find_poses(folder)
     if path is None:
         return None
     poses = read_kitti_poses(path).T_world_camera
-    lines = roll.lines(len(poses))
+    lines = listing.lines(len(poses))
     if lines is None:
         raise SourceError(
             "fewer poses than images",
             where=path,
             got=f"{len(poses)} poses",
-            expected=f"{len(roll.names)}",
+            expected=f"{len(listing.names)}",
         )
     calibration = folder / "calib.txt"
     # KITTI's poses are those of camera 0, which need not be the left camera of this pair.

@@ -21,8 +21,8 @@ from recon.io.cameras.kitti import read_kitti_rig
 from recon.sources.calibration import as_rectified, read_rig
 from recon.sources.images import ImageSource, image_size, list_images, pair_listed
 from recon.sources.kitti import choose_cameras
-from recon.sources.pairing import check_increasing
 from recon.sources.settings import SourceSettings
+from recon.sources.stamps import check_increasing
 from recon.sources.times import read_dates
 
 _CALIBRATION: Final = "calib_cam_to_cam.txt"
@@ -39,7 +39,7 @@ def open_kitti_raw(folder: Path, settings: SourceSettings) -> ImageSource:
     """
     cameras = choose_cameras(folder, "image_{:02d}")
     views = [folder / f"image_{camera:02d}" for camera in cameras]
-    frames, roll = pair_listed([_read_list(v) for v in views], settings, folder)
+    frames, listing = pair_listed([_read_list(v) for v in views], settings, folder)
     rig, calibration_files = _read_rig(
         folder, settings, cameras, image_size(frames[0].left, settings)
     )
@@ -47,10 +47,10 @@ def open_kitti_raw(folder: Path, settings: SourceSettings) -> ImageSource:
     return ImageSource(
         name=folder.resolve().name,
         description=f"KITTI raw drive, {views[0].name} and {views[1].name}, {rectified}, "
-        f"paired by stamps{roll}",
+        f"paired by stamps{listing}",
         calibration=rig,
         images=frames,
-        roll=roll,
+        listing=listing,
         texts=(*calibration_files, *(view / "timestamps.txt" for view in views)),
     )
 

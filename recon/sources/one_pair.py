@@ -13,7 +13,7 @@ from recon.core.values.arrays import UInt8
 from recon.io.files import StrPath
 from recon.io.images.image import MAX_MEGAPIXELS, eight_bits, find_white, read_levels
 from recon.io.middlebury.scene import read_middlebury_scene
-from recon.sources.pairing import Roll
+from recon.sources.frame_list import FrameList
 from recon.sources.settings import SourceSettings
 
 LEAST_SIDE_PX: Final = 16
@@ -62,7 +62,7 @@ def open_middlebury(folder: Path, settings: SourceSettings) -> OnePair:
         FormatError: The folder is not a Middlebury scene, or a file in it is damaged.
         CalibrationError: No calibration is published for the scene, or it cannot give depth.
     """
-    Roll([""], [0]).choose(settings, folder)
+    FrameList([""], [0]).choose(settings, folder)
     scene = read_middlebury_scene(folder)
     if scene.camera is None:
         raise CalibrationError(

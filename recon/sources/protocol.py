@@ -15,7 +15,7 @@ from recon.core.values import (
     StereoPair,
 )
 from recon.core.values.arrays import Float64
-from recon.sources.pairing import Roll
+from recon.sources.frame_list import FrameList
 
 
 @runtime_checkable
@@ -121,7 +121,7 @@ class Recording(ABC):
         name: Name of the file or folder.
         description: Recognised kind and how it is read, in one line.
         calibration: The rectified camera, or the two raw ones.
-        roll: Which frames of the recording are pairs.
+        listing: Which frames of the recording are pairs.
         texts: Calibration and other text files that were read.
         truth: Ground truth trajectory, if known.
     """
@@ -129,21 +129,21 @@ class Recording(ABC):
     name: str
     description: str
     calibration: Rig
-    roll: Roll
+    listing: FrameList
     texts: tuple[Path, ...]
     truth: SequenceTruth | None = None
 
     @property
     def left_out(self) -> int:
         """Number of images without a partner."""
-        return sum(self.roll.alone)
+        return sum(self.listing.alone)
 
     def lines(self, count: int) -> list[int] | None:
-        """Return the line of each pair in a file with one line per frame; see `Roll.lines`."""
-        return self.roll.lines(count)
+        """Return the line of each pair in a file with one line per frame; see `FrameList.lines`."""
+        return self.listing.lines(count)
 
     def __len__(self) -> int:
-        return len(self.roll.kept)
+        return len(self.listing.kept)
 
     def __iter__(self) -> Iterator[StereoPair]:
         return self.frames()

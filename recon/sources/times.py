@@ -14,7 +14,7 @@ from recon.core.values import SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.files import read_table, read_text, reader
 from recon.io.trajectory import read_tum
-from recon.sources.pairing import Roll
+from recon.sources.frame_list import FrameList
 
 
 @reader
@@ -28,11 +28,11 @@ def read_times(path: Path, frames: int) -> Float64:
         SourceError: The file is missing or too short.
         FormatError: A line is not a number, or time runs backwards.
     """
-    return read_times_of_pairs(path, Roll([""] * frames, range(frames)))
+    return read_times_of_pairs(path, FrameList([""] * frames, range(frames)))
 
 
-def read_times_of_pairs(path: Path, roll: Roll) -> Float64:
-    """Read ``times.txt`` for the frames that are pairs; see `Roll.lines`.
+def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
+    """Read ``times.txt`` for the frames that are pairs; see `FrameList.lines`.
 
     Returns:
         float64, one time per pair, not decreasing.
@@ -44,13 +44,13 @@ def read_times_of_pairs(path: Path, roll: Roll) -> Float64:
     if not path.exists():
         raise SourceError("file does not exist", where=path)
     table, lines = read_table(path, (1,))
-    chosen = roll.lines(len(table))
+    chosen = listing.lines(len(table))
     if chosen is None:
         raise SourceError(
             "fewer times than images",
             where=path,
             got=f"{len(table)} times",
-            expected=f"{len(roll.names)}",
+            expected=f"{len(listing.names)}",
         )
     times: Float64 = table[chosen, 0]
     backwards = np.diff(times) < 0

@@ -17,9 +17,10 @@ import numpy as np
 
 from recon.core.errors import SourceError
 from recon.sources.calibration import read_rig
+from recon.sources.image_names import find_partners
 from recon.sources.images import ImageSource, image_size, is_image, pair_listed
-from recon.sources.pairing import check_increasing, find_partners
 from recon.sources.settings import SourceSettings
+from recon.sources.stamps import check_increasing
 from recon.sources.times import read_stamped_names, read_tum_truth
 
 
@@ -33,15 +34,16 @@ def open_tum(folder: Path, settings: SourceSettings) -> ImageSource:
     """
     paths = _find_lists(folder, settings)
     lists = [_read_list(path) for path in paths]
-    frames, roll = pair_listed(lists, settings, folder)
+    frames, listing = pair_listed(lists, settings, folder)
     rig, texts = read_rig(settings, folder, image_size(frames[0].left, settings))
     truth, note = read_tum_truth(folder, np.array([frame.timestamp_s for frame in frames]))
     return ImageSource(
         name=folder.resolve().name,
-        description=f"TUM drive, {paths[0].name} and {paths[1].name}, paired by stamps{roll}{note}",
+        description=f"TUM drive, {paths[0].name} and {paths[1].name}, "
+        f"paired by stamps{listing}{note}",
         calibration=rig,
         images=frames,
-        roll=roll,
+        listing=listing,
         truth=truth,
         texts=(*texts, *paths),
     )

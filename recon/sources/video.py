@@ -14,7 +14,8 @@ from recon.core.values import StereoPair, check_size
 from recon.core.values.arrays import UInt8
 from recon.io.images.video import VIDEOS, VideoFile, open_video
 from recon.sources.calibration import read_rig
-from recon.sources.pairing import Roll, find_partners
+from recon.sources.frame_list import FrameList
+from recon.sources.image_names import find_partners
 from recon.sources.protocol import Recording
 from recon.sources.settings import SourceSettings
 
@@ -47,7 +48,7 @@ class VideoSource(Recording):
             SourceError: The times of the two files drift apart.
             FormatError: A frame cannot be decoded, or its time does not increase.
         """
-        last_s, numbers = -np.inf, self.roll.kept[start:]
+        last_s, numbers = -np.inf, self.listing.kept[start:]
         views = zip(numbers, self._views(numbers), strict=True) if numbers else ()
         for index, (number, (stamp_s, left, right)) in enumerate(views, start=start):
             for view in (left, right):
@@ -100,7 +101,7 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
     videos = open_videos(_find_videos(path, settings))
     frames = frames_of(videos)
     alone = (videos[0].frames - frames, videos[-1].frames - frames)
-    roll = Roll([""] * frames, range(frames), alone).choose(settings, path)
+    listing = FrameList([""] * frames, range(frames), alone).choose(settings, path)
     size = view_size(videos[0], settings) if len(videos) == 1 else _size(videos[0])
     home = path if path.is_dir() else path.resolve().parent
     rig, texts = read_rig(settings, home, size)
@@ -108,12 +109,12 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
     layout = f"{settings.side_by_side} in one video" if len(videos) == 1 else "two videos"
     return VideoSource(
         name=path.resolve().name,
-        description=f"{layout}, {rate_hz:g} Hz, paired frame by frame{roll}",
+        description=f"{layout}, {rate_hz:g} Hz, paired frame by frame{listing}",
         calibration=rig,
         videos=videos,
         settings=settings,
         texts=texts,
-        roll=roll,
+        listing=listing,
     )
 
 

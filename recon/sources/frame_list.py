@@ -1,0 +1,112 @@
+"""The frames of a recording: which of them are pairs, and which of the pairs are used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+from recon.core.errors import SourceError
+from recon.sources.settings import SourceSettings
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True)
+class FrameList:
+    """Which frames of a recording are pairs.
+
+    Attributes:
+        names: Names without suffix of all frames in order, also of those without a partner; empty
+            names where there are none.
+        paired: Positions of the pairs among them.
+        alone: Numbers of left and right images without a partner, which are left out.
+        chosen: Which of the pairs are used; None = all.
+    """
+
+    names: Sequence[str]
+    paired: Sequence[int]
+    alone: tuple[int, int] = (0, 0)
+    chosen: range | None = None
+
+    def __str__(self) -> str:
+        text = ""
+        if any(self.alone):
+            text = f", {self.alone[0]} left and {self.alone[1]} right without a partner left out"
+        if self.chosen is None:
+            return text
+        every = f" in steps of {self.chosen.step}" if self.chosen.step > 1 else ""
+        return f"{text}, frames {self.chosen[0]} to {self.chosen[-1]}{every}"
+
+    @property
+    def kept(self) -> Sequence[int]:
+        """Positions of the pairs that are used."""
+        return self.used(self.paired)
+
+    def used(self, of_pairs: Sequence[Item]) -> list[Item]:
+        """Return what belongs to the pairs that are used, of what belongs to all pairs."""
+        return list(of_pairs) if self.chosen is None else [of_pairs[k] for k in self.chosen]
+
+    def choose(self, settings: SourceSettings, where: Path) -> FrameList:
+        """Return the same recording, of which the frames from ``start`` to ``end`` are used.
+
+        Raises:
+            SourceError: There are none.
+        """
+        if (settings.start, settings.end, settings.stride) == (0, None, 1):
+            return self
+        chosen = range(len(self.paired))[settings.start : settings.end : settings.stride]
+        if not chosen:
+            raise SourceError(
+                "no frame is chosen",
+                where=where,
+                got=f"from {settings.start} to before {settings.end or len(self.paired)}",
+                expected=f"frames from 0 to {len(self.paired) - 1}",
+                hint="see --start and --end",
+            )
+        return replace(self, chosen=chosen)
+
+    def lines(self, count: int) -> list[int] | None:
+        """Return the line of each pair in a file with one line per frame, such as ``times.txt``.
+
+        One line per pair fits at once, whether of all pairs or of those used. Else names that are
+        counters give the line, so that it stays the right one where images are missing; else the
+        position does, and further lines are ignored.
+
+        Returns:
+            Indices from 0; None = the file has too few lines.
+        """
+        of_pairs = self._lines_of_all(count)
+        if of_pairs is None:
+            return list(range(count)) if count == len(self.kept) else None
+        return self.used(of_pairs)
+
+    def _lines_of_all(self, count: int) -> list[int] | None:
+        if count == len(self.paired):
+            return list(range(count))
+        names = [self.names[k] for k in self.paired]
+        numbers = [int(name) if name.isdecimal() else count for name in names]
+        if max(numbers) < count:
+            return numbers
+        return list(self.paired) if len(self.names) <= count else None
+
+
+def check_most(pairs: int, images: int, where: Path) -> None:
+    """Refuse a recording of which most is missing.
+
+    Args:
+        pairs: Number of pairs.
+        images: Number of images of one camera, found or listed.
+        where: The source, for the error message.
+
+    Raises:
+        SourceError: Fewer than half of the images have a partner.
+    """
+    if 2 * pairs < images:
+        raise SourceError(
+            "most images have no partner",
+            where=where,
+            got=f"{pairs} pairs of {images} images",
+            hint="give both images of a pair the same name or time, and copy missing files again",
+        )

@@ -1,0 +1,120 @@
+"""Images paired by the time they were taken, which may be stated in their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import SourceError
+from recon.core.geometry.interpolation import nearest_sorted
+from recon.core.values.arrays import Float64
+
+_STAMP: Final = re.compile(r"\d{10}(\.\d+)?|\d{13}|\d{16}|\d{19}|\d+\.\d+", re.ASCII)
+
+_SECONDS_DIGITS: Final = 10
+"""Digits of a time in seconds since 1970, from 2001 to 2286."""
+_CLOCK_STEPS: Final = 10
+"""Least step of padded numbers that are a clock: 10 ms, or less in finer units."""
+
+
+@dataclass(frozen=True, eq=False)
+class StampPairs:
+    """Pairs of entries of two series of timestamps.
+
+    Attributes:
+        left: Indices into the left series, increasing.
+        right: Indices of their partners in the right series, increasing.
+        alone: Numbers of entries (left, right) without a partner.
+    """
+
+    left: Sequence[int]
+    right: Sequence[int]
+    alone: tuple[int, int]
+
+
+def stamp_of_name(stem: str) -> float | None:
+    """Return timestamp in a file name: seconds, or an integer number of ms, µs or ns since 1970.
+
+    Returns:
+        Seconds, or None if the name is not a timestamp.
+    """
+    if _STAMP.fullmatch(stem) is None:
+        return None
+    if "." in stem or len(stem) == _SECONDS_DIGITS:
+        return float(stem)
+    return float(int(stem) / 10 ** (len(stem) - _SECONDS_DIGITS))
+
+
+def stamps_of_names(stems: Sequence[str]) -> Float64 | None:
+    """Return timestamps in the file names of one camera.
+
+    Returns:
+        float64 (N,), seconds; None unless all names are timestamps, or if they are counters, such
+        as KITTI's ``0000000123``.
+    """
+    stamps = [stamp_of_name(stem) for stem in stems]
+    if any(stamp is None for stamp in stamps) or _are_counters(stems):
+        return None
+    return np.array(stamps, dtype=np.float64)
+
+
+def _are_counters(stems: Sequence[str]) -> bool:
+    """Return whether names with as many digits as a timestamp count frames.
+
+    Today's times have no leading zero. Those of a clock that starts at 0 may have one, but are
+    many of their units (ms, µs or ns) apart, and no camera is timed in whole seconds.
+    """
+    if any("." in stem for stem in stems) or not stems[0].startswith("0"):
+        return False
+    steps = np.diff([int(stem) for stem in stems])
+    return len(stems[0]) == _SECONDS_DIGITS or not steps.size or np.median(steps) < _CLOCK_STEPS
+
+
+def check_increasing(stamps_s: Float64, where: str) -> None:
+    """Check that timestamps are strictly increasing.
+
+    Raises:
+        SourceError: They are not.
+    """
+    backwards = np.flatnonzero(np.diff(stamps_s) <= 0)
+    if backwards.size:
+        at = int(backwards[0]) + 1
+        still = stamps_s[at] == stamps_s[at - 1]
+        raise SourceError(
+            "two images have the same timestamp" if still else "timestamps are out of order",
+            where=f"{where}, image {at}",
+            got=f"{stamps_s[at]:.6f} s after {stamps_s[at - 1]:.6f} s",
+            hint="the images of each camera must be in the order of their exposure",
+        )
+
+
+def pair_stamps(left_s: Float64, right_s: Float64, tolerance_s: float, where: str) -> StampPairs:
+    """Pair two series of timestamps that are mutual nearest neighbours.
+
+    Args:
+        left_s: float64 (N,), seconds, increasing.
+        right_s: float64 (M,), seconds, increasing.
+        tolerance_s: Largest difference within a pair.
+        where: The source, for the error message.
+
+    Raises:
+        SourceError: No two are close enough.
+    """
+    to_right, to_left = nearest_sorted(left_s, right_s), nearest_sorted(right_s, left_s)
+    mutual = to_left[to_right] == np.arange(len(left_s))
+    apart_s = np.abs(right_s[to_right] - left_s)
+    chosen = np.flatnonzero(mutual & (apart_s <= tolerance_s))
+    if not chosen.size:
+        raise SourceError(
+            "no left and right images were taken at the same time",
+            where=where,
+            got=f"at best {apart_s.min():.4g} s apart",
+            expected=f"at most {tolerance_s:g} s",
+            hint="raise --set source.tolerance_s= if that is the true skew of the cameras",
+        )
+    alone = (len(left_s) - len(chosen), len(right_s) - len(chosen))
+    return StampPairs(chosen.tolist(), to_right[chosen].tolist(), alone)
