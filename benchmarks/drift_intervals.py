@@ -1,9 +1,9 @@
 """Whether the odometry knows its error: how often its 95 % intervals hold.
 
 Short drives through rendered streets, each in other weather and with a rig that is calibrated as
-well as `recon.odometry.expected` assumes: its disparities, the angle between its cameras and its
-baseline are off by a random amount of that size. A segment is covered if its end is as near to the
-true one as ``expected_drift_percent`` says with 95 % probability. Segments with frames that the
+well as `recon.odometry.path_drift` assumes: its disparities, the angle between its cameras and
+its baseline are off by a random amount of that size. A segment is covered if its end is as near to
+the true one as ``expected_drift_percent`` says with 95 % probability. Segments with frames that the
 odometry itself does not trust do not count.
 
 With DRIVE, the drives of `altered_drives.py` are judged instead; their rigs are as they are.
@@ -28,7 +28,7 @@ from recon.core.values import RectifiedCamera, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
 from recon.evaluation.trajectory import TrajectoryRules, compare_paths
 from recon.odometry import OdometryFrame, expected_drift, make_odometry
-from recon.odometry.expected import RIG_BASELINE, RIG_DISPARITY_PX, RIG_YAW_DEG
+from recon.odometry.path_drift import RIG_BASELINE, RIG_DISPARITY_PX, RIG_YAW_DEG
 from recon.run.machine import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource

@@ -35,11 +35,11 @@ from recon.map.drive.workspace import Workspace
 from recon.map.localize.sequence import localize_sequence
 from recon.map.localize.surroundings import Surroundings
 from recon.map.store.map import Map
-from recon.map.store.views import MapViews
-from recon.odometry.points import select_points
+from recon.map.store.map_views import MapViews
+from recon.odometry.icp_points import select_points
 from recon.odometry.protocol import OdometryFrame
 from recon.places.keyframe import Keyframe, make_keyframe
-from recon.places.known import KnownPlaces, KnownView
+from recon.places.known_places import KnownPlaces, KnownView
 from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source
 from recon.stereo.frame import FrameReconstructor

@@ -29,7 +29,7 @@ from recon.map.sessions.joining import join_sessions
 from recon.map.sessions.placed import place_map
 from recon.map.store.map import MAP_FILE, Map
 from recon.run import Run
-from tests.map.test_map_of_several_drives import _drive, _links, _poses
+from tests.map.sessions.test_map_of_several_drives import _drive, _links, _poses
 
 STEP_M = 12.0
 SETTINGS = ("submaps.length_m=8", "submaps.tile_m=25.6", "fusion.min_count=1")

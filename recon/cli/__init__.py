@@ -1,8 +1,8 @@
 """The command line: parse, build the configuration, call one story of `commands/`, print one table.
 
-One file per command. What several of them take is in `options.py`, and for drives in `drive.py`: a
-dataclass is a group of options, which `takes_groups` spreads. `errors.py` says what an error looks
-like, and `show/` has the tables and the progress.
+One file per command. What several of them take is in `options.py`, and for drives in
+`drive_options.py`: a dataclass is a group of options, which `takes_groups` spreads. `errors.py`
+says what an error looks like, and `show/` has the tables and the progress.
 
 Nothing heavy is imported before a command runs, so ``recon --help`` answers at once.
 """

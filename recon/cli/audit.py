@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.drive import SourceOptions, Start
+from recon.cli.drive_options import SourceOptions, Start
 from recon.cli.errors import one_line_errors
 from recon.cli.show.tables import print_figures, print_json
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.drive import open_workers
+from recon.cli.drive_options import open_workers
 from recon.core.errors import SettingsError
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.drive import DriveOptions, StartInMap, announced, open_drive, read_start
+from recon.cli.drive_options import DriveOptions, StartInMap, announced, open_drive, read_start
 from recon.cli.interrupt import until_interrupted
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from recon.cli import options as opt
-from recon.cli.drive import DriveOptions, StartInMap, open_drive, read_start
+from recon.cli.drive_options import DriveOptions, StartInMap, open_drive, read_start
 
 
 @opt.takes_groups

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from recon.cli import options as opt
-from recon.cli.drive import DriveOptions, Start, open_drive, open_workers
+from recon.cli.drive_options import DriveOptions, Start, open_drive, open_workers
 
 
 @opt.takes_groups

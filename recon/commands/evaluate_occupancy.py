@@ -9,7 +9,7 @@ from recon.commands.config import ReconConfig, run_settings
 from recon.commands.demo import demo_source
 from recon.core.errors import EvaluationError
 from recon.core.values import OccupancyGrid, OccupancyMetrics, OccupancyTruth
-from recon.evaluation.drive import LEAST_FRAMES, known_occupancy
+from recon.evaluation.drive_errors import LEAST_FRAMES, known_occupancy
 from recon.evaluation.occupancy import evaluate_occupancy
 from recon.io.images.image import write_image
 from recon.io.occupancy.nav2 import read_nav2

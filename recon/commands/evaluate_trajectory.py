@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.core.values import Trajectory
 from recon.evaluation.association import TOLERANCE_S, associate
-from recon.evaluation.interpolated import interpolation_warnings
+from recon.evaluation.interpolated_truth import interpolation_warnings
 from recon.evaluation.trajectory import TrajectoryRules, TrajectoryRun, compare_paths
 from recon.io.trajectory import holds_times, read_trajectory, write_tum
 from recon.report.trajectory_page import write_trajectory_page

@@ -11,14 +11,14 @@ from recon.commands.identity import identity_of
 from recon.commands.map_options import MapOptions
 from recon.commands.map_pieces import begun_in_pieces, map_in_pieces, pieces_of
 from recon.commands.resume import begin_or_resume, with_resume_hint
-from recon.evaluation.drive import compare_with_truth
+from recon.evaluation.drive_errors import compare_with_truth
 from recon.export.products import Products, write_products
 from recon.export.trajectories import export_paths
-from recon.map.drive.empty import check_map
 from recon.map.drive.map_run import MapRun
+from recon.map.drive.refuse_empty import check_map
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.drive.workspace import Workspace
-from recon.map.store.kept import keep_map
+from recon.map.store.keep_map import keep_map
 from recon.map.store.map import MAP_FILE, Map
 from recon.odometry.health import health_warnings
 from recon.report.map_page import write_map_page

@@ -12,9 +12,9 @@ from recon.commands.joined import REMADE, copied, joined_settings, make_joined
 from recon.commands.map import map_whole
 from recon.commands.map_options import MapOptions
 from recon.core.errors import SettingsError
-from recon.map.drive.empty import check_map
+from recon.map.drive.refuse_empty import check_map
 from recon.map.sessions.copying import copy_sessions
-from recon.map.store.kept import keep_map
+from recon.map.store.keep_map import keep_map
 from recon.map.store.map import MAP_FILE, Map
 from recon.run.finished import open_run, refuse_as_target
 from recon.run.run import Run

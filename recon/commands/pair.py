@@ -11,7 +11,7 @@ from recon.evaluation.disparity import evaluate_disparity
 from recon.export.pair import mesh_frame, write_cloud_files, write_disparity_files
 from recon.io.files import StrPath
 from recon.io.models.mesh import check_mesh_formats
-from recon.map.drive.empty import check_cloud
+from recon.map.drive.refuse_empty import check_cloud
 from recon.report.pair_page import write_disparity_images, write_pair_page
 from recon.rig.audit.pair_checks import check_found, find_pair_faults
 from recon.run.progress import SILENT, Progress

@@ -13,7 +13,7 @@ import numpy as np
 from recon.core.errors import SettingsError
 from recon.core.values import FREE, OCCUPIED, OccupancyGrid, RectifiedCamera
 from recon.core.values.cloud import Frame
-from recon.export.finished import (
+from recon.export.finished_map import (
     FinishedMap,
     Place,
     map_as_written,

@@ -4,12 +4,13 @@
 - `visual.py`: features tracked (`tracking.py`) through a short window of frames (`window.py`);
 - `kiss.py`: clouds registered over time by `kiss_icp.py`, which also registers in a finished map
   (`recon.map.localize`);
-- `checked.py`: poses that cannot be trusted are marked; `expected.py`: how far a path may be off;
+- `checked.py`: poses that cannot be trusted are marked; `path_drift.py`: how far a path may be
+  off;
 - `prior.py`: what wheels or an inertial unit say.
 """
 
-from recon.odometry.expected import ExpectedDrift, expected_drift
-from recon.odometry.known import KnownPoses
+from recon.odometry.known_poses import KnownPoses
+from recon.odometry.path_drift import ExpectedDrift, expected_drift
 from recon.odometry.prior import MotionPrior
 from recon.odometry.prior_axes import FoundAxes, find_axes, first_moving
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult

@@ -8,8 +8,8 @@ import numpy as np
 
 from recon.core.geometry.se3 import invert
 from recon.core.values.arrays import Float64
+from recon.odometry.icp_points import select_points
 from recon.odometry.kiss_icp import KissIcp, KissIcpOptions
-from recon.odometry.points import select_points
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 
 _VOXEL_M: Final = 0.2

@@ -3,5 +3,5 @@
 - `keyframe.py`: what is kept of a frame; `places.py`: which of them look alike and may be near;
 - `verify.py`: whether two show one place, and the motion between them (`align.py`);
 - `agree.py`: loops that confirm each other; `closure.py`: the path corrected by them;
-- `detector.py`: all this during a drive; `known.py`: in a map that is there already.
+- `detector.py`: all this during a drive; `known_places.py`: in a map that is there already.
 """

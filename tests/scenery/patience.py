@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from recon.map.drive.behind import MapBehind, Registered
+from recon.map.drive.map_behind import MapBehind, Registered
 from recon.sources import live
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.cli.drive import SourceOptions
+from recon.cli.drive_options import SourceOptions
 from recon.commands.config import load_config
 from recon.core.errors import ReconError
 from recon.core.geometry.se3 import make_transform

@@ -9,9 +9,9 @@ from typing import Any, Final
 
 from recon.core.errors import RegistrationError
 from recon.core.values import RectifiedPair, Trajectory
-from recon.map.drive.behind import Registered, poses_first
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.frame_result import FrameResult
+from recon.map.drive.map_behind import Registered, poses_first
 from recon.map.drive.mapper import Mapper
 from recon.map.drive.workspace import Workspace, resuming
 from recon.map.occupancy.rays import thin_rays

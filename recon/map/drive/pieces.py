@@ -22,8 +22,8 @@ from recon.map.drive.drive_loops import DRIFT, LoopWatch
 from recon.map.drive.sequence import MappedSequence
 from recon.map.drive.workspace import Workspace
 from recon.map.settings import DriveSettings
+from recon.map.store.cast_submaps import with_occupancy
 from recon.map.store.map import Map
-from recon.map.store.recast import with_occupancy
 from recon.map.store.records import Key
 from recon.map.store.session import RAYS, Session
 from recon.map.submaps import Submap

@@ -20,7 +20,7 @@ from recon.odometry.visual import VisualEstimate, VisualOdometry
 from recon.places.closure import loop_bias
 from recon.places.drift import path_lengths
 from recon.places.keyframe import Keyframe, make_keyframe
-from recon.places.known import KnownPlaces
+from recon.places.known_places import KnownPlaces
 from recon.places.verify import Loop
 
 _VIEWS: Final = 2

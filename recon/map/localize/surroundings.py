@@ -16,8 +16,8 @@ from recon.map.localize.gate import Correction, icp_covariance, is_worthwhile
 from recon.map.localize.surfaces import Fit, Surfaces, describe_surfaces, fit_surfaces
 from recon.map.store.map import Map
 from recon.map.store.session import Session
+from recon.odometry.icp_points import select_points
 from recon.odometry.kiss_icp import IcpAlignment, KissIcp, KissIcpOptions
-from recon.odometry.points import select_points
 from recon.odometry.protocol import OdometryFrame
 
 _VOXEL_M: Final = 0.3

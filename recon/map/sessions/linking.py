@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from recon.core.values.arrays import Float64
-from recon.map.sessions.shared import link_by_frame, shared_frames
+from recon.map.sessions.shared_frames import link_by_frame, shared_frames
 from recon.map.store.links import Link
 from recon.map.store.map import Map
+from recon.map.store.map_views import MapViews
 from recon.map.store.session import Session
-from recon.map.store.views import MapViews
 from recon.odometry.health import trusted_poses
 from recon.places.agree import agreeing_loops
 from recon.places.drift import DriftModel, path_lengths
-from recon.places.known import KnownPlaces, KnownView
+from recon.places.known_places import KnownPlaces, KnownView
 from recon.places.verify import Loop
 
 DRIFT = DriftModel()

@@ -9,10 +9,10 @@ import numpy as np
 
 from recon.core.geometry.se3 import apply
 from recon.core.values.arrays import Bool, Float64
-from recon.map.sessions.shared import seen_before
+from recon.map.sessions.shared_frames import seen_before
 from recon.map.settings import DriveSettings
+from recon.map.store.cast_submaps import CastSubmaps, check_rays
 from recon.map.store.map import Map
-from recon.map.store.recast import CastSubmaps, check_rays
 from recon.map.store.records import Store
 from recon.map.store.session import Session
 from recon.map.store.submaps import Submaps

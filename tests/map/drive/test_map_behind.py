@@ -9,7 +9,7 @@ import pytest
 
 from recon.core.errors import MappingError
 from recon.core.values import RectifiedCamera, RectifiedPair
-from recon.map.drive.behind import MapBehind, Registered
+from recon.map.drive.map_behind import MapBehind, Registered
 from recon.odometry import OdometryHealth, OdometryResult
 
 GREY = np.zeros((16, 16), np.uint8)

@@ -8,8 +8,8 @@ import pytest
 from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera
 from recon.map.store.map import Map
+from recon.map.store.map_views import MapViews
 from recon.map.store.session import SessionInfo
-from recon.map.store.views import MapViews
 from recon.odometry import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe

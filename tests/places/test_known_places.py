@@ -10,7 +10,7 @@ from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.places.agree import agreeing_loops
 from recon.places.drift import DriftModel
 from recon.places.keyframe import make_keyframe
-from recon.places.known import KnownPlaces, KnownView
+from recon.places.known_places import KnownPlaces, KnownView
 from tests.places.conftest import LAP, PERIOD
 
 AHEAD = RectifiedCamera(180.0, 159.5, 59.5, 159.5, 0.54, 320, 120)

@@ -8,7 +8,7 @@ import pytest
 from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import invert
 from recon.core.values import Trajectory
-from recon.odometry.known import KnownPoses
+from recon.odometry.known_poses import KnownPoses
 from recon.odometry.protocol import Odometry, OdometryFrame
 
 See = Callable[..., OdometryFrame]

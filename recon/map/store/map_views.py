@@ -9,7 +9,7 @@ from recon.core.errors import MappingError
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.map.store.map import Map
-from recon.places.known import KnownPlaces, KnownView
+from recon.places.known_places import KnownPlaces, KnownView
 
 
 def known_places(map_: Map) -> KnownPlaces:

@@ -20,7 +20,7 @@ from recon.map.occupancy.rays import ray_grain, thin_rays
 from recon.map.sessions.copying import check_session, copy_sessions
 from recon.map.sessions.joining import join_new, join_sessions
 from recon.map.sessions.placed import PlacedSubmaps, place_map
-from recon.map.sessions.shared import seen_before, shared_frames
+from recon.map.sessions.shared_frames import seen_before, shared_frames
 from recon.map.store.links import Link
 from recon.map.store.map import Map
 from recon.map.store.session import Session, SessionInfo

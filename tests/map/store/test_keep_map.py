@@ -15,9 +15,9 @@ from recon.map.fusion.part import FusedPart, join_fused
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.occupancy.part import join_occupancy
 from recon.map.occupancy.rays import ray_grain, thin_rays
-from recon.map.store.kept import keep_map
+from recon.map.store.cast_submaps import with_occupancy
+from recon.map.store.keep_map import keep_map
 from recon.map.store.map import Map
-from recon.map.store.recast import with_occupancy
 from recon.map.store.session import Session, SessionInfo
 from recon.map.submaps import SubmapBuilder
 from recon.odometry import OdometryHealth

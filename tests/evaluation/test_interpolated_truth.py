@@ -7,7 +7,7 @@ import pytest
 
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
-from recon.evaluation.interpolated import interpolated_poses, interpolation_warnings
+from recon.evaluation.interpolated_truth import interpolated_poses, interpolation_warnings
 from recon.evaluation.trajectory import choose_segments
 
 
