@@ -4,9 +4,9 @@
 - `visual.py`: features tracked (`tracking.py`) through a short window of frames (`window.py`);
 - `kiss.py`: clouds registered over time by `kiss_icp.py`, which also registers in a finished map
   (`recon.map.localize`);
-- `checked.py`: poses that cannot be trusted are marked; `path_drift.py`: how far a path may be
-  off;
-- `prior.py`: what wheels or an inertial unit say.
+- `checked.py`: poses that cannot be trusted are marked, by all patches of the image
+  (`agreement.py`); `health.py`: what that says of a drive; `path_drift.py`: how far it may be off;
+- `prior.py`: what wheels or an inertial unit say; `prior_axes.py`: in which axes they say it.
 """
 
 from recon.odometry.known_poses import KnownPoses

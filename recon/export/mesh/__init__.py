@@ -1,4 +1,9 @@
-"""Surface meshes from point clouds, whole or in tiles with closed seams."""
+"""Surface meshes from point clouds, whole or in pieces with closed seams.
+
+- `poisson.py`: the surface of a cloud; `view.py`: that of a single pair, as its camera saw it;
+- `pieces.py`: that of a map, piece by piece, cut (`cut.py`), joined (`seams.py`) and trimmed
+  (`surgery.py`).
+"""
 
 from recon.export.mesh.cut import Plane, cut_mesh
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
