@@ -44,6 +44,18 @@ def warped_pair(disparity: Float64) -> RectifiedPair:
     return make_pair(smooth_texture(x, y), smooth_texture(x + disparity, y))
 
 
+def square_before_wall() -> tuple[RectifiedPair, np.ndarray]:
+    """A square (disparity 20) before a wall (disparity 4), and the mask of its half shadow."""
+    wall, square = noise(80, 160, seed=3), noise(40, 50, seed=4)
+    left, right = wall[:, :144].copy(), wall[:, 4:148].copy()
+    left[20:60, 70:120] = square
+    right[20:60, 50:100] = square
+    # The square hides wall columns 50 to 99 of the right view, 54 to 103 of the left one.
+    hidden = np.zeros(left.shape, bool)
+    hidden[20:60, 54:70] = True
+    return make_pair(left, right), hidden
+
+
 def inner(array: np.ndarray, left: int = 40, margin: int = 8) -> np.ndarray:
     """The part of a map that both images show, off the border."""
     return array[margin:-margin, left:-margin]
