@@ -36,7 +36,6 @@ from recon.map.ground.floor import add_floors, find_floors
 from recon.map.ground.grid import flatten
 from recon.map.ground.surface import estimate_ground_surface
 from recon.odometry import Odometry, OdometryFrame, OdometryResult, make_odometry
-from recon.places.drift import DriftModel
 from recon.report.drive_figures import grid_figure, loops_figure, seen_from_above
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
@@ -154,7 +153,7 @@ def deceiving(source: Filmed, options: argparse.Namespace) -> dict[str, Any]:
     """A repetitive street: loops closed, and loops found without the odometry check."""
     config = config_of(options, "alike")
     loops = mapped_with(source, config, 0.0)[0].loops
-    with patch("recon.map.drive.drive_loops.DRIFT", DriftModel(share=1.0, turn_deg=5.0)):
+    with patch.multiple("recon.places.drift", SHARE=1.0, TURN_DEG=5.0):
         trusting = mapped_with(source, config, 0.0)[0].loops
     if loops is None or trusting is None:
         raise SystemExit("loop closure is off")

@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import invert
 from recon.core.values.arrays import Float64
-from recon.places.drift import Drift, DriftModel, drift_over, is_possible
+from recon.places.drift import Drift, drift_over, is_possible
 from recon.places.verify import Loop
 
 Poses: TypeAlias = Mapping[int, tuple[Float64, float]]
@@ -31,7 +31,6 @@ def agreeing_loops(
     loops: Sequence[Loop],
     firsts: Poses,
     lasts: Poses,
-    drift: DriftModel,
     *,
     keyframes: int = _MIN_AGREEING,
 ) -> list[Loop]:
@@ -47,7 +46,6 @@ def agreeing_loops(
         firsts: For each keyframe in which a loop begins its pose by odometry, and the path up to
             it; in a map without drift of its own, always 0.
         lasts: The same for those in which one ends; those of another drive may have other axes.
-        drift: How far odometry may drift.
         keyframes: Least number of later keyframes among the loops that agree.
     """
     poses = (firsts, lasts)
@@ -56,7 +54,7 @@ def agreeing_loops(
     for number, loop in enumerate(loops):
         firsts_m, lasts_m = np.abs(paths_m - paths_m[number]).T
         near = np.flatnonzero(lasts_m <= _NEAR_M)
-        rings = {k: _closes(loop, loops[k], poses, drift) for k in near.tolist()}
+        rings = {k: _closes(loop, loops[k], poses) for k in near.tolist()}
         against = sum(not closes for closes in rings.values())
         # Loops to elsewhere on the path may contradict, but over that distance agree too easily.
         same = [loops[k] for k, closes in rings.items() if closes and firsts_m[k] <= _NEAR_M]
@@ -66,13 +64,13 @@ def agreeing_loops(
     return agreeing
 
 
-def _closes(one: Loop, other: Loop, poses: tuple[Poses, Poses], model: DriftModel) -> bool:
+def _closes(one: Loop, other: Loop, poses: tuple[Poses, Poses]) -> bool:
     """Return whether two loops agree within the drift of the odometry between them."""
     firsts, lasts = poses
     T_lasts, lasts_m = _between(one.last, other.last, lasts)
     T_firsts, firsts_m = _between(one.first, other.first, firsts)
     ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
-    drift = drift_over(lasts_m + firsts_m, model)
+    drift = drift_over(lasts_m + firsts_m)
     return is_possible(ring, drift, LOOP_SIGMAS)
 
 

@@ -16,7 +16,7 @@ from recon.core.geometry.interpolation import pose_between
 from recon.core.geometry.se3 import adjoint, as_step, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
-from recon.places.drift import Drift, DriftModel, drift_over
+from recon.places.drift import Drift, drift_over
 from recon.places.open3d_pose_graph import PoseEdge, optimise_poses
 from recon.places.verify import Loop
 
@@ -107,19 +107,16 @@ class JoinedDrives:
     kept: Bool
 
 
-def close_loops(
-    trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop], drift: DriftModel
-) -> Closure:
+def close_loops(trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop]) -> Closure:
     """Correct a path so that its loops close, by `join_drives`.
 
     Args:
         trajectory: By odometry.
         path_m: float64 (N,), path up to each frame, by `path_lengths`.
         loops: Loops between frames of it.
-        drift: How far odometry may drift.
     """
     ties = [Tie((0, 0), loop) for loop in loops]
-    joined = join_drives([DrivePath(trajectory, path_m)], ties, drift) if ties else None
+    joined = join_drives([DrivePath(trajectory, path_m)], ties) if ties else None
     if joined is None:  # a map by odometry alone is better than none
         return Closure(trajectory, (), tuple(loops))
     sides = [
@@ -129,9 +126,7 @@ def close_loops(
     return Closure(joined.trajectories[0], tuple(sides[0]), tuple(sides[1]))
 
 
-def join_drives(
-    drives: Sequence[DrivePath], ties: Sequence[Tie], drift: DriftModel
-) -> JoinedDrives | None:
+def join_drives(drives: Sequence[DrivePath], ties: Sequence[Tie]) -> JoinedDrives | None:
     """Correct the paths of drives so that their ties hold; None = the ties are not believed.
 
     Nodes are spaced along the paths; odometry edges link each to the next, ties link distant ones.
@@ -142,7 +137,6 @@ def join_drives(
     Args:
         drives: The drives; the first pose of the first one is fixed.
         ties: What holds them together.
-        drift: How far odometry may drift.
 
     Ref:
         Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
@@ -150,10 +144,10 @@ def join_drives(
     nodes = _spaced(drives)
     begins = np.cumsum([0, *map(len, nodes)]).tolist()
     chains = [
-        _odometry_edges(drive, own, begin, drift)
+        _odometry_edges(drive, own, begin)
         for drive, own, begin in zip(drives, nodes, begins[:-1], strict=True)
     ]
-    edges = [_tie_edge(tie, drives, nodes, begins, drift) for tie in ties]
+    edges = [_tie_edge(tie, drives, nodes, begins) for tie in ties]
     start = [d.trajectory.T_world_camera[own] for d, own in zip(drives, nodes, strict=True)]
     steps = [edge for chain in chains for edge in chain]
     try:
@@ -222,15 +216,13 @@ def _solve(start: Float64, steps: list[PoseEdge], ties: list[PoseEdge]) -> tuple
     return poses, weights[len(steps) :]
 
 
-def _odometry_edges(
-    drive: DrivePath, nodes: NDArray[np.intp], begin: int, model: DriftModel
-) -> list[PoseEdge]:
+def _odometry_edges(drive: DrivePath, nodes: NDArray[np.intp], begin: int) -> list[PoseEdge]:
     """Return the edges along a drive, whose nodes are numbered from ``begin``."""
     poses, path_m = drive.trajectory.T_world_camera, drive.path_m
     edges = []
     for k, (first, last) in enumerate(pairwise(nodes), begin):
         # Where the camera stands still, 0.1 m keeps the information finite.
-        drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1), model)
+        drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1))
         T = invert(poses[first]) @ poses[last]
         edges.append(PoseEdge(k, k + 1, T, _inverse(drift.covariance)))
     return edges
@@ -241,13 +233,12 @@ def _tie_edge(
     drives: Sequence[DrivePath],
     nodes: Sequence[NDArray[np.intp]],
     begins: Sequence[int],
-    model: DriftModel,
 ) -> PoseEdge:
     """Return a tie as an edge between the nodes nearest to its frames."""
     loop, (one, other) = tie.loop, tie.drives
     first, to_first, before_m = _to_node(drives[one], nodes[one], loop.first)
     last, to_last, after_m = _to_node(drives[other], nodes[other], loop.last)
-    drift, bias = drift_over(before_m + after_m, model), loop_bias(loop)
+    drift, bias = drift_over(before_m + after_m), loop_bias(loop)
     more = Drift(
         math.hypot(drift.position_m, bias.position_m),
         math.hypot(drift.angle_rad, bias.angle_rad),

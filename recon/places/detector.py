@@ -12,7 +12,7 @@ from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float64
 from recon.places.agree import LOOP_SIGMAS, agreeing_loops
-from recon.places.drift import DriftModel, drift_over, is_possible
+from recon.places.drift import drift_over, is_possible
 from recon.places.keyframe import Keyframe, make_keyframe, words_of
 from recon.places.places import Place, Places, most_alike
 from recon.places.verify import Loop, verify
@@ -70,13 +70,11 @@ class LoopDetector:
     same frames in the same order give the same loops.
 
     Args:
-        drift: How far odometry may drift.
         store: Where keyframes go.
         search: Whether to look for loops; else keyframes are only kept, for later drives.
     """
 
-    def __init__(self, drift: DriftModel, store: KeyframeStore, *, search: bool = True) -> None:
-        self._drift = drift
+    def __init__(self, store: KeyframeStore, *, search: bool = True) -> None:
         self._store = store
         self._search = search
         self._places = Places()
@@ -131,7 +129,7 @@ class LoopDetector:
         places = self._places
         known = zip(places.frames, places.T_world_camera, places.path_m.tolist(), strict=True)
         poses = {frame: (T, path_m) for frame, T, path_m in known}
-        return agreeing_loops(self.loops, poses, poses, self._drift)
+        return agreeing_loops(self.loops, poses, poses)
 
     def _place(self, stored: StoredKeyframe) -> Place:
         words = words_of(stored.keyframe.descriptors)
@@ -160,7 +158,7 @@ class LoopDetector:
 
     def _candidates(self, place: Place) -> list[int]:
         """Return numbers of old keyframes that may be near, most similar first."""
-        near = self._places.near(place, self._drift)
+        near = self._places.near(place)
         if not near.any():
             return []
         likeness = self._places.likeness(place)
@@ -170,5 +168,5 @@ class LoopDetector:
     def _possible(self, old: int, new: Place, loop: Loop) -> bool:
         """Return whether drift explains the difference between a loop and odometry."""
         T = invert(self._places.T_world_camera[old]) @ new.T_world_camera
-        drift = drift_over(new.path_m - float(self._places.path_m[old]), self._drift)
+        drift = drift_over(new.path_m - float(self._places.path_m[old]))
         return is_possible(invert(T) @ loop.T_first_last, drift, LOOP_SIGMAS)

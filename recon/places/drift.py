@@ -1,4 +1,4 @@
-"""A model of how odometry drifts."""
+"""How far odometry may drift; larger figures give more candidates and refuse less."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.geometry.se3 import angle_rad, invert
+from recon.core.geometry.se3 import angle_rad
 from recon.core.values.arrays import Bool, Float64
 
 _LOST_FACTOR: Final = 20.0
@@ -21,18 +21,11 @@ _LOST_M: Final = 2.0
 SIGMAS: Final = 3.5
 """Largest possible deviation from odometry, in standard deviations."""
 
+SHARE: Final = 0.02
+"""Standard deviation of a position, as a share of the path."""
 
-@dataclass(frozen=True)
-class DriftModel:
-    """How far odometry may drift; larger values give more candidates and refuse less.
-
-    Attributes:
-        share: Standard deviation of a position, as a share of the path.
-        turn_deg: Standard deviation of the heading after 1 m; grows with the root of the path.
-    """
-
-    share: float = 0.02
-    turn_deg: float = 0.15
+TURN_DEG: Final = 0.15
+"""Standard deviation of the heading after 1 m; it grows with the root of the path."""
 
 
 @dataclass(frozen=True)
@@ -69,20 +62,20 @@ def path_lengths(T_world_camera: Float64, trusted: Bool) -> Float64:
     return np.concatenate([np.zeros(min(1, len(trusted))), np.cumsum(step_m)])
 
 
-def drift_over(path_m: float, model: DriftModel) -> Drift:
+def drift_over(path_m: float) -> Drift:
     """Return the drift over a path.
 
     The scale error is constant and the heading a random walk. The position error of the latter is
     that of a straight drive, the worst case: ``turn·√(path³/3)``.
     """
-    position_m, turn_rad = spread_over(np.array(path_m), model)
+    position_m, turn_rad = spread_over(np.array(path_m))
     return Drift(float(position_m), float(turn_rad))
 
 
-def spread_over(path_m: Float64, model: DriftModel) -> tuple[Float64, Float64]:
+def spread_over(path_m: Float64) -> tuple[Float64, Float64]:
     """Return `drift_over` of many paths (N,): standard deviations of positions and of rotations."""
-    turn = math.radians(model.turn_deg)
-    position_m = np.hypot(model.share * path_m, turn * np.sqrt(path_m**3 / 3.0))
+    turn = math.radians(TURN_DEG)
+    position_m = np.hypot(SHARE * path_m, turn * np.sqrt(path_m**3 / 3.0))
     return position_m, turn * np.sqrt(path_m)
 
 
@@ -99,9 +92,3 @@ def is_possible(T_difference: NDArray[np.float64], drift: Drift, other: Drift) -
     sigma_m = math.hypot(drift.position_m, other.position_m)
     sigma_rad = math.hypot(drift.angle_rad, other.angle_rad)
     return off_m <= SIGMAS * sigma_m and off_rad <= SIGMAS * sigma_rad
-
-
-def motion(T_world_camera: Float64, first: int, last: int) -> Float64:
-    """Return ``T_first_last`` (4, 4) of two poses of a stack."""
-    T: Float64 = invert(T_world_camera[first]) @ T_world_camera[last]
-    return T

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.values.arrays import Bool, Float64
-from recon.places.drift import SIGMAS, DriftModel, spread_over
+from recon.places.drift import SIGMAS, spread_over
 
 _LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms and 10 MB
 
@@ -85,10 +85,10 @@ class Places:
         """float64 (N,)."""
         return self._path_m[: len(self)]
 
-    def near(self, place: Place, drift: DriftModel) -> Bool:
+    def near(self, place: Place) -> Bool:
         """Return bool (N,), places that drift allows to be in view of a later one."""
         way_m = place.path_m - self.path_m
-        sigma_m, sigma_rad = spread_over(np.maximum(way_m, 0.0), drift)
+        sigma_m, sigma_rad = spread_over(np.maximum(way_m, 0.0))
         T = invert(self.T_world_camera) @ place.T_world_camera
         far_m = np.linalg.norm(T[:, :3, 3], axis=1) - SIGMAS * sigma_m
         turned = angle_rad(T) - SIGMAS * sigma_rad

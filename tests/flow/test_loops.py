@@ -16,10 +16,8 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.values import SequenceTruth, StereoPair
 from recon.io.trajectory import read_tum
-from recon.map.drive import drive_loops
 from recon.map.drive.frame_result import FrameResult
 from recon.map.drive.map_run import MapRun
-from recon.places.drift import DriftModel
 from recon.run.progress import Silent
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
@@ -163,7 +161,7 @@ def test_a_street_that_repeats_itself_is_mapped_as_if_nobody_looked_for_loops(
     drive = _Filmed(ALIKE)
     looked = _run(drive, tmp_path / "looked")
     _run(drive, tmp_path / "off", "loops.enabled=false")
-    with patch.object(drive_loops, "DRIFT", DriftModel(share=1.0, turn_deg=5.0)):
+    with patch.multiple("recon.places.drift", SHARE=1.0, TURN_DEG=5.0):
         blind = _run(drive, tmp_path / "blind")
 
     assert looked.summary["loops"]["found"] == 0

@@ -12,7 +12,7 @@ import pytest
 from recon.core.geometry import se3
 from recon.core.values import Disparity, Reason, RectifiedPair, Trajectory
 from recon.places.detector import LoopDetector, StoredKeyframe
-from recon.places.drift import DriftModel, path_lengths
+from recon.places.drift import path_lengths
 from recon.places.keyframe import Keyframe, make_keyframe
 from recon.street.render import StreetCamera
 from recon.street.settings import CORNER_M, StreetScene
@@ -102,11 +102,11 @@ class Filmed:
     def keyframe(self, index: int) -> Keyframe:
         return make_keyframe(index, *self.frame(index))
 
-    def detect(self, frames, path: Trajectory, drift: DriftModel | None = None, lost=()):
+    def detect(self, frames, path: Trajectory, lost=()):
         """A detector that has seen some frames, their poses being those of ``path``."""
         trusted = ~np.isin(np.arange(len(path)), list(lost))
         path_m = path_lengths(path.T_world_camera, trusted)
-        detector = LoopDetector(drift or DriftModel(), KeyframeMemory())
+        detector = LoopDetector(KeyframeMemory())
         for k in frames:
             pair, disparity = self.frame(k)
             pose = path.T_world_camera[k]

@@ -11,11 +11,9 @@ from recon.core.geometry import se3
 from recon.core.values import Trajectory
 from recon.places.agree import agreeing_loops
 from recon.places.closure import close_loops
-from recon.places.drift import DriftModel
 from recon.places.verify import Loop
 from tests.places.conftest import drifted
 
-DRIFT = DriftModel()
 INFORMATION = np.diag([0.05**-2] * 3 + [0.003**-2] * 3)
 LAP = 200
 HOUSE_M = 8
@@ -59,7 +57,7 @@ def _agreeing(odometry: Trajectory, loops: list[Loop]) -> list[Loop]:
         for loop in loops
         for frame in (loop.first, loop.last)
     }
-    return agreeing_loops(loops, poses, poses, DRIFT)
+    return agreeing_loops(loops, poses, poses)
 
 
 def test_loops_that_tell_the_same_are_believed(odometry, truth):
@@ -105,7 +103,7 @@ def test_loops_to_anywhere_bend_nothing(odometry, truth, seed):
     ]
 
     believed = _agreeing(odometry, [*right, *wrong])
-    closure = close_loops(odometry, odometry.distances_m, believed, DRIFT)
+    closure = close_loops(odometry, odometry.distances_m, believed)
     assert not set(map(id, wrong)) & set(map(id, closure.closed))
     before, after = (
         np.linalg.norm(path.positions_m - truth.positions_m, axis=1).max()

@@ -11,11 +11,10 @@ from recon.core.errors import RegistrationError
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
 from recon.places.closure import DrivePath, Tie, close_loops, join_drives
-from recon.places.drift import Drift, DriftModel, drift_over, is_possible, path_lengths
+from recon.places.drift import Drift, drift_over, is_possible, path_lengths
 from recon.places.verify import Loop
 from tests.places.conftest import drifted
 
-DRIFT = DriftModel()
 INFORMATION = np.diag([0.05**-2] * 3 + [0.003**-2] * 3)
 LAP = 200
 
@@ -57,7 +56,7 @@ def _path_m(path: Trajectory) -> np.ndarray:
 
 
 def _close(odometry: Trajectory, loops: list[Loop]):
-    return close_loops(odometry, _path_m(odometry), loops, DRIFT)
+    return close_loops(odometry, _path_m(odometry), loops)
 
 
 def _end_error_m(path: Trajectory, truth: Trajectory) -> float:
@@ -163,8 +162,7 @@ def test_a_metre_without_measurement_counts_as_many():
 
 
 def test_drift_grows_with_the_path_and_bounds_what_is_possible():
-    settings = DriftModel(share=0.02, turn_deg=0.1)
-    near, far = drift_over(50.0, settings), drift_over(500.0, settings)
+    near, far = drift_over(50.0), drift_over(500.0)
     off = se3.make_transform(np.eye(3), np.array([5.0, 0.0, 0.0]))
 
     assert far.position_m > near.position_m
@@ -191,7 +189,7 @@ def test_a_drive_with_known_poses_keeps_its_shape(truth, odometry, known):
         for k, step in enumerate(off[: len(truth) // 20])
     ]
 
-    joined = join_drives(drives, ties, DRIFT)
+    joined = join_drives(drives, ties)
 
     assert joined is not None
     assert joined.kept.all()

@@ -8,7 +8,6 @@ import pytest
 from recon.core.geometry import se3
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.places.agree import agreeing_loops
-from recon.places.drift import DriftModel
 from recon.places.keyframe import make_keyframe
 from recon.places.known_places import KnownPlaces, KnownView
 from tests.places.conftest import LAP, PERIOD
@@ -30,7 +29,7 @@ def known(block) -> KnownPlaces:
 def _agreeing(known, loops, poses):
     firsts = {number: (T, 0.0) for number, T in enumerate(known.T_world_camera)}
     lasts = {loop.last: (poses[loop.last], 1.5 * loop.last) for loop in loops}
-    return agreeing_loops(loops, firsts, lasts, DriftModel())
+    return agreeing_loops(loops, firsts, lasts)
 
 
 def _off_m(known, block, loop) -> float:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from recon.core.geometry import se3
 from recon.places import places as places_file
-from recon.places.drift import SIGMAS, DriftModel, drift_over
+from recon.places.drift import SIGMAS, drift_over
 from recon.places.places import Place, Places, WordIndex
 
 images = st.lists(st.sets(st.integers(0, 30)), max_size=20)
@@ -54,8 +54,7 @@ def _place(frame: int, x_m: float, path_m: float, turned_deg: float = 0.0) -> Pl
 
 
 def test_a_place_is_near_if_odometry_could_be_so_wrong():
-    drift = DriftModel()
-    far = drift_over(100.0, drift)
+    far = drift_over(100.0)
     reach_m = places_file.VIEW_M + SIGMAS * far.position_m
     turn_deg = places_file.VIEW_DEG + np.degrees(SIGMAS * far.angle_rad)
     places = Places()
@@ -65,7 +64,7 @@ def test_a_place_is_near_if_odometry_could_be_so_wrong():
         places.add(_place(len(places), 0.0, 0.0, share * turn_deg))
     places.add(_place(9, 0.0, 100.0 - 0.9 * places_file._MIN_PATH_M))
 
-    near = places.near(_place(10, 0.0, 100.0), drift)
+    near = places.near(_place(10, 0.0, 100.0))
     assert near.tolist() == [True, True, False, True, False, False]
 
 
@@ -91,7 +90,7 @@ def test_a_question_after_ten_kilometres_takes_milliseconds():
     seconds = []
     for _ in range(5):
         start = time.perf_counter()
-        places.near(asked, DriftModel())
+        places.near(asked)
         places.likeness(asked)
         seconds.append(time.perf_counter() - start)
     # Ten milliseconds on an idle core; comparing image with image takes half a second.

@@ -16,15 +16,12 @@ from recon.map.store.keyframes import Keyframes
 from recon.map.store.submaps import SubmapEntry
 from recon.places.closure import Closure, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector
-from recon.places.drift import DriftModel, path_lengths
+from recon.places.drift import path_lengths
 from recon.run.stopwatch import Stopwatch
 from recon.stereo.frame import ReconstructedFrame
 
 _TELLING: Final = 3  # implausible place recognitions from which a warning is given
 _BEHIND: Final = 4  # frames by which loop detection may lag behind
-
-DRIFT: Final = DriftModel()
-"""How far the odometry of a drive may drift."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +131,7 @@ class LoopWatch:
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
         self._waiting: deque[Future[None]] = deque()
         self._keyframes = keyframes
-        self._detector = LoopDetector(DRIFT, keyframes, search=search)
+        self._detector = LoopDetector(keyframes, search=search)
         self._path_m: list[float] = []
         self._last: Float64 = np.eye(4)
 
@@ -194,7 +191,7 @@ class LoopWatch:
         loops = self._detector.agreeing()
         return DriveLoops(
             odometry=trajectory,
-            closure=close_loops(trajectory, path_m, loops, DRIFT),
+            closure=close_loops(trajectory, path_m, loops),
             keyframes=len(self._detector),
             found=len(self._detector.loops),
             refused=dict(self._detector.refused),

@@ -18,7 +18,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import invert, orthonormalise
 from recon.core.values.arrays import Float64
-from recon.map.drive.drive_loops import DRIFT, LoopWatch
+from recon.map.drive.drive_loops import LoopWatch
 from recon.map.drive.sequence import MappedSequence
 from recon.map.drive.workspace import Workspace
 from recon.map.settings import DriveSettings
@@ -90,7 +90,7 @@ def join_pieces(
         OutputError: The map cannot be written.
     """
     session = map_.session()
-    detector = LoopDetector(DRIFT, session.keyframes, search=settings.loops.enabled)
+    detector = LoopDetector(session.keyframes, search=settings.loops.enabled)
     for piece, one in zip(pieces, mapped, strict=True):
         part = one.session()
         if not len(session):

@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import adjoint, as_step, as_transform, invert, orthonormalise
 from recon.core.values.arrays import Float64
-from recon.places.drift import DriftModel, drift_over
+from recon.places.drift import drift_over
 
 _MAX_CHI2: Final = 22.5
 """Chi-square, with six degrees of freedom, above which a correction contradicts: 0.1 % of right
@@ -37,7 +37,7 @@ class Belief:
 
         Errors of the scale add up along the path, so its drift is not that of independent steps.
         """
-        return self.corrected + drift_over(self.path_m, DriftModel()).covariance
+        return self.corrected + drift_over(self.path_m).covariance
 
     @property
     def sigma_m(self) -> float:

@@ -9,7 +9,6 @@ from typing import Final
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.places.agree import agreeing_loops
-from recon.places.drift import DriftModel
 from recon.places.keyframe import Keyframe
 from recon.places.known_places import KnownPlaces
 from recon.places.verify import Loop
@@ -98,4 +97,4 @@ class Search:
             for sight in self._seen
             for loop in sight.loops
         }
-        return agreeing_loops(loops, firsts, lasts, DriftModel(), keyframes=self._frames)
+        return agreeing_loops(loops, firsts, lasts, keyframes=self._frames)

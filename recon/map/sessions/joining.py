@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.geometry.se3 import invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.map.sessions.linking import DRIFT, find_links, path_up_to
+from recon.map.sessions.linking import find_links, path_up_to
 from recon.map.store.links import Link
 from recon.map.store.map import Map
 from recon.map.store.session import Session
@@ -126,7 +126,7 @@ def _solve(map_: Map, places: dict[int, Float64], links: Sequence[Link]) -> _Joi
         for loop in session.loops.get("closed", ())
     ]
     ties = [Tie(_places(numbers, link), link.loop) for link in links]
-    joined = join_drives(drives, [*loops, *ties], DRIFT)
+    joined = join_drives(drives, [*loops, *ties])
     if joined is None:
         return _Joined({}, [])
     kept = joined.kept[len(loops) :]

@@ -15,11 +15,9 @@ from recon.map.store.map_views import MapViews
 from recon.map.store.session import Session
 from recon.odometry.health import trusted_poses
 from recon.places.agree import agreeing_loops
-from recon.places.drift import DriftModel, path_lengths
+from recon.places.drift import path_lengths
 from recon.places.known_places import KnownPlaces, KnownView
 from recon.places.verify import Loop
-
-DRIFT = DriftModel()
 
 
 def find_links(map_: Map, new: Collection[int]) -> list[Link]:
@@ -98,7 +96,7 @@ def _confirmed(loops: Sequence[Loop], views: MapViews, new: Session) -> list[Lin
     lasts = {loop.last: (poses[loop.last], float(path_m[loop.last])) for loop in loops}
     return [
         Link((views[loop.first].session, new.number), _of_frames(loop, views))
-        for loop in agreeing_loops(loops, firsts, lasts, DRIFT)
+        for loop in agreeing_loops(loops, firsts, lasts)
     ]
 
 

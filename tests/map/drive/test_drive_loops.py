@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import time
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -26,9 +27,9 @@ from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.store.keyframes import Keyframes
 from recon.map.store.records import Store
 from recon.map.store.submaps import SubmapEntry
+from recon.places import drift
 from recon.places.closure import close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
-from recon.places.drift import DriftModel
 from recon.stereo.frame import ReconstructedFrame
 from tests.run.pools import observed_pool
 
@@ -199,10 +200,10 @@ def test_a_foreign_keyframe_is_reported(frames):
 
 
 def test_loops_that_contradict_odometry_are_a_warning(closed):
-    """The settings believe odometry to the millimetre, so that bending it is impossible."""
-    strict = DriftModel(share=1e-6, turn_deg=1e-5)
+    """Odometry is believed to the millimetre, so that bending it is impossible."""
     path = closed.odometry
-    refused = close_loops(path, path.distances_m, list(closed.closure.closed), strict)
+    with patch.multiple(drift, SHARE=1e-6, TURN_DEG=1e-5):
+        refused = close_loops(path, path.distances_m, list(closed.closure.closed))
     loops = DriveLoops(path, refused, FRAMES, len(closed.closure.closed), {})
 
     assert refused.trajectory is path
@@ -212,7 +213,7 @@ def test_loops_that_contradict_odometry_are_a_warning(closed):
 @pytest.mark.parametrize(("times", "warned"), [(2, False), (3, True)])
 def test_places_where_the_drive_cannot_have_been_are_a_warning(times, warned):
     path = _circle()
-    nothing = close_loops(path, path.distances_m, [], DriftModel())
+    nothing = close_loops(path, path.distances_m, [])
     loops = DriveLoops(path, nothing, FRAMES, 0, {CONTRADICTED: times})
 
     assert [("alike" in text) for text in loops.warnings()] == [True] * warned
