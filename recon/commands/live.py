@@ -24,6 +24,8 @@ from recon.sources.protocol import StereoSource
 
 _FIRST: Final = 3
 """Pairs that are worked on before the first one counts: the first use of a library takes long."""
+_PACE_S: Final = 0.1
+"""Time between them, whatever their own times are: a recording may begin with a gap."""
 
 
 def run_live(
@@ -61,7 +63,7 @@ def run_live(
         raise SettingsError("a rate is positive", where="--rate", got=f"{rate:g}")
     config, options = config or load_config(), options or MapOptions(command="live")
     _check_pose_first(config)
-    _warm_up(LiveSource(_Beginning(source)), config, map_path)
+    _warm_up(LiveSource(_Beginning(source), stopped=stopped), config, map_path)
     live = isinstance(source, CameraSource) and source.live
     played = LiveSource(source, None if live else rate, stopped)
     options = replace(options, audit=False, progress=played.timed(options.progress))
@@ -88,7 +90,8 @@ class _Beginning:
     truth = None
 
     def __init__(self, source: StereoSource) -> None:
-        self._pairs = list(islice(source.frames(), _FIRST))
+        first = enumerate(islice(source.frames(), _FIRST))
+        self._pairs = [replace(pair, timestamp_s=n * _PACE_S) for n, pair in first]
         self.name, self.description = source.name, source.description
         self.calibration, self.files = source.calibration, source.files
 

@@ -128,7 +128,8 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
         )
     left, right = _list_both(*views)
     by = settings.pair_by
-    listed = next((p / _TIMES for p in (folder, views[0]) if (p / _TIMES).is_file()), None)
+    timed = () if settings.rate_hz else (folder, views[0])
+    listed = next((p / _TIMES for p in timed if (p / _TIMES).is_file()), None)
     stamps = _stamps(left, right) if by in {"auto", "stamp"} else None
     if stamps is not None:
         found = _pair_by_stamp(left, right, stamps, settings, folder)

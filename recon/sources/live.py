@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from recon.core.errors import SourceError
 from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair
 from recon.run.progress import Progress, Step
 from recon.sources.protocol import StereoSource
@@ -100,6 +101,7 @@ class LiveSource:
 
         Raises:
             ReconError: A pair cannot be read.
+            SourceError: The drive is stopped before the first one.
         """
         Thread(target=self._play, args=(start,), name="live", daemon=True).start()
         try:
@@ -185,6 +187,8 @@ class LiveSource:
             while not (self._waiting or self._ended or self._stopped()):
                 self._news.wait(_PATIENCE_S)
             if self._stopped():
+                if not self._due_s:
+                    raise SourceError("the drive was stopped before its first frame")
                 return None
             if not self._waiting:
                 if self._error is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -17,6 +18,8 @@ _STAMP: Final = re.compile(r"\d{10}(\.\d+)?|\d{13}|\d{16}|\d{19}|\d+\.\d+", re.A
 
 _SECONDS_DIGITS: Final = 10
 """Digits of a time in seconds since 1970, from 2001 to 2286."""
+_LONGEST_STEP_S: Final = 60.0
+"""Longest usual time between two frames of a drive."""
 _CLOCK_STEPS: Final = 10
 """Least step of padded numbers that are a clock: 10 ms, or less in finer units."""
 
@@ -89,6 +92,27 @@ def check_increasing(stamps_s: Float64, where: str) -> None:
             where=f"{where}, image {at}",
             got=f"{stamps_s[at]:.6f} s after {stamps_s[at - 1]:.6f} s",
             hint="the images of each camera must be in the order of their exposure",
+        )
+
+
+def check_seconds(stamps_s: Float64, where: str | Path) -> None:
+    """Check that timestamps can be seconds of a drive, not milliseconds or all the same.
+
+    Args:
+        stamps_s: float64 (N,), in the order of the frames.
+        where: Their file.
+
+    Raises:
+        SourceError: Half of the frames or more are at the same time, or more than a minute apart.
+    """
+    step_s = float(np.median(np.diff(stamps_s))) if len(stamps_s) > 1 else 1.0
+    if not 0.0 < step_s <= _LONGEST_STEP_S:
+        raise SourceError(
+            "times are not those of a drive in seconds",
+            where=where,
+            got=f"{step_s:g} s from frame to frame",
+            expected=f"more than 0, at most {_LONGEST_STEP_S:g} s",
+            hint="convert them; --set source.rate_hz= replaces those of a times.txt",
         )
 
 

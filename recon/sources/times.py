@@ -15,6 +15,7 @@ from recon.core.values.arrays import Float64
 from recon.io.files import read_table, read_text, reader
 from recon.io.trajectory import read_tum
 from recon.sources.frame_list import FrameList
+from recon.sources.stamps import check_seconds
 
 
 @reader
@@ -25,7 +26,7 @@ def read_times(path: Path, frames: int) -> Float64:
         float64 (frames,), not decreasing.
 
     Raises:
-        SourceError: The file is missing or too short.
+        SourceError: The file is missing or too short, or its times are no seconds.
         FormatError: A line is not a number, or time runs backwards.
     """
     return read_times_of_pairs(path, FrameList([""] * frames, range(frames)))
@@ -38,7 +39,7 @@ def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
         float64, one time per pair, not decreasing.
 
     Raises:
-        SourceError: The file is missing or too short.
+        SourceError: The file is missing or too short, or its times are no seconds.
         FormatError: A line is not a number, or time runs backwards.
     """
     if not path.exists():
@@ -52,6 +53,7 @@ def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
             got=f"{len(table)} times",
             expected=f"{len(listing.names)}",
         )
+    check_seconds(table[:, 0], path)
     times: Float64 = table[chosen, 0]
     backwards = np.diff(times) < 0
     if backwards.any():

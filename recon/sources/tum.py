@@ -20,7 +20,7 @@ from recon.sources.calibration import read_rig
 from recon.sources.image_names import find_partners
 from recon.sources.images import ImageSource, image_size, is_image, pair_listed
 from recon.sources.settings import SourceSettings
-from recon.sources.stamps import check_increasing
+from recon.sources.stamps import check_increasing, check_seconds
 from recon.sources.times import read_stamped_names, read_tum_truth
 
 
@@ -78,5 +78,7 @@ def _find_lists(folder: Path, settings: SourceSettings) -> tuple[Path, Path]:
 
 def _read_list(path: Path) -> list[tuple[float, Path]]:
     listed = [(stamp, path.parent / name) for stamp, name in read_stamped_names(path)]
-    check_increasing(np.array([stamp for stamp, _ in listed]), str(path))
+    stamps_s = np.array([stamp for stamp, _ in listed])
+    check_increasing(stamps_s, str(path))
+    check_seconds(stamps_s, path)
     return listed

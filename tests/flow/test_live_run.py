@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from recon.commands.config import ReconConfig, load_config
 from recon.commands.live import run_live
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core.errors import MappingError, SettingsError
+from recon.core.errors import MappingError, SettingsError, SourceError
 from recon.io.trajectory import read_tum
 from recon.map.drive.map_behind import MapBehind
 from recon.run.progress import Silent
@@ -115,6 +116,45 @@ def test_a_drive_ends_when_it_is_told_to_and_its_map_is_completed(
 
     assert summary["frames"] == 5
     assert (tmp_path / "live" / "map" / "cloud.ply").is_file()
+
+
+class _WithGap:
+    """A street whose second image comes an hour after the first."""
+
+    truth = None
+
+    def __init__(self, street: Film) -> None:
+        self._street = street
+        self.name, self.description = street.name, street.description
+        self.calibration, self.files = street.calibration, street.files
+
+    def __len__(self) -> int:
+        return len(self._street)
+
+    def frames(self, start: int = 0):
+        for pair in self._street.frames(start):
+            late_s = 3600.0 if pair.index else 0.0
+            yield replace(pair, timestamp_s=pair.timestamp_s + late_s)
+
+
+def test_a_gap_at_the_beginning_is_not_waited_for_twice(street, config, patient, tmp_path) -> None:
+    arrived = []
+
+    class Watch(Silent):
+        def on_step(self, step) -> None:
+            arrived.append(step)
+
+    options = MapOptions("live", tmp_path / "live", mesh=False, progress=Watch())
+    summary = run_live(_WithGap(street), config, options, stopped=lambda: bool(arrived))
+
+    assert summary["frames"] == 1
+
+
+def test_a_drive_that_is_stopped_before_it_began_says_so(street, config, tmp_path) -> None:
+    options = MapOptions("live", tmp_path / "live", mesh=False)
+    with pytest.raises(SourceError, match="stopped before its first frame"):
+        run_live(street, config, options, stopped=lambda: True)
+    assert not (tmp_path / "live").exists()
 
 
 def test_kiss_icp_comes_too_late_for_live_poses(street, tmp_path) -> None:
