@@ -15,12 +15,6 @@ from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResul
 _VOXEL_M: Final = 0.2
 """Edge of a voxel of the map."""
 
-_INITIAL_THRESHOLD_M: Final = 2.0
-"""First value of the adaptive threshold."""
-
-_MIN_MOTION_M: Final = 0.1
-"""Deviations from the motion model below this do not change the threshold."""
-
 _MIN_POINTS: Final = 300
 """Frames with fewer points are skipped."""
 
@@ -36,14 +30,7 @@ class KissOdometry:
 
     def __init__(self, max_range_m: float) -> None:
         self._max_range_m = max_range_m
-        self._icp = KissIcp(
-            KissIcpOptions(
-                max_range_m=max_range_m,
-                voxel_m=_VOXEL_M,
-                initial_threshold_m=_INITIAL_THRESHOLD_M,
-                min_motion_m=_MIN_MOTION_M,
-            )
-        )
+        self._icp = KissIcp(KissIcpOptions(max_range_m, _VOXEL_M))
         self._poses: list[Float64] = []
 
     def register(self, frame: OdometryFrame) -> OdometryResult:

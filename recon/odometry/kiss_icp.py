@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from kiss_icp.config import KISSConfig
@@ -23,29 +23,31 @@ from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import angle_rad, orthonormalise
 from recon.core.values.arrays import Float64
 
+_POINTS_PER_VOXEL: Final = 20
+"""Most points that a voxel of the map keeps."""
+
+_INITIAL_THRESHOLD_M: Final = 2.0
+"""First value of the adaptive threshold."""
+
+_MIN_MOTION_M: Final = 0.1
+"""Smaller deviations from the motion model do not change the threshold."""
+
 
 @dataclass(frozen=True)
 class KissIcpOptions:
-    """All parameters of kiss-icp.
+    """What users of kiss-icp choose.
 
     Attributes:
         max_range_m: Points farther from the sensor are dropped, and the map is clipped there.
         voxel_m: Voxel size of the map.
-        points_per_voxel: Maximum number of points per voxel of the map.
         iterations: Maximum number of ICP iterations.
         convergence: Step length below which ICP has converged.
-        initial_threshold_m: Initial value of the adaptive threshold.
-        min_motion_m: Deviations from the motion model below this do not change the adaptive
-            threshold.
     """
 
     max_range_m: float
     voxel_m: float
-    points_per_voxel: int = 20
     iterations: int = 500
     convergence: float = 1e-4
-    initial_threshold_m: float = 2.0
-    min_motion_m: float = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +70,7 @@ class KissIcp:
     that sums have a fixed order and equal input gives equal output.
 
     Args:
-        options: All parameters of kiss-icp.
+        options: Range, voxels, and when to stop.
 
     Raises:
         RegistrationError: kiss-icp rejects the options.
@@ -169,10 +171,9 @@ class _AdaptiveThreshold:
         Vizzo et al., "KISS-ICP: in defense of point-to-point ICP", RA-L 2023, section III-C.
     """
 
-    def __init__(self, options: KissIcpOptions) -> None:
-        self._max_range_m = options.max_range_m
-        self._min_motion_m = options.min_motion_m
-        self._sum_m2 = options.initial_threshold_m**2
+    def __init__(self, max_range_m: float) -> None:
+        self._max_range_m = max_range_m
+        self._sum_m2 = _INITIAL_THRESHOLD_M**2
         self._count = 1
 
     def get_threshold(self) -> float:
@@ -183,7 +184,7 @@ class _AdaptiveThreshold:
         """Count one more deviation, a transform (4, 4)."""
         turn_m = 2.0 * self._max_range_m * math.sin(0.5 * float(angle_rad(model_deviation)))
         error_m = turn_m + float(np.linalg.norm(model_deviation[:3, 3]))
-        if error_m > self._min_motion_m:
+        if error_m > _MIN_MOTION_M:
             self._sum_m2 += error_m**2
             self._count += 1
 
@@ -203,7 +204,7 @@ def _new(options: KissIcpOptions) -> KissICP:
     """Return kiss-icp with an empty map, and a threshold of which the state can be saved."""
     with _our_errors():
         icp = KissICP(_config(options))
-    icp.adaptive_threshold = _AdaptiveThreshold(options)
+    icp.adaptive_threshold = _AdaptiveThreshold(options.max_range_m)
     return icp
 
 
@@ -217,13 +218,11 @@ def _config(options: KissIcpOptions) -> KISSConfig:
             convergence_criterion=options.convergence,
             max_num_threads=1,
         ),
-        mapping=MappingConfig(
-            voxel_size=options.voxel_m, max_points_per_voxel=options.points_per_voxel
-        ),
+        mapping=MappingConfig(voxel_size=options.voxel_m, max_points_per_voxel=_POINTS_PER_VOXEL),
         adaptive_threshold=AdaptiveThresholdConfig(
             fixed_threshold=None,
-            initial_threshold=options.initial_threshold_m,
-            min_motion_th=options.min_motion_m,
+            initial_threshold=_INITIAL_THRESHOLD_M,
+            min_motion_th=_MIN_MOTION_M,
         ),
     )
 

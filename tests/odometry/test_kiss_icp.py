@@ -119,15 +119,12 @@ def test_the_threshold_is_that_of_kiss_icp() -> None:
     """Our threshold, unlike that of kiss-icp, can be saved; it gives the same values."""
     from kiss_icp.pybind import kiss_icp_pybind
 
-    from recon.odometry.kiss_icp import _AdaptiveThreshold
+    from recon.odometry.kiss_icp import _INITIAL_THRESHOLD_M, _MIN_MOTION_M, _AdaptiveThreshold
 
-    options = KissIcpOptions(max_range_m=30.0, voxel_m=0.3)
     theirs = kiss_icp_pybind._AdaptiveThreshold(
-        initial_threshold=options.initial_threshold_m,
-        min_motion_th=options.min_motion_m,
-        max_range=options.max_range_m,
+        initial_threshold=_INITIAL_THRESHOLD_M, min_motion_th=_MIN_MOTION_M, max_range=30.0
     )
-    ours, rng = _AdaptiveThreshold(options), np.random.default_rng(4)
+    ours, rng = _AdaptiveThreshold(30.0), np.random.default_rng(4)
     for size in (0.0, 0.001, 0.01, 0.1, 0.5):
         T = make_transform(exp_so3(size * rng.normal(size=3)), size * rng.normal(size=3))
         ours.update_model_deviation(T)
