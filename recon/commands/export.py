@@ -1,4 +1,4 @@
-"""The story of `recon export`: products of a finished run, with other settings or formats."""
+"""`recon export`: products of a finished run, with other settings or formats."""
 
 from __future__ import annotations
 

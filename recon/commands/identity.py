@@ -1,4 +1,4 @@
-"""What a run was started with: unchanged, a resumed run ends like one that was not interrupted."""
+"""What a run was started with: where it is unchanged, a resumed run gives the same result."""
 
 from __future__ import annotations
 

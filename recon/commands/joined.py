@@ -97,9 +97,7 @@ def copied(file: Path, map_: Map, settings: ReconConfig) -> list[int]:
         return copy_sessions(other, map_)
 
 
-def joined_settings(
-    folder: Path, config: ReconConfig | None, sections: Sequence[str]
-) -> ReconConfig:
+def joined_settings(folder: Path, config: ReconConfig | None) -> ReconConfig:
     """Return the settings of a finished run, or those with changes where they have an effect.
 
     Raises:
@@ -108,5 +106,5 @@ def joined_settings(
     open_run(folder)
     ran = run_settings(folder)
     if config is not None:
-        check_changes(ran, config, sections)
+        check_changes(ran, config, REMADE)
     return config or ran

@@ -1,4 +1,4 @@
-"""The story of `recon live`: map a drive, or find it in a map, while its images arrive."""
+"""`recon live`: map a drive, or find it in a map, while its images arrive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The story of `recon localize`: find each frame of a drive in a map that is there already."""
+"""`recon localize`: find each frame of a drive in a map that is there already."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from recon.commands.config import ReconConfig, run_settings
-from recon.commands.joined import REMADE, copied, joined_settings, make_joined
+from recon.commands.joined import copied, joined_settings, make_joined
 from recon.commands.map import map_whole
 from recon.commands.map_options import MapOptions
 from recon.core.errors import SettingsError
@@ -46,7 +46,7 @@ def run_merge(
     if len(runs) < 2:
         raise SettingsError("there is nothing to merge", got=len(runs), expected="two runs")
     _refuse_twice(runs)
-    settings = joined_settings(runs[0], config, REMADE)
+    settings = joined_settings(runs[0], config)
     for run in runs:
         open_run(run)
         refuse_as_target(run, options.out)
@@ -103,7 +103,7 @@ def run_remove(
         ReconError: There is no such drive, or no other one, or the run is damaged; the run stays.
     """
     options = options or MapOptions()
-    settings = joined_settings(folder, config, REMADE)
+    settings = joined_settings(folder, config)
 
     def fill(run: Run, map_: Map) -> list[int]:
         with closing(Map.open(folder)) as old:

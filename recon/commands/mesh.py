@@ -1,4 +1,4 @@
-"""The story of `recon mesh`: a PLY or a run in, a surface in several formats out."""
+"""`recon mesh`: a PLY or a run in, a surface in several formats out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The story of `recon occupancy`: the grid and the OctoMap of a run with other settings."""
+"""`recon occupancy`: the grid and the OctoMap of a run with other settings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The map of a run beside a reference cloud: brought into its axes, and doubted where it is off."""
+"""The map of a run beside a reference cloud: in its axes, with a warning where they seem wrong."""
 
 from __future__ import annotations
 

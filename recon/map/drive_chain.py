@@ -1,4 +1,4 @@
-"""What drives observed in a tile, one after the other: what a later one saw counts more."""
+"""The occupancy that several drives observed in a tile: a later drive counts more."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from recon.map.store.tile_parts import TileKey, TileParts
 
 _EVIDENCE: Final = "evidence"
 _OLD: Final = log_odds(0.85)
-"""Log-odds that count at most for a later drive: five rays of it free what was surely occupied."""
+"""Most log-odds that earlier drives keep: five rays of a later one free what was occupied."""
 
 
 class DriveChain:

@@ -1,4 +1,4 @@
-"""How far a path may be off: from its own health, and from what nobody knows about the rig."""
+"""How far a path may be off: errors of its steps, and what a calibration leaves uncertain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Finds the axes of an external trajectory: whose turn of it explains what the cameras see."""
+"""Finds the axes of a prior: those in which it agrees with what the cameras see."""
 
 from __future__ import annotations
 

@@ -43,8 +43,8 @@ class OdometryHealth:
             well features fit, and how far their disparities may be off.
         sigma_deg: That of the rotation.
         scale_px: Disparity on which the length of the motion rests: the mean over the features,
-            each weighted by how much it tells. What all disparities are off, in shares of it, the
-            motion is too long or too short.
+            each weighted by its information. If all disparities are off by 1 % of it, so is the
+            length of the motion.
         icp_points: Points given to ICP.
         notes: Why something was refused or went wrong, for the log.
         warnings: Problems of the frame that the user should know, even if it has a pose.

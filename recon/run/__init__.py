@@ -2,6 +2,6 @@
 
 - `run.py`: one run of a command, with its configuration, summary and record;
 - `directory.py`: its folder, which is complete or not there; `finished.py`: what it has left;
-- `progress.py`: who is shown how far it is; `lookahead.py`: work that overlaps in threads;
+- `progress.py`: how far it is; `lookahead.py`: work that overlaps in threads;
 - `batch/`: many commands as jobs, on this machine or on a cluster.
 """

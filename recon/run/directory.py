@@ -62,8 +62,8 @@ class RunDirectory:
         resume: Resume the unfinished run in the folder.
 
     Attributes:
-        whole: Write beside the folder, and put the new one in its place in one step: whoever
-            looks finds the old run or the new one, never some files of each.
+        whole: Write beside the folder, and put the new one in its place in one step: there is
+            the old run or the new one at any time, never some files of each.
 
     Raises:
         OutputError: The folder cannot be written, holds files that are not of a run, or another

@@ -18,8 +18,8 @@ from recon.run.progress import Progress, Step
 from recon.sources.protocol import StereoSource
 
 _WAITING: Final = 1
-"""Pairs that may wait; where another comes, the oldest is left out. With one, who is too slow gets
-the newest whenever he is ready: what is left out is spread evenly, and nothing is old."""
+"""Pairs that may wait; where another comes, the oldest is dropped. With one, a slow consumer always
+gets the newest pair, and what is dropped is spread evenly."""
 
 _PATIENCE_S: Final = 0.2
 """How long to wait for a pair before asking whether to stop."""
@@ -112,7 +112,7 @@ class LiveSource:
 
     @property
     def waits(self) -> bool:
-        """Whether the next pair is there already: who takes it is late."""
+        """Whether the next pair is there already: the consumer is late."""
         return bool(self._waiting)
 
     def leave_unmatched(self) -> None:

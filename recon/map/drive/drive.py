@@ -150,7 +150,7 @@ class Drive:
         self.wait()  # else keyframes that a resumed run needs might be missing
         with self._stage("checkpoint"):
             if self._live:
-                self.mapper.close()  # the map has all so far; what was dropped nobody can repeat
+                self.mapper.close()  # not to be resumed: frames that were dropped do not come again
             else:
                 seconds = time.perf_counter() - self._start
                 self.session.set_state({"mapper": self.mapper.state(), "seconds": seconds})

@@ -1,4 +1,4 @@
-"""While images arrive poses come first; frames are matched behind, as far as there is time."""
+"""Live mapping: poses come first; frames are matched later, as far as there is time."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from recon.sources.live import LiveSource
 from recon.stereo.frame import FrameReconstructor
 
 _MOST_WAITING: Final = 20
-"""Frames that may wait to be mapped; where more do, the next pose waits, too. So many come only
-while the disk hangs."""
+"""Most frames that wait to be mapped; the next pose waits, too, then. So many wait only while the
+disk hangs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +70,8 @@ def poses_first(
 class MapBehind:
     """Maps frames behind their poses, in a thread of lower priority.
 
-    When a frame is done, the newest of those that wait by then is matched; the ones before it are
-    mapped unmatched, which takes no time. So matching gets what time poses leave, and keeps none
-    from them.
+    When a frame is done, the newest frame that waits is matched; older ones are mapped unmatched,
+    which takes no time. So matching uses the time that poses leave, and delays none of them.
 
     Args:
         source: Where the frames come from; it counts what is not matched.

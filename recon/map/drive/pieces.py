@@ -1,9 +1,9 @@
 """A long drive in pieces that overlap: where it is cut, and how the pieces become one drive again.
 
-Each piece is mapped for itself. Its first frames, the lead, are also the last ones of the piece
-before: there the odometry gets going, and a frame that both have is where one goes on from the
-other. Such a link is exact, as it is the same frame; what is uncertain is the motion before and
-after it, as in a drive that was never cut. Loops are then looked for in the whole drive.
+Each piece is mapped alone. Its first frames, the lead, are also the last ones of the piece before:
+there the odometry gets going, and a frame that both pieces have joins them. This joint is exact, as
+it is one frame; the motion before and after it is as uncertain as in a drive that was never cut.
+Loops are then looked for in the whole drive.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The part of the fused cloud by a part of a drive: sums per voxel, additive over parts."""
+"""The cloud that one submap fused: sums per voxel, which add up over submaps."""
 
 from __future__ import annotations
 

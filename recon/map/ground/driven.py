@@ -1,9 +1,9 @@
 """The space that the vehicle took up on its way: it was free while the vehicle was there.
 
-A camera that looks ahead never sees the ground on which it starts, and what passed before it may
-have left hits. But where a vehicle drives nothing else is: from the ground to the height of its
-camera, and as wide as it is. That is as good as an observation of free space at that time. What was
-seen before is outdone by it, and what is seen on a later visit outdoes it.
+A camera that looks ahead never sees the ground on which it starts, and what passed in front of it
+may have left hits. But where a vehicle drives there is nothing else, from the ground to the height
+of its camera and as wide as it is. That is an observation of free space at that time: it counts
+more than what was seen before, and less than what is seen on a later visit.
 """
 
 from __future__ import annotations

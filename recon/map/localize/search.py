@@ -1,4 +1,4 @@
-"""The first fix: places recognised in several frames that tell the same."""
+"""The first fix: places recognised in several frames that agree."""
 
 from __future__ import annotations
 

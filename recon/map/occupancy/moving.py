@@ -1,20 +1,21 @@
-"""What moved: points of the fused cloud where rays of other frames went through.
+"""What moved: points of the fused cloud that rays of other frames went through.
 
-Rays of a frame end two standard deviations before what they hit, so what is far or uncertain frees
-nothing near itself; and a voxel in which a frame hit something is not freed by that frame. All
-that a drive saw in a voxel adds up: hits of a thing that was there, rays through it before and
-after. One voxel alone tells little: someone who walks is hit in it nearly as often as it is seen
-through, and the surface of a wall lies partly in voxels that rays pass. So evidence is averaged
-over the voxels around a point in which there are points. What moved has left a whole body where
-space was free; next to what stands, most voxels are surely occupied.
+All that a drive saw in a voxel adds up: hits of a thing that was there, and rays that passed before
+and after. Rays of a frame end two standard deviations before what they hit, so what is far or
+uncertain frees nothing near itself. A voxel that a frame hit is not freed by that frame.
+
+One voxel alone tells little. Someone who walks is hit in it nearly as often as it is seen through,
+and the surface of a wall lies partly in voxels that rays pass. So evidence is averaged over the
+voxels around a point in which there are points. What moved left a whole body where space was free;
+next to what stands, most voxels are surely occupied.
 
 What a later drive looked through is free, however often it was hit before.
 
-What moved has places that no ray came through before or after, such as its last ones in a drive.
-They hang together with the others, and less is known of them than of what stands, which was seen
-again and again: so where a whole piece of surface was free, what moved grows into voxels that are
-not surely occupied, if half of those beside them at the same height have moved. That is one of two
-along an upright surface; at a straight edge on the ground it is three of eight, and nothing grows.
+No ray passes some of the places where something moved, such as its last ones in a drive. They touch
+the others, and less is known of them than of what stands, which was seen again and again. So where
+a whole piece of surface was free, what moved grows into voxels that are not surely occupied, if
+half of those beside them at the same height have moved. That is one of two along an upright
+surface; at a straight edge on the ground it is three of eight, and nothing grows.
 
 A point that its frames could not place in a voxel stays if something occupied is in its reach.
 """

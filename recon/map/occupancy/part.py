@@ -1,4 +1,4 @@
-"""The part of the occupancy by a part of a drive, to be chained with other parts."""
+"""The occupancy that one submap saw, to be chained with that of others."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ class Store:
         self._lock = RLock()
         self.path = path
         self.cache = Cache(cache_bytes)
-        weakref.finalize(self, database.close)  # of who reads a map and does not close it
+        weakref.finalize(self, database.close)  # where a reader does not close it
 
     @classmethod
     def create(cls, path: Path, *, cache_bytes: int = CACHE_BYTES) -> Self:

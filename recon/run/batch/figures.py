@@ -1,4 +1,4 @@
-"""The figures of a batch: one row for each job, and how unusual each is among its like."""
+"""The figures of a batch: one row for each job, and how unusual each is among jobs of its kind."""
 
 from __future__ import annotations
 
