@@ -1,4 +1,4 @@
-"""Corners to track, spread over the image."""
+"""Corners to track, spread over the image, and kept so."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.values.arrays import Bool, Float32, UInt8
+from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.stereo.match.sad import halve
 
 _CELL_PX: Final = 40
@@ -59,6 +59,26 @@ def find_corners(
     missing = per_cell - _count_per_cell(taken_uv, grey.shape, cell_px)
     keep = order[rank < missing[cells[order]]]
     return np.stack([u[keep], v[keep]], axis=1).astype(np.float32)
+
+
+def in_crowd(uv: Float64, shape: tuple[int, ...]) -> Bool:
+    """Return which features are more than their cell may hold; those that come first stay.
+
+    Where a camera drives backwards, or turns away, features that are followed gather far ahead, and
+    would outnumber those that are near.
+
+    Args:
+        uv: float64 (N, 2), columns and rows; NaN = not seen.
+        shape: Height and width of the image.
+
+    Returns:
+        bool (N,), False where not seen.
+    """
+    crowd, seen = np.zeros(len(uv), np.bool_), np.flatnonzero(np.isfinite(uv[:, 0]))
+    cells = _cell_of(uv[seen], shape, _CELL_PX)
+    order = np.argsort(cells, kind="stable")
+    crowd[seen[order]] = _rank_in_group(cells[order]) >= _PER_CELL
+    return crowd
 
 
 def find_fewer_corners(grey: UInt8, taken_uv: Float32) -> Float32:

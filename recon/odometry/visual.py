@@ -11,7 +11,7 @@ from recon.core.geometry.projection import depth_from_disparity, project, unproj
 from recon.core.geometry.se3 import apply, as_step, invert
 from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float32, Float64, UInt8
-from recon.odometry.corners import find_corners, find_fewer_corners
+from recon.odometry.corners import find_corners, find_fewer_corners, in_crowd
 from recon.odometry.covariance import covariance_of, step_covariance
 from recon.odometry.motion import Motion
 from recon.odometry.patches import find_again, measure_disparity, surface_slopes, warp_of
@@ -320,7 +320,8 @@ class VisualOdometry:
         return np.where(d + camera.doffs_px < MIN_DISPARITY_PX, np.nan, d)
 
     def _replenish(self, window: TrackWindow, frame: OdometryFrame) -> TrackWindow:
-        """Return the window with new points where the newest frame has too few."""
+        """Return the window with as many points in each part of the newest frame: some new."""
+        window = window.without_newest(in_crowd(window.uvd[-1, :, :2], frame.pair.left.shape))
         taken = window.uvd[-1, window.seen[-1], :2].astype(np.float32)
         uv = (find_fewer_corners if frame.rough else find_corners)(frame.pair.left, taken)
         d = self._measured(frame, uv)

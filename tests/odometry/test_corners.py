@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from recon.odometry import corners
-from recon.odometry.corners import find_corners, find_fewer_corners
+from recon.odometry.corners import find_corners, find_fewer_corners, in_crowd
 from recon.odometry.protocol import OdometryFrame
 
 NONE = np.zeros((0, 2), np.float32)
@@ -30,6 +30,13 @@ def test_features_already_followed_fill_their_cells(see: Callable[..., OdometryF
     assert per_cell(np.concatenate([first, more])).max() <= corners._PER_CELL
     distance = np.linalg.norm(first[:, None] - more[None], axis=2)
     assert distance.size == 0 or distance.min() >= corners._DISTANCE_PX
+
+
+def test_of_a_crowd_those_that_come_first_stay() -> None:
+    gathered = np.array([[50.0, 50.0], [np.nan, np.nan], [200.0, 10.0]] + 4 * [[45.0, 60.0]])
+    expected = [False, False, False, False, False, True, True]
+    assert in_crowd(gathered, (100, 300)).tolist() == expected
+    assert in_crowd(np.zeros((0, 2)), (100, 300)).shape == (0,)
 
 
 def test_the_corners_of_a_square_are_found() -> None:

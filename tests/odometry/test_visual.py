@@ -8,6 +8,7 @@ import pytest
 
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import Disparity, RectifiedPair
+from recon.odometry.corners import in_crowd
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.visual import VisualOdometry
 from recon.stereo.match.half_size import HalfSizeMatcher
@@ -43,6 +44,17 @@ def test_a_motion_is_found(step: np.ndarray, see: See) -> None:
     # or turn while they are followed cost some hundredths of a pixel each time.
     assert np.linalg.norm(off[:3, 3]) < 0.02
     assert angle_rad(off) < 0.25 / 260
+
+
+def test_features_stay_spread_over_the_image_where_a_drive_backwards_gathers_them(
+    street: tuple[OdometryFrame, ...],
+) -> None:
+    odometry = VisualOdometry()
+    for frame in reversed(street):
+        odometry.register(frame)
+    newest = odometry.window.uvd[-1, odometry.window.seen[-1], :2]
+    assert len(newest) > 50
+    assert not in_crowd(newest, street[0].pair.left.shape).any()
 
 
 def test_the_first_frame_is_the_identity(see: See, street_poses: np.ndarray) -> None:
