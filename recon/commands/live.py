@@ -20,7 +20,7 @@ from recon.map.localize.sequence import StartPose, localize_sequence
 from recon.map.store.map import Map
 from recon.rig.cameras import CameraSource
 from recon.sources.live import LiveSource
-from recon.sources.protocol import StereoSource
+from recon.sources.protocol import DerivedSource, StereoSource
 
 _FIRST: Final = 3
 """Pairs that are worked on before the first one counts: the first use of a library takes long."""
@@ -84,22 +84,16 @@ def _because_it_was_too_fast(error: MappingError, played: LiveSource) -> Mapping
     return MappingError(error.what, where=error.where, got=why, hint=hint)
 
 
-class _Beginning:
-    """The first pairs of a source."""
-
-    truth = None
+class _Beginning(DerivedSource):
+    """The first pairs of a source, read once: a camera takes none again."""
 
     def __init__(self, source: StereoSource) -> None:
+        super().__init__(source)
         first = enumerate(islice(source.frames(), _FIRST))
         self._pairs = [replace(pair, timestamp_s=n * _PACE_S) for n, pair in first]
-        self.name, self.description = source.name, source.description
-        self.calibration, self.files = source.calibration, source.files
 
     def __len__(self) -> int:
         return len(self._pairs)
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         return iter(self._pairs[start:])

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.core.values.arrays import Bool, Float64
 from recon.io.models.ply import read_ply_pieces
 from recon.io.occupancy.octomap import octomap_pieces
 from recon.map.sessions.placed import PlacedMap, place_map
@@ -18,21 +17,15 @@ from recon.map.tiles import Tiles
 from recon.run.finished import CLOUD, OCTOMAP, FinishedRun
 
 
-@dataclass(frozen=True)
-class FinishedMap:
-    """The map of a run, ready to be made into products again.
+@dataclass(frozen=True, eq=False)
+class FinishedMap(PlacedMap):
+    """The map of a run, ready to be made into products again; its path is empty if it is not read.
 
     Attributes:
-        tiles: The map.
-        path_m: float64 (N, 3), positions of the camera, map axes; empty if they were not read.
-        trusted: bool (N,), which of them are to be trusted.
         files: What was read.
         warnings: What the run lacks.
     """
 
-    tiles: Tiles
-    path_m: Float64
-    trusted: Bool
     files: tuple[Path, ...]
     warnings: tuple[str, ...] = ()
 

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from threading import Condition, Thread
 from typing import Any, Final
 
 import numpy as np
 
 from recon.core.errors import SourceError
-from recon.core.values import RectifiedCamera, StereoCalibration, StereoPair
+from recon.core.values import StereoPair
 from recon.run.progress import Progress, Step
-from recon.sources.protocol import StereoSource
+from recon.sources.protocol import DerivedSource, StereoSource
 
 _WAITING: Final = 1
 """Pairs that may wait; where another comes, the oldest is dropped. With one, a slow consumer always
@@ -33,7 +32,7 @@ class _Arrived:
     due_s: float
 
 
-class LiveSource:
+class LiveSource(DerivedSource):
     """Hands over the pairs of a source when they are due; what comes too fast is left out.
 
     A thread reads each pair and hands it over when it is due. Where the consumer is not ready, one
@@ -46,15 +45,13 @@ class LiveSource:
         stopped: Asked now and then; True ends the drive.
     """
 
-    truth = None
-
     def __init__(
         self,
         source: StereoSource,
         rate: float | None = 1.0,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._source = source
+        super().__init__(source)
         self.rate = rate
         self._stopped = stopped
         self._waiting: deque[_Arrived] = deque()
@@ -67,34 +64,15 @@ class LiveSource:
         self.dropped = 0
 
     @property
-    def name(self) -> str:
-        """That of the source."""
-        return self._source.name
-
-    @property
     def description(self) -> str:
         """That of the source, and how it is played."""
         if self.rate is None:
-            return self._source.description
-        return f"{self._source.description}, played at {self.rate:g} times its speed"
-
-    @property
-    def calibration(self) -> RectifiedCamera | StereoCalibration:
-        """That of the source."""
-        return self._source.calibration
-
-    @property
-    def files(self) -> Sequence[Path]:
-        """Those of the source."""
-        return self._source.files
+            return self.source.description
+        return f"{self.source.description}, played at {self.rate:g} times its speed"
 
     def __len__(self) -> int:
         """Return the number of pairs, if none is dropped."""
-        return len(self._source)
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        """Yield the pairs, like ``frames()``."""
-        return self.frames()
+        return len(self.source)
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Yield the pairs as they arrive, those that are not dropped; once.
@@ -157,7 +135,7 @@ class LiveSource:
         """Hand over each pair when it is due."""
         begun_s, first_s = time.monotonic(), None
         try:
-            for pair in self._source.frames(start):
+            for pair in self.source.frames(start):
                 first_s = pair.timestamp_s if first_s is None else first_s
                 due_s = pair.timestamp_s
                 if self.rate is not None:

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from itertools import islice
-from pathlib import Path
 
-from recon.core.values import Rig, StereoPair
-from recon.sources.protocol import StereoSource
+from recon.core.values import StereoPair
+from recon.sources.protocol import DerivedSource, StereoSource
 
 
-@dataclass(frozen=True, eq=False)
-class SourcePart:
-    """Consecutive pairs of a source, without its ground truth.
+class SourcePart(DerivedSource):
+    """Consecutive pairs of a source.
 
-    Attributes:
+    Args:
         source: The source.
         first: Its pair that is the first of the part.
         last: Its pair behind the last one of the part.
@@ -23,38 +20,17 @@ class SourcePart:
             nothing of them is put into the map.
     """
 
-    source: StereoSource
-    first: int
-    last: int
-    lead: int = 0
-
-    truth = None
+    def __init__(self, source: StereoSource, first: int, last: int, lead: int = 0) -> None:
+        super().__init__(source)
+        self.first, self.last, self.lead = first, last, lead
 
     @property
     def name(self) -> str:
         """That of the source, and which pairs."""
         return f"{self.source.name} {self.first} to {self.last - 1}"
 
-    @property
-    def description(self) -> str:
-        """That of the source."""
-        return self.source.description
-
-    @property
-    def calibration(self) -> Rig:
-        """That of the source."""
-        return self.source.calibration
-
-    @property
-    def files(self) -> Sequence[Path]:
-        """Those of the source."""
-        return self.source.files
-
     def __len__(self) -> int:
         return self.last - self.first
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return self.frames()
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         """Yield the pairs from number ``start`` of the part on."""

@@ -68,6 +68,51 @@ class StereoSource(Protocol):
         ...
 
 
+class DerivedSource(ABC):
+    """A source made of another one, with its name, calibration and files, but without its truth.
+
+    Args:
+        source: The other one.
+    """
+
+    truth = None
+
+    def __init__(self, source: StereoSource) -> None:
+        self.source = source
+
+    @property
+    def name(self) -> str:
+        """That of the source."""
+        return self.source.name
+
+    @property
+    def description(self) -> str:
+        """That of the source."""
+        return self.source.description
+
+    @property
+    def calibration(self) -> Rig:
+        """That of the source."""
+        return self.source.calibration
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """Those of the source."""
+        return self.source.files
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        """Yield all pairs, like ``frames()``."""
+        return self.frames()
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Return the number of pairs."""
+
+    @abstractmethod
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """Yield the pairs from number ``start`` on."""
+
+
 @runtime_checkable
 class KnowsOccupancy(Protocol):
     """A source with ground truth of the occupancy."""
