@@ -63,7 +63,7 @@ def run_map(
         apart = options.workers is not None or begun_in_pieces(run)
         mapped = (map_in_pieces if apart else map_whole)(source, config, options, run, map_)
         with run.stage("cloud"):
-            check_map(mapped, source.name)
+            check_map(mapped, source.name, findings)
         made = write_products(mapped, run, config.mesh if options.mesh else None)
         with run.stage("compare"):
             given = options.known_poses is not None

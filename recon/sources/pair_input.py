@@ -18,6 +18,8 @@ from recon.io.images.image import MAX_MEGAPIXELS
 from recon.io.middlebury.scene import stand_in_camera
 from recon.sources.one_pair import read_pair
 
+_WIDEST_DEG: Final = 165.0
+"""Flat images see no more: a pixel at the side would be 60 times as wide as in the middle."""
 UP_TO_SCALE: Final = "no baseline was given: all lengths are in baselines, not in metres"
 
 
@@ -83,7 +85,7 @@ def read_pair_input(
         FormatError: A file is missing, damaged or of the wrong size.
         SourceError: The images differ in size.
         SettingsError: The camera is given twice.
-        CalibrationError: The focal length is neither given nor in the image, or not positive.
+        CalibrationError: The focal length is neither given nor in the image, or implausible.
     """
     if calibration is not None and known not in (None, KnownCamera()):
         raise SettingsError(
@@ -133,6 +135,14 @@ def _with_camera(given: PairInput, known: KnownCamera) -> PairInput:
         width_px=width_px,
         height_px=height_px,
     )
+    if camera.field_of_view_deg > _WIDEST_DEG:
+        raise CalibrationError(
+            "focal length is implausible",
+            where="--focal",
+            got=f"{focal_px:g} px: images of {width_px} px see {camera.field_of_view_deg:.0f} deg",
+            expected=f"at most {_WIDEST_DEG:g} deg",
+            hint="it is in pixels, not in millimetres",
+        )
     up_to_scale = known.baseline_m is None
     unscaled = f"{UP_TO_SCALE}; --baseline M gives metres" if up_to_scale else ""
     notes = tuple(note for note in (basis, unscaled) if note)

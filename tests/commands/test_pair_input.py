@@ -61,3 +61,8 @@ def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(
 def test_an_unknown_focal_length_is_refused(images: tuple[Path, Path]) -> None:
     with pytest.raises(CalibrationError, match=r"left\.png: focal length is unknown.*--focal PX"):
         read(images, KnownCamera(baseline_m=0.2))
+
+
+def test_a_focal_length_in_millimetres_is_refused(images: tuple[Path, Path]) -> None:
+    with pytest.raises(CalibrationError, match=r"--focal: .*4\.5 px.*see 17\d deg.*in pixels"):
+        read(images, KnownCamera(focal_px=4.5, baseline_m=0.2))

@@ -228,6 +228,17 @@ def test_a_drive_out_of_range_fails_with_the_reason(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_baseline_in_millimetres_is_named_where_the_map_is_empty(
+    seen: list[RectifiedPair], tmp_path: Path
+) -> None:
+    write_drive(seen[:4], tmp_path / "drive")
+    source = open_source(tmp_path / "drive")
+    in_mm = replace(source, calibration=replace(CAMERA, baseline_m=1000 * CAMERA.baseline_m))
+    options = MapOptions(out=tmp_path / "out", mesh=False)
+    with pytest.raises(MappingError, match=r"the map is empty .*baseline is implausible: 540 m"):
+        run_map(in_mm, load_config(), options)
+
+
 @pytest.mark.parametrize("grain", [1.0, 25.0])
 def test_a_confident_wrong_path_is_not_believed(grain: float) -> None:
     """kiss-icp reports no motion and full confidence, with or without texture on the road."""

@@ -35,8 +35,13 @@ def check_cloud(frame: ReconstructedFrame, settings: CloudSettings, where: str) 
         )
 
 
-def check_map(mapped: MappedSequence, where: str) -> None:
+def check_map(mapped: MappedSequence, where: str, findings: Sequence[str] = ()) -> None:
     """Refuse a drive that gives no map.
+
+    Args:
+        mapped: The drive.
+        where: Its name.
+        findings: What an audit found, the worst first.
 
     Raises:
         MappingError: There is no point.
@@ -44,6 +49,7 @@ def check_map(mapped: MappedSequence, where: str) -> None:
     if any(len(tile.cloud) for tile in mapped.tiles):
         return
     why, hint = _explain_poses(mapped.health) or _explain_sample(mapped)
+    hint = "; ".join((*findings[:1], hint))
     raise MappingError("the map is empty", where=where, got=why, hint=hint)
 
 
