@@ -37,7 +37,7 @@ def settings(
         from dataclasses import asdict
 
         from recon.commands.settings import list_settings
-        from recon.core.settings_list import settings_page
+        from recon.commands.settings_list import settings_page
 
         groups = list_settings(name)
     if json:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig
+from recon.commands.settings_list import SettingGroup, setting_groups
 from recon.core.errors import SettingsError
 from recon.core.settings import suggest_names
-from recon.core.settings_list import SettingGroup, setting_groups
 
 
 def list_settings(name: str | None = None) -> tuple[SettingGroup, ...]:

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from recon.core.settings_list import SettingEntry, SettingGroup
+    from recon.commands.settings_list import SettingEntry, SettingGroup
     from recon.run.installation import Check
 
 

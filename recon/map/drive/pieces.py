@@ -24,8 +24,9 @@ from recon.map.drive.workspace import Workspace
 from recon.map.settings import DriveSettings
 from recon.map.store.cast_submaps import with_occupancy
 from recon.map.store.map import Map
+from recon.map.store.rays import RAYS
 from recon.map.store.records import Key
-from recon.map.store.session import RAYS, Session
+from recon.map.store.session import Session
 from recon.map.submaps import Submap
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.drift import path_lengths

@@ -9,10 +9,12 @@ import numpy as np
 from recon.core.errors import FormatError, SettingsError
 from recon.map.settings import DriveSettings
 from recon.map.store.cast_submaps import check_rays
+from recon.map.store.frames import FRAMES
 from recon.map.store.keyframes import KEYFRAME
 from recon.map.store.map import Map
+from recon.map.store.rays import RAYS
 from recon.map.store.records import Key
-from recon.map.store.session import AXES, FRAMES, LOOPS, RAYS, SESSION, Session
+from recon.map.store.session import AXES, LOOPS, SESSION, Session
 from recon.map.store.submaps import ENTRY, SUBMAP
 
 _KINDS = (SESSION, AXES, FRAMES, LOOPS, KEYFRAME, RAYS, SUBMAP, ENTRY)

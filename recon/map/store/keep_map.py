@@ -17,7 +17,8 @@ from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.map.store.keyframes import KEYFRAME
 from recon.map.store.map import Map
-from recon.map.store.session import AXES, LOOPS, RAYS, Session
+from recon.map.store.rays import RAYS
+from recon.map.store.session import AXES, LOOPS, Session
 from recon.map.submaps import Submap
 
 _PLACED: Final = slice(0, 4)

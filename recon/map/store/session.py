@@ -2,35 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
-from recon.core.values.arrays import Float64, frozen_array
+from recon.core.values.arrays import Float64
 from recon.io.files import reading
+from recon.map.store.frames import FRAMES, frames_in, frames_record
 from recon.map.store.keyframes import Keyframes
+from recon.map.store.rays import RAYS, rays_in, rays_record
 from recon.map.store.records import Store
 from recon.map.store.submaps import Submaps
 from recon.odometry import OdometryHealth
 from recon.places.closure import Closure
 
-FRAMES: Final = "frames"
-RAYS: Final = "rays"
 SESSION: Final = "session"
 AXES: Final = "axes"
 LOOPS: Final = "loops"
 _STATE: Final = "state"
-_FARTHEST_M: Final = 1e5
-"""From the start: farther than any drive, or ray."""
-_SKEW: Final = 1e-3
-"""Of poses that were written with few digits."""
-_HEALTH: Final = tuple(f.name for f in fields(OdometryHealth))
 
 
 @dataclass(frozen=True)
@@ -206,15 +200,8 @@ class Session:
         Raises:
             OutputError: They cannot be written.
         """
-        content = {
-            # Of neighbours in the image: small numbers, which compress.
-            "steps": _zigzag(np.diff(rays.places, axis=0, prepend=np.zeros((1, 3), np.int16))),
-            "sigma_m": rays.sigma_m,
-            "confidence": rays.confidence,
-            "count": rays.count,
-            "grain": asdict(grain),
-        }
-        self._store.put(RAYS, (self.number, frame), content, compress=True)
+        key = (self.number, frame)
+        self._store.put(RAYS, key, rays_record(rays, grain), compress=True)
 
     def rays(self, frame: int) -> tuple[RayCloud, RayGrain]:
         """Return the rays of a frame, as they were kept.
@@ -223,13 +210,7 @@ class Session:
             FormatError: They are missing or damaged.
         """
         with reading(self._store.name):
-            content = self._store.read(RAYS, (self.number, frame))
-            grain = _checked(RayGrain(**content["grain"]))
-            steps = frozen_array("steps", content["steps"], np.uint16, (None, 3))
-            places = np.cumsum(_unzigzag(steps), axis=0, dtype=np.int16)
-            return RayCloud(
-                places, content["sigma_m"], content["confidence"], content["count"], grain.unit_m
-            ), grain
+            return rays_in(self._store.read(RAYS, (self.number, frame)))
 
     def same_rays(self, frame: int, other: Session, other_frame: int) -> bool:
         """Return whether this drive and another of the map kept the same rays, and any at all.
@@ -275,13 +256,7 @@ class Session:
         first, self._flushed = self._flushed, len(self)
         if first == len(self):
             return
-        content = {
-            "T_world_camera": np.stack(self._poses[first:]),
-            "times_s": np.array(self._times_s[first:]),
-            "health": {
-                name: [getattr(health, name) for health in self._health[first:]] for name in _HEALTH
-            },
-        }
+        content = frames_record(self._poses[first:], self._times_s[first:], self._health[first:])
         self._store.put(FRAMES, (self.number, first), content, compress=True)
 
     @property
@@ -292,53 +267,6 @@ class Session:
         for first in self._store.numbers(FRAMES, self.number):
             if first != len(self):
                 raise FormatError("frames of the drive are missing", got=f"{len(self)} to {first}")
-            for T, time_s, health in _frames_of(self._store.read(FRAMES, (self.number, first))):
+            for T, time_s, health in frames_in(self._store.read(FRAMES, (self.number, first))):
                 self.add_frame(T, time_s, health)
         self._flushed = len(self)
-
-
-def _frames_of(content: dict[str, Any]) -> Iterator[tuple[Float64, float, OdometryHealth]]:
-    path, columns = Trajectory(content["T_world_camera"], content["times_s"]), content["health"]
-    _check_rotations(path)
-    times_s = path.timestamps_s.tolist()
-    for number, (T, time_s) in enumerate(zip(path.T_world_camera, times_s, strict=True)):
-        # Older versions measured more.
-        values = {name: columns[name][number] for name in columns if name in _HEALTH}
-        values.update({name: tuple(values[name]) for name in ("notes", "warnings")})
-        yield T, time_s, OdometryHealth(**values)
-
-
-def _check_rotations(path: Trajectory) -> None:
-    """Check poses, which may come from a file with few digits, or be far off.
-
-    Raises:
-        FormatError: One is no pose of a drive.
-    """
-    R = path.T_world_camera[:, :3, :3]
-    skew = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    far_m = np.abs(path.positions_m).max(axis=1)
-    wrong = (skew > _SKEW) | (far_m > _FARTHEST_M) | (np.linalg.det(R) <= 0)
-    if wrong.any():
-        raise FormatError("the path of the map has an impossible pose", got=int(np.argmax(wrong)))
-
-
-def _checked(grain: RayGrain) -> RayGrain:
-    """Return the resolution of rays.
-
-    Raises:
-        FormatError: It is impossible.
-    """
-    sizes_m = (grain.cell_m, grain.unit_m, grain.max_range_m)
-    # Not above the range; this is false for NaN as well.
-    if not (min(sizes_m) > 0 and max(sizes_m) <= grain.max_range_m <= _FARTHEST_M):
-        raise FormatError("sizes of the rays are impossible", got=sizes_m)
-    return grain
-
-
-def _zigzag(steps: NDArray[np.int16]) -> NDArray[np.uint16]:
-    """Return steps of either sign as small positive numbers: 0, −1, 1, −2 become 0, 1, 2, 3."""
-    return ((steps << 1) ^ (steps >> 15)).view(np.uint16)
-
-
-def _unzigzag(codes: NDArray[np.uint16]) -> NDArray[np.int16]:
-    return ((codes >> 1) ^ -(codes & 1)).view(np.int16)
