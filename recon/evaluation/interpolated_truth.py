@@ -9,7 +9,7 @@ import numpy as np
 from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool
-from recon.evaluation.trajectory import Segments
+from recon.evaluation.segments import Segments
 
 _EVEN: Final = 0.02
 """A turn changes evenly from frame to frame if it does so less than this share of the median."""

@@ -27,7 +27,7 @@ def loaded(probe: str) -> set[str]:
 
 
 def test_help_loads_the_shells_and_neither_libraries_nor_numbers_nor_settings() -> None:
-    """What it takes is measured by `benchmarks/against.py`; this is what makes it little."""
+    """What it takes is measured by `benchmarks/two_checkouts.py`; this is what makes it little."""
     found = loaded(PROBE)
     assert found.isdisjoint(HEAVY | {"numpy", "pydantic", "scipy", "dask"})
     rooms = {name.split(".")[1] for name in found if name.startswith("recon.")}

@@ -3,7 +3,7 @@
 Both map the drive in turn, each in a process of its own, so that other load affects both alike;
 figures are medians over the rounds. Ratios are this checkout's over the other's.
 
-Example: python benchmarks/against.py --other ../earlier --drive DRIVE --rounds 3
+Example: python benchmarks/two_checkouts.py --other ../earlier --drive DRIVE --rounds 3
 """
 
 from __future__ import annotations
