@@ -106,14 +106,16 @@ def jobs_of_sources(
 ) -> list[Entry]:
     """Return one job for each source, named by its last part.
 
+    Where two would have one name, each is named by as many of the last parts as tell all apart.
+
     Raises:
-        SettingsError: There is no source, or two have one name.
+        SettingsError: There is no source, or two are the same.
     """
     if not sources:
         raise SettingsError("there is no source", where=f"recon batch {command}")
     entries = [
-        Entry(_name_of(source), command, (source,), tuple(options), tuple(settings))
-        for source in sources
+        Entry(name, command, (source,), tuple(options), tuple(settings))
+        for name, source in zip(_names_of(sources), sources, strict=True)
     ]
     check_names(entries, f"recon batch {command}")
     return entries
@@ -163,7 +165,8 @@ def check_names(entries: Sequence[Entry], where: str) -> None:
             )
         # On some file systems, capital and small letters are the same.
         if entry.name.lower() in seen:
-            raise SettingsError("two jobs have one name", where=where, got=entry.name)
+            hint = "if they are two jobs, name them in a file of jobs"
+            raise SettingsError("two jobs have one name", where=where, got=entry.name, hint=hint)
         seen[entry.name.lower()] = entry.name
 
 
@@ -222,7 +225,16 @@ def _plain(value: Any) -> str:
     return re.sub(r"[^A-Za-z0-9_.+-]", "-", str(value))
 
 
-def _name_of(source: str) -> str:
-    """Return the last part of a path, without what a folder cannot be named by."""
-    name = _plain(Path(source).resolve().name)
-    return re.sub(r"^[^A-Za-z0-9]+", "", name) or "job"
+def _names_of(sources: Sequence[str]) -> list[str]:
+    """Return names of sources, by as many last parts of their paths as tell all apart."""
+    paths = [Path(source).resolve().parts[1:] for source in sources]
+    for count in range(1, max(map(len, paths)) + 1):
+        names = [_name_of(parts[-count:]) for parts in paths]
+        if len({name.lower() for name in names}) == len(names):
+            return names
+    return [_name_of(parts[-1:]) for parts in paths]
+
+
+def _name_of(parts: Sequence[str]) -> str:
+    """Return parts of a path as one name, without what a folder cannot be named by."""
+    return re.sub(r"^[^A-Za-z0-9]+", "", _plain("_".join(parts))) or "job"

@@ -63,8 +63,15 @@ def test_a_sweep_spreads_every_job_over_every_combination(tmp_path: Path) -> Non
 def test_sources_are_named_by_their_last_part() -> None:
     entries = jobs_of_sources("map", ["a/2011_09 x", "b/.c/"], ["--no-mesh"], ["k=1"])
     assert [entry.name for entry in entries] == ["2011_09-x", "c"]
+
+
+def test_sources_with_one_last_part_are_named_by_more_of_their_paths() -> None:
+    entries = jobs_of_sources("map", ["robot1/monday", "Robot2/monday", "robot2/friday"], [], [])
+    assert [entry.name for entry in entries] == ["robot1_monday", "Robot2_monday", "robot2_friday"]
+    with pytest.raises(SettingsError, match=r"two jobs have one name.*got x.*in a file"):
+        jobs_of_sources("map", ["a/x", "b/../a/x"], [], [])
     with pytest.raises(SettingsError, match="two jobs have one name"):
-        jobs_of_sources("map", ["a/x", "b/x"], [], [])
+        jobs_of_sources("map", ["/", "/"], [], [])
 
 
 def one_job(**changes: str) -> str:
