@@ -24,7 +24,8 @@ from recon.commands.config import load_config
 from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
 from recon.core.values.arrays import Float64, UInt8
-from recon.odometry import ODOMETRIES, OdometryFrame, make_odometry
+from recon.odometry.protocol import OdometryFrame
+from recon.odometry.registry import ODOMETRIES, make_odometry
 from recon.run.machine import serial_algebra
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource

@@ -35,7 +35,8 @@ from recon.core.values import Trajectory
 from recon.evaluation.association import associate
 from recon.evaluation.trajectory import evaluate_trajectory
 from recon.io.trajectory import read_tum
-from recon.odometry import OdometryFrame, make_odometry
+from recon.odometry.protocol import OdometryFrame
+from recon.odometry.registry import make_odometry
 from recon.run.machine import available_cores, serial_algebra
 from recon.sources.protocol import StereoSource
 from recon.sources.registry import open_source

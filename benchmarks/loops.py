@@ -35,7 +35,8 @@ from recon.map.fusion.builder import fusion_range_m
 from recon.map.ground.floor import add_floors, find_floors
 from recon.map.ground.grid import flatten
 from recon.map.ground.surface import estimate_ground_surface
-from recon.odometry import Odometry, OdometryFrame, OdometryResult, make_odometry
+from recon.odometry.protocol import Odometry, OdometryFrame, OdometryResult
+from recon.odometry.registry import make_odometry
 from recon.report.drive_figures import grid_figure, loops_figure, seen_from_above
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene

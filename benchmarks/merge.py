@@ -40,7 +40,7 @@ from recon.io.trajectory import read_trajectory
 from recon.map.sessions.linking import find_links
 from recon.map.store.map import Map
 from recon.map.store.session import SessionInfo
-from recon.odometry import OdometryHealth
+from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.drift import path_lengths
 from recon.places.keyframe import make_keyframe

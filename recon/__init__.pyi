@@ -35,7 +35,7 @@ from recon.evaluation.map import evaluate_map as evaluate_map
 from recon.evaluation.middlebury.rules import MiddleburyRules as MiddleburyRules
 from recon.evaluation.middlebury.rules import evaluate_middlebury as evaluate_middlebury
 from recon.evaluation.trajectory import evaluate_trajectory as evaluate_trajectory
-from recon.export.mesh import reconstruct_mesh as reconstruct_mesh
+from recon.export.mesh.poisson import reconstruct_mesh as reconstruct_mesh
 from recon.io.cameras.calibration import read_calibration as read_calibration
 from recon.io.images.image import read_image as read_image
 from recon.io.images.pfm import read_pfm as read_pfm

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from recon.core.errors import MeshingError
 from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import Disparity, RectifiedPair, TriangleMesh
-from recon.export.mesh import MeshSettings, check_coverage, mesh_coverage, reconstruct_view
+from recon.export.mesh.poisson import MeshSettings
+from recon.export.mesh.view import check_coverage, mesh_coverage, reconstruct_view
 from recon.io.images.disparity_png import fitting_scale, write_disparity_png
 from recon.io.images.image import write_image
 from recon.io.images.pfm import write_pfm

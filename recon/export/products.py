@@ -10,8 +10,8 @@ from recon.core.values import OccupancyGrid, PointCloud
 from recon.core.values.arrays import Bool, Float64
 from recon.export.cloud import export_cloud
 from recon.export.grid import export_grid
-from recon.export.mesh import MeshSettings
 from recon.export.mesh.pieces import WrittenMesh, export_mesh
+from recon.export.mesh.poisson import MeshSettings
 from recon.export.octomap import export_octomap
 from recon.map.tiles import Tiles
 from recon.run.run import Run

@@ -21,14 +21,9 @@ from recon.export.finished_map import (
     place_here,
 )
 from recon.export.grid import export_grid
-from recon.export.mesh import (
-    MeshSettings,
-    check_coverage,
-    mesh_coverage,
-    reconstruct_mesh,
-    reconstruct_view,
-)
 from recon.export.mesh.pieces import WHOLE, export_mesh
+from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
+from recon.export.mesh.view import check_coverage, mesh_coverage, reconstruct_view
 from recon.export.octomap import export_octomap
 from recon.export.survey import Survey, georeference
 from recon.io.atomic import atomic_path

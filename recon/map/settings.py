@@ -11,7 +11,7 @@ from recon.map.ground.grid import GridSettings
 from recon.map.ground.surface import GroundSettings
 from recon.map.occupancy.builder import OccupancySettings
 from recon.map.submaps import SubmapSettings
-from recon.odometry import OdometrySettings
+from recon.odometry.settings import OdometrySettings
 from recon.run.memory import MemorySettings
 from recon.stereo.cloud.filters import FilterSettings
 from recon.stereo.settings import StereoSettings

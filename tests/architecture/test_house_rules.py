@@ -76,6 +76,24 @@ def test_no_package_or_module_is_a_drawer_for_everything(trees: dict[Path, ast.M
     assert names & NO_NAMES == set()
 
 
+def test_a_name_is_imported_from_the_file_that_defines_it(
+    trees: dict[Path, ast.Module], root: Path
+) -> None:
+    gathering = {
+        path.parent.relative_to(root).as_posix()
+        for path, tree in trees.items()
+        if path.name == "__init__.py"
+        and any(isinstance(node, ast.ImportFrom) for node in tree.body if not _of_future(node))
+    }
+
+    # `recon` loads its names on first use; `cli` is the program.
+    assert gathering - {"recon", "recon/cli"} == {"recon/core/values", "recon/stereo/kernels/simd"}
+
+
+def _of_future(node: ast.stmt) -> bool:
+    return isinstance(node, ast.ImportFrom) and node.module == "__future__"
+
+
 def test_files_are_short(root: Path) -> None:
     lengths = {
         str(path.relative_to(root)): len(path.read_text().splitlines())

@@ -22,7 +22,8 @@ from recon.core.errors import CalibrationError, MappingError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import RectifiedCamera, RectifiedPair, Trajectory
 from recon.map.drive.map_run import MapRun
-from recon.odometry import OdometryFrame, OdometryResult, make_odometry
+from recon.odometry.protocol import OdometryFrame, OdometryResult
+from recon.odometry.registry import make_odometry
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.match.registry import make_matcher

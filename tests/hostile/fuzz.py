@@ -40,7 +40,7 @@ from recon.map.occupancy.builder import OccupancySettings
 from recon.map.occupancy.rays import ray_grain
 from recon.map.store.map import Map
 from recon.map.store.session import SessionInfo
-from recon.odometry import OdometryHealth
+from recon.odometry.protocol import OdometryHealth
 from recon.sources.registry import open_source
 from recon.sources.times import read_dates, read_stamped_names
 from tests.hostile.calibrations import CAMERA_INFO, VALID

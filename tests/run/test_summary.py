@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from recon.odometry import OdometryHealth
 from recon.odometry.health import health_warnings
+from recon.odometry.protocol import OdometryHealth
 from recon.run.run import Run
 from recon.run.summary import plain
 

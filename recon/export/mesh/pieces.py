@@ -13,14 +13,9 @@ import numpy as np
 from recon.core.errors import MeshingError
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32
-from recon.export.mesh import (
-    MeshSettings,
-    Plane,
-    close_seam,
-    cut_mesh,
-    open_edges,
-    reconstruct_mesh,
-)
+from recon.export.mesh.cut import Plane, cut_mesh
+from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
+from recon.export.mesh.seams import close_seam, open_edges
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.map.occupancy.free_space import looked_through

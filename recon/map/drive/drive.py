@@ -16,7 +16,7 @@ from recon.map.drive.mapper import Mapper
 from recon.map.drive.workspace import Workspace, resuming
 from recon.map.occupancy.rays import thin_rays
 from recon.map.settings import DriveSettings
-from recon.odometry import OdometryFrame, OdometryResult
+from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.run.lookahead import look_ahead
 from recon.sources.live import LiveSource
 from recon.sources.part import SourcePart

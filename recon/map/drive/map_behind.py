@@ -12,8 +12,7 @@ import numpy as np
 
 from recon.core.values import RectifiedPair
 from recon.map.drive.frame_result import FrameResult
-from recon.odometry import OdometryFrame
-from recon.odometry.protocol import OdometryResult
+from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.run.machine import work_in_background
 from recon.sources.live import LiveSource
 from recon.stereo.frame import FrameReconstructor

@@ -19,7 +19,7 @@ from recon.map.occupancy.rays import ray_grain, thin_rays
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.submaps import SubmapBuilder
-from recon.odometry import Odometry, OdometryFrame, OdometryResult
+from recon.odometry.protocol import Odometry, OdometryFrame, OdometryResult
 from recon.run.lookahead import OneBehind
 from recon.run.stopwatch import Stopwatch
 from recon.stereo.frame import ReconstructedFrame

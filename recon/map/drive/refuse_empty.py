@@ -13,7 +13,7 @@ from recon.core.geometry.projection import depth_from_disparity
 from recon.core.values import Disparity, RectifiedCamera
 from recon.map.drive.sequence import MappedSequence
 from recon.map.fusion.builder import fusion_range_m
-from recon.odometry import OdometryHealth
+from recon.odometry.protocol import OdometryHealth
 from recon.stereo.cloud.back_project import CloudSettings
 from recon.stereo.frame import ReconstructedFrame
 

@@ -27,12 +27,9 @@ from recon.map.drive.workspace import Workspace
 from recon.map.settings import DriveSettings
 from recon.map.store.submaps import Submaps
 from recon.map.tiles import Tiles
-from recon.odometry import (
-    ExpectedDrift,
-    OdometryHealth,
-    expected_drift,
-)
 from recon.odometry.health import trusted_poses
+from recon.odometry.path_drift import ExpectedDrift, expected_drift
+from recon.odometry.protocol import OdometryHealth
 from recon.run.machine import serial_algebra
 from recon.run.progress import SILENT, Progress
 from recon.sources.protocol import StereoSource

@@ -18,7 +18,7 @@ from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings
 from recon.map.store.map import Map
 from recon.map.store.map_views import known_places
-from recon.odometry import OdometryFrame
+from recon.odometry.protocol import OdometryFrame
 from recon.run.lookahead import look_ahead
 from recon.run.machine import serial_algebra
 from recon.run.progress import SILENT, Progress

@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.errors import FormatError
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.odometry import OdometryHealth
+from recon.odometry.protocol import OdometryHealth
 
 FRAMES: Final = "frames"
 FARTHEST_M: Final = 1e5

@@ -18,7 +18,7 @@ from recon.map.store.keyframes import Keyframes
 from recon.map.store.rays import RAYS, rays_in, rays_record
 from recon.map.store.records import Store
 from recon.map.store.submaps import Submaps
-from recon.odometry import OdometryHealth
+from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import Closure
 
 SESSION: Final = "session"

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.core.values import TriangleMesh
-from recon.export.mesh import Plane, close_seam, cut_mesh, open_edges
-from recon.export.mesh.seams import nearest_on_edges
+from recon.export.mesh.cut import Plane, cut_mesh
+from recon.export.mesh.seams import close_seam, nearest_on_edges, open_edges
 
 
 def sheet(seed: int, n: int = 24, shift_m: float = 0.0, noise_m: float = 0.0) -> TriangleMesh:

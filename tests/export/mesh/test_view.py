@@ -8,7 +8,8 @@ import pytest
 from recon.core.errors import MeshingError
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.arrays import Float64
-from recon.export.mesh import MeshSettings, mesh_coverage, reconstruct_view
+from recon.export.mesh.poisson import MeshSettings
+from recon.export.mesh.view import mesh_coverage, reconstruct_view
 
 CAMERA = RectifiedCamera(150.0, 79.5, 49.5, 79.5, 0.2, 160, 100)
 SETTINGS = MeshSettings(point_weight=16.0)

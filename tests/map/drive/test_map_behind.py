@@ -10,7 +10,7 @@ import pytest
 from recon.core.errors import MappingError
 from recon.core.values import RectifiedCamera, RectifiedPair
 from recon.map.drive.map_behind import MapBehind, Registered
-from recon.odometry import OdometryHealth, OdometryResult
+from recon.odometry.protocol import OdometryHealth, OdometryResult
 
 GREY = np.zeros((16, 16), np.uint8)
 CAMERA = RectifiedCamera(10.0, 8.0, 8.0, 8.0, 0.5, 16, 16)

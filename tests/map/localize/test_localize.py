@@ -22,7 +22,7 @@ from recon.map.localize.sequence import (
 from recon.map.settings import DriveSettings
 from recon.map.store.map import Map
 from recon.map.store.session import SessionInfo
-from recon.odometry import OdometryFrame
+from recon.odometry.protocol import OdometryFrame
 from recon.stereo.frame import FrameReconstructor
 from recon.street.settings import StreetScene
 from tests.scenery.film import RIG, Film, film

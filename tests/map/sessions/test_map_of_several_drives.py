@@ -25,7 +25,7 @@ from recon.map.store.links import Link
 from recon.map.store.map import Map
 from recon.map.store.session import Session, SessionInfo
 from recon.map.submaps import SubmapBuilder
-from recon.odometry import OdometryHealth
+from recon.odometry.protocol import OdometryHealth
 from recon.places.verify import Loop
 
 CONFIG = load_config(None, ["submaps.length_m=8", "fusion.min_count=1"])

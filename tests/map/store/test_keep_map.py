@@ -20,7 +20,7 @@ from recon.map.store.keep_map import keep_map
 from recon.map.store.map import Map
 from recon.map.store.session import Session, SessionInfo
 from recon.map.submaps import SubmapBuilder
-from recon.odometry import OdometryHealth
+from recon.odometry.protocol import OdometryHealth
 
 CONFIG = load_config(None, ["submaps.length_m=4"])
 CAMERA = RectifiedCamera(100.0, 9.0, 5.0, 9.0, 0.5, 20, 12)

@@ -10,7 +10,7 @@ from recon.core.values import RectifiedCamera
 from recon.map.store.map import Map
 from recon.map.store.map_views import MapViews
 from recon.map.store.session import SessionInfo
-from recon.odometry import OdometryHealth
+from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
 

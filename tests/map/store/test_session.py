@@ -12,7 +12,7 @@ from recon.core.values import RayCloud, RayGrain, RectifiedCamera
 from recon.map.sessions.linking import path_up_to
 from recon.map.store.map import Map
 from recon.map.store.session import Session, SessionInfo
-from recon.odometry import OdometryHealth
+from recon.odometry.protocol import OdometryHealth
 
 GRAIN = RayGrain(0.1, 0.1 / 64, 25.0)
 CAMERA = RectifiedCamera(100.0, 9.0, 5.0, 9.5, 0.5, 20, 12)

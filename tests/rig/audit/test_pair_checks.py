@@ -15,7 +15,7 @@ from recon.commands.pair import run_disparity, run_pair
 from recon.core.errors import FormatError, MappingError, MatchingError, SettingsError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
-from recon.export.mesh import check_coverage
+from recon.export.mesh.view import check_coverage
 from recon.run.progress import Silent
 from recon.sources.pair_input import PairInput
 from recon.stereo.pair_run import PairRun
