@@ -94,16 +94,16 @@ def map_(
         request = MapRequest(source, reading.kind, poses, prior, mesh)
         method = [] if odometry is None else [f"odometry.method={odometry}"]
         changes = [*shared.changes, *method, *reading.overrides(start)]
+        limit = memory_overrides(reading.memory_limit)
         if resume is not None:
-            limit = reading.memory_limit
-            request, settings = resumed(resume, request, shared.config, changes, limit)
+            request, settings = resumed(
+                resume, request, shared.config, changes, reading.memory_limit
+            )
+        elif into is not None:
+            of_the_source = () if remove is not None else ("source",)
+            settings = run_settings(into, shared.config, [*changes, *limit], of_the_source)
         else:
-            changes += memory_overrides(reading.memory_limit)
-            if into is None:
-                settings = load_config(shared.config, changes)
-            else:
-                of_the_source = () if remove is not None else ("source",)
-                settings = run_settings(into, shared.config, changes, of_the_source)
+            settings = load_config(shared.config, [*changes, *limit])
         if into is not None and remove is not None:
             options = MapOptions(threads=shared.threads, mesh=mesh, progress=shared.viewer())
             summary = run_remove(into, remove, settings, options)
@@ -118,10 +118,10 @@ def map_(
                 tell=partial(warn, quiet=shared.quiet, verbose=shared.verbose),
                 workers=apart,
             )
-            if into is None:
-                summary = run_map(drive, settings, options).summary
-            else:
+            if into is not None:
                 summary = run_map_into(into, drive, settings, options)
+            else:
+                summary = run_map(drive, settings, options).summary
     shared.show(summary)
 
 

@@ -14,6 +14,7 @@ from recon.core.values import Disparity, Reason, RectifiedPair, Trajectory
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.drift import path_lengths
 from recon.places.keyframe import Keyframe, make_keyframe
+from recon.places.verify import Loop
 from recon.street.render import StreetCamera
 from recon.street.settings import CORNER_M, StreetScene
 from recon.street.street import build_street
@@ -151,3 +152,18 @@ def drifted(truth: Trajectory, *, share: float, turn_deg_per_m: float) -> Trajec
         longer = se3.make_transform(step[:3, :3] @ turn, step[:3, 3] * (1.0 + share))
         poses.append(poses[-1] @ longer)
     return Trajectory(np.stack(poses), truth.timestamps_s)
+
+
+INFORMATION = np.diag([0.05**-2] * 3 + [0.003**-2] * 3)
+
+
+def true_loop(truth: Trajectory, first: int, last: int) -> Loop:
+    """The loop that two frames of a path give."""
+    poses = truth.T_world_camera
+    return Loop(first, last, se3.invert(poses[first]) @ poses[last], INFORMATION, 100, 1.0)
+
+
+@pytest.fixture(scope="module")
+def odometry(truth: Trajectory) -> Trajectory:
+    """The path of a test module, as odometry would have it."""
+    return drifted(truth, share=0.01, turn_deg_per_m=0.02)

@@ -12,9 +12,8 @@ from recon.core.values import Trajectory
 from recon.places.agree import agreeing_loops
 from recon.places.closure import close_loops
 from recon.places.verify import Loop
-from tests.places.conftest import drifted
+from tests.places.conftest import drifted, true_loop
 
-INFORMATION = np.diag([0.05**-2] * 3 + [0.003**-2] * 3)
 LAP = 200
 HOUSE_M = 8
 """From one house to the next, alike one."""
@@ -36,19 +35,9 @@ def truth() -> Trajectory:
     return _circle(1.2)
 
 
-@pytest.fixture(scope="module")
-def odometry(truth) -> Trajectory:
-    return drifted(truth, share=0.01, turn_deg_per_m=0.02)
-
-
-def _loop(truth: Trajectory, first: int, last: int) -> Loop:
-    poses = truth.T_world_camera
-    return Loop(first, last, se3.invert(poses[first]) @ poses[last], INFORMATION, 100, 1.0)
-
-
 def _next_house(truth: Trajectory, first: int, last: int) -> Loop:
     """The house beside the right one is taken for it."""
-    return replace(_loop(truth, first, last), first=first + HOUSE_M)
+    return replace(true_loop(truth, first, last), first=first + HOUSE_M)
 
 
 def _agreeing(odometry: Trajectory, loops: list[Loop]) -> list[Loop]:
@@ -61,24 +50,24 @@ def _agreeing(odometry: Trajectory, loops: list[Loop]) -> list[Loop]:
 
 
 def test_loops_that_tell_the_same_are_believed(odometry, truth):
-    loops = [_loop(truth, k, LAP + k) for k in range(0, 12, 2)]
+    loops = [true_loop(truth, k, LAP + k) for k in range(0, 12, 2)]
 
     assert _agreeing(odometry, loops) == loops
 
 
 def test_two_loops_are_too_few(odometry, truth):
-    assert _agreeing(odometry, [_loop(truth, k, LAP + k) for k in (0, 2)]) == []
+    assert _agreeing(odometry, [true_loop(truth, k, LAP + k) for k in (0, 2)]) == []
 
 
 def test_a_minority_of_alike_houses_is_outvoted(odometry, truth):
-    right = [_loop(truth, k, LAP + k) for k in range(0, 12, 2)]
+    right = [true_loop(truth, k, LAP + k) for k in range(0, 12, 2)]
     wrong = [_next_house(truth, k, LAP + k) for k in (1, 5, 9)]
 
     assert _agreeing(odometry, [*right, *wrong]) == right
 
 
 def test_without_a_clear_majority_nobody_is_believed(odometry, truth):
-    right = [_loop(truth, k, LAP + k) for k in range(0, 12, 3)]
+    right = [true_loop(truth, k, LAP + k) for k in range(0, 12, 3)]
     wrong = [_next_house(truth, k, LAP + k) for k in range(1, 12, 3)]
 
     assert _agreeing(odometry, [*right, *wrong]) == []
@@ -87,7 +76,7 @@ def test_without_a_clear_majority_nobody_is_believed(odometry, truth):
 def test_loops_to_several_laps_do_not_contradict_each_other():
     truth = _circle(2.2)
     odometry = drifted(truth, share=0.01, turn_deg_per_m=0.02)
-    loops = [_loop(truth, k + LAP * (k % 2), 2 * LAP + k) for k in range(12)]
+    loops = [true_loop(truth, k + LAP * (k % 2), 2 * LAP + k) for k in range(12)]
 
     assert _agreeing(odometry, loops) == loops
 
@@ -96,9 +85,11 @@ def test_loops_to_several_laps_do_not_contradict_each_other():
 def test_loops_to_anywhere_bend_nothing(odometry, truth, seed):
     """A third as many false loops as right ones, to random places."""
     rng = np.random.default_rng(seed)
-    right = [_loop(truth, k, LAP + k) for k in range(0, 24, 2)]
+    right = [true_loop(truth, k, LAP + k) for k in range(0, 24, 2)]
     wrong = [
-        replace(_loop(truth, int(first), LAP + k), first=int(first + rng.integers(HOUSE_M, 120)))
+        replace(
+            true_loop(truth, int(first), LAP + k), first=int(first + rng.integers(HOUSE_M, 120))
+        )
         for k, first in zip(range(1, 24, 6), rng.integers(0, 24, 4), strict=True)
     ]
 

@@ -13,9 +13,8 @@ from recon.core.values import Trajectory
 from recon.places.closure import DrivePath, Tie, close_loops, join_drives
 from recon.places.drift import Drift, drift_over, is_possible, path_lengths
 from recon.places.verify import Loop
-from tests.places.conftest import drifted
+from tests.places.conftest import INFORMATION, true_loop
 
-INFORMATION = np.diag([0.05**-2] * 3 + [0.003**-2] * 3)
 LAP = 200
 
 
@@ -37,18 +36,8 @@ def truth() -> Trajectory:
 
 
 @pytest.fixture(scope="module")
-def odometry(truth) -> Trajectory:
-    return drifted(truth, share=0.01, turn_deg_per_m=0.02)
-
-
-@pytest.fixture(scope="module")
 def loops(truth) -> list[Loop]:
-    return [_loop(truth, k, LAP + k) for k in range(0, 20, 2)]
-
-
-def _loop(truth: Trajectory, first: int, last: int) -> Loop:
-    poses = truth.T_world_camera
-    return Loop(first, last, se3.invert(poses[first]) @ poses[last], INFORMATION, 100, 1.0)
+    return [true_loop(truth, k, LAP + k) for k in range(0, 20, 2)]
 
 
 def _path_m(path: Trajectory) -> np.ndarray:
@@ -87,7 +76,7 @@ def test_the_whole_path_gets_better_not_just_its_end(odometry, truth, loops):
 
 
 def test_a_false_loop_among_right_ones_is_refused(odometry, truth, loops):
-    false = replace(_loop(truth, 30, 34), last=120)
+    false = replace(true_loop(truth, 30, 34), last=120)
     closure = _close(odometry, [*loops[:5], false, *loops[5:]])
 
     assert closure.refused == (false,)
@@ -95,7 +84,7 @@ def test_a_false_loop_among_right_ones_is_refused(odometry, truth, loops):
 
 
 def test_a_false_loop_alone_is_refused_whole(odometry, truth):
-    false = replace(_loop(truth, 30, 34), last=120)
+    false = replace(true_loop(truth, 30, 34), last=120)
     closure = _close(odometry, [false])
 
     assert closure.trajectory is odometry
@@ -107,7 +96,7 @@ def test_a_path_that_closes_already_stays_where_it_is():
     poses = np.tile(np.eye(4), (41, 1, 1))
     poses[:, 2, 3] = 20.0 - np.abs(np.arange(41) - 20.0)
     path = Trajectory(poses, 0.1 * np.arange(41))
-    closure = _close(path, [_loop(path, k, 40 - k) for k in range(5)])
+    closure = _close(path, [true_loop(path, k, 40 - k) for k in range(5)])
 
     assert len(closure.closed) == 5
     assert np.allclose(closure.trajectory.T_world_camera, poses, atol=1e-9)

@@ -10,7 +10,7 @@ import numpy as np
 
 from recon.core.errors import FormatError
 from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair, check_size
-from recon.core.values.arrays import Bool, Float32, UInt8
+from recon.core.values.arrays import Bool, Float32, UInt8, size_text
 from recon.io.files import StrPath, read_table, reader
 from recon.io.images.disparity_png import read_disparity_png
 from recon.io.images.image import read_grey_levels, read_image
@@ -123,7 +123,7 @@ def _read_pair(path: Path, layout: Layout) -> StereoPair:
         raise FormatError(
             "left and right images differ in size",
             where=path,
-            got=f"{layout.left} {_size(left)}, {layout.right} {_size(right)}",
+            got=f"{layout.left} {size_text(left)}, {layout.right} {size_text(right)}",
         )
     return StereoPair(left, right, name=path.name)
 
@@ -156,10 +156,6 @@ def _read_ndisp(path: Path) -> int | None:
         return None
     table, _ = read_table(info, (1, 2))
     return int(table.ravel()[-1]) + 1
-
-
-def _size(image: UInt8) -> str:
-    return f"{image.shape[1]}x{image.shape[0]}"
 
 
 def read_middlebury_truth(

@@ -38,7 +38,9 @@ def test_decimation_keeps_a_flat_sheet_flat_and_its_border() -> None:
     np.testing.assert_allclose(np.ptp(vertices[:, :2], axis=0), 12, atol=0.5)
 
 
-def test_failures_are_ours(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_open3d_cannot_read_or_write_is_an_error_of_ours(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     vertices, faces = sheet(1)
     with pytest.raises(OutputError):
         open3d_meshes.write_mesh(tmp_path / "none" / "a.stl", TriangleMesh(vertices, faces))

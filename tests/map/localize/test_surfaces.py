@@ -47,7 +47,7 @@ def test_few_points_are_no_surface() -> None:
     np.testing.assert_array_equal(describe_surfaces(wall(5), 100.0).information, 0.0)
 
 
-def test_nothing_fits_nothing() -> None:
+def test_where_the_map_has_no_surface_nothing_overlaps() -> None:
     empty = np.zeros((0, 3))
     fit = fit_surfaces(wall(), describe_surfaces(empty, 1.0))
     assert fit.overlap == 0.0
