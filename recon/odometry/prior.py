@@ -19,8 +19,8 @@ _CAMERA_FROM_BODY: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0
 
 
 MAX_SIGMAS: Final = 4.7
-"""A visual motion farther from that of the path, in standard deviations of their difference,
-contradicts it: 0.1 % of right ones do, with six degrees of freedom."""
+"""Two measures of one motion that differ by more standard deviations of their difference contradict
+each other: 0.1 % of right ones do, with six degrees of freedom."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.core.values.board import parse_board
 from recon.io.images.image import write_image
 from recon.io.models.ply import read_ply
-from recon.stereo.rectify.lens import unproject
+from recon.stereo.rectify.lens import rays_of
 from recon.stereo.rectify.rectifier import RectificationSettings, plan_turns
 from tests.scenery.boards import Lens, board_rig, place_boards, render_views
 
@@ -29,7 +29,7 @@ WALLS /= np.linalg.norm(WALLS[:, :3], axis=1, keepdims=True)
 def photograph(camera: CameraIntrinsics, T_left_camera: np.ndarray) -> np.ndarray:
     """uint8 (H, W), the walls through the camera's own lens."""
     v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px]
-    rays = unproject(camera, np.stack([u.ravel(), v.ravel()], axis=1)) @ T_left_camera[:3, :3].T
+    rays = rays_of(camera, np.stack([u.ravel(), v.ravel()], axis=1)) @ T_left_camera[:3, :3].T
     centre = T_left_camera[:3, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = np.stack([-(centre @ n[:3] + n[3]) / (rays @ n[:3]) for n in WALLS])

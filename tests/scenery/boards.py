@@ -15,7 +15,7 @@ from recon.core.values import CameraIntrinsics, LensModel, StereoCalibration
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.board import CalibrationBoard
 from recon.rig.opencv_boards import dark_rectangles
-from recon.stereo.rectify.lens import project, unproject
+from recon.stereo.rectify.lens import project_raw, rays_of
 
 Lens = Literal["radtan", "rational", "fisheye"]
 
@@ -106,7 +106,7 @@ class BoardRenderer:
         self._camera, self._board, self._samples = camera, board, samples
         v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px]
         pixels = np.stack([u.ravel(), v.ravel()], axis=1)
-        rays = unproject(camera, pixels)[:, :2]
+        rays = rays_of(camera, pixels)[:, :2]
         self._rays = rays.reshape(camera.height_px, camera.width_px, 2)
         # Rays vary smoothly, so linear interpolation within a pixel has no visible error.
         self._by_v = np.asarray(np.gradient(self._rays, axis=0))
@@ -130,7 +130,7 @@ class BoardRenderer:
 
     def _box(self, T_camera_board: Float64) -> tuple[slice, slice]:
         """Rows and columns that the paper may cover; all if part of it is behind the camera."""
-        pixels = project(self._camera, apply(T_camera_board, _outline(self._board, margin=1.0)))
+        pixels = project_raw(self._camera, apply(T_camera_board, _outline(self._board, margin=1.0)))
         if not np.isfinite(pixels).all():
             return slice(None), slice(None)
         low = np.maximum(np.floor(pixels.min(axis=0)).astype(int) - 2, 0)
@@ -189,7 +189,7 @@ def _try_place(
     """One random pose, or None if a corner is outside an image."""
     left = rig.left
     aim = rng.uniform((0.05, 0.05), (0.95, 0.95)) * (left.width_px, left.height_px)
-    ray = unproject(left, aim[None])[0]
+    ray = rays_of(left, aim[None])[0]
     if not np.isfinite(ray).all():
         return None
     reach = max(board.size_m) * left.matrix[0, 0] / left.width_px
@@ -200,7 +200,7 @@ def _try_place(
     R = _facing(ray) @ turn @ roll
     T = make_transform(R, centre - R @ board.corners_m.mean(axis=0))
     xyz = apply(T, np.concatenate([board.corners_m, _outline(board)]))
-    seen = project(left, xyz), project(rig.right, apply(rig.T_right_left, xyz))
+    seen = project_raw(left, xyz), project_raw(rig.right, apply(rig.T_right_left, xyz))
     corners = len(board.corners_m)
     if not all(_inside(left, px) for px in seen):
         return None

@@ -10,16 +10,13 @@ import numpy as np
 from recon.core.values.arrays import Float64
 from recon.map.localize.surfaces import Fit
 from recon.odometry.covariance import covariance_of, step_covariance
+from recon.odometry.prior import MAX_SIGMAS
 
 _MIN_OVERLAP: Final = 0.5
 """Least share of points that lie in a cell of the map."""
 
 _MIN_RESIDUAL_GAIN: Final = 0.02
 """Least relative decrease of the median residual."""
-
-_MAX_SIGMAS: Final = 4.7
-"""Corrections farther from the prior, in standard deviations of their difference, are refused:
-0.1 % of right ones, with six degrees of freedom."""
 
 _MIN_SHARE: Final = 0.1
 """Least Kalman gain, in the direction in which it is largest: with less, ICP knows no more than the
@@ -63,7 +60,7 @@ def is_worthwhile(correction: Correction, prior_covariance: Float64) -> bool:
     if not after.residual_m <= (1.0 - _MIN_RESIDUAL_GAIN) * before.residual_m:
         return False
     both = prior_covariance + icp_covariance(after)
-    likely = float(step @ np.linalg.solve(both, step)) <= _MAX_SIGMAS**2
+    likely = float(step @ np.linalg.solve(both, step)) <= MAX_SIGMAS**2
     return after.overlap >= _MIN_OVERLAP and likely and _gain(prior_covariance, both) >= _MIN_SHARE
 
 

@@ -18,7 +18,7 @@ from recon.core.values.arrays import Float64
 from recon.rig.calibrate.bundle import RigState, moved, solve_scaled
 from recon.rig.calibrate.settings import CalibrationSettings
 from recon.rig.calibrate.stereo import StereoFit, stereo_of
-from recon.stereo.rectify.lens import project_into_image, unproject
+from recon.stereo.rectify.lens import project_into_image, rays_of
 
 # The depth error is evaluated on a 3 by 3 grid in the left image, in fractions of its size.
 _PLACES: Final = (0.2, 0.5, 0.8)
@@ -135,8 +135,8 @@ def working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> f
 def measure_depth(rig: StereoCalibration, left_px: Float64, right_px: Float64) -> Float64:
     """Return float64 (N,), depth along the left optical axis, from matched raw pixels."""
     T_left_right = invert(rig.T_right_left)
-    a = unproject(rig.left, left_px)
-    b = unproject(rig.right, right_px) @ T_left_right[:3, :3].T
+    a = rays_of(rig.left, left_px)
+    b = rays_of(rig.right, right_px) @ T_left_right[:3, :3].T
     # Closest points of the lines l·a and c + m·b, from their normal equations.
     c = T_left_right[:3, 3]
     aa, ab, bb = (np.einsum("ni,ni->n", p, q) for p, q in ((a, a), (a, b), (b, b)))
@@ -178,7 +178,7 @@ def _depth_error(fit: StereoFit, rigs: list[StereoCalibration], depth_m: float) 
     rig = fit.calibration
     width, height = rig.left.width_px, rig.left.height_px
     places = np.array([[x * width, y * height] for y in _PLACES for x in _PLACES])
-    xyz = unproject(rig.left, places) * depth_m
+    xyz = rays_of(rig.left, places) * depth_m
     right_px = project_into_image(rig.right, apply(rig.T_right_left, xyz))
     shared = np.asarray(np.isfinite(right_px).all(axis=1))
     focal_px = float(rig.left.matrix[0, 0])

@@ -22,7 +22,7 @@ from recon.core.geometry.se3 import apply, exp_so3, make_transform, orthonormali
 from recon.core.least_squares import Problem, minimise
 from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64, Int32
-from recon.stereo.rectify.lens import project, project_with_jacobian
+from recon.stereo.rectify.lens import project_raw, project_with_jacobian
 
 _ROUNDS: Final = 100
 # Relative decrease of the cost at which the solver has converged.
@@ -262,7 +262,7 @@ def _shared_numbers(state: RigState) -> Float64:
 def _squares(corners: Sequence[_Corners], state: RigState) -> list[Float64]:
     """Return for each camera float64 (N,), squared distances in the image, pixels²."""
     return [
-        ((seen.pixels - project(camera, apply(T, seen.in_rig(state)))) ** 2).sum(axis=1)
+        ((seen.pixels - project_raw(camera, apply(T, seen.in_rig(state)))) ** 2).sum(axis=1)
         for camera, T, seen in zip(state.cameras, state.T_camera_rig, corners, strict=True)
     ]
 

@@ -16,7 +16,7 @@ from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64
 from recon.rig.calibrate.bundle import RigState, Sighting, View, solve, squared_errors
 from recon.rig.calibrate.settings import CalibrationSettings
-from recon.stereo.rectify.lens import unproject
+from recon.stereo.rectify.lens import rays_of
 
 Size = tuple[int, int]
 
@@ -83,7 +83,7 @@ def locate_board(camera: CameraIntrinsics, seen: Sighting) -> Float64:
     Raises:
         CalibrationError: The corners are collinear, or no pose fits.
     """
-    rays = unproject(camera, seen.pixels)
+    rays = rays_of(camera, seen.pixels)
     known = np.isfinite(rays).all(axis=1)
     try:
         done, rotation, shift = cv2.solvePnP(

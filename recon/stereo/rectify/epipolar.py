@@ -9,7 +9,7 @@ import numpy as np
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.core.values.arrays import Float64
-from recon.stereo.rectify.lens import project_into_image, unproject
+from recon.stereo.rectify.lens import project_into_image, rays_of
 
 # Depths along a ray, in baselines: from nearer than any rig measures to practically infinity.
 _DEPTHS: Final = np.geomspace(0.5, 1e4, 400)
@@ -55,7 +55,7 @@ def epipolar_lines(
 def _curve(
     seen_by: CameraIntrinsics, other: CameraIntrinsics, T: Float64, pixel: Float64, unit_m: float
 ) -> Float64:
-    ray = unproject(seen_by, pixel[None])
+    ray = rays_of(seen_by, pixel[None])
     return project_into_image(other, apply(T, ray * _DEPTHS[:, None] * unit_m))
 
 

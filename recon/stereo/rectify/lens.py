@@ -19,7 +19,7 @@ _LARGEST_MISS_PX: Final = 0.01
 _EXACT: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
 
 
-def project(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
+def project_raw(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
     """Return float64 (N, 2), pixels of points (N, 3) in camera axes; NaN at or behind its plane."""
     return project_with_jacobian(camera, xyz)[0]
 
@@ -59,16 +59,16 @@ def project_into_image(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
     Far outside the field of view, the distortion polynomial may fold points back into the image;
     the ray of such a pixel does not lead to the point, and it is NaN too.
     """
-    pixels = project(camera, xyz)
+    pixels = project_raw(camera, xyz)
     limit = np.array([camera.width_px - 1, camera.height_px - 1])
     inside = np.asarray(((pixels >= 0) & (pixels <= limit)).all(axis=1))
     with np.errstate(invalid="ignore", divide="ignore"):
-        apart = np.abs(unproject(camera, np.where(inside[:, None], pixels, 0.0)) * xyz[:, 2:] - xyz)
+        apart = np.abs(rays_of(camera, np.where(inside[:, None], pixels, 0.0)) * xyz[:, 2:] - xyz)
         true = np.asarray((apart < 1e-3 * np.abs(xyz[:, 2:])).all(axis=1))
     return np.where((inside & true)[:, None], pixels, np.nan)
 
 
-def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
+def rays_of(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
     """Return float64 (N, 3), the rays of pixels (N, 2) in camera axes, with z = 1.
 
     A ray is NaN where the lens model cannot be inverted (outside the image), or at 90 degrees or
@@ -87,7 +87,7 @@ def unproject(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
     # more than 90 degrees, it returns the ray of another pixel.
     rays[~(np.abs(rays).max(axis=1) < 1e5)] = np.nan
     with np.errstate(invalid="ignore"):
-        missed = np.abs(project(camera, rays) - points[:, 0]).max(axis=1) > _LARGEST_MISS_PX
+        missed = np.abs(project_raw(camera, rays) - points[:, 0]).max(axis=1) > _LARGEST_MISS_PX
     rays[missed] = np.nan
     return rays
 
@@ -101,7 +101,7 @@ def sees_all(camera: CameraIntrinsics) -> bool:
     t = np.linspace(0, 1, 65)
     sides = [(0 * t, h * t), (w + 0 * t, h * t), (w * t, 0 * t), (w * t, h + 0 * t)]
     border = np.concatenate([np.stack(side, axis=1) for side in sides])
-    return bool(np.isfinite(unproject(camera, border)).all())
+    return bool(np.isfinite(rays_of(camera, border)).all())
 
 
 def rectifying_maps(

@@ -24,7 +24,7 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.stereo.rectify.grey import to_grey
-from recon.stereo.rectify.lens import rectifying_maps, sees_all, unproject
+from recon.stereo.rectify.lens import rays_of, rectifying_maps, sees_all
 from recon.stereo.rectify.wide import plan_wide_view
 
 # Allows for rounding in identity maps; far below the resolution of the interpolation (1/32 px).
@@ -178,7 +178,7 @@ class RectifyingTurns:
     ) -> Float64:
         """Return rectified positions, float64 (N, 2), of raw pixels of one camera; NaN = none."""
         camera = calibration.right if right else calibration.left
-        rays = unproject(camera, pixels) @ (self.R_right if right else self.R_left).T
+        rays = rays_of(camera, pixels) @ (self.R_right if right else self.R_left).T
         flat = (rays / rays[:, 2:]) @ self.matrices[int(right)].T
         return np.asarray(np.where(rays[:, 2:] > 0, flat[:, :2], np.nan))
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.core.values.arrays import Float64
-from recon.stereo.rectify.lens import unproject
+from recon.stereo.rectify.lens import rays_of
 
 # A planar image stretches by 1 / cos²: fourfold at 60 degrees from the optical axis.
 _WIDEST: Final = math.tan(math.radians(60))
@@ -75,7 +75,7 @@ def _boxes(camera: CameraIntrinsics, rotation: Float64) -> tuple[Box, Box]:
 
 def _flat(camera: CameraIntrinsics, rotation: Float64, pixels: Float64) -> Float64:
     """Return border pixels on the plane z = 1 of the view, clipped to the widest angle."""
-    plane = unproject(camera, pixels)
+    plane = rays_of(camera, pixels)
     # Rays at 90 degrees or more do not meet z = 1: they are placed at the clipping limit.
     centre = np.array([camera.matrix[0, 2], camera.matrix[1, 2]])
     outward = np.concatenate([(pixels - centre) * 1e3, np.ones((len(pixels), 1))], axis=1)

@@ -9,7 +9,7 @@ import pytest
 
 from recon.rig.audit.lens_fit import BentLenses, estimate_lenses, straightened
 from recon.rig.audit.rig_fit import StereoTracks
-from recon.stereo.rectify.lens import unproject
+from recon.stereo.rectify.lens import rays_of
 from tests.rig.audit.test_turn import CAMERA, tracks
 
 LEFT = np.array([8e-3, -3e-3, -1e-3, 5e-4, 2e-3, -1e-3])
@@ -47,7 +47,7 @@ def test_rows_meet_and_disparities_fit_with_the_lenses_that_are_found() -> None:
     for depth_px in (10.0, 30.0):
         seen = (bent(uv, LEFT), bent(uv - [depth_px, 0.0], RIGHT))
         left, right = (
-            unproject(camera, each.reshape(-1, 2))
+            rays_of(camera, each.reshape(-1, 2))
             for camera, each in zip((rig.left, rig.right), seen, strict=True)
         )
         right = right @ rig.T_right_left[:3, :3]
@@ -71,6 +71,6 @@ def test_the_calibration_has_the_lenses_in_opencvs_order(terms: np.ndarray) -> N
     rig = BentLenses(CAMERA, np.zeros(4), terms, NONE).calibration
     v, u = np.mgrid[0:369:5j, 0:1199:9j]
     uv = np.stack([u, v], axis=-1).reshape(-1, 2)
-    rays = unproject(rig.left, uv)
+    rays = rays_of(rig.left, uv)
     expected = straightened((uv - CENTRE) / CAMERA.focal_px, terms)
     np.testing.assert_allclose(rays[:, :2] / rays[:, 2:], expected, atol=1e-7)

@@ -15,7 +15,7 @@ from recon.rig.calibrate.bootstrap import measure_depth, measure_spread
 from recon.rig.calibrate.bundle import View
 from recon.rig.calibrate.settings import CalibrationSettings
 from recon.rig.calibrate.stereo import calibrate_stereo
-from recon.stereo.rectify.lens import project, unproject
+from recon.stereo.rectify.lens import project_raw, rays_of
 
 SIZE = (640, 480)
 LENSES = ("radtan", "rational", "fisheye")
@@ -159,8 +159,8 @@ def test_two_radial_terms_leave_no_third(make_views) -> None:
 def test_depth_of_matched_pixels_is_that_of_the_point(make_views) -> None:
     rig, _ = make_views(count=1)
     pixels = np.array([[320.0, 240], [100, 100], [500, 400]])
-    xyz = unproject(rig.left, pixels) * [[2.0], [5.0], [20.0]]
-    right = project(rig.right, apply(rig.T_right_left, xyz))
+    xyz = rays_of(rig.left, pixels) * [[2.0], [5.0], [20.0]]
+    right = project_raw(rig.right, apply(rig.T_right_left, xyz))
     np.testing.assert_allclose(measure_depth(rig, pixels, right), [2, 5, 20], rtol=1e-8)
 
 
@@ -212,8 +212,8 @@ def test_the_intervals_hold_the_truth_in_most_repeats(make_views, lens: str) -> 
             "baseline": (*spread.baseline_m, rig.baseline_m),
         }
         for each in spread.depths:
-            xyz = unproject(rig.left, middle) * each.depth_m
-            right = project(rig.right, apply(rig.T_right_left, xyz))
+            xyz = rays_of(rig.left, middle) * each.depth_m
+            right = project_raw(rig.right, apply(rig.T_right_left, xyz))
             error = measure_depth(fit.calibration, middle, right)[0] - each.depth_m
             truths[f"{each.depth_m:g} m"] = (each.low_m, each.high_m, error)
         for name, (low, high, truth) in truths.items():

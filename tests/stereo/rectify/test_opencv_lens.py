@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recon.core.values import CameraIntrinsics, LensModel
-from recon.stereo.rectify.lens import project, project_with_jacobian, unproject
+from recon.stereo.rectify.lens import project_raw, project_with_jacobian, rays_of
 
 LENSES: list[tuple[LensModel, list[float]]] = [
     ("pinhole", []),
@@ -28,7 +28,7 @@ def test_a_ray_of_a_pixel_leads_back_to_the_point(
     model: LensModel, coefficients: list[float]
 ) -> None:
     camera = lens(model, np.array([500.0, 501, 320, 240, *coefficients]))
-    rays = unproject(camera, project(camera, XYZ))
+    rays = rays_of(camera, project_raw(camera, XYZ))
     np.testing.assert_allclose(rays, XYZ / XYZ[:, 2:], atol=1e-9)
 
 
@@ -41,7 +41,7 @@ def test_derivatives_are_those_of_small_differences(
 
     def slope(move: np.ndarray, of_lens: bool) -> np.ndarray:
         ends = [
-            project(
+            project_raw(
                 lens(model, numbers + s * move if of_lens else numbers),
                 XYZ if of_lens else XYZ + s * move,
             )
@@ -61,11 +61,11 @@ def test_what_is_behind_the_camera_has_no_pixel(
     model: LensModel, coefficients: list[float]
 ) -> None:
     camera = lens(model, np.array([500.0, 501, 320, 240, *coefficients]))
-    assert np.isnan(project(camera, np.array([[0.1, 0.2, -1.0], [0.1, 0.2, 0.0]]))).all()
+    assert np.isnan(project_raw(camera, np.array([[0.1, 0.2, -1.0], [0.1, 0.2, 0.0]]))).all()
 
 
 def test_rays_at_ninety_degrees_and_more_are_nan() -> None:
     camera = lens("fisheye", np.array([100.0, 100, 320, 240, 0, 0, 0, 0]))
-    rays = unproject(camera, np.array([[320 + 100 * 1.5, 240], [320 + 100 * 1.7, 240]]))
+    rays = rays_of(camera, np.array([[320 + 100 * 1.5, 240], [320 + 100 * 1.7, 240]]))
     assert np.isfinite(rays[0]).all()
     assert np.isnan(rays[1]).any()

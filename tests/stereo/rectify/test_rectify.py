@@ -14,8 +14,7 @@ from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration, StereoPair
 from recon.io.cameras.calibration import read_calibration
 from recon.io.images.image import read_image
-from recon.stereo.rectify.lens import project as project_raw
-from recon.stereo.rectify.lens import unproject as unproject_raw
+from recon.stereo.rectify.lens import project_raw, rays_of
 from recon.stereo.rectify.rectifier import (
     RectificationSettings,
     Rectifier,
@@ -287,7 +286,7 @@ def test_a_point_seen_by_fisheyes_lies_on_one_row_at_its_disparity(
     poses = (np.eye(4), calibration.T_right_left)
     rotations = (turns.R_left, turns.R_right)
     for camera, T, R, K in zip(sides, poses, rotations, turns.matrices, strict=True):
-        rays_of_pixels = unproject_raw(camera, project_raw(camera, apply(T, xyz))) @ R.T
+        rays_of_pixels = rays_of(camera, project_raw(camera, apply(T, xyz))) @ R.T
         seen.append((rays_of_pixels / rays_of_pixels[:, 2:]) @ K.T)
     left, right = seen
     np.testing.assert_allclose(left[:, 1], right[:, 1], rtol=0, atol=1e-6)
@@ -335,7 +334,7 @@ def fisheye_stripes() -> StereoPair:
     pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
     images = []
     for camera, T in ((calibration.left, np.eye(4)), (calibration.right, T_left_right)):
-        directions = unproject_raw(camera, pixels) @ T[:3, :3].T
+        directions = rays_of(camera, pixels) @ T[:3, :3].T
         angle = np.arctan2(directions @ across, directions @ forward)
         grey = np.nan_to_num(128 + 100 * np.sin(angle * 12), nan=0.0)
         images.append(np.rint(grey).astype(np.uint8).reshape(HEIGHT, WIDTH))
@@ -354,4 +353,4 @@ def test_a_lens_that_folds_in_its_corners_is_not_zoomed_into_its_middle() -> Non
     assert rectifier.valid is not None
     assert 0.8 < rectifier.valid.mean() <= 1.0
     corner = np.array([[0.0, 0.0]])
-    assert np.isnan(unproject_raw(camera, corner)).all()
+    assert np.isnan(rays_of(camera, corner)).all()
