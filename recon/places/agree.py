@@ -10,7 +10,7 @@ import numpy as np
 from recon.core.geometry.se3 import invert
 from recon.core.values.arrays import Float64
 from recon.places.drift import Drift, drift_over, is_possible
-from recon.places.verify import Loop
+from recon.places.loop import Loop
 
 Poses: TypeAlias = Mapping[int, tuple[Float64, float]]
 """For each keyframe its pose by odometry, and the path up to it."""

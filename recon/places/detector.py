@@ -14,8 +14,9 @@ from recon.core.values.arrays import Float64
 from recon.places.agree import LOOP_SIGMAS, agreeing_loops
 from recon.places.drift import drift_over, is_possible
 from recon.places.keyframe import Keyframe, make_keyframe, words_of
+from recon.places.loop import Loop
 from recon.places.places import Place, Places, most_alike
-from recon.places.verify import Loop, verify
+from recon.places.verify import verify
 
 CONTRADICTED: Final = "odometry contradicts"
 """Why a loop is refused that differs from odometry by more than its drift explains."""

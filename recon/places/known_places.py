@@ -12,8 +12,9 @@ from recon.core.geometry.se3 import angle_rad, invert
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, freeze
 from recon.places.keyframe import Keyframe, words_of
+from recon.places.loop import Loop
 from recon.places.places import VIEW_DEG, VIEW_M, WordIndex, most_alike
-from recon.places.verify import Loop, Verdict, verify
+from recon.places.verify import Verdict, verify
 
 _TURN_M: Final = 4.0
 """Two views in opposite directions count as twice this far apart."""

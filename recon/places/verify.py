@@ -11,9 +11,10 @@ import numpy as np
 from recon.core.geometry.projection import project
 from recon.core.geometry.se3 import angle_rad, apply, invert
 from recon.core.values import RectifiedCamera
-from recon.core.values.arrays import Float32, Float64, UInt8, freeze
+from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.places.align import MIN_INLIERS, Alignment, Seen, agreement, locate, refine
 from recon.places.keyframe import Keyframe, points_of
+from recon.places.loop import Loop
 
 _CELLS = 4
 
@@ -50,34 +51,6 @@ _MIN_DENSE_POINTS: Final = 50
 
 
 @dataclass(frozen=True, eq=False)
-class Loop:
-    """Two frames that show the same place, and the motion between them.
-
-    Attributes:
-        first: Number of the earlier frame.
-        last: Number of the later frame.
-        T_first_last: float64 (4, 4).
-        information: float64 (6, 6) of a step (translation in metres, rotation vector in radians)
-            in the axes of the later frame.
-        inliers: Matches that agree in both frames.
-        dense_share: Share of the coarse disparities that agree.
-        same_frame: Whether the two are one frame, in two recordings that overlap.
-    """
-
-    first: int
-    last: int
-    T_first_last: Float64
-    information: Float64
-    inliers: int
-    dense_share: float
-    same_frame: bool = False
-
-    def __post_init__(self) -> None:
-        freeze(self, "T_first_last", np.float64, (4, 4))
-        freeze(self, "information", np.float64, (6, 6))
-
-
-@dataclass(frozen=True, eq=False)
 class Verdict:
     """The result of a verification.
 
@@ -109,7 +82,7 @@ def verify(
         first_camera: That took the earlier one; None = the same.
     """
     cameras = (first_camera or camera, camera)
-    aligned = _aligned(*match(first, last, *cameras))
+    aligned = _aligned(*match_keyframes(first, last, *cameras))
     if isinstance(aligned, str):
         return Verdict(None, aligned)
     dense = dense_agreement(first, last, aligned.T_first_last, *cameras)
@@ -138,7 +111,7 @@ def _aligned(first: Seen, last: Seen) -> Alignment | str:
     return _weakness(*among, aligned, agree.size) or aligned
 
 
-def match(
+def match_keyframes(
     first: Keyframe, last: Keyframe, first_camera: RectifiedCamera, last_camera: RectifiedCamera
 ) -> tuple[Seen, Seen]:
     """Return features that are each other's best match and have a depth in both frames."""

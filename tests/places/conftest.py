@@ -14,7 +14,7 @@ from recon.core.values import Disparity, Reason, RectifiedPair, Trajectory
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.drift import path_lengths
 from recon.places.keyframe import Keyframe, make_keyframe
-from recon.places.verify import Loop
+from recon.places.loop import Loop
 from recon.street.render import StreetCamera
 from recon.street.settings import CORNER_M, StreetScene
 from recon.street.street import build_street

@@ -11,7 +11,7 @@ from recon.core.geometry import se3
 from recon.core.values import Trajectory
 from recon.places.agree import agreeing_loops
 from recon.places.closure import close_loops
-from recon.places.verify import Loop
+from recon.places.loop import Loop
 from tests.places.conftest import drifted, true_loop
 
 LAP = 200

@@ -12,7 +12,7 @@ from recon.core.geometry import se3
 from recon.core.values import Trajectory
 from recon.places.closure import DrivePath, Tie, close_loops, join_drives
 from recon.places.drift import Drift, drift_over, is_possible, path_lengths
-from recon.places.verify import Loop
+from recon.places.loop import Loop
 from tests.places.conftest import INFORMATION, true_loop
 
 LAP = 200

@@ -18,7 +18,7 @@ from recon.core.values import (
 from recon.map.drive.drive_loops import DriveLoops
 from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import Closure
-from recon.places.verify import Loop
+from recon.places.loop import Loop
 from recon.report.map_page import map_content, write_map_page
 from recon.report.pair_page import write_pair_page
 from recon.run.directory import RunDirectory

@@ -21,7 +21,7 @@ from recon.places.closure import loop_bias
 from recon.places.drift import path_lengths
 from recon.places.keyframe import Keyframe, make_keyframe
 from recon.places.known_places import KnownPlaces
-from recon.places.verify import Loop
+from recon.places.loop import Loop
 
 _VIEWS: Final = 2
 """Nearest views of the map that each frame is compared with."""

@@ -11,7 +11,7 @@ from recon.core.values.arrays import Bool, Float64
 from recon.places.agree import agreeing_loops
 from recon.places.keyframe import Keyframe
 from recon.places.known_places import KnownPlaces
-from recon.places.verify import Loop
+from recon.places.loop import Loop
 
 _REMEMBERED: Final = 10
 """Frames whose recognised places still count."""

@@ -16,7 +16,7 @@ from recon.map.store.links import Link
 from recon.map.store.map import Map
 from recon.map.store.session import Session
 from recon.places.closure import DrivePath, Tie, join_drives
-from recon.places.verify import Loop
+from recon.places.loop import Loop
 
 _ALONE: Final = "T_alone_camera"
 """The path of a drive before links to others bent it; None = that of odometry."""

@@ -17,7 +17,7 @@ from recon.odometry.health import trusted_poses
 from recon.places.agree import agreeing_loops
 from recon.places.drift import path_lengths
 from recon.places.known_places import KnownPlaces, KnownView
-from recon.places.verify import Loop
+from recon.places.loop import Loop
 
 
 def find_links(map_: Map, new: Collection[int]) -> list[Link]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.map.store.map import Map
 from recon.map.store.session import Session
-from recon.places.verify import Loop
+from recon.places.loop import Loop
 
 _INFORMATION: Final = 1e8
 """Of what is the same: 0.1 mm and 0.1 mrad, as no covariance may be zero."""

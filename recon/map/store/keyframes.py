@@ -10,7 +10,7 @@ from recon.io.files import reading
 from recon.map.store.records import Store
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
-from recon.places.verify import Loop
+from recon.places.loop import Loop
 
 KEYFRAME: Final = "keyframe"
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 from recon.core.errors import FormatError
-from recon.places.verify import Loop
+from recon.places.loop import Loop
 
 LINKS: Final = "links"
 
