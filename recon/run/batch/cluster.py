@@ -6,7 +6,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -289,7 +289,7 @@ def join_cluster(address: str) -> Iterator[Cluster]:
         yield Cluster(client)
 
 
-def connect(scheduler: str | None, workers: int) -> Any:
+def connect(scheduler: str | None, workers: int) -> AbstractContextManager[Cluster]:
     """Return the workers of a scheduler, or else new ones on this machine, for ``with``."""
     return local_cluster(workers) if scheduler is None else join_cluster(scheduler)
 
