@@ -8,6 +8,7 @@ moved accordingly, do not match what is seen there.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import cv2
@@ -67,6 +68,11 @@ class Sight:
     left: UInt8
     disparity: Disparity
 
+    @cached_property
+    def noise(self) -> float:
+        """Standard deviation of the noise of the image, grey values."""
+        return noise_sigma(self.left)
+
 
 @dataclass(frozen=True, eq=False)
 class _Samples:
@@ -87,7 +93,7 @@ class _Samples:
 
 def explain_motion(
     before: Sight,
-    left: UInt8,
+    now: Sight,
     T_before_now: Float64,
     camera: RectifiedCamera,
 ) -> Agreement:
@@ -100,13 +106,13 @@ def explain_motion(
 
     Args:
         before: The last frame.
-        left: uint8 (H, W), this image.
+        now: This one.
         T_before_now: float64 (4, 4), the motion in question.
         camera: The rectified camera.
     """
-    samples = _sample(before, left, T_before_now, camera)
+    samples = _sample(before, now.left, T_before_now, camera)
     count = np.bincount(samples.patch)
-    noise = (noise_sigma(before.left), noise_sigma(left))
+    noise = (before.noise, now.noise)
     informative = (count >= _MIN_PIXELS) & _textured(samples, count, noise[0])
     # An image that shows little more than noise where the patches should be is blind.
     blind = _power(samples, samples.now, count) < 2.0 * noise[1] ** 2

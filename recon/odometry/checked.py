@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.geometry.se3 import invert
-from recon.core.values import Disparity
+from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.odometry.agreement import Sight, explain_motion
 from recon.odometry.protocol import (
@@ -67,7 +67,8 @@ class CheckedOdometry:
         if state is None or not result.health.ok:
             return result
         T_before_now = invert(state.T_world_camera) @ result.T_world_camera
-        doubts = self._doubts(result.health, state.sight, frame, T_before_now)
+        views = (state.sight, sight)
+        doubts = self._doubts(result.health, views, T_before_now, frame.pair.camera)
         notes = (*result.health.notes, *doubts)
         return replace(result, health=replace(result.health, ok=not doubts, notes=notes))
 
@@ -94,13 +95,17 @@ class CheckedOdometry:
             self._state = CheckedState(sight, pose_in(last, "T_world_camera"))
 
     def _doubts(
-        self, health: OdometryHealth, before: Sight, frame: OdometryFrame, T_before_now: Float64
+        self,
+        health: OdometryHealth,
+        views: tuple[Sight, Sight],
+        T_before_now: Float64,
+        camera: RectifiedCamera,
     ) -> list[str]:
         """Return what speaks against a motion; empty where it is to be trusted."""
         length_m = float(np.linalg.norm(T_before_now[:3, 3]))
         if health.sigma_m > _MAX_SIGMA_M + _MAX_SIGMA_SHARE * length_m:
             return [f"the motion is known to {health.sigma_m:.2f} m only"]
-        found = explain_motion(before, frame.pair.left, T_before_now, frame.pair.camera)
+        found = explain_motion(*views, T_before_now, camera)
         if found.informative >= _MIN_TELLING:
             return _contradiction(found.share, found.informative)
         # A visual motion has passed the test of its uncertainty; any other has no other evidence.

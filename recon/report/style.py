@@ -36,7 +36,8 @@ def bare_figure(width_in: float, height_in: float) -> Figure:
 def to_png(figure: Figure) -> bytes:
     """Render a figure to the bytes of a PNG file."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    # Pages embed WebP; to pack these bytes well would take longer than to draw the figure.
+    figure.savefig(buffer, format="png", pil_kwargs={"compress_level": 1})
     return buffer.getvalue()
 
 

@@ -18,8 +18,8 @@ STEP = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.array([0.0, 0.0, 0
 
 
 def ask(before: OdometryFrame, now: OdometryFrame, T_before_now: np.ndarray) -> Agreement:
-    sight = Sight(before.pair.left, before.disparity)
-    return explain_motion(sight, now.pair.left, T_before_now, now.pair.camera)
+    views = (Sight(frame.pair.left, frame.disparity) for frame in (before, now))
+    return explain_motion(*views, T_before_now, now.pair.camera)
 
 
 def scaled(T: np.ndarray, share: float) -> np.ndarray:

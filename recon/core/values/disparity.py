@@ -4,14 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from functools import cached_property
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from recon.core.errors import ShapeError
-from recon.core.values.arrays import Bool, Float32, UInt8, float_map, freeze, map_text, size_text
+from recon.core.values.arrays import (
+    Bool,
+    Float32,
+    UInt8,
+    float_map,
+    freeze,
+    frozen_array,
+    map_text,
+    size_text,
+)
 
 ASSUMED_CONFIDENCE: Final = 0.9
 """Confidence of matches whose matcher gives none."""
@@ -101,10 +111,10 @@ class Disparity:
     def __repr__(self) -> str:
         return f"Disparity({size_text(self.values)}, {map_text(self.values)} valid)"
 
-    @property
+    @cached_property
     def valid(self) -> Bool:
-        """bool (H, W), where there is a disparity."""
-        return np.isfinite(self.values)
+        """bool (H, W), where there is a disparity; read-only."""
+        return frozen_array("Disparity.valid", np.isfinite(self.values), np.bool_, (None, None))
 
     @property
     def reason_shares(self) -> dict[Reason, float]:
@@ -115,12 +125,12 @@ class Disparity:
 
     def reject(self, mask: Bool, reason: Reason) -> Disparity:
         """Return a copy without the pixels of ``mask``; those that had a value get ``reason``."""
-        drop = mask & self.valid
+        drop = np.flatnonzero(mask & self.valid)
         return Disparity(
-            values=np.where(drop, np.float32(np.nan), self.values),
-            confidence=np.where(drop, np.float32(0), self.confidence),
-            sigma_px=np.where(drop, np.float32(np.nan), self.sigma_px),
-            reason=np.where(drop, np.uint8(reason), self.reason),
+            values=_put(self.values, drop, np.nan),
+            confidence=_put(self.confidence, drop, 0.0),
+            sigma_px=_put(self.sigma_px, drop, np.nan),
+            reason=_put(self.reason, drop, int(reason)),
         )
 
 
@@ -129,3 +139,10 @@ def _where(mask: Bool, inside: Float32, outside: float) -> Float32:
     filled = np.full(mask.shape, outside, dtype=np.float32)
     filled[mask] = inside
     return filled
+
+
+def _put(array: NDArray[Any], places: NDArray[np.intp], value: float) -> NDArray[Any]:
+    """Return a copy with a value at some places, counted row by row."""
+    changed: NDArray[Any] = array.copy()
+    changed.flat[places] = value
+    return changed

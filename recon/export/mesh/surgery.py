@@ -61,5 +61,7 @@ def _compact(vertices: Float32, faces: Int32) -> tuple[Float32, Int32]:
 
 def renumbered(faces: Int32) -> tuple[Int32, Int32]:
     """Return int32 (V,): vertices that faces (F, 3) use, ascending; and the faces with these."""
-    used, numbers = np.unique(faces, return_inverse=True)
-    return used, numbers.reshape(-1, 3).astype(np.int32)
+    used = np.flatnonzero(np.bincount(faces.ravel())).astype(np.int32)
+    numbers = np.zeros(used.max(initial=-1) + 1, np.int32)
+    numbers[used] = np.arange(len(used))
+    return used, numbers[faces]
