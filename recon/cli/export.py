@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from recon.cli import options as opt
 from recon.cli.drive_options import open_workers
-from recon.core.errors import SettingsError
-
-if TYPE_CHECKING:
-    from recon.export.survey import Survey
 
 
 @opt.takes_groups
@@ -41,14 +36,7 @@ def export(
             show_default="map coordinates",
         ),
     ] = None,
-    antenna: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,Z",
-            help="Where that antenna or prism is, from the left camera: metres forward, left, up.",
-            show_default="0,0,0",
-        ),
-    ] = None,
+    antenna: opt.Antenna = None,
     crs: Annotated[
         str | None,
         typer.Option(
@@ -87,27 +75,6 @@ def export(
             out=out,
             threads=shared.threads,
             workers=open_workers(workers, scheduler, shared),
-            survey=_survey(georeference, antenna, crs),
+            survey=opt.survey_of(georeference, antenna, crs),
         )
     shared.show(summary)
-
-
-def _survey(positions: Path | None, antenna: str | None, crs: str | None) -> Survey | None:
-    """Return what the options say of a survey.
-
-    Raises:
-        SettingsError: The offset is not three numbers, or there are no positions.
-    """
-    from recon.export.survey import Survey
-
-    if positions is None:
-        if antenna is None and crs is None:
-            return None
-        given = "--crs" if antenna is None else "--antenna"
-        raise SettingsError(
-            "there are no positions that it describes", where=given, expected="--georeference FILE"
-        )
-    offset = opt.parse_numbers(antenna or "0,0,0", "--antenna")
-    if offset is None or len(offset) != 3 or not all(map(math.isfinite, offset)):
-        raise SettingsError("not three numbers", where="--antenna", got=antenna, expected="X,Y,Z")
-    return Survey(positions, (offset[0], offset[1], offset[2]), crs)

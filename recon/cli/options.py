@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, is_dataclass
@@ -17,6 +18,7 @@ from recon.cli.show.tables import print_json, print_run
 from recon.core.errors import SettingsError
 
 if TYPE_CHECKING:
+    from recon.map.sessions.measured import Survey
     from recon.run.progress import Progress
 
 Out = Annotated[
@@ -71,6 +73,14 @@ Formats = Annotated[
     ),
 ]
 Mesh = Annotated[bool, typer.Option(help="Reconstruct the surface mesh.")]
+Antenna = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z",
+        help="Where that antenna or prism is, from the left camera: metres forward, left, up.",
+        show_default="0,0,0",
+    ),
+]
 Scheduler = Annotated[
     str | None,
     typer.Option(
@@ -116,6 +126,27 @@ def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:
         raise SettingsError(
             "not numbers separated by commas", where=option, got=text, expected="0.1,0.2,0.5"
         ) from error
+
+
+def survey_of(positions: Path | None, antenna: str | None, crs: str | None = None) -> Survey | None:
+    """Return what the options say of a survey.
+
+    Raises:
+        SettingsError: The offset is not three numbers, or there are no positions.
+    """
+    from recon.map.sessions.measured import Survey
+
+    if positions is None:
+        if antenna is None and crs is None:
+            return None
+        given = "--crs" if antenna is None else "--antenna"
+        raise SettingsError(
+            "there are no positions that it describes", where=given, expected="--georeference FILE"
+        )
+    offset = parse_numbers(antenna or "0,0,0", "--antenna")
+    if offset is None or len(offset) != 3 or not all(map(math.isfinite, offset)):
+        raise SettingsError("not three numbers", where="--antenna", got=antenna, expected="X,Y,Z")
+    return Survey(positions, (offset[0], offset[1], offset[2]), crs)
 
 
 @dataclass(frozen=True)

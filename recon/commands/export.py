@@ -19,10 +19,10 @@ from recon.export.remake import (
     mesh_cloud,
     remake_map,
 )
-from recon.export.survey import Survey
 from recon.io.files import StrPath
 from recon.io.models.las import check_crs
 from recon.io.models.mesh import check_mesh_formats
+from recon.map.sessions.measured import Survey
 from recon.map.sessions.spread import place_map_on
 from recon.run.batch.cluster import connect
 from recon.run.batch.work import BatchOptions

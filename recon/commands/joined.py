@@ -14,6 +14,7 @@ from recon.export.joined import JoinedMap, export_sessions, joined_figures, join
 from recon.export.products import write_products
 from recon.map.sessions.copying import check_session, copy_sessions
 from recon.map.sessions.joining import join_new
+from recon.map.sessions.measured import Survey, hold
 from recon.map.sessions.placed import place_map
 from recon.map.store.map import MAP_FILE, Map
 from recon.report.joined_page import write_joined_page
@@ -32,6 +33,7 @@ def make_joined(
     fill: Fill,
     inputs: Sequence[Path],
     replaced: Path | None = None,
+    survey: Survey | None = None,
 ) -> dict[str, Any]:
     """Fill the map of a run, link and place its drives, and make its products and its report.
 
@@ -43,6 +45,8 @@ def make_joined(
         fill: Puts the drives into its map.
         inputs: The files that are read.
         replaced: The run whose place it takes; None = it is a new one.
+        survey: Measured positions that the paths are bent to run through; None = no more than the
+            drives have already.
 
     Returns:
         The figures of ``summary.json``.
@@ -61,6 +65,7 @@ def make_joined(
         Map.create(run.path(MAP_FILE), cache_bytes=settings.memory.cache_bytes) as map_,
     ):
         new = fill(run, map_)
+        left_out = [] if survey is None else hold(map_, survey)
         with run.stage("links"):
             join_new(map_, new)
         map_.commit()
@@ -70,7 +75,7 @@ def make_joined(
         joined = JoinedMap(
             map_, settings, made, None if made.mesh is None else made.mesh.to_show(run)
         )
-        summary = {**joined_figures(joined), "warnings": joined_warnings(joined)}
+        summary = {**joined_figures(joined), "warnings": [*left_out, *joined_warnings(joined)]}
         export_sessions(joined, run)
         with run.report(summary):
             write_joined_page(joined, summary, run)

@@ -14,6 +14,7 @@ from recon.commands.map_options import MapOptions
 from recon.core.errors import SettingsError
 from recon.map.drive.refuse_empty import check_map
 from recon.map.sessions.copying import copy_sessions
+from recon.map.sessions.measured import Survey
 from recon.map.store.keep_map import keep_map
 from recon.map.store.map import MAP_FILE, Map
 from recon.run.finished import open_run, refuse_as_target
@@ -22,9 +23,12 @@ from recon.sources.protocol import StereoSource
 
 
 def run_merge(
-    runs: Sequence[Path], config: ReconConfig | None = None, options: MapOptions | None = None
+    runs: Sequence[Path],
+    config: ReconConfig | None = None,
+    options: MapOptions | None = None,
+    survey: Survey | None = None,
 ) -> dict[str, Any]:
-    """Make one map of several runs: what `recon merge` does.
+    """Make one map of several runs, or hold runs at measured positions: what `recon merge` does.
 
     The drives are linked by places that two of them saw, and placed in one pose graph; cloud,
     OctoMap, grid and mesh are made of all that are linked with the first. What a later run saw
@@ -34,6 +38,8 @@ def run_merge(
         runs: Folders of finished runs; the world and the axes of the first are those of the map.
         config: Settings of the first run with changes; None = its own.
         options: Folder, threads, mesh and progress of the run; None = the defaults.
+        survey: Positions that were measured during drives, whose paths are bent to run through
+            them; None = none.
 
     Returns:
         The figures of ``summary.json``.
@@ -43,8 +49,9 @@ def run_merge(
             another size, or the folder cannot be written; nothing is left behind.
     """
     options = options or MapOptions(command="merge")
-    if len(runs) < 2:
-        raise SettingsError("there is nothing to merge", got=len(runs), expected="two runs")
+    if len(runs) < 2 and survey is None:
+        expected = "two runs, or one and --georeference FILE"
+        raise SettingsError("there is nothing to merge", got=len(runs), expected=expected)
     _refuse_twice(runs)
     settings = joined_settings(runs[0], config)
     for run in runs:
@@ -55,7 +62,8 @@ def run_merge(
         added = [copied(folder / MAP_FILE, map_, settings) for folder in runs]
         return [number for numbers in added[1:] for number in numbers]
 
-    return make_joined(options, settings, fill, [run / MAP_FILE for run in runs])
+    files = [*(run / MAP_FILE for run in runs), *([] if survey is None else [survey.positions])]
+    return make_joined(options, settings, fill, files, survey=survey)
 
 
 def run_map_into(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from recon.run.directory import RECORD
 from recon.run.finished import CLOUD, open_run
 
 ReferenceFrame = Literal["camera", "map"]
-_PATH: Final = "trajectory_tum.txt"
 # From half of either cloud near the other it is a fit; below a tenth of both it is none.
 _FITS, _HARDLY_MEETS = 0.5, 0.1
 
@@ -74,10 +73,10 @@ def read_mapped_cloud(run: Path) -> MappedCloud:
     folder = run if run.is_dir() else run.parent.parent
     if not run.is_dir() and (run.parent.name != "map" or not (folder / RECORD).is_file()):
         return MappedCloud(read_ply(run))
-    T_map_world = open_run(folder).T_map_world
+    mapped = open_run(folder)
     cloud = read_ply(run / CLOUD if run.is_dir() else run)
-    path = read_trajectory(folder / _PATH) if (folder / _PATH).is_file() else None
-    return MappedCloud(cloud, path, folder, T_map_world)
+    path = read_trajectory(mapped.path_file) if mapped.path_file.is_file() else None
+    return MappedCloud(cloud, path, folder, mapped.T_map_world)
 
 
 def place_cloud(
@@ -189,7 +188,7 @@ def _path_motion(mapped: MappedCloud, poses: Path) -> Float64:
     """Return the rigid motion that brings the run's path closest to ground truth."""
     if mapped.folder is None:
         raise EvaluationError("a cloud without a run has no path to align")
-    path, truth = read_trajectory(mapped.folder / _PATH), read_trajectory(poses)
+    path, truth = read_trajectory(open_run(mapped.folder).path_file), read_trajectory(poses)
     if holds_times(poses):
         path, truth = associate(path, truth, TOLERANCE_S)
     if len(path) != len(truth):

@@ -10,6 +10,7 @@ from recon.core.values import Trajectory, TriangleMesh
 from recon.export.products import Products
 from recon.io.trajectory import write_kitti_poses, write_tum
 from recon.map.ground.axes import base_axes
+from recon.map.sessions.measured import doubts_of_positions, misfit_rms_m
 from recon.map.settings import DriveSettings
 from recon.map.store.map import Map
 from recon.run.directory import RunDirectory
@@ -61,10 +62,12 @@ def joined_figures(joined: JoinedMap) -> dict[str, Any]:
                 "frames": len(session),
                 "length_m": session.trajectory.path_length_m,
                 "linked": session.number in linked,
+                "positions": len(session.fixes),
             }
             for session in map_.sessions
         ],
         "links": {"count": len(kept), "refused": len(map_.links) - len(kept), "pairs": dict(pairs)},
+        "positions_misfit_rms_m": misfit_rms_m(map_),
         "points": made.points,
         "points_removed": made.removed,
         "voxels": made.voxels,
@@ -76,13 +79,17 @@ def joined_figures(joined: JoinedMap) -> dict[str, Any]:
 
 
 def joined_warnings(joined: JoinedMap) -> list[str]:
-    """Return what the user should know: drives that are linked to nothing."""
+    """Return what the user should know: drives that are linked to nothing, doubtful positions."""
     linked = joined.map.linked
     apart = [session for session in joined.map.sessions if session not in linked]
     names = ", ".join(f"{session.number} ({session.info.source})" for session in apart)
     what = "shares no verified place" if len(apart) == 1 else "share no verified place"
     text = f"session {names} {what} with session {linked[0].number}: kept in the map, but not in "
-    return [*([text + "cloud, grid, OctoMap and mesh"] if apart else ()), *joined.made.warnings]
+    return [
+        *([text + "cloud, grid, OctoMap and mesh"] if apart else ()),
+        *doubts_of_positions(joined.map),
+        *joined.made.warnings,
+    ]
 
 
 def export_sessions(joined: JoinedMap, run: RunDirectory) -> None:

@@ -25,7 +25,7 @@ from recon.export.mesh.pieces import WHOLE, export_mesh
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
 from recon.export.mesh.view import check_coverage, mesh_coverage, reconstruct_view
 from recon.export.octomap import export_octomap
-from recon.export.survey import Survey, georeference
+from recon.export.survey import georeference
 from recon.io.atomic import atomic_path
 from recon.io.files import reading
 from recon.io.models.las import SUFFIXES as LAS
@@ -34,6 +34,7 @@ from recon.io.models.mesh import read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.io.models.ply import read_ply, read_ply_pieces, write_ply
 from recon.map.ground.axes import base_axes
+from recon.map.sessions.measured import Survey
 from recon.map.settings import DriveSettings
 from recon.run.finished import CLOUD, MAPPED_BY, UNTRUSTED, FinishedRun
 from recon.run.run import Run

@@ -17,6 +17,7 @@ from recon.core.geometry.se3 import adjoint, as_step, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.places.drift import Drift, drift_over
+from recon.places.fixes import Held
 from recon.places.loop import Loop
 from recon.places.open3d_pose_graph import PoseEdge, optimise_poses
 
@@ -45,6 +46,13 @@ _MAX_CHI2: Final = 22.5
 
 _MAX_BEND_CHI2: Final = 6.0
 """Mean chi-square of the odometry edges above which no loop is believed."""
+
+_USUAL: Final = 0.3
+"""What odometry usually drifts, as a share of what it may: measured positions, whose errors do not
+grow, would make a path as rough as they are if it counted for less."""
+
+_HELD_ROUNDS: Final = 2
+"""Solutions of a graph with measured positions; the second knows how antennas are turned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +134,9 @@ def close_loops(trajectory: Trajectory, path_m: Float64, loops: Sequence[Loop]) 
     return Closure(joined.trajectories[0], tuple(sides[0]), tuple(sides[1]))
 
 
-def join_drives(drives: Sequence[DrivePath], ties: Sequence[Tie]) -> JoinedDrives | None:
+def join_drives(
+    drives: Sequence[DrivePath], ties: Sequence[Tie], held: Held | None = None
+) -> JoinedDrives | None:
     """Correct the paths of drives so that their ties hold; None = the ties are not believed.
 
     Nodes are spaced along the paths; odometry edges link each to the next, ties link distant ones.
@@ -137,26 +147,31 @@ def join_drives(drives: Sequence[DrivePath], ties: Sequence[Tie]) -> JoinedDrive
     Args:
         drives: The drives; the first pose of the first one is fixed.
         ties: What holds them together.
+        held: Positions that were measured along them; None = none.
 
     Ref:
         Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
     """
     nodes = _spaced(drives)
     begins = np.cumsum([0, *map(len, nodes)]).tolist()
+    share = 1.0 if held is None else _USUAL
     chains = [
-        _odometry_edges(drive, own, begin)
+        _odometry_edges(drive, own, begin, share)
         for drive, own, begin in zip(drives, nodes, begins[:-1], strict=True)
     ]
     edges = [_tie_edge(tie, drives, nodes, begins) for tie in ties]
     start = [d.trajectory.T_world_camera[own] for d, own in zip(drives, nodes, strict=True)]
     steps = [edge for chain in chains for edge in chain]
     try:
-        poses, weights = _solve(np.concatenate(start), steps, edges)
+        if held is None:
+            poses, weights = _solve(np.concatenate(start), steps, edges)
+        else:
+            poses, weights = _solve_held(drives, nodes, steps, edges, held)
     except RegistrationError:
         return None
     bends = [np.mean([misfit(edge, poses) for edge in chain]) for chain in chains if chain]
     kept = weights >= _KEPT
-    if max(bends, default=0.0) > _MAX_BEND_CHI2 or not kept.any():
+    if share**2 * max(bends, default=0.0) > _MAX_BEND_CHI2 or (ties and not kept.any()):
         return None
     parts = [poses[a:b] for a, b in pairwise(begins)]
     paths = [_bent(*each) for each in zip(drives, nodes, parts, strict=True)]
@@ -208,7 +223,7 @@ def _nodes(path_m: Float64, most: int = _MAX_NODES) -> NDArray[np.intp]:
 def _solve(start: Float64, steps: list[PoseEdge], ties: list[PoseEdge]) -> tuple[Float64, Float64]:
     """Return poses of the nodes, and the weights of the loops."""
     poses = start
-    worst = max(misfit(edge, poses) for edge in ties)
+    worst = max((misfit(edge, poses) for edge in ties), default=0.0)
     rounds = math.ceil(math.log(max(worst / _MAX_CHI2, 1.0), _EASING))
     for k in range(rounds, -1, -1):
         tolerance = _MAX_CHI2 * _EASING**k
@@ -216,15 +231,40 @@ def _solve(start: Float64, steps: list[PoseEdge], ties: list[PoseEdge]) -> tuple
     return poses, weights[len(steps) :]
 
 
-def _odometry_edges(drive: DrivePath, nodes: NDArray[np.intp], begin: int) -> list[PoseEdge]:
-    """Return the edges along a drive, whose nodes are numbered from ``begin``."""
+def _solve_held(
+    drives: Sequence[DrivePath],
+    nodes: Sequence[NDArray[np.intp]],
+    steps: list[PoseEdge],
+    ties: list[PoseEdge],
+    held: Held,
+) -> tuple[Float64, Float64]:
+    """Return poses and weights as `_solve`, with the survey as one more node, which is free."""
+    paths = [drive.trajectory for drive in drives]
+    start = [path.T_world_camera[own] for path, own in zip(paths, nodes, strict=True)]
+    poses = np.concatenate([*start, held.T_world_survey[None]])
+    for _ in range(_HELD_ROUNDS):
+        poses, weights = _solve(poses, [*steps, *held.edges(paths, nodes, poses)], ties)
+    return poses[:-1], weights
+
+
+def _odometry_edges(
+    drive: DrivePath, nodes: NDArray[np.intp], begin: int, share: float
+) -> list[PoseEdge]:
+    """Return the edges along a drive, whose nodes are numbered from ``begin``.
+
+    Args:
+        drive: The drive.
+        nodes: Its frames that are nodes.
+        begin: Number of the first.
+        share: Of the drift that is possible, what is assumed.
+    """
     poses, path_m = drive.trajectory.T_world_camera, drive.path_m
     edges = []
     for k, (first, last) in enumerate(pairwise(nodes), begin):
         # Where the camera stands still, 0.1 m keeps the information finite.
         drift = drift_over(max(float(path_m[last] - path_m[first]), 0.1))
         T = invert(poses[first]) @ poses[last]
-        edges.append(PoseEdge(k, k + 1, T, _inverse(drift.covariance)))
+        edges.append(PoseEdge(k, k + 1, T, _inverse(share**2 * drift.covariance)))
     return edges
 
 

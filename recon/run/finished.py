@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -48,6 +49,18 @@ class FinishedRun:
 
     def __post_init__(self) -> None:
         freeze(self, "T_map_world", np.float64, (4, 4))
+
+    @property
+    def path_file(self) -> Path:
+        """The path of the drive, or of the one that began the map; it may be missing."""
+        alone = self.folder / "trajectory_tum.txt"
+        drives = self.folder.glob("sessions/*/trajectory_tum.txt")
+        return alone if alone.is_file() else min(drives, key=_session_of, default=alone)
+
+
+def _session_of(path_file: Path) -> int:
+    """Return the number of the drive whose folder a file is in."""
+    return int(path_file.parent.name) if path_file.parent.name.isdecimal() else sys.maxsize
 
 
 def open_run(folder: Path) -> FinishedRun:

@@ -11,9 +11,10 @@ from recon.core.errors import EvaluationError, FormatError
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.export.survey import Survey, georeference
+from recon.export.survey import georeference
 from recon.io.trajectory import write_tum
 from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.sessions.measured import Survey
 from recon.run.finished import FinishedRun
 
 T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))

@@ -20,7 +20,10 @@ from recon.commands.map_options import MapOptions
 from recon.commands.merge import run_map_into, run_merge, run_remove
 from recon.commands.occupancy import run_occupancy
 from recon.io.trajectory import read_trajectory
+from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.sessions.measured import Survey
 from recon.map.store.map import Map
+from recon.run.finished import open_run
 from recon.sources.part import SourcePart
 from recon.sources.protocol import StereoSource
 from recon.street.settings import StreetScene
@@ -83,6 +86,18 @@ def test_drives_that_share_places_are_linked_and_others_stay_apart(merged: Path)
     assert found["links"]["count"] >= 3
     assert found["frames"] == 2 * FRAMES  # those of the drives that are linked
     assert any("session 2 (film)" in warning for warning in found["warnings"])
+
+
+def test_one_run_is_held_at_measured_positions(runs: Path, tmp_path: Path) -> None:
+    before = read_trajectory(runs / "first/trajectory_tum.txt")
+    longer_m = 1.01 * before.positions_m @ AXES_MAP_WORLD.T
+    np.savetxt(tmp_path / "gnss.txt", np.column_stack([before.timestamps_s, longer_m]))
+    out, survey = tmp_path / "held", Survey(tmp_path / "gnss.txt")
+    found = run_merge([runs / "first"], None, MapOptions("merge", out, mesh=False), survey)
+    assert found["sessions"][0]["positions"] == FRAMES
+    assert found["positions_misfit_rms_m"] < 0.03
+    held = read_trajectory(open_run(out).path_file)
+    assert 1.005 < held.path_length_m / before.path_length_m < 1.012
 
 
 def test_the_second_drive_is_placed_where_it_was(merged: Path) -> None:

@@ -1,4 +1,4 @@
-"""The drives of a map placed beside one another by their links, in one pose graph."""
+"""The drives of a map placed beside one another by links and measured positions: a pose graph."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.geometry.se3 import invert, orthonormalise
+from recon.core.errors import RegistrationError
+from recon.core.geometry.alignment import fit_upright
+from recon.core.geometry.se3 import apply, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.sessions.linking import find_links, path_up_to
 from recon.map.store.links import Link
 from recon.map.store.map import Map
-from recon.map.store.session import Session
+from recon.map.store.session import NO_LOOPS, Session
 from recon.places.closure import DrivePath, Tie, join_drives
+from recon.places.fixes import Held
 from recon.places.loop import Loop
 
 _ALONE: Final = "T_alone_camera"
@@ -53,7 +56,7 @@ def join_sessions(map_: Map, links: Sequence[Link]) -> None:
     """Place the drives that links hold together; keep the links, and which drives those are.
 
     The first drive stays where it is, and its axes are those of the map. Drives that no link holds
-    stay apart.
+    stay apart. Paths along which positions were measured are bent to run through them.
 
     Args:
         map_: The map, which is written.
@@ -79,16 +82,22 @@ def _held_together(map_: Map, links: Sequence[Link]) -> _Joined:
     while True:
         places = _reached(map_, links)
         inside = [link for link in links if set(link.sessions) <= set(places)]
-        if len(places) == 1:
+        if len(places) == 1 and not len(map_.sessions[0].fixes):
             return _Joined({}, [])
         joined = _solve(map_, places, inside)
+        if len(places) == 1 and not joined.paths:
+            raise RegistrationError(
+                "measured positions bend the path more than its drift explains",
+                where=map_.sessions[0].info.source,
+                hint="have they its clock, metres, and the offset of the antenna?",
+            )
         if set(_reached(map_, joined.links)) == set(places):
             return joined
         links = joined.links
 
 
 def _reached(map_: Map, links: Sequence[Link]) -> dict[int, Float64]:
-    """Return about where the drives are that links connect with the first one.
+    """Return about where the drives are that links or measured positions connect with the first.
 
     Returns:
         By number, ``T_world_session`` (4, 4), in the world of the first.
@@ -98,6 +107,9 @@ def _reached(map_: Map, links: Sequence[Link]) -> dict[int, Float64]:
     while True:
         bridges = (link for link in surest if sum(n in found for n in link.sessions) == 1)
         bridge = next(bridges, None)
+        if bridge is None and (measured := _by_survey(map_, found)):
+            found |= measured
+            continue
         if bridge is None:
             return found
         one, other = bridge.sessions
@@ -106,6 +118,24 @@ def _reached(map_: Map, links: Sequence[Link]) -> dict[int, Float64]:
             found[other] = orthonormalise(found[one] @ T_one_other)
         else:
             found[one] = orthonormalise(found[other] @ invert(T_one_other))
+
+
+def _by_survey(map_: Map, found: dict[int, Float64]) -> dict[int, Float64]:
+    """Return about where the next drive is that only measured positions place beside others."""
+    held = [session for session in map_.sessions if len(session.fixes)]
+    there = [session for session in held if session.number in found]
+    away = [session for session in held if session.number not in found]
+    if not there or not away:
+        return {}
+    T_map_world, new = map_.first.T_map_world, away[0]
+    paths = [
+        apply(T_map_world @ found[one.number], one.fixes.by_path(one.odometry)) for one in there
+    ]
+    surveyed = np.concatenate([one.fixes.position_m for one in there])
+    T_map_survey = fit_upright(surveyed, np.concatenate(paths)).T_to_from
+    own_m = apply(new.T_map_world, new.fixes.by_path(new.odometry))
+    T_map_own = fit_upright(own_m, apply(T_map_survey, new.fixes.position_m)).T_to_from
+    return {new.number: orthonormalise(invert(T_map_world) @ T_map_own @ new.T_map_world)}
 
 
 def _motion(one: Session, other: Session, loop: Loop) -> Float64:
@@ -126,12 +156,27 @@ def _solve(map_: Map, places: dict[int, Float64], links: Sequence[Link]) -> _Joi
         for loop in session.loops.get("closed", ())
     ]
     ties = [Tie(_places(numbers, link), link.loop) for link in links]
-    joined = join_drives(drives, [*loops, *ties])
+    joined = join_drives(drives, [*loops, *ties], _held(map_, sessions, drives))
     if joined is None:
         return _Joined({}, [])
     kept = joined.kept[len(loops) :]
     believed = [link for link, keep in zip(links, kept, strict=True) if keep]
     return _Joined(dict(zip(numbers, joined.trajectories, strict=True)), believed)
+
+
+def _held(map_: Map, sessions: Sequence[Session], drives: Sequence[DrivePath]) -> Held | None:
+    """Return the positions that were measured along drives; None if there are none."""
+    fixes = [session.fixes for session in sessions]
+    position_m = np.concatenate([each.position_m for each in fixes])
+    if not len(position_m):
+        return None
+    T_map_world, centre_m = map_.first.T_map_world, position_m.mean(axis=0)
+    by_path = [each.by_path(one.trajectory) for each, one in zip(fixes, drives, strict=True)]
+    ours_m = apply(T_map_world, np.concatenate(by_path))
+    T_map_survey = fit_upright(position_m - centre_m, ours_m).T_to_from
+    # Numbers of millions of metres would cost the optimiser digits.
+    near = [replace(each, position_m=each.position_m - centre_m) for each in fixes]
+    return Held(invert(T_map_world) @ T_map_survey, near)
 
 
 def _places(numbers: list[int], link: Link) -> tuple[int, int]:
@@ -150,7 +195,7 @@ def _place(map_: Map, session: Session, path: Trajectory) -> None:
     """Write where a drive is: its axes, and how its path is bent."""
     T_world_session = path.T_world_camera[0] @ invert(session.odometry.T_world_camera[0])
     bent = invert(T_world_session) @ path.T_world_camera
-    loops = {"closed": [], "refused": [], "T_world_camera": None, **session.loops}
+    loops = {**NO_LOOPS, **session.loops}
     alone = loops.get(_ALONE, loops["T_world_camera"])
     session.set_loops({**loops, _ALONE: alone, "T_world_camera": bent})
     first = map_.sessions[0]

@@ -20,10 +20,13 @@ from recon.map.store.records import Store
 from recon.map.store.submaps import Submaps
 from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import Closure
+from recon.places.fixes import NO_FIXES, Fixes
 
 SESSION: Final = "session"
 AXES: Final = "axes"
 LOOPS: Final = "loops"
+NO_LOOPS: Final[Mapping[str, Any]] = {"closed": [], "refused": [], "T_world_camera": None}
+"""What a map keeps of a drive without loops, if it keeps anything else with them."""
 _STATE: Final = "state"
 
 
@@ -228,6 +231,33 @@ class Session:
             OutputError: It cannot be written.
         """
         self._store.put(LOOPS, self.number, content)
+
+    @property
+    def fixes(self) -> Fixes:
+        """Positions that were measured during the drive; usually none.
+
+        Raises:
+            FormatError: Their record is damaged.
+        """
+        with reading(self._store.name):
+            found = self.loops.get("fixes")
+            return NO_FIXES if found is None else Fixes(**found)
+
+    def set_fixes(self, fixes: Fixes) -> None:
+        """Keep positions that were measured during the drive, in place of earlier ones.
+
+        Raises:
+            OutputError: They cannot be written.
+        """
+        self.set_loops(
+            {
+                "closed": [],
+                "refused": [],
+                "T_world_camera": None,
+                **self.loops,
+                "fixes": asdict(fixes),
+            }
+        )
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Keep what the rest of the drive depends on, beside all that was added.

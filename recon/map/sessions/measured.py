@@ -1,0 +1,239 @@
+"""Positions that were measured along drives, beside the paths that a map has of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from recon.core.errors import EvaluationError
+from recon.core.geometry.alignment import find_agreeing, fit_upright
+from recon.core.geometry.interpolation import interpolate_poses, nearest_sorted
+from recon.core.geometry.se3 import apply, invert
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Bool, Float64
+from recon.io.files import read_table, reader
+from recon.map.store.map import Map
+from recon.map.store.session import Session
+from recon.odometry.health import trusted_poses
+from recon.places.fixes import Fixes
+
+LARGEST_MISFIT: Final = 0.01
+"""Misfit, as a share of the extent of the path, that drift may explain."""
+_LEAST_SPAN_M: Final = 1.0
+"""Positions closer together than this say nothing of the direction of the map."""
+_LONGEST_GAP_S: Final = 1.0
+"""Between frames farther apart than this, nobody knows where the camera was."""
+
+_NAMED: Final = 3
+_LEAST_SIGMA_M: Final = 0.01
+"""However smooth positions are, no antenna is known better."""
+_SIGMA_OF_BEND: Final = 1.4826 / np.sqrt(6.0)
+"""Standard deviation of errors, by the median of how far they are from a line through three."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Positions along a drive in the coordinates of a survey.
+
+    Attributes:
+        positions: File with rows of time in seconds, easting, northing and height in metres (or a
+            TUM file), on the clock of the images.
+        antenna_m: Where what they are the positions of (antenna, prism) is, from the left camera:
+            metres forward, left and up.
+        crs: Name of the coordinate system, such as ``EPSG:25832``; None = not stated.
+    """
+
+    positions: Path
+    antenna_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    crs: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Positions that were measured during a drive.
+
+    Attributes:
+        times_s: float64 (N,), ascending.
+        position_m: float64 (N, 3), in the coordinates of the survey.
+        ours_m: float64 (N, 3), by the path, in map axes.
+        agree: bool (N,), False for positions that contradict most others.
+    """
+
+    times_s: Float64
+    position_m: Float64
+    ours_m: Float64
+    agree: Bool
+
+    @cached_property
+    def T_survey_map(self) -> Float64:
+        """float64 (4, 4), rigid, by which the path runs through the positions that agree."""
+        return fit_upright(self.ours_m[self.agree], self.position_m[self.agree]).T_to_from
+
+    @property
+    def misfit_m(self) -> Float64:
+        """float64 (N, 3), by how much each is off then."""
+        return np.asarray(apply(self.T_survey_map, self.ours_m) - self.position_m)
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of a coordinate, by how evenly the positions differ from the path.
+
+        What many in a row are off by, or by more and more, cannot be told from drift of the path.
+        """
+        bends_m = np.abs(np.diff(self.misfit_m[self.agree], n=2, axis=0))
+        bend_m = float(np.median(bends_m)) if len(bends_m) else 0.0
+        return max(_LEAST_SIGMA_M, float(_SIGMA_OF_BEND * bend_m))
+
+    def warnings(self) -> list[str]:
+        """Return a line that names positions that are left out, if there are any."""
+        off_m = np.linalg.norm(self.misfit_m, axis=1)
+        worst = [n for n in np.argsort(-off_m) if not self.agree[n]]
+        if not worst:
+            return []
+        named = [f"at {self.times_s[n]:.3f} s ({off_m[n]:.1f} m off)" for n in worst[:_NAMED]]
+        more = ", …" if len(worst) > _NAMED else ""
+        of_all = f"{len(worst)} of {len(off_m)} positions"
+        return [f"{of_all} contradict the others and are left out: {', '.join(named)}{more}"]
+
+
+def measure_along(path: Trajectory, T_map_world: Float64, survey: Survey) -> Measured:
+    """Return the positions that were measured during a drive, and where its path has them.
+
+    Args:
+        path: The path, interpolated at their times.
+        T_map_world: float64 (4, 4), from its world to map axes.
+        survey: What was measured.
+
+    Raises:
+        FormatError: The file is missing or damaged.
+        EvaluationError: No position was measured during the drive, or all at one place.
+    """
+    rows = _read_positions(survey.positions)
+    here = rows[_during(path, rows[:, 0])]
+    if not len(here):
+        raise EvaluationError(
+            "no position was measured during the drive",
+            where=survey.positions,
+            got=f"times {rows[0, 0]:.3f} to {rows[-1, 0]:.3f} s",
+            expected=f"times within {path.timestamps_s[0]:.3f} to {path.timestamps_s[-1]:.3f} s",
+            hint="both need one clock",
+        )
+    if span_m(here[:, 1:]) < _LEAST_SPAN_M:
+        raise EvaluationError(
+            "the positions do not say how the map is turned",
+            where=survey.positions,
+            got=f"{len(here)} positions within {span_m(here[:, 1:]):.2f} m",
+            expected=f"{_LEAST_SPAN_M:g} m or more",
+        )
+    antenna_m = _in_camera(survey, T_map_world)
+    T_map_camera = T_map_world @ interpolate_poses(path, here[:, 0])
+    ours_m = np.stack([apply(T, antenna_m[None])[0] for T in T_map_camera])
+    agree = find_agreeing(ours_m, here[:, 1:], LARGEST_MISFIT * span_m(ours_m))
+    return Measured(here[:, 0], here[:, 1:], ours_m, agree)
+
+
+def hold(map_: Map, survey: Survey) -> list[str]:
+    """Keep the positions that were measured during the drives of a map, with these drives.
+
+    `join_sessions` then bends their paths to run through them.
+
+    Args:
+        map_: The map, which is written.
+        survey: What was measured, in any of the drives.
+
+    Returns:
+        Warnings of positions that are left out.
+
+    Raises:
+        FormatError: The file is missing or damaged.
+        EvaluationError: No position was measured during any drive, or all of one at one place.
+        OutputError: The map cannot be written.
+    """
+    times_s, lines = _read_positions(survey.positions)[:, 0], list[str]()
+    sessions = [each for each in map_.sessions if _during(_trusted(each), times_s).any()]
+    for session in sessions or map_.sessions[:1]:
+        measured = measure_along(_trusted(session), session.T_map_world, survey)
+        session.set_fixes(_fixes(session, measured, survey))
+        lines += measured.warnings()
+    return lines
+
+
+def misfit_rms_m(map_: Map) -> float | None:
+    """Return how far paths and measured positions are apart, root mean square; None = none are.
+
+    The positions are those of linked drives, moved rigidly to where they fit best.
+    """
+    held = [session for session in map_.linked if len(session.fixes)]
+    if not held:
+        return None
+    ours_m = np.concatenate(
+        [apply(one.T_map_world, one.fixes.by_path(one.trajectory)) for one in held]
+    )
+    position_m = np.concatenate([one.fixes.position_m for one in held])
+    off_m = apply(fit_upright(ours_m, position_m).T_to_from, ours_m) - position_m
+    return float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))))
+
+
+def doubts_of_positions(map_: Map) -> list[str]:
+    """Return a warning if paths that are held at measured positions are far from them still."""
+    off_m = misfit_rms_m(map_)
+    extent_m = max((span_m(each.trajectory.positions_m) for each in map_.linked), default=0.0)
+    if off_m is None or off_m <= LARGEST_MISFIT * extent_m:
+        return []
+    why = "another clock, another antenna offset, other units, or positions that are no better"
+    return [f"the paths are {off_m:.2f} m from the measured positions (RMS): {why}"]
+
+
+def _fixes(session: Session, measured: Measured, survey: Survey) -> Fixes:
+    """Return the positions of a drive that agree, by frame."""
+    times_s, path = measured.times_s[measured.agree], session.trajectory
+    frames = nearest_sorted(times_s, path.timestamps_s)
+    T_frame_camera = invert(path.T_world_camera[frames]) @ interpolate_poses(
+        _trusted(session), times_s
+    )
+    antenna_m = _in_camera(survey, session.T_map_world)
+    return Fixes(
+        frames,
+        np.stack([apply(T, antenna_m[None])[0] for T in T_frame_camera]),
+        measured.position_m[measured.agree],
+        measured.sigma_m,
+    )
+
+
+def _in_camera(survey: Survey, T_map_world: Float64) -> Float64:
+    """Return where the antenna is (3,), in axes of the camera that begins a drive."""
+    R_map_camera = T_map_world[:3, :3]
+    forward, up = R_map_camera[:, 2] * [1.0, 1.0, 0.0], np.array([0.0, 0.0, 1.0])
+    forward = forward / np.linalg.norm(forward)
+    R_map_vehicle = np.column_stack([forward, np.cross(up, forward), up])
+    return np.asarray(R_map_camera.T @ R_map_vehicle @ np.asarray(survey.antenna_m))
+
+
+def _trusted(session: Session) -> Trajectory:
+    """Return the path of a drive without frames that are not trusted."""
+    path, good = session.trajectory, trusted_poses(session.health)
+    return Trajectory(path.T_world_camera[good], path.timestamps_s[good])
+
+
+def span_m(positions: Float64) -> float:
+    """Return the diagonal of the box around positions (N, 3)."""
+    return float(np.linalg.norm(np.ptp(positions, axis=0)))
+
+
+@reader
+def _read_positions(file: Path) -> Float64:
+    """Return time, east, north and up (N, 4), in the order of time."""
+    table, _ = read_table(file, (4, 8))
+    return np.asarray(table[np.argsort(table[:, 0], kind="stable"), :4])
+
+
+def _during(path: Trajectory, times_s: Float64) -> Bool:
+    """Return bool (N,): times between two frames of a path that follow each other."""
+    frames_s = path.timestamps_s
+    inside = (times_s >= frames_s[0]) & (times_s <= frames_s[-1])
+    near_s = np.abs(frames_s[nearest_sorted(times_s, frames_s)] - times_s)
+    return np.asarray(inside & (near_s <= 0.5 * _LONGEST_GAP_S))

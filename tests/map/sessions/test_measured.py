@@ -1,0 +1,117 @@
+"""Positions measured along drives are kept with them, bend their paths and place them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recon.core.errors import EvaluationError, RegistrationError
+from recon.core.geometry.interpolation import interpolate_poses
+from recon.core.geometry.se3 import exp_so3, make_transform
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64
+from recon.map.ground.axes import AXES_MAP_WORLD
+from recon.map.sessions.copying import copy_sessions
+from recon.map.sessions.joining import join_new
+from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
+from recon.map.store.map import Map
+from tests.map.sessions.test_map_of_several_drives import TRUE, _drive, _off_m
+
+T_SURVEY_WORLD = make_transform(
+    exp_so3(np.array([0.0, 0.0, 0.7])), np.array([456789.0, 5433210.0, 118.0])
+) @ make_transform(AXES_MAP_WORLD, np.zeros(3))
+ANTENNA = (0.4, -0.3, 1.1)
+DAY_S = 100
+
+
+def drives(count: int = 1, drift: float = 0.01) -> Map:
+    """Drives of different days that no link holds; ``drift`` stretches their paths."""
+    map_ = Map.temporary()
+    for number in range(count):
+        _drive(map_, TRUE[number], DAY_S * number, drift=drift)
+    map_.commit()
+    return map_
+
+
+def positions(folder: Path, numbers: tuple[int, ...] = (0,), every_s: float = 0.25) -> Path:
+    """Several while each of these drives lasts, and one when nobody drove."""
+    rows = [np.array([[DAY_S * 50.0, 1.0, 2.0, 3.0]])]
+    for number in numbers:
+        times_s = DAY_S * number + np.arange(0.03, 1.9, every_s)
+        path = Trajectory(TRUE[number], DAY_S * number + 0.1 * np.arange(len(TRUE[number])))
+        rows.append(np.column_stack([times_s, antenna(interpolate_poses(path, times_s))]))
+    np.savetxt(folder / "gnss.txt", np.concatenate(rows), fmt="%.4f")
+    return folder / "gnss.txt"
+
+
+def antenna(T_world_camera: Float64) -> Float64:
+    offset_m = AXES_MAP_WORLD.T @ np.array(ANTENNA)
+    T = T_SURVEY_WORLD @ T_world_camera
+    return np.asarray(T[:, :3, :3] @ offset_m + T[:, :3, 3])
+
+
+def test_a_drive_is_bent_to_measured_positions(tmp_path: Path) -> None:
+    map_ = drives()
+    assert _off_m(map_, 0) > 0.15
+    assert hold(map_, Survey(positions(tmp_path), ANTENNA)) == []
+    join_new(map_, [])
+    assert _off_m(map_, 0) < 0.03
+    assert misfit_rms_m(map_) == pytest.approx(0.0, abs=0.02)
+    assert doubts_of_positions(map_) == []
+
+
+def test_drives_that_share_no_place_are_placed_by_measured_positions(tmp_path: Path) -> None:
+    map_ = drives(2)
+    join_new(map_, [])
+    assert [session.number for session in map_.linked] == [0]
+    hold(map_, Survey(positions(tmp_path, (0, 1)), ANTENNA))
+    join_new(map_, [])
+    assert [session.number for session in map_.linked] == [0, 1]
+    assert _off_m(map_, 0) < 0.03
+    assert _off_m(map_, 1) < 0.1
+
+
+def test_a_drive_without_positions_stays_apart(tmp_path: Path) -> None:
+    map_ = drives(2)
+    hold(map_, Survey(positions(tmp_path), ANTENNA))
+    join_new(map_, [])
+    assert [session.number for session in map_.linked] == [0]
+    assert _off_m(map_, 0) < 0.03
+
+
+def test_positions_go_with_a_drive_into_other_maps(tmp_path: Path) -> None:
+    map_ = drives()
+    hold(map_, Survey(positions(tmp_path), ANTENNA))
+    other = Map.temporary()
+    copy_sessions(map_, other)
+    join_new(other, [])
+    assert _off_m(other, 0) < 0.03
+
+
+def test_positions_when_nobody_drove_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match="no position was measured during the drive"):
+        hold(drives(), Survey(positions(tmp_path, ())))
+
+
+def winding(folder: Path, off_m: float, every_s: float) -> Path:
+    """Positions that leave the true path to either side."""
+    rows = np.loadtxt(positions(folder, (0,), every_s))
+    rows[1:, 1:3] += off_m * np.sin(3.0 * rows[1:, 0])[:, None]
+    np.savetxt(folder / "gnss.txt", rows, fmt="%.4f")
+    return folder / "gnss.txt"
+
+
+def test_positions_far_from_the_path_are_warned_of(tmp_path: Path) -> None:
+    map_ = drives()
+    hold(map_, Survey(winding(tmp_path, 3.0, 0.25), ANTENNA))
+    join_new(map_, [])
+    assert "from the measured positions" in doubts_of_positions(map_)[0]
+
+
+def test_positions_that_no_drift_explains_are_refused(tmp_path: Path) -> None:
+    map_ = drives()
+    hold(map_, Survey(winding(tmp_path, 8.0, 0.02), ANTENNA))
+    with pytest.raises(RegistrationError, match="bend the path more than its drift explains"):
+        join_new(map_, [])
