@@ -14,6 +14,7 @@ from recon.commands.resume import begin_or_resume, with_resume_hint
 from recon.evaluation.drive_errors import compare_with_truth
 from recon.export.products import Products, write_products
 from recon.export.trajectories import export_paths
+from recon.map.drive.drive_odometry import doubt_poses
 from recon.map.drive.map_run import MapRun
 from recon.map.drive.refuse_empty import check_map
 from recon.map.drive.sequence import MappedSequence, map_sequence
@@ -39,8 +40,7 @@ def run_map(
 
     A quick audit says what is wrong with the recording. Frame by frame the drive becomes a map in
     the folder of the run, from which an interrupted run is resumed. Cloud, OctoMap, grid and mesh
-    are made of the map, path and surface are compared with the truth if the source knows it, and
-    a report shows the result.
+    are made of the map, compared with the truth if the source knows it, and shown in a report.
 
     Args:
         source: The drive.
@@ -53,6 +53,8 @@ def run_map(
     """
     config, options = config or load_config(), options or MapOptions()
     findings = quick_warnings(source, config) if options.audit else ()
+    if options.audit and options.known_poses is not None:
+        findings += doubt_poses(options.known_poses, source, config)
     options.tell(findings)
     identity = identity_of(source, config, options.known_poses, options.prior)
     with (

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
 
 from recon.core.errors import RegistrationError
 from recon.core.values import Trajectory
@@ -16,6 +19,9 @@ from recon.odometry.registry import make_odometry
 from recon.odometry.settings import PriorSettings
 from recon.sources.protocol import IncompleteSource, StampedSource, StereoSource
 from recon.stereo.frame import FrameReconstructor
+
+_KNOWN: Final = PriorSettings(sigma_share=0.01)
+"""How well poses are expected to be known; only where they are much worse is it said."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +92,41 @@ def odometry_of(
             axes = settings.prior.model_copy(update={"axes": used.axes})
             settings = settings.model_copy(update={"prior": axes})
         return make_odometry(settings.method, settings, prior)
+    return KnownPoses(_of_frames(known_poses, source))
+
+
+def doubt_poses(
+    known_poses: Trajectory, source: StereoSource, config: DriveSettings
+) -> tuple[str, ...]:
+    """Return a line for the user if known poses contradict what the cameras see.
+
+    They are compared with the first motions, in camera axes and in those of a body.
+
+    Raises:
+        RegistrationError: There are fewer known poses than frames.
+    """
+    poses = _of_frames(known_poses, source).T_world_camera
+    by_number = Trajectory(poses, np.arange(len(poses), dtype=np.float64))
+    if len(poses) < 2:
+        return ()
+    start = first_moving(by_number, by_number.timestamps_s, _KNOWN)
+    pairs = (replace(pair, timestamp_s=float(pair.index)) for pair in source.frames(start))
+    reconstructor = FrameReconstructor(source.calibration, config)
+    frames = (OdometryFrame(*reconstructor.match(pair)) for pair in pairs)
+    try:
+        found = find_axes(by_number, frames, _KNOWN)
+    except RegistrationError as error:
+        what = f"contradict what the cameras see ({error.got})"
+    else:
+        if found is None or found.axes == "camera":
+            return ()
+        what = "fit what the cameras see as those of a body (x forward, z up), not of the camera"
+    must = "they must be T_world_camera of this drive, in metres, z forward, one for each frame"
+    return (f"the known poses {what}; {must}",)
+
+
+def _of_frames(known_poses: Trajectory, source: StereoSource) -> Trajectory:
+    """Return the known pose of each frame."""
     count = len(known_poses)
     lines = list(range(len(source))) if count >= len(source) else None
     if isinstance(source, IncompleteSource):
@@ -98,4 +139,4 @@ def odometry_of(
             hint="the pose file must list every frame of the source",
         )
     poses, times_s = known_poses.T_world_camera[lines], known_poses.timestamps_s[lines]
-    return KnownPoses(Trajectory(poses, times_s))
+    return Trajectory(poses, times_s)
