@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.errors import ShapeError
 from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64, Int32, frozen_array
@@ -39,6 +40,8 @@ class Fixes:
         frozen_array("frames", self.frames, np.int32, (count,))
         frozen_array("offset_m", self.offset_m, np.float64, (count, 3))
         frozen_array("position_m", self.position_m, np.float64, (count, 3))
+        if not (np.isfinite(self.position_m).all() and self.sigma_m > 0.0):
+            raise ShapeError("measured positions are finite, and have a standard deviation")
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -241,7 +241,11 @@ class Session:
         """
         with reading(self._store.name):
             found = self.loops.get("fixes")
-            return NO_FIXES if found is None else Fixes(**found)
+            fixes = NO_FIXES if found is None else Fixes(**found)
+        if not np.isin(fixes.frames, np.arange(len(self))).all():
+            what = "the map has measured positions of frames without a pose"
+            raise FormatError(what, where=self._store.name)
+        return fixes
 
     def set_fixes(self, fixes: Fixes) -> None:
         """Keep positions that were measured during the drive, in place of earlier ones.

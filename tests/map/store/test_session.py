@@ -165,3 +165,19 @@ def test_submaps_of_frames_without_a_pose_are_refused(tmp_path: Path) -> None:
         made.commit()
     with pytest.raises((FormatError, ShapeError), match="without a pose"):
         Map.open(tmp_path / "map.recon")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"frames": np.array([5], np.int32)}, {"sigma_m": 0.0}, {"position_m": np.ones((2, 3))}],
+)
+def test_damaged_positions_are_refused(wrong: dict[str, object]) -> None:
+    fixes = {"frames": np.zeros(1, np.int32), "offset_m": np.zeros((1, 3))}
+    with Map.temporary() as made:
+        session = made.begin(SessionInfo("drive", "of a test", 5))
+        _fill(session, 0, 5)
+        session.set_loops({"fixes": {**fixes, "position_m": np.ones((1, 3)), "sigma_m": 1.0}})
+        assert len(session.fixes) == 1
+        session.set_loops({"fixes": {**session.loops["fixes"], **wrong}})
+        with pytest.raises((FormatError, ShapeError)):
+            _ = session.fixes
