@@ -172,13 +172,13 @@ def mapped_with(
 ) -> tuple[MappedSequence, dict[str, float]]:
     """Map the drive with drifting odometry; also the seconds of loop closure and of the run."""
 
-    def drifting(method: str, settings: Any) -> Odometry:
-        inner = make_odometry(method, settings)
+    def drifting(method: str, settings: Any, prior: Any) -> Odometry:
+        inner = make_odometry(method, settings, prior)
         return Drifting(inner, drift_percent / 100, drift_percent / 100) if drift_percent else inner
 
     work = Workspace()
     start = time.perf_counter()
-    with patch("recon.map.drive.sequence.make_odometry", drifting):
+    with patch("recon.map.drive.drive_odometry.make_odometry", drifting):
         mapped = map_sequence(source, config, workspace=work)
     seconds = {n: s for n, s in work.stopwatch.seconds.items() if "loops" in n}
     return mapped, seconds | {"all": time.perf_counter() - start}
@@ -239,7 +239,7 @@ def flat_grid(mapped: MappedSequence) -> OccupancyGrid:
     config, T = mapped.config, mapped.T_map_world
     cloud = transform_cloud(mapped.cloud, T, frame="map")
     path_m = se3.apply(T, mapped.trajectory.positions_m)
-    floor = add_floors(cloud, find_floors(mapped.voxels), config.ground)
+    floor = add_floors(cloud, find_floors(mapped.voxels))
     ground = estimate_ground_surface(floor, path_m, config.ground)
     return flatten(mapped.voxels, ground, config.grid)
 

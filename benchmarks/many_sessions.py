@@ -28,7 +28,7 @@ from recon.export.products import write_products
 from recon.map.sessions.joining import join_sessions
 from recon.map.sessions.placed import place_map
 from recon.map.store.map import MAP_FILE, Map
-from recon.run import Run
+from recon.run.run import Run
 from tests.map.sessions.test_map_of_several_drives import _drive, _links, _poses
 
 STEP_M = 12.0
