@@ -28,7 +28,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.voxels import pack_keys, unpack_keys
+from recon.core.kernels.voxels import pack_keys
 from recon.core.keys import are_among, find_keys
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float32, Float64
@@ -129,9 +129,9 @@ def _touching(
     wanted: NDArray[np.int64], keys: NDArray[np.int64], steps: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """Return int64 (N,), how many of the sorted keys are some steps away from each wanted one."""
-    number, cells = np.zeros(len(wanted), np.int64), unpack_keys(wanted)
-    for step in steps:
-        number += find_keys(pack_keys(cells + step), keys)[1]
+    number = np.zeros(len(wanted), np.int64)
+    for stride in _strides(steps):
+        number += find_keys(wanted + stride, keys)[1]
     return number
 
 
@@ -141,12 +141,16 @@ def _mean_around(wanted: NDArray[np.int64], keys: NDArray[np.int64], values: Flo
     NaN where there are none.
     """
     total, number = np.zeros((2, len(wanted)), np.float32)
-    cells = unpack_keys(wanted)
-    for step in _AROUND:
-        place, known = find_keys(pack_keys(cells + step), keys)
+    for stride in _strides(_AROUND):
+        place, known = find_keys(wanted + stride, keys)
         total[known] += values[place[known]]
         number += known
     return np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
+
+
+def _strides(steps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return int64 (S,), what steps (S, 3) add to a packed cell."""
+    return pack_keys(steps) - pack_keys(np.zeros((1, 3), np.int64))
 
 
 def _in_reach(places: Float64, reach: Float32, keys: NDArray[np.int64]) -> Bool:
