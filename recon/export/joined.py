@@ -10,6 +10,7 @@ from recon.core.values import Trajectory, TriangleMesh
 from recon.export.products import Products
 from recon.io.trajectory import write_kitti_poses, write_tum
 from recon.map.ground.axes import base_axes
+from recon.map.sessions.lengths import doubts_of_lengths
 from recon.map.sessions.measured import doubts_of_positions, misfit_rms_m
 from recon.map.settings import DriveSettings
 from recon.map.store.map import Map
@@ -79,7 +80,7 @@ def joined_figures(joined: JoinedMap) -> dict[str, Any]:
 
 
 def joined_warnings(joined: JoinedMap) -> list[str]:
-    """Return what the user should know: drives that are linked to nothing, doubtful positions."""
+    """Return what the user should know: drives apart, doubtful lengths and positions."""
     linked = joined.map.linked
     apart = [session for session in joined.map.sessions if session not in linked]
     names = ", ".join(f"{session.number} ({session.info.source})" for session in apart)
@@ -87,6 +88,7 @@ def joined_warnings(joined: JoinedMap) -> list[str]:
     text = f"session {names} {what} with session {linked[0].number}: kept in the map, but not in "
     return [
         *([text + "cloud, grid, OctoMap and mesh"] if apart else ()),
+        *doubts_of_lengths(joined.map),
         *doubts_of_positions(joined.map),
         *joined.made.warnings,
     ]
