@@ -38,6 +38,7 @@ from recon.io.models.ply import read_ply
 from recon.io.occupancy.nav2 import read_nav2
 from recon.io.trajectory import read_trajectory
 from recon.map.sessions.linking import find_links
+from recon.map.sessions.measured import Survey
 from recon.map.store.map import Map
 from recon.map.store.session import SessionInfo
 from recon.odometry.protocol import OdometryHealth
@@ -80,6 +81,12 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--frames", type=int, default=40, help="frames of each rendered drive")
     parser.add_argument("--width", type=int, default=480, help="width of the rendered pictures")
     parser.add_argument("--lane", choices=LATERAL_M, default="aside", help="of the second drive")
+    parser.add_argument(
+        "--measured",
+        type=float,
+        metavar="SIGMA_M",
+        help="hold both rendered drives at their true positions with noise, as of an antenna",
+    )
     parser.add_argument("--tries", type=int, default=200, help="pairs of streets that look alike")
     return parser.parse_args(arguments)
 
@@ -162,8 +169,10 @@ def second(asked: argparse.Namespace, folder: Path) -> dict[str, Any]:
     for number, source in enumerate(days):
         options = MapOptions(out=folder / f"day{number}", mesh=False, audit=False)
         run_map(source, config, options)
-    options = MapOptions("merge", folder / "days", mesh=False)
-    summary = run_merge([folder / "day0", folder / "day1"], None, options)
+    runs = [folder / "day0", folder / "day1"]
+    if asked.measured is not None:
+        runs = [hold(*each, asked.measured) for each in zip(runs, days, strict=True)]
+    summary = run_merge(runs, None, MapOptions("merge", folder / "days", mesh=False))
     options = MapOptions("localize", folder / "found")
     found = run_localize(days[1], folder / "day0", config, options).summary
     return {
@@ -172,6 +181,16 @@ def second(asked: argparse.Namespace, folder: Path) -> dict[str, Any]:
         "localized": {name: found[name] for name in ("frames", "frames_tracking", "warnings")},
         **compare_days(days, folder, config),
     }
+
+
+def hold(run: Path, source: SyntheticSource, sigma_m: float) -> Path:
+    """A run held at its true positions in the street, with noise."""
+    places_m = source.world.T_street_camera[:, :3, 3]
+    noise_m = np.random.default_rng(1).normal(0.0, sigma_m, places_m.shape)
+    file, out = run.with_suffix(".txt"), run.with_name(f"held_{run.name}")
+    np.savetxt(file, np.column_stack([source.truth.trajectory.timestamps_s, places_m + noise_m]))
+    run_merge([run], None, MapOptions("merge", out, mesh=False), Survey(file))
+    return out
 
 
 def compare_days(
