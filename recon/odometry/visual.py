@@ -13,9 +13,9 @@ from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.odometry.corners import find_corners, find_fewer_corners, in_crowd
 from recon.odometry.covariance import covariance_of, step_covariance
+from recon.odometry.locate_camera import MIN_INLIERS, REPROJECTION_PX, enough_agree, locate_camera
 from recon.odometry.motion import Motion
 from recon.odometry.patches import find_again, measure_disparity, surface_slopes, warp_of
-from recon.odometry.pose import MIN_INLIERS, REPROJECTION_PX, enough_agree, locate_camera
 from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in, tree_of
 from recon.odometry.tracking import follow, sample_disparity

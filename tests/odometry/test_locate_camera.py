@@ -9,7 +9,7 @@ from recon.core.geometry.projection import depth_from_disparity, project, unproj
 from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.odometry.pose import REPROJECTION_PX, locate_camera
+from recon.odometry.locate_camera import REPROJECTION_PX, locate_camera
 from recon.odometry.visual import MIN_DISPARITY_PX
 
 CAMERA = RectifiedCamera(360.0, 320.0, 120.0, 320.0, 0.54, 640, 240)
