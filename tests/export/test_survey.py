@@ -172,3 +172,12 @@ def test_positions_just_across_the_border_of_a_zone_are_taken(tmp_path: Path) ->
     rows[:, 1] -= 300000.0  # 1.6 degrees west of zone 33
     survey = Survey(write_positions(tmp_path, rows), ANTENNA, "EPSG:25833")
     assert not georeference(write_run(tmp_path), survey).warnings()
+
+
+def test_swapped_columns_are_recognised_by_the_bend_of_the_path(tmp_path: Path) -> None:
+    rows = positions(FROM_S + np.arange(20))
+    right = georeference(write_run(tmp_path), Survey(write_positions(tmp_path, rows), ANTENNA))
+    assert not right.warnings()
+    swapped = write_positions(tmp_path, rows[:, [0, 2, 1, 3]])
+    lines = georeference(write_run(tmp_path), Survey(swapped, ANTENNA)).warnings()
+    assert [line for line in lines if "with easting and northing swapped" in line]

@@ -28,6 +28,9 @@ _LEAST_SPAN_M: Final = 1.0
 _LONGEST_GAP_S: Final = 1.0
 """Between frames farther apart than this, nobody knows where the camera was."""
 
+_FEWEST_TO_BEND: Final = 5
+_LEAST_BEND_M: Final = 0.1
+"""Positions of so many places, and so far from a straight line, tell left from right."""
 _NAMED: Final = 3
 _LEAST_SIGMA_M: Final = 0.01
 """However smooth positions are, no antenna is known better."""
@@ -89,7 +92,25 @@ class Measured:
         return max(_LEAST_SIGMA_M, float(_SIGMA_OF_BEND * bend_m))
 
     def warnings(self) -> list[str]:
-        """Return a line that names positions that are left out, if there are any."""
+        """Return lines of positions that are left out, and of columns that seem swapped."""
+        return [*self._left_out(), *self._swapped()]
+
+    def _swapped(self) -> list[str]:
+        """Return a line if the path, which may bend left or right, is that of a mirror image."""
+        ours_m, position_m = self.ours_m[self.agree], self.position_m[self.agree]
+        if len(ours_m) < _FEWEST_TO_BEND:
+            return []
+        as_given, swapped = (
+            float(np.sqrt(3.0 * np.mean(_off_m(ours_m, there_m) ** 2)))
+            for there_m in (position_m, position_m[:, [1, 0, 2]])
+        )
+        if swapped > 0.5 * as_given or as_given < _LEAST_BEND_M:
+            return []
+        better = f"{swapped:.2f} m instead of {as_given:.2f} m (RMS)"
+        ask = "columns are time, easting, northing, height"
+        return [f"with easting and northing swapped the positions fit better, {better}: {ask}"]
+
+    def _left_out(self) -> list[str]:
         off_m = np.linalg.norm(self.misfit_m, axis=1)
         worst = [n for n in np.argsort(-off_m) if not self.agree[n]]
         if not worst:
@@ -98,6 +119,11 @@ class Measured:
         more = ", …" if len(worst) > _NAMED else ""
         of_all = f"{len(worst)} of {len(off_m)} positions"
         return [f"{of_all} contradict the others and are left out: {', '.join(named)}{more}"]
+
+
+def _off_m(ours_m: Float64, there_m: Float64) -> Float64:
+    """Return by how much positions are off after a rigid fit (N, 3)."""
+    return np.asarray(apply(fit_upright(ours_m, there_m).T_to_from, ours_m) - there_m)
 
 
 def measure_along(path: Trajectory, T_map_world: Float64, survey: Survey) -> Measured:
