@@ -11,6 +11,7 @@ from recon.commands.live import run_live as run_live
 from recon.commands.localize import run_localize as run_localize
 from recon.commands.map import run_map as run_map
 from recon.commands.map_options import MapOptions as MapOptions
+from recon.commands.merge import run_merge as run_merge
 from recon.commands.occupancy import run_occupancy as run_occupancy
 from recon.commands.pair import run_disparity as run_disparity
 from recon.commands.pair import run_pair as run_pair
@@ -49,6 +50,7 @@ from recon.io.models.ply import write_ply as write_ply
 from recon.io.trajectory import read_trajectory as read_trajectory
 from recon.map.drive.sequence import MappedSequence as MappedSequence
 from recon.map.drive.sequence import map_sequence as map_sequence
+from recon.map.sessions.measured import Survey as Survey
 from recon.map.store.map import Map as Map
 from recon.rig.audit.audit import Audit as Audit
 from recon.sources.pair_input import PairInput as PairInput
