@@ -19,28 +19,12 @@ from recon.odometry.patches import find_again, measure_disparity, surface_slopes
 from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in, tree_of
 from recon.odometry.tracking import follow, sample_disparity
-from recon.odometry.window import (
-    SIGMA_UV_PX,
-    TrackWindow,
-    adjust,
-    misfits,
-    pose_information,
-    reprojection,
-)
+from recon.odometry.visual_uncertainty import newest_health, newest_information
+from recon.odometry.window import TrackWindow, adjust, misfits
 from recon.stereo.rectify.features import match_features
 
 _FRAMES: Final = 6
 """Frames adjusted together."""
-
-_INDEPENDENCE: Final = 0.25
-"""Share of the tracks whose errors count as independent."""
-
-_BEST_PX: Final = 0.05
-"""However well features fit, they count as no better: on planes with exact truth they are off by
-0.03 px to 0.12 px."""
-
-_MEDIAN: Final = 1.18
-"""Median length of an error in the image, in standard deviations along either axis."""
 
 _RELOCATE_FEATURES: Final = 2000
 """Features matched over the whole image where tracking fails."""
@@ -139,7 +123,10 @@ class VisualOdometry:
         window = self._replenish(seen.window.trimmed(_FRAMES), frame)
         motion = state.motion.moved(T_world_camera, time_s)
         self._state = VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
-        return self._estimate(seen, frame.pair.camera)
+        camera = frame.pair.camera
+        health = newest_health(seen.window, camera, seen.tracks, seen.note)
+        information = newest_information(seen.window, camera)
+        return VisualEstimate(OdometryResult(T_world_camera, health), information)
 
     @property
     def window(self) -> TrackWindow:
@@ -185,7 +172,7 @@ class VisualOdometry:
             return False
         found = invert(state.window.T_world_camera[-1]) @ seen.window.T_world_camera[-1]
         off = as_step(invert(prior_motion) @ found)
-        information = _information(seen.window, frame.pair.camera)
+        information = newest_information(seen.window, frame.pair.camera)
         both = covariance_of(information) + step_covariance(*self._prior.sigmas(prior_motion))
         return float(np.sqrt(off @ np.linalg.solve(both, off))) > MAX_SIGMAS
 
@@ -327,44 +314,6 @@ class VisualOdometry:
         d = self._measured(frame, uv)
         uvd = np.column_stack([uv, d])[np.isfinite(d)]
         return window.with_points(uvd, _points(uvd, window.T_world_camera[-1], frame.pair.camera))
-
-    def _estimate(self, seen: _Seen, camera: RectifiedCamera) -> VisualEstimate:
-        """Return the pose of a registered frame, its health and its information."""
-        window = seen.window
-        information = _information(window, camera)
-        newest = window.seen[-1]
-        error = reprojection(window, camera)[-1, newest, :2]
-        reprojection_px = float(np.median(np.linalg.norm(error, axis=1)))
-        # What stays with a feature, its disparity, is as uncertain as assumed however well it fits.
-        fits_px = max(reprojection_px, _BEST_PX) / _MEDIAN
-        sigma = np.sqrt(np.diag(covariance_of(_information(window, camera, fits_px))))
-        health = OdometryHealth(
-            tracks=seen.tracks,
-            inliers=int(newest.sum()),
-            reprojection_px=reprojection_px,
-            sigma_m=float(np.linalg.norm(sigma[:3])),
-            sigma_deg=float(np.rad2deg(np.linalg.norm(sigma[3:]))),
-            scale_px=_scale_px(window.uvd[-1, :, 2], camera),
-            notes=(seen.note,) if seen.note else (),
-        )
-        T_world_camera = window.T_world_camera[-1].copy()
-        return VisualEstimate(OdometryResult(T_world_camera, health), information)
-
-
-def _information(
-    window: TrackWindow, camera: RectifiedCamera, sigma_uv_px: float = SIGMA_UV_PX
-) -> Float64:
-    """Return information (6, 6) of the newest pose, scaled because errors of tracks correlate."""
-    return _INDEPENDENCE * pose_information(window, camera, sigma_uv_px)
-
-
-def _scale_px(disparity: Float64, camera: RectifiedCamera) -> float:
-    """Return the disparity that fixes the length of a motion, from those (N,) of the features.
-
-    A disparity gives a share of the depth, so a feature tells as much as the square of its own.
-    """
-    d = disparity[np.isfinite(disparity)] + camera.doffs_px
-    return float(d @ d / d.sum()) if len(d) else float("nan")
 
 
 def _seen_from(T_world_camera: Float64, xyz_world: Float64, camera: RectifiedCamera) -> Float64:
