@@ -7,18 +7,24 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.geometry.projection import depth_from_disparity, project, unproject
-from recon.core.geometry.se3 import apply, as_step, invert
-from recon.core.values import Disparity, RectifiedCamera
-from recon.core.values.arrays import Float32, Float64, UInt8
-from recon.odometry.corners import find_corners, find_fewer_corners, in_crowd
+from recon.core.geometry.se3 import as_step, invert
+from recon.core.values import Disparity
+from recon.core.values.arrays import Float64
 from recon.odometry.covariance import covariance_of, step_covariance
-from recon.odometry.locate_camera import MIN_INLIERS, REPROJECTION_PX, enough_agree, locate_camera
+from recon.odometry.locate_camera import MIN_INLIERS, enough_agree, locate_camera
 from recon.odometry.motion import Motion
-from recon.odometry.patches import find_again, measure_disparity, surface_slopes, warp_of
 from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in, tree_of
-from recon.odometry.tracking import follow, sample_disparity
+from recon.odometry.visual_features import (
+    VisualState,
+    empty_window,
+    feature_disparity,
+    follow_points,
+    known_disparity,
+    observe_points,
+    points_of,
+    replenish,
+)
 from recon.odometry.visual_uncertainty import newest_health, newest_information
 from recon.odometry.window import TrackWindow, adjust, misfits
 from recon.stereo.rectify.features import match_features
@@ -28,28 +34,6 @@ _FRAMES: Final = 6
 
 _RELOCATE_FEATURES: Final = 2000
 """Features matched over the whole image where tracking fails."""
-
-MIN_DISPARITY_PX: Final = 0.5
-"""Features with less disparity count as without depth."""
-
-
-@dataclass(frozen=True, eq=False)
-class VisualState:
-    """What is kept from frame to frame.
-
-    Attributes:
-        window: The last frames that were registered, and the points in them.
-        left: uint8 (H, W), the left image of the newest of them.
-        disparity: Its disparity.
-        motion: Pose and motion by now, which may be some frames later.
-        seen_s: Time of the newest frame that was registered.
-    """
-
-    window: TrackWindow
-    left: UInt8
-    disparity: Disparity
-    motion: Motion
-    seen_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +104,7 @@ class VisualOdometry:
             what = "features contradict the prior"
             return self._lost(state, frame, motion, prior_motion, what)
         T_world_camera = seen.window.T_world_camera[-1].copy()
-        window = self._replenish(seen.window.trimmed(_FRAMES), frame)
+        window = replenish(seen.window.trimmed(_FRAMES), frame)
         motion = state.motion.moved(T_world_camera, time_s)
         self._state = VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
         camera = frame.pair.camera
@@ -131,7 +115,7 @@ class VisualOdometry:
     @property
     def window(self) -> TrackWindow:
         """The last frames that were registered; without points before the first one."""
-        return _empty(np.eye(4)) if self._state is None else self._state.window
+        return empty_window(np.eye(4)) if self._state is None else self._state.window
 
     def state(self) -> dict[str, Any]:
         """Return everything that later poses depend on."""
@@ -157,7 +141,7 @@ class VisualOdometry:
 
     def _begin(self, frame: OdometryFrame, motion: Motion) -> VisualState:
         """Return a new window that starts at a pose."""
-        window = self._replenish(_empty(motion.T_world_camera), frame)
+        window = replenish(empty_window(motion.T_world_camera), frame)
         time_s = frame.pair.timestamp_s
         return VisualState(window, frame.pair.left, frame.disparity, motion, time_s)
 
@@ -185,12 +169,12 @@ class VisualOdometry:
         they look from there: those that were lost are found, and the others more closely.
         """
         window = state.window
-        uv = self._follow(state, frame, predicted)
+        uv = follow_points(state, frame, predicted)
         tracks = np.flatnonzero(np.isfinite(uv[:, 0]))
         rough = locate_camera(window.xyz_world[tracks], uv[tracks], frame.pair.camera, predicted)
         if rough is None:
             return None
-        uvd = self._observe(state, frame, uv, rough.T_world_camera)
+        uvd = observe_points(state, frame, uv, rough.T_world_camera)
         return self._register(window, uvd, frame, rough.T_world_camera)
 
     def _by_matching(
@@ -203,11 +187,11 @@ class VisualOdometry:
         )
         uv, uv_now = found.left_uv, found.right_uv
         camera, T_world_then = frame.pair.camera, state.window.T_world_camera[-1]
-        then = np.column_stack([uv, self._disparity(state.disparity, camera, uv)])
-        now = np.column_stack([uv_now, self._measured(frame, uv_now)])
+        then = np.column_stack([uv, known_disparity(state.disparity, camera, uv)])
+        now = np.column_stack([uv_now, feature_disparity(frame, uv_now)])
         known = np.isfinite(then[:, 2])
         then, now = then[known].astype(np.float64), now[known].astype(np.float64)
-        window = _empty(T_world_then).with_points(then, _points(then, T_world_then, camera))
+        window = empty_window(T_world_then).with_points(then, points_of(then, T_world_then, camera))
         seen = self._register(window, now, frame, predicted)
         if seen is None:
             return None
@@ -251,83 +235,3 @@ class VisualOdometry:
         health = OdometryHealth(sigma_m=sigma_m, sigma_deg=sigma_deg, notes=(note,))
         information = np.asarray(np.linalg.inv(step_covariance(sigma_m, sigma_deg)), np.float64)
         return VisualEstimate(OdometryResult(motion.T_world_camera, health), information)
-
-    def _follow(self, state: VisualState, frame: OdometryFrame, predicted: Float64) -> Float64:
-        """Return column and row (N, 2) in the new frame of the points of the window, tracked."""
-        window = state.window
-        there = np.full((len(window.xyz_world), 2), np.nan)
-        alive = np.flatnonzero(window.seen[-1])
-        uv = window.uvd[-1, alive, :2].astype(np.float32)
-        expected = _seen_from(predicted, window.xyz_world[alive], frame.pair.camera)
-        guess = np.where(np.isfinite(expected), expected, uv).astype(np.float32)
-        followed, found = follow(state.left, frame.pair.left, uv, guess)
-        there[alive[found]] = followed[found]
-        return there
-
-    def _observe(
-        self, state: VisualState, frame: OdometryFrame, followed: Float64, T_world_camera: Float64
-    ) -> Float64:
-        """Return column, row and disparity (N, 3) in a frame of known pose of the window's points.
-
-        Args:
-            state: The frames before.
-            frame: The frame.
-            followed: float64 (N, 2), where tracking has found the points; NaN = nowhere.
-            T_world_camera: float64 (4, 4), about its pose.
-        """
-        window, camera = state.window, frame.pair.camera
-        uvd = np.full((len(window.xyz_world), 3), np.nan)
-        alive = np.flatnonzero(window.seen[-1])
-        uv, xyz_world = window.uvd[-1, alive, :2], window.xyz_world[alive]
-        T_then_world = invert(window.T_world_camera[-1])
-        T_now_then = invert(T_world_camera) @ window.T_world_camera[-1]
-        slope = surface_slopes(state.disparity, uv)
-        warp = warp_of(uv, apply(T_then_world, xyz_world), slope, T_now_then, camera)
-        expected = _seen_from(T_world_camera, xyz_world, camera)
-        with np.errstate(invalid="ignore"):
-            near = np.abs(followed[alive] - expected).max(axis=1) <= REPROJECTION_PX
-        guess = np.where(near[:, None], followed[alive], expected)
-        uvd[alive, :2] = find_again(state.left, frame.pair.left, uv, warp, guess)
-        there = alive[np.isfinite(uvd[alive, 0])]
-        uv_now = uvd[there, :2].astype(np.float32)
-        uvd[there, 2] = self._measured(frame, uv_now)
-        return uvd
-
-    def _measured(self, frame: OdometryFrame, uv: Float32) -> Float64:
-        """Return the disparity (N,) of features of a frame; see `_disparity`."""
-        d = self._disparity(frame.disparity, frame.pair.camera, uv)
-        if not frame.rough:
-            return d
-        at = uv.astype(np.float64)
-        return measure_disparity(frame.pair, at, d, surface_slopes(frame.disparity, at))
-
-    def _disparity(self, disparity: Disparity, camera: RectifiedCamera, uv: Float32) -> Float64:
-        """Return the disparity (N,) of features; NaN = unknown, or too small to give a depth."""
-        d = sample_disparity(disparity, uv).astype(np.float64)
-        return np.where(d + camera.doffs_px < MIN_DISPARITY_PX, np.nan, d)
-
-    def _replenish(self, window: TrackWindow, frame: OdometryFrame) -> TrackWindow:
-        """Return the window with as many points in each part of the newest frame: some new."""
-        window = window.without_newest(in_crowd(window.uvd[-1, :, :2], frame.pair.left.shape))
-        taken = window.uvd[-1, window.seen[-1], :2].astype(np.float32)
-        uv = (find_fewer_corners if frame.rough else find_corners)(frame.pair.left, taken)
-        d = self._measured(frame, uv)
-        uvd = np.column_stack([uv, d])[np.isfinite(d)]
-        return window.with_points(uvd, _points(uvd, window.T_world_camera[-1], frame.pair.camera))
-
-
-def _seen_from(T_world_camera: Float64, xyz_world: Float64, camera: RectifiedCamera) -> Float64:
-    """Return column and row (N, 2) of points seen from a pose; NaN behind the camera."""
-    u, v, _ = project(apply(invert(T_world_camera), xyz_world), camera)
-    return np.stack([u, v], axis=1)
-
-
-def _points(uvd: Float64, T_world_camera: Float64, camera: RectifiedCamera) -> Float64:
-    """Return the world points (N, 3) of features with a disparity."""
-    depth = depth_from_disparity(uvd[:, 2], camera).astype(np.float64)
-    return apply(T_world_camera, unproject(uvd[:, 0], uvd[:, 1], depth, camera))
-
-
-def _empty(T_world_camera: Float64) -> TrackWindow:
-    """Return a window of one frame without points."""
-    return TrackWindow(T_world_camera[None], np.zeros((1, 0, 3)), np.zeros((0, 3)))

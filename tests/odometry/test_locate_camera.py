@@ -10,7 +10,7 @@ from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_tran
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.odometry.locate_camera import REPROJECTION_PX, locate_camera
-from recon.odometry.visual import MIN_DISPARITY_PX
+from recon.odometry.visual_features import MIN_DISPARITY_PX
 
 CAMERA = RectifiedCamera(360.0, 320.0, 120.0, 320.0, 0.54, 640, 240)
 T_TRUE = make_transform(exp_so3(np.array([0.002, 0.01, -0.003])), np.array([-0.03, -0.02, 1.0]))
