@@ -33,7 +33,9 @@ with a feature from frame to frame and does not average out."""
 CAUCHY_SIGMAS: Final = 0.7
 """Residual at which the weight of an observation is one half: most are far smaller than the
 standard deviations, which hold for what stays with a feature; those that are not are on something
-that moves, or slide along an edge."""
+that moves, or slide along an edge. Chosen on two drives: nearly all their paths are better at 0.7 than
+at 3, and at 0.5 a rendered road with few features is no longer trusted
+(docs/decisions/0018-warped-patches.md)."""
 
 _DOUBTED_SIGMAS: Final = 3.0
 """The same where only the certainty of a pose is asked for: there an observation that fits as
@@ -122,6 +124,8 @@ def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
 def weighted(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Float64]:
     """Return residuals in standard deviations, and the weight of each observation.
 
+    As `adjust` weighs them in its kernel; for the audit of a rig (`recon/rig/audit/`) alone.
+
     Returns:
         float64 (W, N, 3), 0 where nothing is seen; float64 (W, N), Cauchy weights, likewise.
     """
@@ -196,7 +200,10 @@ def pose_information(
 
 
 def normal_equations(window: TrackWindow, camera: RectifiedCamera) -> bundle.NormalEquations:
-    """Return the normal equations of all poses and points of a window, as `bundle.linearise`."""
+    """Return the normal equations of all poses and points of a window, as `bundle.linearise`.
+
+    For the audit of a rig (`recon/rig/audit/`) alone, which has one more unknown than `adjust`.
+    """
     return _linearise(window, _model(camera))
 
 
