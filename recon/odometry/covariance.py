@@ -20,3 +20,8 @@ def covariance_of(information: Float64) -> Float64:
 def step_covariance(sigma_m: float, sigma_deg: float) -> Float64:
     """Return the covariance (6, 6) of a step that is equally uncertain in all directions."""
     return np.diag(np.repeat([sigma_m**2, np.deg2rad(sigma_deg) ** 2], 3))
+
+
+def distance_in_sigmas(step: Float64, covariance: Float64) -> float:
+    """Return the length of a step (6,) in standard deviations (Mahalanobis distance)."""
+    return float(np.sqrt(step @ np.linalg.solve(covariance, step)))

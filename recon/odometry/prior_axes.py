@@ -13,7 +13,7 @@ from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import as_step, invert
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
-from recon.odometry.covariance import covariance_of, step_covariance
+from recon.odometry.covariance import covariance_of, distance_in_sigmas, step_covariance
 from recon.odometry.prior import MAX_SIGMAS, MotionPrior
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.settings import PriorSettings
@@ -150,4 +150,4 @@ def _distance(prior: MotionPrior, seen: _VisualMotion) -> float:
     off = as_step(invert(expected) @ seen.T_from_to)
     # The standard deviations are those from frame to frame; independent ones add in squares.
     own = seen.frames * step_covariance(*prior.sigmas(expected))
-    return float(np.sqrt(off @ np.linalg.solve(own + seen.covariance, off)))
+    return distance_in_sigmas(off, own + seen.covariance)

@@ -10,7 +10,7 @@ import numpy as np
 from recon.core.geometry.se3 import as_step, invert
 from recon.core.values import Disparity
 from recon.core.values.arrays import Float64
-from recon.odometry.covariance import covariance_of, step_covariance
+from recon.odometry.covariance import covariance_of, distance_in_sigmas, step_covariance
 from recon.odometry.locate_camera import MIN_INLIERS, enough_agree, locate_camera
 from recon.odometry.motion import Motion
 from recon.odometry.prior import MAX_SIGMAS, MotionPrior
@@ -158,7 +158,7 @@ class VisualOdometry:
         off = as_step(invert(prior_motion) @ found)
         information = newest_information(seen.window, frame.pair.camera)
         both = covariance_of(information) + step_covariance(*self._prior.sigmas(prior_motion))
-        return float(np.sqrt(off @ np.linalg.solve(both, off))) > MAX_SIGMAS
+        return distance_in_sigmas(off, both) > MAX_SIGMAS
 
     def _by_tracking(
         self, state: VisualState, frame: OdometryFrame, predicted: Float64

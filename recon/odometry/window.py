@@ -33,8 +33,8 @@ with a feature from frame to frame and does not average out."""
 CAUCHY_SIGMAS: Final = 0.7
 """Residual at which the weight of an observation is one half: most are far smaller than the
 standard deviations, which hold for what stays with a feature; those that are not are on something
-that moves, or slide along an edge. Chosen on two drives: nearly all their paths are better at 0.7 than
-at 3, and at 0.5 a rendered road with few features is no longer trusted
+that moves, or slide along an edge. Chosen on two drives: nearly all their paths are better at 0.7
+than at 3, and at 0.5 a rendered road with few features is no longer trusted
 (docs/decisions/0018-warped-patches.md)."""
 
 _DOUBTED_SIGMAS: Final = 3.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.core.values.arrays import Float64
 from recon.map.localize.surfaces import Fit
-from recon.odometry.covariance import covariance_of, step_covariance
+from recon.odometry.covariance import covariance_of, distance_in_sigmas, step_covariance
 from recon.odometry.prior import MAX_SIGMAS
 
 _MIN_OVERLAP: Final = 0.5
@@ -60,7 +60,7 @@ def is_worthwhile(correction: Correction, prior_covariance: Float64) -> bool:
     if not after.residual_m <= (1.0 - _MIN_RESIDUAL_GAIN) * before.residual_m:
         return False
     both = prior_covariance + icp_covariance(after)
-    likely = float(step @ np.linalg.solve(both, step)) <= MAX_SIGMAS**2
+    likely = distance_in_sigmas(step, both) <= MAX_SIGMAS
     return after.overlap >= _MIN_OVERLAP and likely and _gain(prior_covariance, both) >= _MIN_SHARE
 
 
