@@ -9,7 +9,7 @@ from pydantic import Field
 
 from recon.core.errors import MemoryLimitError, SettingsError
 from recon.core.settings import Settings
-from recon.run.machine import peak_memory_mb
+from recon.run.machine import peak_memory_mb, return_free_memory
 
 _UNITS_MB: Final = {"": 1, "M": 1, "MB": 1, "G": 1000, "GB": 1000}
 _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*")
@@ -49,12 +49,14 @@ class MemorySettings(Settings):
         return _CACHE_BYTES if self.limit_mb is None else int(1e6 * self.limit_mb * _CACHE_SHARE)
 
     def check(self, where: str) -> None:
-        """Stop a run that exceeds the limit.
+        """Stop a run that exceeds the limit; else return what is free, for what comes next.
 
         Raises:
             MemoryLimitError: The peak memory of the process is above the limit.
         """
-        if self.limit_mb is not None and peak_memory_mb() > self.limit_mb:
+        if self.limit_mb is None:
+            return
+        if peak_memory_mb() > self.limit_mb:
             raise MemoryLimitError(
                 "the memory limit cannot be kept",
                 where=where,
@@ -63,6 +65,7 @@ class MemorySettings(Settings):
                 hint="give more with --memory-limit, or take smaller images, fewer disparities "
                 "or a coarser map",
             )
+        return_free_memory()
 
 
 def memory_overrides(limit: str | None) -> list[str]:
