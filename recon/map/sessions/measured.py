@@ -154,6 +154,7 @@ def measure_along(path: Trajectory, T_map_world: Float64, survey: Survey) -> Mea
             where=survey.positions,
             got=f"{len(here)} positions within {span_m(here[:, 1:]):.2f} m",
             expected=f"{_LEAST_SPAN_M:g} m or more",
+            hint="eastings and northings are in metres, not degrees",
         )
     antenna_m = _in_camera(survey, T_map_world)
     T_map_camera = T_map_world @ interpolate_poses(path, here[:, 0])
