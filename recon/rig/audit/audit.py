@@ -13,7 +13,7 @@ from recon.core.geometry.projection import depth_sigma
 from recon.core.values import RectifiedCamera, Rig, StereoCalibration
 from recon.core.values.arrays import Float64
 from recon.io.cameras.recon_yaml import write_recon_calibration
-from recon.rig.audit.alignment import RowAlignment, correct_rig
+from recon.rig.audit.bent_lenses import BentLenses, estimate_lenses
 from recon.rig.audit.findings import (
     Finding,
     Verdict,
@@ -26,11 +26,11 @@ from recon.rig.audit.findings import (
     verdict_of,
 )
 from recon.rig.audit.geometry import Geometry, measure_geometry
-from recon.rig.audit.lens_fit import BentLenses, estimate_lenses
 from recon.rig.audit.measures import Gaps, find_gaps
+from recon.rig.audit.row_alignment import RowAlignment, correct_rig
 from recon.rig.audit.sample import Look, Sample, take_sample
+from recon.rig.audit.seen_motion import SeenMotion, measure_turn, turn_figures
 from recon.rig.audit.settings import AuditedSettings
-from recon.rig.audit.turn import SeenMotion, measure_turn, turn_figures
 from recon.run.summary import plain
 from recon.sources.protocol import IncompleteSource, StereoSource
 from recon.stereo.match.registry import MatchingSettings, settings_of

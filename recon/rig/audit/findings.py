@@ -11,9 +11,9 @@ import numpy as np
 from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
 from recon.rig.audit.geometry import MIN_FEATURES, Geometry
 from recon.rig.audit.measures import Gaps
+from recon.rig.audit.right_turn import RightTurn
 from recon.rig.audit.sample import BLANK_DN, Sample
-from recon.rig.audit.turn import turn_figures
-from recon.rig.audit.turn_fit import RightTurn
+from recon.rig.audit.seen_motion import turn_figures
 from recon.stereo.match.protocol import Matcher
 
 Verdict = Literal["good", "usable", "not usable"]

@@ -9,8 +9,8 @@ import numpy as np
 
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.rig.audit.alignment import RowAlignment, align_rows
 from recon.rig.audit.measures import measure_time_skew
+from recon.rig.audit.row_alignment import RowAlignment, align_rows
 from recon.rig.audit.sample import Sample
 from recon.stereo.rectify.features import PairFeatures, pool_features
 from recon.stereo.rectify.inspect import inspect_features

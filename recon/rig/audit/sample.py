@@ -12,7 +12,6 @@ import numpy as np
 from recon.core.errors import ReconError
 from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Float64
-from recon.rig.audit.alignment import count_aligned
 from recon.rig.audit.measures import (
     RepeatCounter,
     measure_gain,
@@ -20,6 +19,7 @@ from recon.rig.audit.measures import (
     measure_speed,
     track,
 )
+from recon.rig.audit.row_alignment import count_aligned
 from recon.rig.audit.settings import AuditSettings
 from recon.sources.protocol import StereoSource
 from recon.stereo.rectify.features import NO_FEATURES, PairFeatures, match_features

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from recon.core.geometry.se3 import exp_so3
 from recon.core.values import RectifiedCamera
-from recon.rig.audit.alignment import align_rows, correct_rig, count_aligned, turn_features
 from recon.rig.audit.findings import Finding, verdict_of
 from recon.rig.audit.measures import (
     RepeatCounter,
@@ -21,6 +20,7 @@ from recon.rig.audit.measures import (
     measure_speed,
     measure_time_skew,
 )
+from recon.rig.audit.row_alignment import align_rows, correct_rig, count_aligned, turn_features
 from recon.rig.audit.sample import plan_centres, plan_stretches
 from recon.rig.audit.settings import AuditSettings
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
 from recon.core.values.arrays import Float64
-from recon.rig.audit.alignment import correct_rig
 from recon.rig.audit.rig_fit import Placed, StereoTracks, fit_correction, misfit
-from recon.rig.audit.turn_fit import MIN_WINDOWS, Turning, turned_places
+from recon.rig.audit.right_turn import MIN_WINDOWS, Turning, turned_places
+from recon.rig.audit.row_alignment import correct_rig
 
 _TERMS: Final = 6
 """Of each lens: k1 k2 p1 p2 s1 s3 of OpenCV."""

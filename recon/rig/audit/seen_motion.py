@@ -27,8 +27,8 @@ from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualOdometry
 from recon.odometry.window import TrackWindow
 from recon.rig.audit.rig_fit import StereoTracks
+from recon.rig.audit.right_turn import MIN_WINDOWS, RightTurn, estimate_turn
 from recon.rig.audit.sample import plan_stretches
-from recon.rig.audit.turn_fit import MIN_WINDOWS, RightTurn, estimate_turn
 from recon.run.machine import serial_algebra
 from recon.sources.protocol import StereoSource
 from recon.stereo.frame import FrameReconstructor

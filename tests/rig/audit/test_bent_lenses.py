@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.rig.audit.lens_fit import BentLenses, estimate_lenses, straightened
+from recon.rig.audit.bent_lenses import BentLenses, estimate_lenses, straightened
 from recon.rig.audit.rig_fit import StereoTracks
 from recon.stereo.rectify.lens import rays_of
-from tests.rig.audit.test_turn import CAMERA, tracks
+from tests.rig.audit.test_right_turn import CAMERA, tracks
 
 LEFT = np.array([8e-3, -3e-3, -1e-3, 5e-4, 2e-3, -1e-3])
 RIGHT = np.array([5e-3, -2e-3, 1e-3, 2e-3, -3e-3, 1e-3])
