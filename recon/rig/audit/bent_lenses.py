@@ -15,7 +15,7 @@ import numpy as np
 
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
 from recon.core.values.arrays import Float64
-from recon.rig.audit.rig_fit import Placed, StereoTracks, fit_correction, misfit
+from recon.rig.audit.rig_fit import CorrectedPlaces, StereoTracks, fit_correction, remaining_cost
 from recon.rig.audit.right_turn import MIN_WINDOWS, Turning, turned_places
 from recon.rig.audit.row_alignment import correct_rig
 
@@ -32,7 +32,7 @@ _ROUNDS: Final = 10
 """Times that bent places are straightened; each adds at least a digit where lenses are usable."""
 
 _LEAST_GAIN: Final = 0.1
-"""Share of the misfit of other windows that lenses must take away, or they are not believed."""
+"""Share of the cost of other windows that lenses must take away, or they are not believed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ def estimate_lenses(tracks: Sequence[StereoTracks], camera: RectifiedCamera) -> 
     turning, bending = Turning(camera), _Bending(camera)
     seen, others = tracks[::2], tracks[1::2]
     turned, straight = (
-        misfit(others, camera, each, fit_correction(seen, camera, each).values)
+        remaining_cost(others, camera, each, fit_correction(seen, camera, each).values)
         for each in (turning, bending)
     )
     if straight > (1.0 - _LEAST_GAIN) * turned:
@@ -127,7 +127,7 @@ class _Bending:
 
     camera: RectifiedCamera
 
-    def place(self, tracks: StereoTracks, values: Float64) -> Placed:
+    def place(self, tracks: StereoTracks, values: Float64) -> CorrectedPlaces:
         """Return where the features of a window are, straightened and turned."""
         camera, (turn, left, right) = self.camera, _split(values)
         left_uv, by_left = self._straight(tracks.window.uvd[..., :2], camera.cx_px, 1.0, left)
@@ -135,7 +135,7 @@ class _Bending:
         right_uv, by_right = self._straight(tracks.right_uv, camera.cx_right_px, enlarged, right)
         by_turn = Turning.by_turn(right_uv, camera)[..., :_TURN]
         none = np.zeros_like(by_left)
-        return Placed(
+        return CorrectedPlaces(
             left_uv,
             turned_places(right_uv, np.array([*turn[:3], 0.0, 0.0]), camera),
             np.concatenate([np.zeros_like(by_turn), by_left, none], axis=-1),

@@ -47,7 +47,7 @@ class StereoTracks:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class CorrectedPlaces:
     """Where features are after a correction, and how that follows its parameters (P).
 
     Attributes:
@@ -73,10 +73,10 @@ class Placed:
         return replace(window, uvd=np.concatenate([self.left_uv, disparity], axis=2))
 
 
-class Correction(Protocol):
+class RigCorrection(Protocol):
     """What may be wrong with a rig, as parameters (P) that are 0 where nothing is."""
 
-    def place(self, tracks: StereoTracks, values: Float64) -> Placed:
+    def place(self, tracks: StereoTracks, values: Float64) -> CorrectedPlaces:
         """Return where the features of a window are after a correction."""
 
     def prior(self) -> Float64:
@@ -99,7 +99,7 @@ class Fitted:
 
 
 def fit_correction(
-    tracks: Sequence[StereoTracks], camera: RectifiedCamera, correction: Correction
+    tracks: Sequence[StereoTracks], camera: RectifiedCamera, correction: RigCorrection
 ) -> Fitted:
     """Fit a correction to windows of tracks."""
     prior = correction.prior()
@@ -118,8 +118,11 @@ def fit_correction(
     return Fitted(values, H, g - H @ step)
 
 
-def misfit(
-    tracks: Sequence[StereoTracks], camera: RectifiedCamera, correction: Correction, values: Float64
+def remaining_cost(
+    tracks: Sequence[StereoTracks],
+    camera: RectifiedCamera,
+    correction: RigCorrection,
+    values: Float64,
 ) -> float:
     """Return what is left of row errors and disparities after a correction, as a robust cost."""
     total = 0.0
@@ -133,7 +136,7 @@ def misfit(
 
 
 def _system(
-    window: TrackWindow, placed: Placed, camera: RectifiedCamera
+    window: TrackWindow, placed: CorrectedPlaces, camera: RectifiedCamera
 ) -> tuple[Float64, Float64]:
     """Return the normal equations (P, P) and (P,) of a further correction, all else eliminated."""
     normal = normal_equations(window, camera)
@@ -175,7 +178,7 @@ class _Shared:
     H_point: Float64
 
 
-def _of_rows(placed: Placed) -> tuple[Float64, Float64]:
+def _of_rows(placed: CorrectedPlaces) -> tuple[Float64, Float64]:
     """Return normal equations of the row errors (W, N), which neither pose nor depth changes."""
     residual = np.nan_to_num(placed.row_error) / _ROW_SIGMA_PX
     weight = np.isfinite(placed.row_error) / (1.0 + (residual / CAUCHY_SIGMAS) ** 2)
@@ -186,7 +189,7 @@ def _of_rows(placed: Placed) -> tuple[Float64, Float64]:
     return H, -np.einsum("wni,wn->i", J_weighted, residual)
 
 
-def _of_places(window: TrackWindow, placed: Placed, camera: RectifiedCamera) -> _Shared:
+def _of_places(window: TrackWindow, placed: CorrectedPlaces, camera: RectifiedCamera) -> _Shared:
     T_camera_world = invert(window.T_world_camera)
     residual, weight = weighted(window, camera)
     xyz = np.stack([apply(T, window.xyz_world) for T in T_camera_world])

@@ -10,7 +10,7 @@ import numpy as np
 
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.rig.audit.rig_fit import Placed, StereoTracks, fit_correction
+from recon.rig.audit.rig_fit import CorrectedPlaces, StereoTracks, fit_correction
 
 MIN_WINDOWS: Final = 6
 """Fewer windows do not show how much their answers scatter."""
@@ -83,11 +83,11 @@ class Turning:
 
     camera: RectifiedCamera
 
-    def place(self, tracks: StereoTracks, values: Float64) -> Placed:
+    def place(self, tracks: StereoTracks, values: Float64) -> CorrectedPlaces:
         """Return where the features of a window are after a turn."""
         uv, by_right = tracks.window.uvd[:, :, :2], self.by_turn(tracks.right_uv, self.camera)
         right = turned_places(tracks.right_uv, values, self.camera)
-        return Placed(uv, right, np.zeros_like(by_right), by_right)
+        return CorrectedPlaces(uv, right, np.zeros_like(by_right), by_right)
 
     def prior(self) -> Float64:
         """Return what is known beforehand: nothing."""
