@@ -220,7 +220,7 @@ def test_the_first_failure_ends_a_batch_that_fails_fast(batches: Batches, tmp_pa
         (["jobs.toml"], "file does not exist"),
         (["mapp", "a"], "unknown command"),
         (["map"], "there is no source"),
-        (["map", "a", "b/a"], "two jobs have one name"),
+        (["map", "a", "./a"], "two jobs have one name"),
         (["map", "a", "--set", "matching.window_px=9"], "matching.sad.window_px"),
         (["map", "a", "--option=--no-such"], "No such option"),
         (["--resume", "nowhere"], "holds no batch"),
