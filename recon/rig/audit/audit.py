@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -109,7 +110,7 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
         *find_image_faults(sample, config.matching.matcher),
         *find_series_faults(sample, gaps),
         *find_geometry_faults(geometry),
-        *find_turn_faults(turn, camera),
+        *_turn_faults(source.calibration, motion, camera),
         *find_range_faults(geometry, reach_px, camera),
         *find_calibration_faults(sample, source.calibration, camera, settings.baseline_m),
     ]
@@ -190,6 +191,16 @@ def _bent_lenses(rig: Rig, motion: SeenMotion | None) -> BentLenses | None:
     if motion is None or not isinstance(rig, RectifiedCamera):
         return None
     return estimate_lenses(motion.tracks_as_recorded(rig), rig)
+
+
+def _turn_faults(rig: Rig, motion: SeenMotion | None, camera: RectifiedCamera) -> Iterable[Finding]:
+    """Return a right camera that is turned, unless lenses that bend explain it better."""
+    turn = None if motion is None else motion.turn
+    found = list(find_turn_faults(turn, camera))
+    lenses = _bent_lenses(rig, motion) if found else None
+    if turn is None or lenses is None:
+        return found
+    return find_turn_faults(replace(turn, values=np.append(lenses.turn, 0.0)), camera)
 
 
 def _corrected_turn(

@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from recon.rig.audit.audit import _turn_faults
 from recon.rig.audit.bent_lenses import BentLenses, estimate_lenses, straightened
 from recon.rig.audit.rig_fit import StereoTracks
+from recon.rig.audit.right_turn import RightTurn
+from recon.rig.audit.seen_motion import SeenMotion
 from recon.stereo.rectify.lens import rays_of
 from tests.rig.audit.test_right_turn import CAMERA, tracks
 
@@ -74,3 +77,12 @@ def test_the_calibration_has_the_lenses_in_opencvs_order(terms: np.ndarray) -> N
     rays = rays_of(rig.left, uv)
     expected = straightened((uv - CENTRE) / CAMERA.focal_px, terms)
     np.testing.assert_allclose(rays[:, :2] / rays[:, 2:], expected, atol=1e-7)
+
+
+@pytest.mark.parametrize(("left", "right", "codes"), [(LEFT, RIGHT, []), (NONE, NONE, ["yaw"])])
+def test_what_bent_lenses_explain_better_is_no_turn(
+    left: np.ndarray, right: np.ndarray, codes: list[str]
+) -> None:
+    yaw = RightTurn(np.array([0.0, 1.0 / CAMERA.focal_px, 0.0, 0.0, 0.0]), 1e-12 * np.eye(5), 12)
+    motion = SeenMotion(yaw, tuple(drive(left, right)), None)
+    assert [found.code for found in _turn_faults(CAMERA, motion, CAMERA)] == codes
