@@ -54,6 +54,15 @@ class Survey:
     antenna_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     crs: str | None = None
 
+    @cached_property
+    def rows(self) -> Float64:
+        """float64 (N, 4), time, easting, northing and height, in the order of time.
+
+        Raises:
+            FormatError: The file is missing or damaged.
+        """
+        return _read_positions(self.positions)
+
 
 @dataclass(frozen=True, eq=False)
 class Measured:
@@ -138,7 +147,7 @@ def measure_along(path: Trajectory, T_map_world: Float64, survey: Survey) -> Mea
         FormatError: The file is missing or damaged.
         EvaluationError: No position was measured during the drive, or all at one place.
     """
-    rows = _read_positions(survey.positions)
+    rows = survey.rows
     here = rows[_during(path, rows[:, 0])]
     if not len(here):
         raise EvaluationError(
@@ -157,8 +166,7 @@ def measure_along(path: Trajectory, T_map_world: Float64, survey: Survey) -> Mea
             hint="eastings and northings are in metres, not degrees",
         )
     antenna_m = _in_camera(survey, T_map_world)
-    T_map_camera = T_map_world @ interpolate_poses(path, here[:, 0])
-    ours_m = np.stack([apply(T, antenna_m[None])[0] for T in T_map_camera])
+    ours_m = _placed(T_map_world @ interpolate_poses(path, here[:, 0]), antenna_m)
     agree = find_agreeing(ours_m, here[:, 1:], LARGEST_MISFIT * span_m(ours_m))
     return Measured(here[:, 0], here[:, 1:], ours_m, agree)
 
@@ -180,11 +188,12 @@ def hold(map_: Map, survey: Survey) -> list[str]:
         EvaluationError: No position was measured during any drive, or all of one at one place.
         OutputError: The map cannot be written.
     """
-    times_s, lines = _read_positions(survey.positions)[:, 0], list[str]()
+    times_s, lines = survey.rows[:, 0], list[str]()
     sessions = [each for each in map_.sessions if _during(_trusted(each), times_s).any()]
-    for session in sessions or map_.sessions[:1]:
-        measured = measure_along(_trusted(session), session.T_map_world, survey)
-        session.set_fixes(_fixes(session, measured, survey))
+    for session in sessions or map_.sessions[:1]:  # of none, the first says why
+        path = _trusted(session)
+        measured = measure_along(path, session.T_map_world, survey)
+        session.set_fixes(_fixes(session, path, measured, survey))
         lines += measured.warnings()
     return lines
 
@@ -201,8 +210,7 @@ def misfit_rms_m(map_: Map) -> float | None:
         [apply(one.T_map_world, one.fixes.by_path(one.trajectory)) for one in held]
     )
     position_m = np.concatenate([one.fixes.position_m for one in held])
-    off_m = apply(fit_upright(ours_m, position_m).T_to_from, ours_m) - position_m
-    return float(np.sqrt(np.mean(np.sum(off_m**2, axis=1))))
+    return float(np.sqrt(np.mean(np.sum(_off_m(ours_m, position_m) ** 2, axis=1))))
 
 
 def doubts_of_positions(map_: Map) -> list[str]:
@@ -215,20 +223,22 @@ def doubts_of_positions(map_: Map) -> list[str]:
     return [f"the paths are {off_m:.2f} m from the measured positions (RMS): {why}"]
 
 
-def _fixes(session: Session, measured: Measured, survey: Survey) -> Fixes:
-    """Return the positions of a drive that agree, by frame."""
-    times_s, path = measured.times_s[measured.agree], session.trajectory
-    frames = nearest_sorted(times_s, path.timestamps_s)
-    T_frame_camera = invert(path.T_world_camera[frames]) @ interpolate_poses(
-        _trusted(session), times_s
-    )
-    antenna_m = _in_camera(survey, session.T_map_world)
+def _fixes(session: Session, path: Trajectory, measured: Measured, survey: Survey) -> Fixes:
+    """Return the positions of a drive that agree, by frame; between frames its path is trusted."""
+    times_s, T_world_frame = measured.times_s[measured.agree], session.trajectory.T_world_camera
+    frames = nearest_sorted(times_s, session.trajectory.timestamps_s)
+    T_frame_camera = invert(T_world_frame[frames]) @ interpolate_poses(path, times_s)
     return Fixes(
         frames,
-        np.stack([apply(T, antenna_m[None])[0] for T in T_frame_camera]),
+        _placed(T_frame_camera, _in_camera(survey, session.T_map_world)),
         measured.position_m[measured.agree],
         measured.sigma_m,
     )
+
+
+def _placed(T: Float64, point_m: Float64) -> Float64:
+    """Return a point (3,) by transforms (N, 4, 4): float64 (N, 3)."""
+    return np.asarray(T[:, :3, :3] @ point_m + T[:, :3, 3])
 
 
 def _in_camera(survey: Survey, T_map_world: Float64) -> Float64:
