@@ -85,13 +85,13 @@ def _held_together(map_: Map, links: Sequence[Link]) -> _Joined:
         if len(places) == 1 and not len(map_.sessions[0].fixes):
             return _Joined({}, [])
         joined = _solve(map_, places, inside)
-        if len(places) == 1 and not joined.paths:
+        if not joined.paths and not inside:
             raise RegistrationError(
-                "measured positions bend the path more than its drift explains",
-                where=map_.sessions[0].info.source,
+                "measured positions bend a path more than its drift explains",
+                where=", ".join(map_.session(number).info.source for number in places),
                 hint="have they its clock, metres, and the offset of the antenna?",
             )
-        if set(_reached(map_, joined.links)) == set(places):
+        if joined.paths and set(_reached(map_, joined.links)) == set(places):
             return joined
         links = joined.links
 

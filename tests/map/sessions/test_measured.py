@@ -95,9 +95,9 @@ def test_positions_when_nobody_drove_are_refused(tmp_path: Path) -> None:
         hold(drives(), Survey(positions(tmp_path, ())))
 
 
-def winding(folder: Path, off_m: float, every_s: float) -> Path:
+def winding(folder: Path, off_m: float, every_s: float, numbers: tuple[int, ...] = (0,)) -> Path:
     """Positions that leave the true path to either side."""
-    rows = np.loadtxt(positions(folder, (0,), every_s))
+    rows = np.loadtxt(positions(folder, numbers, every_s))
     rows[1:, 1:3] += off_m * np.sin(3.0 * rows[1:, 0])[:, None]
     np.savetxt(folder / "gnss.txt", rows, fmt="%.4f")
     return folder / "gnss.txt"
@@ -110,8 +110,11 @@ def test_positions_far_from_the_path_are_warned_of(tmp_path: Path) -> None:
     assert "from the measured positions" in doubts_of_positions(map_)[0]
 
 
-def test_positions_that_no_drift_explains_are_refused(tmp_path: Path) -> None:
-    map_ = drives()
-    hold(map_, Survey(winding(tmp_path, 8.0, 0.02), ANTENNA))
-    with pytest.raises(RegistrationError, match="bend the path more than its drift explains"):
+@pytest.mark.parametrize("numbers", [(0,), (0, 1)])
+def test_positions_that_no_drift_explains_are_refused(
+    tmp_path: Path, numbers: tuple[int, ...]
+) -> None:
+    map_ = drives(len(numbers))
+    hold(map_, Survey(winding(tmp_path, 8.0, 0.02, numbers), ANTENNA))
+    with pytest.raises(RegistrationError, match="bend a path more than its drift explains"):
         join_new(map_, [])
